@@ -1,0 +1,55 @@
+"""What every reconstruction scheme returns: `irs`, `ers` and `fit` share this one signature.
+
+``reconstruct(match: Match, rig: Rig, settings) -> Reconstruction``
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from labapp.core.boundary import Boundary
+from labapp.core.surface import Surface
+from labapp.core.values import FloatArray, IntArray, freeze
+
+Scheme = Literal["fit", "ers", "irs"]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A pool surface and how far it explains the reflected dots.
+
+    Parameters
+    ----------
+    scheme
+        Which scheme made it.
+    surface
+        z = f(x, y); defined at least inside the boundary.
+    boundary
+        The pool's boundary.
+    ray
+        Ray (i, j) of each reflection point, counted from 1, shape (n, 2).
+    points_mm
+        Reflection points, UCS, shape (n, 3), mm.
+    residual_mm
+        Computed minus captured reflected dot on the imaging plane (X′, Z′), shape (n, 2), mm.
+    sigma_mm
+        Standard uncertainty of each reflection point's height, shape (n,), mm; NaN where the
+        scheme gives none.
+    variants
+        Surfaces and boundaries one standard deviation away along each principal direction of
+        the result's uncertainty, in pairs (plus, minus); empty where the scheme gives none.
+        `measures` turns them into the ± of width, length, height, area and volume.
+    """
+
+    scheme: Scheme
+    surface: Surface
+    boundary: Boundary
+    ray: IntArray
+    points_mm: FloatArray
+    residual_mm: FloatArray
+    sigma_mm: FloatArray
+    variants: tuple[tuple[Surface, Boundary], ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze(self)

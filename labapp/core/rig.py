@@ -1,0 +1,140 @@
+"""What is bolted to the bench: laser, dot pattern, electrode, imaging plane.
+
+All positions are in the universal coordinate system (UCS): origin on the work piece under the
+electrode tip, Y along the welding direction, Z up, X to the right as the camera sees it; mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from labapp.core.values import FloatArray, freeze
+
+
+@dataclass(frozen=True)
+class Laser:
+    """The laser diode, in the YOZ plane on the side of the pool's head (§3.1.2).
+
+    Parameters
+    ----------
+    projection_angle_deg
+        Elevation of the beam axis above the work piece, degrees (Appendix I's α₅).
+    distance_mm
+        Distance from the diode to the origin, mm.
+    """
+
+    projection_angle_deg: float
+    distance_mm: float
+
+    @property
+    def position_mm(self) -> FloatArray:
+        """Position of the diode, shape (3,), mm."""
+        angle = np.radians(self.projection_angle_deg)
+        return np.array([0.0, self.distance_mm * np.cos(angle), self.distance_mm * np.sin(angle)])
+
+
+@dataclass(frozen=True)
+class DotPattern:
+    """The projected dot matrix: a square tangent grid of rays (Fig. 4-14).
+
+    Parameters
+    ----------
+    rows, columns
+        Number of rays each way.
+    inter_beam_angle_deg
+        Angle between neighbouring rays at the centre, degrees.
+    absent
+        Rays ``(i, j)``, counted from 1, that the lens does not make. None: the centre.
+    """
+
+    rows: int = 19
+    columns: int = 19
+    inter_beam_angle_deg: float = 0.77
+    absent: frozenset[tuple[int, int]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.absent is None:
+            object.__setattr__(self, "absent", frozenset({self.reference}))
+
+    @property
+    def reference(self) -> tuple[int, int]:
+        """The centre reference ray ``(i, j)``, counted from 1."""
+        return (self.rows + 1) // 2, (self.columns + 1) // 2
+
+    @property
+    def absent_rays(self) -> frozenset[tuple[int, int]]:
+        """Rays ``(i, j)`` that are not there."""
+        assert self.absent is not None
+        return self.absent
+
+
+@dataclass(frozen=True)
+class Electrode:
+    """The torch's electrode: its tip stands ``height_mm`` above the origin."""
+
+    height_mm: float = 5.0
+
+
+@dataclass(frozen=True)
+class ImagingPlane:
+    """The imaging plane, of any pose: O′ and the directions of O′X′ and O′Z′ in the UCS.
+
+    Parameters
+    ----------
+    origin_mm
+        O′, shape (3,), mm.
+    x_axis, z_axis
+        Unit vectors along O′X′ and O′Z′, shape (3,).
+    width_mm, height_mm
+        Size along X′ and Z′, mm.
+    """
+
+    origin_mm: FloatArray
+    x_axis: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
+    z_axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    width_mm: float = 101.6
+    height_mm: float = 101.6
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @classmethod
+    def vertical(
+        cls,
+        distance_mm: float,
+        s_mm: float,
+        h_mm: float,
+        width_mm: float = 101.6,
+        height_mm: float = 101.6,
+    ) -> ImagingPlane:
+        """Build the plane y = −distance_mm with O′ at X = −s, Z = h (Fig. 4-5, Eq. 4-5)."""
+        return cls(
+            np.array([-s_mm, -distance_mm, h_mm]), width_mm=width_mm, height_mm=height_mm
+        )
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
+        return np.cross(self.x_axis, self.z_axis)
+
+    def to_universal(self, plane_mm: FloatArray) -> FloatArray:
+        """IPCS (X′, Z′), shape (…, 2), to UCS points, shape (…, 3), mm (Eq. 4-5)."""
+        plane_mm = np.asarray(plane_mm, float)
+        return self.origin_mm + plane_mm[..., :1] * self.x_axis + plane_mm[..., 1:] * self.z_axis
+
+    def from_universal(self, point_mm: FloatArray) -> FloatArray:
+        """UCS points on the plane, shape (…, 3), to IPCS (X′, Z′), shape (…, 2), mm."""
+        offset = np.asarray(point_mm, float) - self.origin_mm
+        return np.stack([offset @ self.x_axis, offset @ self.z_axis], axis=-1)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Everything on the bench whose place must be known to measure."""
+
+    laser: Laser
+    pattern: DotPattern
+    electrode: Electrode
+    imaging_plane: ImagingPlane

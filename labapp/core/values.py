@@ -1,0 +1,41 @@
+"""What every step shares: array types, frozen value objects, and the answer "cannot be measured"."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class CannotMeasure(Exception):
+    """A frame has no answer, and this says why.
+
+    Parameters
+    ----------
+    status
+        One word with hyphens, as it goes into ``measures.csv``: ``no-dots``, ``no-reference``,
+        ``ambiguous-rows``, ``too-few-dots``, …
+    reason
+        One sentence for the operator.
+    """
+
+    def __init__(self, status: str, reason: str) -> None:
+        super().__init__(f"{status}: {reason}")
+        self.status = status
+        self.reason = reason
+
+
+def freeze(value: Any) -> None:
+    """Make every array field of a dataclass instance read-only (call from ``__post_init__``)."""
+    for field in dataclasses.fields(value):
+        item = getattr(value, field.name)
+        if isinstance(item, np.ndarray) and item.flags.writeable:
+            item = item.view()
+            item.flags.writeable = False
+            object.__setattr__(value, field.name, item)
