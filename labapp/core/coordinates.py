@@ -84,8 +84,7 @@ class ImageCalibration:
         plane = self.to_plane(image_px)
         w = image_px @ self.matrix[2, :2] + self.matrix[2, 2]
         return np.asarray(
-            (self.matrix[:2, :2] - plane[..., :, None] * self.matrix[2, :2])
-            / w[..., None, None]
+            (self.matrix[:2, :2] - plane[..., :, None] * self.matrix[2, :2]) / w[..., None, None]
         )
 
 

@@ -55,9 +55,9 @@ def bisecting_gradient(incident: FloatArray, reflected: FloatArray) -> FloatArra
     The normal bisects the reversed incident ray and the reflected one (Eq. 4-3). Both
     directions, shape (…, 3), of any length.
     """
-    normal = reflected / np.linalg.norm(reflected, axis=-1, keepdims=True) - incident / np.linalg.norm(
-        incident, axis=-1, keepdims=True
-    )
+    normal = reflected / np.linalg.norm(
+        reflected, axis=-1, keepdims=True
+    ) - incident / np.linalg.norm(incident, axis=-1, keepdims=True)
     return np.asarray(-normal[..., :2] / normal[..., 2:])
 
 

@@ -110,9 +110,7 @@ class ImagingPlane:
         height_mm: float = 101.6,
     ) -> ImagingPlane:
         """Build the plane y = −distance_mm with O′ at X = −s, Z = h (Fig. 4-5, Eq. 4-5)."""
-        return cls(
-            np.array([-s_mm, -distance_mm, h_mm]), width_mm=width_mm, height_mm=height_mm
-        )
+        return cls(np.array([-s_mm, -distance_mm, h_mm]), width_mm=width_mm, height_mm=height_mm)
 
     @property
     def normal(self) -> FloatArray:

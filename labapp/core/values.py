@@ -1,4 +1,4 @@
-"""What every step shares: array types, frozen value objects, and the answer "cannot be measured"."""
+"""What every step shares: array types, frozen values, and the answer "cannot be measured"."""
 
 from __future__ import annotations
 
