@@ -1,0 +1,287 @@
+"""The forward model: which rays come back from a pool, and where they meet the imaging plane.
+
+Written from the geometry alone (laser and pattern of §4.2.2.2, blocking of §4.2.1), in vectors,
+with nothing of the code that measures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from labapp.core.correspondence import Match, Orientation
+from labapp.core.rig import Rig
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+
+SAMPLES = 256
+"""Steps along a ray between the highest and the lowest point of the pool."""
+
+HALVINGS = 52
+"""Halvings of a step: as far as double precision goes."""
+
+
+class PoolSurface(Protocol):
+    """What a ray needs to know of a pool: z = f(x, y), NaN outside the boundary."""
+
+    def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Height z at (x, y), arrays of one shape, mm; NaN outside the boundary."""
+        ...
+
+    def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Reflections:
+    """What becomes of every ray of the pattern; ray (i, j) is at ``[i - 1, j - 1]``.
+
+    Parameters
+    ----------
+    absent
+        The lens makes no such ray (the centre), shape (rows, columns).
+    hit
+        The ray meets the pool, shape (rows, columns). An absent ray is traced like any other.
+    incident_blocked, reflected_blocked
+        The torch is in the way of the incident or of the reflected ray, shape (rows, columns).
+    on_plane
+        The reflected ray meets the imaging plane within its edges, shape (rows, columns).
+    point_mm
+        Reflection point, UCS, shape (rows, columns, 3), mm; NaN without one.
+    incident, reflected
+        Unit directions, shape (rows, columns, 3); the reflected one NaN without a hit.
+    plane_mm
+        Where the reflected ray meets the plane, its edges ignored, IPCS (X′, Z′), shape
+        (rows, columns, 2), mm; NaN where it never does.
+    """
+
+    absent: BoolArray
+    hit: BoolArray
+    incident_blocked: BoolArray
+    reflected_blocked: BoolArray
+    on_plane: BoolArray
+    point_mm: FloatArray
+    incident: FloatArray
+    reflected: FloatArray
+    plane_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def lit(self) -> BoolArray:
+        """There is such a ray and it meets the pool; whether its dot shows is `visible`."""
+        return np.asarray(self.hit & ~self.absent)
+
+    @property
+    def blocked(self) -> BoolArray:
+        """The torch is in the way, before or after the pool."""
+        return np.asarray(self.incident_blocked | self.reflected_blocked)
+
+    @property
+    def visible(self) -> BoolArray:
+        """A dot shows on the imaging plane."""
+        return np.asarray(self.lit & ~self.blocked & self.on_plane)
+
+
+def trace(pool: PoolSurface, rig: Rig) -> Reflections:
+    """Follow every ray from the laser by way of the pool to the imaging plane.
+
+    Outside the pool's boundary is the work piece at z = 0, which scatters: a ray that meets it
+    first is not lit.
+    """
+    source, incident = _rays(rig)
+    point, hit = _first_hit(pool, source, incident)
+    slope = pool.gradient(point[..., 0], point[..., 1])
+    normal = np.concatenate([-slope, np.ones_like(slope[..., :1])], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    reflected = incident - 2 * np.sum(incident * normal, axis=-1, keepdims=True) * normal
+    plane = _on_imaging_plane(point, reflected, rig)
+    limit = (rig.imaging_plane.width_mm, rig.imaging_plane.height_mm)
+    tip = rig.electrode.height_mm
+    y = point[..., 1]
+    absent = np.zeros(hit.shape, bool)
+    for i, j in rig.pattern.absent_rays:
+        absent[i - 1, j - 1] = True
+    return Reflections(
+        absent=absent,
+        hit=hit,
+        incident_blocked=(y < 0) & (_height_over_origin(point, -incident) > tip),
+        reflected_blocked=(y > 0) & (_height_over_origin(point, reflected) > tip),
+        on_plane=((plane >= 0) & (plane <= limit)).all(axis=-1),
+        point_mm=point,
+        incident=incident,
+        reflected=reflected,
+        plane_mm=plane,
+    )
+
+
+def exact_match(
+    reflections: Reflections,
+    rig: Rig,
+    orientation: Orientation | None = None,
+    sigma_mm: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> Match:
+    """Build the Match that a perfect detector would hand to a reconstruction scheme.
+
+    Parameters
+    ----------
+    reflections
+        What `trace` gave.
+    rig
+        The rig that it was given.
+    orientation
+        The correspondence the match carries; None: the one the dots show.
+    sigma_mm
+        Standard deviation of normal noise put on every dot along X′ and along Z′, mm. The match's
+        covariance is its square, of at least 1 µm, so that it can be inverted.
+    rng
+        Source of the noise; needed when ``sigma_mm`` is not 0.
+
+    Raises
+    ------
+    ValueError
+        If noise is asked for without ``rng``.
+    """
+    visible = reflections.visible
+    ray = np.argwhere(visible) + 1
+    plane = reflections.plane_mm[visible]
+    if sigma_mm > 0:
+        if rng is None:
+            raise ValueError("noise needs a random generator")
+        plane = plane + rng.normal(0.0, sigma_mm, plane.shape)
+    if orientation is None:
+        orientation = seen_orientation(reflections)
+    witness = np.where(visible, 1, np.where(~reflections.hit, -1, 0))
+    witness[reflections.absent] = 0
+    return Match(
+        orientation=orientation,
+        dot=np.arange(len(ray)),
+        ray=ray,
+        reflected=_reflected_numbers(ray, orientation),
+        plane_mm=plane,
+        plane_covariance_mm2=np.tile(max(sigma_mm, 1e-3) ** 2 * np.eye(2), (len(ray), 1, 1)),
+        witness=witness,
+    )
+
+
+def seen_orientation(reflections: Reflections) -> Orientation:
+    """Tell the correspondence from how most neighbouring dots lie to each other on the plane."""
+    dots = np.where(reflections.visible[..., None], reflections.plane_mm, np.nan)
+    across = np.sign(np.diff(dots[..., 0], axis=1))
+    upward = np.sign(np.diff(dots[..., 1], axis=0))
+    if np.nansum(upward) >= 0:
+        return "S/S"
+    return "S/I" if np.nansum(across) >= 0 else "I/I"
+
+
+def _rays(rig: Rig) -> tuple[FloatArray, FloatArray]:
+    """Laser position, shape (3,), and unit ray directions, shape (rows, columns, 3)."""
+    alpha = np.radians(rig.laser.projection_angle_deg)
+    beam = np.array([0.0, -np.cos(alpha), -np.sin(alpha)])
+    up = np.array([0.0, -np.sin(alpha), np.cos(alpha)])
+    beta = np.radians(rig.pattern.inter_beam_angle_deg)
+    rows, columns = rig.pattern.rows, rig.pattern.columns
+    # Row 1 is the topmost of the fan as the laser sends it, so it lands farthest, at the tail.
+    v = np.tan(beta * ((rows - 1) / 2 - np.arange(rows)))
+    h = np.tan(beta * (np.arange(columns) - (columns - 1) / 2))
+    direction = np.empty((rows, columns, 3))
+    direction[..., 0] = h
+    direction[..., 1:] = (beam + v[:, None] * up)[:, None, 1:]
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    return -rig.laser.distance_mm * beam, direction
+
+
+def _first_hit(
+    pool: PoolSurface, source: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """First point of each ray on pool or work piece, NaN unless it is the pool's; and whether.
+
+    The rays are walked down from above the pool to below it, and the first step that goes under
+    the surface is halved. Where the pool stands off the work piece at a low rear, a ray can meet
+    the step between them; that is no reflection point either.
+    """
+
+    def above(t: FloatArray) -> FloatArray:
+        x, y, z = (source[n] + t * direction[..., n] for n in range(3))
+        ground = pool.height(x, y)
+        return np.asarray(z - np.where(np.isnan(ground), 0.0, ground))
+
+    high, low = _extent(pool, source, direction)
+    # t of the horizontal levels just above the highest and just below the lowest point.
+    levels = np.linspace(high, low, SAMPLES)
+    falls = direction[..., 2] < 0
+    down = np.where(falls, direction[..., 2], -1.0)
+    steps = (levels[:, None, None] - source[2]) / down
+    under = above(steps) <= 0
+    first = np.maximum(np.argmax(under, axis=0), 1)
+    far = np.take_along_axis(steps, first[None], axis=0)[0]
+    near = np.take_along_axis(steps, first[None] - 1, axis=0)[0]
+    for _ in range(HALVINGS):
+        middle = (near + far) / 2
+        below = above(middle) <= 0
+        near, far = np.where(below, near, middle), np.where(below, middle, far)
+    point = source + far[..., None] * direction
+    ground = pool.height(point[..., 0], point[..., 1])
+    hit = falls & under.any(axis=0) & (np.abs(point[..., 2] - ground) < 1e-9)
+    return np.where(hit[..., None], point, np.nan), np.asarray(hit)
+
+
+def _extent(
+    pool: PoolSurface, source: FloatArray, direction: FloatArray
+) -> tuple[float, float]:
+    """Levels safely above and below the part of the pool that the rays can reach, mm."""
+    falls = direction[..., 2] < 0
+    down = np.where(falls, direction[..., 2], -1.0)
+    landing = source - source[2] / down[..., None] * direction
+    landing = landing[falls]
+    margin = 0.1 * np.ptp(landing[:, :2], axis=0)
+    x, y = np.meshgrid(
+        *(
+            np.linspace(landing[:, n].min() - margin[n], landing[:, n].max() + margin[n], 101)
+            for n in range(2)
+        )
+    )
+    z = np.nan_to_num(pool.height(x, y), nan=0.0)
+    slack = 0.05 + 0.1 * float(np.ptp(z))
+    return float(max(z.max(), 0.0)) + slack, float(min(z.min(), 0.0)) - slack
+
+
+def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> FloatArray:
+    """Where the reflected rays meet the plane, (X′, Z′), shape (…, 2), mm; NaN where never.
+
+    Solves ``O′ + X′·x + Z′·z = P + t·d`` for X′, Z′ and t, ray by ray.
+    """
+    plane = rig.imaging_plane
+    axes = np.stack([plane.x_axis, plane.z_axis], axis=-1)
+    system = np.concatenate(
+        [np.broadcast_to(axes, (*point.shape[:-1], 3, 2)), -direction[..., None]], axis=-1
+    )
+    with np.errstate(invalid="ignore"):
+        meets = np.abs(np.linalg.det(system)) > 1e-12
+    solution = np.full(point.shape, np.nan)
+    offset = point - np.asarray(plane.origin_mm)
+    solution[meets] = np.linalg.solve(system[meets], offset[meets][..., None])[..., 0]
+    return np.where(solution[..., 2:] > 0, solution[..., :2], np.nan)
+
+
+def _height_over_origin(point: FloatArray, direction: FloatArray) -> FloatArray:
+    """Z at which the rays cross y = 0 (the YOZ rule of §4.2.1.1), shape (…); NaN where never."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = -point[..., 1] / direction[..., 1]
+        return np.asarray(np.where(along > 0, point[..., 2] + along * direction[..., 2], np.nan))
+
+
+def _reflected_numbers(ray: IntArray, orientation: Orientation) -> IntArray:
+    """(k, t), shape (n, 2), counted from 1 at the lowest row and the leftmost column."""
+    if len(ray) == 0:
+        return ray.copy()
+    column_order, row_order = orientation.split("/")
+    number = np.empty_like(ray)
+    for axis, order in ((0, row_order), (1, column_order)):
+        line = ray[:, axis]
+        number[:, axis] = line - line.min() + 1 if order == "S" else line.max() - line + 1
+    return number

@@ -1,0 +1,345 @@
+"""Pool surfaces of known shape: caps, ellipsoids, eggs, and what disturbs them (§4.2.1.2, §7.3).
+
+Every pool is ``z = f(x, y)`` inside a closed boundary and undefined (NaN) outside it, with exact
+gradients up to the boundary. The boundary lies at z = 0 unless a `LowRear` is put on the pool.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from labapp.core.values import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class PoolSize:
+    """True size of a pool, mm.
+
+    Parameters
+    ----------
+    width_mm, length_mm
+        Extent of the boundary along X and along Y.
+    height_mm, depth_mm
+        Largest and smallest z, the boundary included.
+    peak_mm
+        (x, y) of the largest z.
+    """
+
+    width_mm: float
+    length_mm: float
+    height_mm: float
+    depth_mm: float
+    peak_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """An egg-shaped area: head and tail of different length, an ellipse when they are equal.
+
+    Points are placed by ``p = x/(width/2)`` and ``q(y)``, the fractional linear map that takes
+    the tail's end to −1, the widest place to 0 and the head's end to 1; the boundary is
+    p² + q² = 1. The map is smooth, so that no line across the pool has a kink in its curvature.
+
+    Parameters
+    ----------
+    width_mm
+        Largest width, at the centre.
+    head_mm, tail_mm
+        Distance from the centre to the boundary along +Y and along −Y.
+    center_mm
+        Where the pool is widest, (x, y) in the UCS.
+    """
+
+    width_mm: float
+    head_mm: float
+    tail_mm: float
+    center_mm: tuple[float, float] = (0.0, 0.0)
+
+    def place(self, x_mm: FloatArray, y_mm: FloatArray) -> Place:
+        """Place points (x, y), arrays of one shape, in the footprint."""
+        half = self.width_mm / 2
+        slope = (1 / self.tail_mm + 1 / self.head_mm) / 2
+        skew = (1 / self.tail_mm - 1 / self.head_mm) / 2
+        dx = np.asarray(x_mm, float) - self.center_mm[0]
+        dy = np.asarray(y_mm, float) - self.center_mm[1]
+        # The map's pole is more than two lengths away, where only "outside" matters.
+        dy = np.clip(dy, -2 * self.tail_mm, 2 * self.head_mm)
+        below = 1 + skew * dy
+        p, q = dx / half, slope * dy / below
+        return Place(
+            x_mm=dx, y_mm=dy, p=p, q=q, p_x=1 / half, q_y=slope / below**2, rho2=p**2 + q**2
+        )
+
+
+@dataclass(frozen=True)
+class Place:
+    """Points placed in a footprint.
+
+    ``x_mm, y_mm`` from its centre, ``p`` and ``q`` across and along it (±1 at its ends), their
+    derivatives ``p_x`` = dp/dx and ``q_y`` = dq/dy, and ``rho2`` = p² + q², 1 at the boundary.
+    """
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    p: FloatArray
+    q: FloatArray
+    p_x: float
+    q_y: FloatArray
+    rho2: FloatArray
+
+    def gradient(self, by_p: FloatArray, by_q: FloatArray) -> FloatArray:
+        """(∂/∂x, ∂/∂y), shape (…, 2), of a function whose ∂/∂p and ∂/∂q are given."""
+        return np.stack(np.broadcast_arrays(by_p * self.p_x, by_q * self.q_y), axis=-1)
+
+
+class Term(Protocol):
+    """A disturbance added to a cap."""
+
+    def height(self, place: Place) -> FloatArray:
+        """Height that it adds, mm."""
+        ...
+
+    def gradient(self, place: Place) -> FloatArray:
+        """Gradient that it adds, shape (…, 2)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Dent:
+    """A Gaussian dip, as under the torch; damped by 1 − ρ² so that the boundary stays at z = 0.
+
+    Parameters
+    ----------
+    depth_mm, radius_mm
+        Depth and standard deviation of the dip.
+    offset_mm
+        Its (x, y) from the pool's centre.
+    """
+
+    depth_mm: float
+    radius_mm: float
+    offset_mm: tuple[float, float] = (0.0, 0.0)
+
+    def _dip(self, place: Place) -> tuple[FloatArray, FloatArray, FloatArray]:
+        x = (place.x_mm - self.offset_mm[0]) / self.radius_mm
+        y = (place.y_mm - self.offset_mm[1]) / self.radius_mm
+        return -self.depth_mm * np.exp(-(x**2 + y**2) / 2), x, y
+
+    def height(self, place: Place) -> FloatArray:
+        """Height that it adds, mm."""
+        return self._dip(place)[0] * (1 - place.rho2)
+
+    def gradient(self, place: Place) -> FloatArray:
+        """Gradient that it adds, shape (…, 2)."""
+        dip, x, y = self._dip(place)
+        inner = np.stack([-x * dip, -y * dip], axis=-1) / self.radius_mm
+        return inner * (1 - place.rho2)[..., None] + place.gradient(
+            -2 * place.p * dip, -2 * place.q * dip
+        )
+
+
+@dataclass(frozen=True)
+class LowRear:
+    """A tail that sinks smoothly to ``drop_mm`` below the work piece at its end (§7.2)."""
+
+    drop_mm: float
+
+    def height(self, place: Place) -> FloatArray:
+        """Height that it adds, mm."""
+        return -self.drop_mm * np.maximum(-place.q, 0) ** 3
+
+    def gradient(self, place: Place) -> FloatArray:
+        """Gradient that it adds, shape (…, 2)."""
+        return place.gradient(
+            np.zeros_like(place.q), 3 * self.drop_mm * np.maximum(-place.q, 0) ** 2
+        )
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """A swinging pool: the surface slides to and fro along and across, vanishing at the boundary.
+
+    ``amplitude · (1 − ρ²)² · (cos(ωt)·q + ½·sin(ωt)·p)`` has no net volume on an even pool.
+
+    Parameters
+    ----------
+    amplitude_mm
+        Largest factor of the mode.
+    frequency_hz, time_s
+        ω/2π, and the moment that is looked at.
+    """
+
+    amplitude_mm: float
+    frequency_hz: float
+    time_s: float = 0.0
+
+    def _weights(self) -> tuple[float, float]:
+        phase = 2 * np.pi * self.frequency_hz * self.time_s
+        return self.amplitude_mm * np.cos(phase), self.amplitude_mm * np.sin(phase) / 2
+
+    def height(self, place: Place) -> FloatArray:
+        """Height that it adds, mm."""
+        along, across = self._weights()
+        return (1 - place.rho2) ** 2 * (along * place.q + across * place.p)
+
+    def gradient(self, place: Place) -> FloatArray:
+        """Gradient that it adds, shape (…, 2)."""
+        along, across = self._weights()
+        damp = 1 - place.rho2
+        slope = -4 * damp * (along * place.q + across * place.p)
+        return place.gradient(
+            slope * place.p + damp**2 * across, slope * place.q + damp**2 * along
+        )
+
+
+@dataclass(frozen=True)
+class Pool:
+    """A cap of an egg-shaped (or elliptic, or round) footprint, with disturbances on it.
+
+    The cap is ``peak · (√(1 − κρ²) − √(1 − κ)) / (1 − √(1 − κ))``: part of an ellipsoid when head
+    and tail are equal, of a sphere when the width equals them too. κ (`fullness`) is that of the
+    sphere of the pool's width unless given; 0 is a paraboloid, 1 half an ellipsoid.
+
+    Parameters
+    ----------
+    footprint
+        The area inside the boundary.
+    peak_mm
+        z of the undisturbed cap at the centre, negative for a concave pool.
+    terms
+        Disturbances, added up.
+    fullness
+        κ above, 0 ≤ κ < 1.
+
+    Raises
+    ------
+    ValueError
+        If a length is not positive, the cap would overhang, or `fullness` is out of range.
+    """
+
+    footprint: Footprint
+    peak_mm: float
+    terms: tuple[Term, ...] = ()
+    fullness: float | None = None
+
+    def __post_init__(self) -> None:
+        foot = self.footprint
+        if min(foot.width_mm, foot.head_mm, foot.tail_mm) <= 0:
+            raise ValueError("a pool's width, head and tail must be positive")
+        if self.fullness is None and abs(self.peak_mm) >= foot.width_mm / 2:
+            raise ValueError("a cap must be lower than half its width: its sides would overhang")
+        if self.fullness is not None and not 0 <= self.fullness < 1:
+            raise ValueError("fullness must be from 0 up to, but not including, 1")
+
+    @property
+    def _kappa(self) -> float:
+        if self.fullness is not None:
+            return self.fullness
+        half, height = self.footprint.width_mm / 2, abs(self.peak_mm)
+        return (2 * height * half / (half**2 + height**2)) ** 2
+
+    def inside(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+        """Whether (x, y) is within the boundary."""
+        return np.asarray(self.footprint.place(x_mm, y_mm).rho2 <= 1)
+
+    def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Height z at (x, y), arrays of one shape, mm; NaN outside the boundary."""
+        place = self.footprint.place(x_mm, y_mm)
+        kappa = self._kappa
+        # √(1 − κρ²) − √(1 − κ), over the same at ρ = 0, written so that it holds for κ → 0 too.
+        rim = np.sqrt(1 - kappa)
+        root = np.sqrt(np.maximum(1 - kappa * place.rho2, 0))
+        z = self.peak_mm * (1 - place.rho2) * (1 + rim) / (root + rim)
+        for term in self.terms:
+            z = z + term.height(place)
+        return np.where(place.rho2 <= 1, z, np.nan)
+
+    def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2); NaN outside the boundary."""
+        place = self.footprint.place(x_mm, y_mm)
+        kappa = self._kappa
+        root = np.sqrt(np.maximum(1 - kappa * place.rho2, 1 - kappa))
+        slope = -self.peak_mm * (1 + np.sqrt(1 - kappa)) / root
+        gradient = place.gradient(slope * place.p, slope * place.q)
+        for term in self.terms:
+            gradient = gradient + term.gradient(place)
+        return np.where((place.rho2 <= 1)[..., None], gradient, np.nan)
+
+    @property
+    def size(self) -> PoolSize:
+        """True size; the peak is found by ever finer grids, to about 1e-6 mm."""
+        foot = self.footprint
+        high, peak = self._largest(1.0)
+        low, _ = self._largest(-1.0)
+        return PoolSize(foot.width_mm, foot.head_mm + foot.tail_mm, high, -low, peak)
+
+    def boundary_mm(self, count: int = 720) -> FloatArray:
+        """Points of the boundary at even steps of angle in (p, q), shape (count, 3), mm."""
+        foot = self.footprint
+        angle = 2 * np.pi * np.arange(count) / count
+        # A hair inside, so that rounding does not put a point outside, where z is NaN.
+        p, q = (1 - 1e-12) * np.cos(angle), (1 - 1e-12) * np.sin(angle)
+        slope = (1 / foot.tail_mm + 1 / foot.head_mm) / 2
+        skew = (1 / foot.tail_mm - 1 / foot.head_mm) / 2
+        x = foot.center_mm[0] + p * foot.width_mm / 2
+        y = foot.center_mm[1] + q / (slope - skew * q)
+        return np.stack([x, y, self.height(x, y)], axis=-1)
+
+    def _largest(self, sign: float) -> tuple[float, tuple[float, float]]:
+        """Largest of sign × z, the boundary included, and where."""
+        foot = self.footprint
+        rim = self.boundary_mm()
+        best = int(np.argmax(sign * rim[:, 2]))
+        value, at = float(sign * rim[best, 2]), (float(rim[best, 0]), float(rim[best, 1]))
+        middle = np.array([0.0, (foot.head_mm - foot.tail_mm) / 2]) + foot.center_mm
+        reach = np.array([foot.width_mm, foot.head_mm + foot.tail_mm]) / 2
+        for _ in range(5):
+            x, y = np.meshgrid(*(m + r * np.linspace(-1, 1, 81) for m, r in zip(middle, reach)))
+            z = np.nan_to_num(sign * self.height(x, y), nan=-np.inf)
+            index = np.unravel_index(np.argmax(z), z.shape)
+            middle, reach = np.array([x[index], y[index]]), reach / 16
+            if z[index] > value + 1e-12:
+                value, at = float(z[index]), (float(x[index]), float(y[index]))
+        return value, at
+
+
+def spherical_cap(
+    diameter_mm: float, peak_mm: float, center_mm: tuple[float, float] = (0.0, 0.0)
+) -> Pool:
+    """Part of a sphere, the simulated pool of Fig. 4-10; concave when ``peak_mm`` is negative."""
+    return Pool(Footprint(diameter_mm, diameter_mm / 2, diameter_mm / 2, center_mm), peak_mm)
+
+
+def ellipsoidal_cap(
+    width_mm: float,
+    length_mm: float,
+    peak_mm: float,
+    center_mm: tuple[float, float] = (0.0, 0.0),
+) -> Pool:
+    """Part of an ellipsoid, longer or shorter along Y than it is wide."""
+    return Pool(Footprint(width_mm, length_mm / 2, length_mm / 2, center_mm), peak_mm)
+
+
+def egg(
+    width_mm: float,
+    head_mm: float,
+    tail_mm: float,
+    peak_mm: float,
+    center_mm: tuple[float, float] = (0.0, 0.0),
+    terms: tuple[Term, ...] = (),
+) -> Pool:
+    """Build the pool of a moving torch: a short head at +Y, a long tail at −Y."""
+    return Pool(Footprint(width_mm, head_mm, tail_mm, center_mm), peak_mm, terms)
+
+
+def caps_8_3_1() -> tuple[Pool, ...]:
+    """Build the 28 caps of §8.3.1: B = 5, 5.5 … 8 mm, D = B/20 and B/10, convex and concave."""
+    return tuple(
+        spherical_cap(float(diameter), sign * float(diameter) / ratio)
+        for sign in (1, -1)
+        for ratio in (20, 10)
+        for diameter in np.arange(5.0, 8.01, 0.5)
+    )
