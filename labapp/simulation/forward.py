@@ -14,9 +14,13 @@ import numpy as np
 from labapp.core.correspondence import Match, Orientation
 from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.simulation.pools import PoolSize
 
 SAMPLES = 256
 """Steps along a ray between the highest and the lowest point of the pool."""
+
+SLACK_MM = 0.05
+"""How far above and below the pool the walk along a ray begins and ends."""
 
 HALVINGS = 52
 """Halvings of a step: as far as double precision goes."""
@@ -31,6 +35,11 @@ class PoolSurface(Protocol):
 
     def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
+        ...
+
+    @property
+    def size(self) -> PoolSize:
+        """True size, of which the highest and the lowest point are needed."""
         ...
 
 
@@ -110,7 +119,7 @@ def trace(pool: PoolSurface, rig: Rig) -> Reflections:
         hit=hit,
         incident_blocked=(y < 0) & (_height_over_origin(point, -incident) > tip),
         reflected_blocked=(y > 0) & (_height_over_origin(point, reflected) > tip),
-        on_plane=((plane >= 0) & (plane <= limit)).all(axis=-1),
+        on_plane=np.asarray(((plane >= 0) & (plane <= limit)).all(axis=-1)),
         point_mm=point,
         incident=incident,
         reflected=reflected,
@@ -210,9 +219,11 @@ def _first_hit(
         ground = pool.height(x, y)
         return np.asarray(z - np.where(np.isnan(ground), 0.0, ground))
 
-    high, low = _extent(pool, source, direction)
-    # t of the horizontal levels just above the highest and just below the lowest point.
-    levels = np.linspace(high, low, SAMPLES)
+    size = pool.size
+    # t of the horizontal levels from just above the highest to just below the lowest point.
+    levels = np.linspace(
+        max(size.height_mm, 0) + SLACK_MM, min(size.depth_mm, 0) - SLACK_MM, SAMPLES
+    )
     falls = direction[..., 2] < 0
     down = np.where(falls, direction[..., 2], -1.0)
     steps = (levels[:, None, None] - source[2]) / down
@@ -228,26 +239,6 @@ def _first_hit(
     ground = pool.height(point[..., 0], point[..., 1])
     hit = falls & under.any(axis=0) & (np.abs(point[..., 2] - ground) < 1e-9)
     return np.where(hit[..., None], point, np.nan), np.asarray(hit)
-
-
-def _extent(
-    pool: PoolSurface, source: FloatArray, direction: FloatArray
-) -> tuple[float, float]:
-    """Levels safely above and below the part of the pool that the rays can reach, mm."""
-    falls = direction[..., 2] < 0
-    down = np.where(falls, direction[..., 2], -1.0)
-    landing = source - source[2] / down[..., None] * direction
-    landing = landing[falls]
-    margin = 0.1 * np.ptp(landing[:, :2], axis=0)
-    x, y = np.meshgrid(
-        *(
-            np.linspace(landing[:, n].min() - margin[n], landing[:, n].max() + margin[n], 101)
-            for n in range(2)
-        )
-    )
-    z = np.nan_to_num(pool.height(x, y), nan=0.0)
-    slack = 0.05 + 0.1 * float(np.ptp(z))
-    return float(max(z.max(), 0.0)) + slack, float(min(z.min(), 0.0)) - slack
 
 
 def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> FloatArray:

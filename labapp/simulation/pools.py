@@ -190,9 +190,7 @@ class Oscillation:
         along, across = self._weights()
         damp = 1 - place.rho2
         slope = -4 * damp * (along * place.q + across * place.p)
-        return place.gradient(
-            slope * place.p + damp**2 * across, slope * place.q + damp**2 * along
-        )
+        return place.gradient(slope * place.p + damp**2 * across, slope * place.q + damp**2 * along)
 
 
 @dataclass(frozen=True)
@@ -296,11 +294,11 @@ class Pool:
         value, at = float(sign * rim[best, 2]), (float(rim[best, 0]), float(rim[best, 1]))
         middle = np.array([0.0, (foot.head_mm - foot.tail_mm) / 2]) + foot.center_mm
         reach = np.array([foot.width_mm, foot.head_mm + foot.tail_mm]) / 2
-        for _ in range(5):
-            x, y = np.meshgrid(*(m + r * np.linspace(-1, 1, 81) for m, r in zip(middle, reach)))
+        for _ in range(6):
+            x, y = np.meshgrid(*(middle[:, None] + reach[:, None] * np.linspace(-1, 1, 61)))
             z = np.nan_to_num(sign * self.height(x, y), nan=-np.inf)
             index = np.unravel_index(np.argmax(z), z.shape)
-            middle, reach = np.array([x[index], y[index]]), reach / 16
+            middle, reach = np.array([x[index], y[index]]), reach / 12
             if z[index] > value + 1e-12:
                 value, at = float(z[index]), (float(x[index]), float(y[index]))
         return value, at

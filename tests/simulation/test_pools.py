@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from labapp.simulation.pools import (
+    Dent,
+    Footprint,
+    LowRear,
+    Oscillation,
+    Pool,
+    caps_8_3_1,
+    egg,
+    ellipsoidal_cap,
+    spherical_cap,
+)
+
+lengths = st.floats(2.0, 6.0)
+terms = st.lists(
+    st.one_of(
+        st.builds(Dent, st.floats(0, 0.2), st.floats(0.5, 2), st.just((0.3, 0.4))),
+        st.builds(LowRear, st.floats(0, 0.2)),
+        st.builds(Oscillation, st.floats(0, 0.1), st.just(30.0), st.floats(0, 1)),
+    ),
+    max_size=3,
+).map(tuple)
+pools = st.builds(
+    lambda width, head, tail, height, extra: egg(2 * width, head, tail, height, (0.2, -0.3), extra),
+    lengths,
+    lengths,
+    lengths,
+    st.floats(-0.8, 0.8),
+    terms,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(pools, st.integers(0, 2**32 - 1))
+def test_gradient_is_the_derivative_of_the_height_up_to_the_boundary(pool, seed):
+    rng = np.random.default_rng(seed)
+    rim = pool.boundary_mm(60)[:, :2]
+    center = np.array(pool.footprint.center_mm)
+    x, y = (center + np.sqrt(rng.uniform(0, 0.999, 60))[:, None] * (rim - center)).T
+    step = 1e-5
+    numeric = np.stack(
+        [
+            pool.height(x + step, y) - pool.height(x - step, y),
+            pool.height(x, y + step) - pool.height(x, y - step),
+        ],
+        axis=-1,
+    ) / (2 * step)
+    seen = np.isfinite(numeric)
+    assert seen.sum() > 60
+    np.testing.assert_allclose(pool.gradient(x, y)[seen], numeric[seen], atol=2e-7)
+
+
+@settings(max_examples=40, deadline=None)
+@given(pools)
+def test_gradient_is_continuous_up_to_the_boundary(pool):
+    rim = pool.boundary_mm(90)[:, :2]
+    center = np.array(pool.footprint.center_mm)
+    at, near = (pool.gradient(*(center + f * (rim - center)).T) for f in (1 - 1e-11, 1 - 1e-6))
+    np.testing.assert_allclose(at, near, atol=2e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(pools)
+def test_boundary_is_on_the_work_piece_but_for_a_low_rear(pool):
+    rim = pool.boundary_mm(360)
+    drop = sum(term.drop_mm for term in pool.terms if isinstance(term, LowRear))
+    ahead = rim[:, 1] >= pool.footprint.center_mm[1]
+    np.testing.assert_allclose(rim[ahead, 2], 0, atol=1e-9)
+    assert rim[:, 2].min() == pytest.approx(-drop, abs=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(pools)
+def test_size_is_the_extent_of_the_boundary_and_of_the_heights(pool):
+    rim = pool.boundary_mm(7200)
+    size = pool.size
+    assert np.ptp(rim[:, 0]) == pytest.approx(size.width_mm, rel=1e-6)
+    assert np.ptp(rim[:, 1]) == pytest.approx(size.length_mm, rel=1e-6)
+    x, y = np.meshgrid(np.linspace(-7, 7, 301), np.linspace(-7, 7, 301))
+    z = pool.height(x, y)
+    assert size.height_mm >= np.nanmax(z) - 1e-12
+    assert size.height_mm == pytest.approx(max(np.nanmax(z), rim[:, 2].max()), abs=1e-3)
+    assert size.depth_mm == pytest.approx(min(np.nanmin(z), rim[:, 2].min()), abs=1e-3)
+    at_peak = pool.height(*(np.array([c]) for c in size.peak_mm))
+    assert at_peak == pytest.approx(size.height_mm, abs=1e-12)
+
+
+@pytest.mark.parametrize("peak", [0.3, -0.3, 1.5])
+def test_spherical_cap_is_part_of_a_sphere(peak):
+    pool = spherical_cap(6.0, peak, (0.5, -0.25))
+    radius = (9 + peak**2) / (2 * abs(peak))
+    middle = np.array([0.5, -0.25, peak - np.sign(peak) * radius])
+    x, y = np.random.default_rng(1).uniform(-1.6, 1.6, (2, 200))
+    points = np.stack([x, y, pool.height(x, y)], axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(points - middle, axis=-1), radius, rtol=1e-12)
+
+
+def test_ellipsoidal_cap_is_part_of_an_ellipsoid():
+    pool = ellipsoidal_cap(6.0, 9.0, 0.4)
+    x, y = np.random.default_rng(1).uniform(-2, 2, (2, 50))
+    # Squeezing Y to the width must give the sphere of that width.
+    sphere = spherical_cap(6.0, 0.4)
+    np.testing.assert_allclose(pool.height(x, 1.5 * y), sphere.height(x, y), rtol=1e-12)
+
+
+def test_egg_has_its_head_its_tail_and_one_smooth_outline():
+    pool = egg(6.0, 2.5, 4.5, 0.3, (0.0, 1.0))
+    on_axis = np.zeros(4)
+    y = np.array([1.0 + 2.5, 1.0 - 4.5, 1.0 + 2.5, 1.0 - 4.5])
+    y += np.array([-1e-9, 1e-9, 1e-9, -1e-9])
+    assert pool.inside(on_axis, y).tolist() == [True, True, False, False]
+    # The curvature along Y is continuous where head and tail meet.
+    step = 1e-3
+    just = 1.0 + np.array([-step, 0.0, step])
+    slope = pool.gradient(np.zeros(3), just)[:, 1]
+    ahead, behind = (slope[2] - slope[1]) / step, (slope[1] - slope[0]) / step
+    assert ahead == pytest.approx(behind, rel=2e-3)
+
+
+def test_outside_there_is_no_pool():
+    pool = egg(6.0, 2.5, 4.5, 0.3)
+    far = np.array([0.0, 0.0, 3.1, 100.0]), np.array([2.6, -4.6, 0.0, 100.0])
+    assert not pool.inside(*far).any()
+    assert np.isnan(pool.height(*far)).all()
+    assert np.isnan(pool.gradient(*far)).all()
+
+
+def test_dent_makes_a_hollow_under_the_torch_and_leaves_the_boundary():
+    plain, dented = egg(7, 3, 4, 0.3), egg(7, 3, 4, 0.3, terms=(Dent(0.1, 0.7),))
+    zero = np.zeros(1)
+    assert dented.height(zero, zero) == pytest.approx(plain.height(zero, zero) - 0.1)
+    assert dented.size.height_mm < plain.size.height_mm
+    assert np.hypot(*dented.size.peak_mm) > 0.5
+
+
+def test_oscillation_comes_back_after_a_period():
+    start, half, whole = (
+        egg(7, 3, 4, 0.3, terms=(Oscillation(0.03, 40.0, t / 40.0),)) for t in (0.0, 0.5, 1.0)
+    )
+    x, y = np.random.default_rng(2).uniform(-2, 2, (2, 40))
+    still = egg(7, 3, 4, 0.3).height(x, y)
+    np.testing.assert_allclose(whole.height(x, y), start.height(x, y), atol=1e-12)
+    np.testing.assert_allclose(half.height(x, y) - still, still - start.height(x, y), atol=1e-12)
+    assert np.abs(start.height(x, y) - still).max() > 0.005
+
+
+def test_caps_of_8_3_1_are_28_of_the_sizes_the_text_names():
+    caps = caps_8_3_1()
+    ratio = [cap.footprint.width_mm / cap.peak_mm for cap in caps]
+    assert len(caps) == 28
+    assert sorted({round(r) for r in ratio}) == [-20, -10, 10, 20]
+    assert sorted({cap.footprint.width_mm for cap in caps}) == [5, 5.5, 6, 6.5, 7, 7.5, 8]
+
+
+@pytest.mark.parametrize(
+    ("width", "head", "peak", "fullness", "words"),
+    [
+        (0.0, 3.0, 0.3, None, "positive"),
+        (6.0, -1.0, 0.3, None, "positive"),
+        (6.0, 3.0, -3.0, None, "overhang"),
+        (6.0, 3.0, 0.3, 1.0, "fullness"),
+    ],
+)
+def test_impossible_pools_are_refused(width, head, peak, fullness, words):
+    with pytest.raises(ValueError, match=words):
+        Pool(Footprint(width, head, 3.0), peak, fullness=fullness)
