@@ -1,0 +1,172 @@
+"""What the repository promises as a whole: lock, texts, commands, house rules."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlparse
+
+import pytest
+
+import labapp
+
+ROOT = Path(__file__).resolve().parent.parent
+MODULES = sorted((ROOT / "labapp").rglob("*.py"))
+TEXTS = sorted(
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "resources").rglob("*.md")]
+)
+
+# Files over 500 lines and functions over 60, each with its reason.
+LONG_FILES: dict[str, str] = {}
+LONG_FUNCTIONS: dict[str, str] = {}
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def repository_files() -> Iterator[Path]:
+    """Everything git would keep, told without git: a bare machine may have none."""
+    for top in ROOT.iterdir():
+        if top.is_file():
+            yield top
+    for folder in (".ci", "docs", "labapp", "resources", "sample_sessions", "tests"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts:
+                yield path
+
+
+# --- lock and package -------------------------------------------------------------------------
+
+
+def test_lock_names_only_the_public_hosts():
+    lock = (ROOT / "uv.lock").read_text("utf-8")
+    registries = set(re.findall(r'registry = "([^"]*)"', lock))
+    hosts = {urlparse(url).netloc for url in re.findall(r'url = "([^"]*)"', lock)}
+    assert registries == {"https://pypi.org/simple"}
+    assert hosts == {"files.pythonhosted.org"}
+    local = [p["name"] for p in tomllib.loads(lock)["package"] if "registry" not in p["source"]]
+    assert local == ["labapp"]
+
+
+def test_the_version_is_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
+    assert newest is not None
+    assert project["version"] == labapp.__version__ == newest[1]
+
+
+def test_the_core_needs_nothing_that_draws():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    names = {re.split(r"[<>=\[]", line)[0].lower() for line in project["dependencies"]}
+    assert "numpy" in names
+    assert not names & {"pyside6", "pyside6-essentials", "pyqtgraph", "pyvista", "pyvistaqt", "vtk"}
+
+
+# --- texts ------------------------------------------------------------------------------------
+
+
+def test_readme_opens_with_the_two_commands():
+    lines = (ROOT / "README.md").read_text("utf-8").splitlines()
+    assert lines[0].startswith("# ")
+    commands = [line.split("#")[0].strip() for line in lines[1:5] if line.startswith("    ")]
+    assert commands == ["./run demo", "./run test"]
+
+
+def test_links_in_the_texts_lead_somewhere():
+    broken = [
+        f"{relative(text)}: {target}"
+        for text in TEXTS
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text.read_text("utf-8"))
+        if "://" not in target and not (text.parent / target).exists()
+    ]
+    assert not broken
+
+
+def test_decisions_are_numbered_without_gaps():
+    names = sorted(path.name for path in (ROOT / "docs" / "adr").glob("*.md"))
+    assert [int(name[:4]) for name in names] == list(range(1, len(names) + 1))
+    for name in names:
+        title = (ROOT / "docs" / "adr" / name).read_text("utf-8").splitlines()[0]
+        assert title.startswith(f"# {int(name[:4])}. ")
+
+
+def test_no_path_of_one_machine_is_written_down():
+    one_machine = re.compile(r"(?<![\w.])/(?:root|work|farm|tmp|home|Users)/\w")
+    found = []
+    for path in repository_files():
+        try:
+            text = path.read_text("utf-8")
+        except UnicodeDecodeError:
+            continue
+        found += [f"{relative(path)}: {m[0]}" for m in one_machine.finditer(text)]
+    assert not found
+
+
+# --- commands ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("script", ["run", ".ci/run"])
+def test_scripts_can_be_run(script: str):
+    assert os.access(ROOT / script, os.X_OK)
+
+
+def test_continuous_integration_runs_the_same_test():
+    commands = (ROOT / ".ci" / "run").read_text("utf-8").splitlines()[1:]
+    assert [line.split("&&")[-1].strip() for line in commands] == ["./run test"]
+
+
+def test_run_without_a_command_says_what_there_is():
+    answer = subprocess.run([ROOT / "run"], capture_output=True, text=True, check=False)
+    assert answer.returncode == 2
+    assert {"./run demo", "./run test"} <= set(re.findall(r"\./run \w+", answer.stderr))
+
+
+def test_run_and_pyproject_ask_for_the_same_uv():
+    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["uv"]
+    assert f"'uv{wanted['required-version']}'" in (ROOT / "run").read_text("utf-8")
+
+
+def test_the_module_is_the_command():
+    answer = subprocess.run(
+        [sys.executable, "-m", "labapp", "--help"], capture_output=True, text=True, check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+    for command in ("reconstruct", "detect", "calibrate", "demo"):
+        assert command in answer.stdout
+
+
+# --- house rules ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", MODULES, ids=relative)
+def test_every_module_says_what_it_is(path: Path):
+    assert ast.get_docstring(ast.parse(path.read_text("utf-8")))
+
+
+def test_long_files_have_a_reason():
+    lines = {relative(path): len(path.read_text("utf-8").splitlines()) for path in MODULES}
+    assert {name for name, count in lines.items() if count > 500} == set(LONG_FILES)
+
+
+def test_long_functions_have_a_reason():
+    """Sixty lines from the signature to the end, the docstring not counted."""
+    long = set()
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                assert node.end_lineno is not None
+                count = node.end_lineno - node.lineno + 1
+                if ast.get_docstring(node) is not None:
+                    docstring = node.body[0]
+                    assert docstring.end_lineno is not None
+                    count -= docstring.end_lineno - docstring.lineno + 1
+                if count > 60:
+                    long.add(f"{relative(path)}:{node.name}")
+    assert long == set(LONG_FUNCTIONS)
