@@ -1,3 +1,3 @@
-"""labapp measures the three-dimensional surface of a molten weld pool from a reflected dot matrix."""
+"""labapp measures the surface of a molten weld pool in 3-D from a reflected dot matrix."""
 
 __version__ = "0.1.0"

@@ -68,7 +68,7 @@ class ImageCalibration:
         to_image[:2, 2] = origin
         if abs(np.linalg.det(to_image)) < 1e-9:
             raise ValueError("O′ and the points on O′X′ and O′Z′ lie on one line")
-        return cls(np.linalg.inv(to_image))
+        return cls(_inverse(to_image))
 
     def to_plane(self, image_px: FloatArray) -> FloatArray:
         """(u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
@@ -76,7 +76,7 @@ class ImageCalibration:
 
     def to_image(self, plane_mm: FloatArray) -> FloatArray:
         """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
-        return _apply(np.linalg.inv(self.matrix), plane_mm)
+        return _apply(_inverse(self.matrix), plane_mm)
 
     def jacobian(self, image_px: FloatArray) -> FloatArray:
         """∂(X′, Z′)/∂(u, v) at (u, v), shape (…, 2, 2), mm/px."""
@@ -86,6 +86,10 @@ class ImageCalibration:
         return np.asarray(
             (self.matrix[:2, :2] - plane[..., :, None] * self.matrix[2, :2]) / w[..., None, None]
         )
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
 def _apply(matrix: FloatArray, points: FloatArray) -> FloatArray:
