@@ -1,0 +1,116 @@
+"""A frame, where frames come from, and how any picture becomes grey levels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.values import freeze
+
+GreyImage = npt.NDArray[Any]
+"""Grey levels, shape (rows, columns): uint8 or uint16 as recorded, float32 where it was neither."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a source.
+
+    Parameters
+    ----------
+    index
+        Its place in the source, from 0.
+    time_s
+        Time since the source's first frame, s; None where the source has no time base.
+    image
+        Grey levels, shape (rows, columns), read-only.
+    """
+
+    index: int
+    time_s: float | None
+    image: GreyImage
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+class FrameSource(Protocol):
+    """Frames in a fixed order, each of the same shape: a video, an image, a folder of images.
+
+    Attributes
+    ----------
+    name
+        What to call it.
+    frame_rate_hz
+        Frames a second; None where there is no time base.
+    shape
+        (rows, columns) of every frame.
+    warnings
+        What the user should know about it, one sentence each.
+    """
+
+    name: str
+    frame_rate_hz: float | None
+    shape: tuple[int, int]
+    warnings: tuple[str, ...]
+
+    def __len__(self) -> int: ...
+
+    def frame(self, index: int) -> Frame:
+        """Read frame ``index``, 0 ≤ index < len.
+
+        Raises
+        ------
+        InputError
+            If this frame cannot be read; other frames may still be.
+        IndexError
+            If there is no such frame.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the file. Closing twice does no harm."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self.frame(index) for index in range(len(self)))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def check_index(source: FrameSource, index: int) -> None:
+    """Raise IndexError unless ``source`` has frame ``index``."""
+    if not 0 <= index < len(source):
+        raise IndexError(f"{source.name} has frames 0 to {len(source) - 1}, not {index}")
+
+
+def to_grey(image: npt.NDArray[Any]) -> GreyImage:
+    """Grey levels of a decoded picture, shape (rows, columns).
+
+    Parameters
+    ----------
+    image
+        Shape (rows, columns) or (rows, columns, 1 … 4) in OpenCV's order B, G, R, alpha. Colour
+        becomes luminance, alpha is dropped. uint8 and uint16 keep their levels; every other type
+        becomes float32.
+    """
+    if image.dtype not in (np.uint8, np.uint16):
+        image = image.astype(np.float32)
+    if image.ndim == 2:
+        return image
+    if image.shape[2] < 3:
+        return np.ascontiguousarray(image[..., 0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_BGR2GRAY))

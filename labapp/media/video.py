@@ -1,0 +1,171 @@
+"""Frames from video files, decoded by FFmpeg through OpenCV."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.media.base import Frame, FrameSource, GreyImage, check_index, to_grey
+
+FAR_FRAMES = 60
+"""A jump forward of more than this is made by seeking, a shorter one by decoding on."""
+
+GREY_FORMATS = frozenset(
+    int.from_bytes(code, "little") for code in (b"Y800", b"GREY", b"Y8  ", b"Y1\x00\x10")
+)
+"""Pixel formats (8 and 16 bit) that OpenCV hands over as they are with CONVERT_RGB = 0."""
+
+A_VIDEO = "a video that FFmpeg can decode: AVI, MKV or MP4 with FFV1, MJPG, H.264 or raw frames"
+
+
+class VideoSource(FrameSource):
+    """A video whose frames are known by their time stamps.
+
+    The container's number of frames is believed when its last frame can be read and carries the
+    last frame's time; otherwise the frames are counted by decoding. A seek is believed when the
+    frame it lands on carries the right time; otherwise the video is decoded from its start.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Raises
+    ------
+    InputError
+        If there is not one whole frame in it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = path.name
+        self._path = path
+        self._capture = _open(path)
+        try:
+            rate = self._capture.get(cv2.CAP_PROP_FPS)
+            self.frame_rate_hz: float | None = rate if math.isfinite(rate) and rate > 0 else None
+            claimed = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+            self._stamp_ms = self._stamps(claimed)
+            if not len(self._stamp_ms):
+                raise InputError(path, "frames", "not one that is whole", A_VIDEO)
+            self.warnings = self._ends_early(claimed)
+            self._reliable = bool((np.diff(self._stamp_ms) > 0).all())
+            self._time_s = self._times()
+            self._rewind()
+            self._grab()
+            rows, columns = self._retrieve(0).shape
+            self.shape = (rows, columns)
+        except BaseException:
+            self.close()
+            raise
+
+    def __len__(self) -> int:
+        return len(self._stamp_ms)
+
+    def close(self) -> None:
+        """Let go of the file. Closing twice does no harm."""
+        self._capture.release()
+
+    def frame(self, index: int) -> Frame:
+        """Read frame ``index``; see `FrameSource.frame`. Reading in order never seeks."""
+        check_index(self, index)
+        if not self._next - 1 <= index <= self._next + FAR_FRAMES:
+            self._jump(index)
+        while self._next <= index:
+            if not self._grab():
+                self._rewind()
+                raise self._unreadable(index)
+        if not self._stands_at(index):
+            # Frames in between could not be decoded: what was grabbed is a later one.
+            self._next = int(np.searchsorted(self._stamp_ms, self._now() + self._tolerance))
+            raise self._unreadable(index)
+        time_s = None if self._time_s is None else float(self._time_s[index])
+        return Frame(index, time_s, self._retrieve(index))
+
+    def _rewind(self) -> None:
+        self._capture.release()
+        self._capture = _open(self._path)
+        self._next = 0
+
+    def _grab(self) -> bool:
+        grabbed = bool(self._capture.grab())
+        self._next += grabbed
+        return grabbed
+
+    def _jump(self, index: int) -> None:
+        """Make ``index`` the frame that was grabbed last, or the next to be."""
+        if self._reliable:
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+            if self._capture.grab():
+                self._next = index + 1
+                if self._stands_at(index):
+                    return
+        self._rewind()
+
+    def _now(self) -> float:
+        """Time stamp of the frame grabbed last, ms."""
+        return float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
+
+    @property
+    def _tolerance(self) -> float:
+        """Half the shortest step between frames, ms."""
+        return float(np.diff(self._stamp_ms).min(initial=np.inf)) / 2
+
+    def _stands_at(self, index: int) -> bool:
+        return not self._reliable or abs(self._now() - self._stamp_ms[index]) < self._tolerance
+
+    def _retrieve(self, index: int) -> GreyImage:
+        retrieved, image = self._capture.retrieve()
+        if not retrieved or image is None or not image.size:
+            raise self._unreadable(index)
+        return to_grey(image)
+
+    def _unreadable(self, index: int) -> InputError:
+        return InputError(self._path, f"frame {index}", "cannot be decoded", "a whole frame")
+
+    def _stamps(self, claimed: int) -> FloatArray:
+        """Time stamp of every frame, shape (n,), ms."""
+        if self.frame_rate_hz and claimed > 0:
+            stamps = np.arange(claimed) * (1000.0 / self.frame_rate_hz)
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, claimed - 1)
+            if self._capture.grab():
+                late = self._now() - stamps[-1]
+                if abs(late) * self.frame_rate_hz < 500 and not self._capture.grab():
+                    return stamps
+        self._rewind()
+        counted = []
+        while self._grab():
+            counted.append(self._now())
+        return np.array(counted)
+
+    def _ends_early(self, claimed: int) -> tuple[str, ...]:
+        if len(self) >= claimed:
+            return ()
+        return (
+            f"{self.name} ends early: its header says {claimed} frames, {len(self)} are whole",
+        )
+
+    def _times(self) -> FloatArray | None:
+        """Time of every frame since the first, shape (n,), s."""
+        elapsed = (self._stamp_ms - self._stamp_ms[0]) / 1000
+        if self.frame_rate_hz is None:
+            return elapsed if self._reliable else None
+        regular = np.arange(len(self)) / self.frame_rate_hz
+        # Containers round stamps (Matroska: to 1 ms); a frame later than that was later.
+        if self._reliable and (np.abs(elapsed - regular) * self.frame_rate_hz >= 0.5).any():
+            return elapsed
+        return regular
+
+
+def _open(path: Path) -> cv2.VideoCapture:
+    # FFmpeg only: other back ends take names with digits for numbered pictures.
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise InputError(path, "content", "not a video, or its index is missing", A_VIDEO)
+    if int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) in GREY_FORMATS:
+        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+    return capture
