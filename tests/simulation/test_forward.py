@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ast
 import csv
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.simulation import forward
 from labapp.simulation.correspondence_table import correspondence_letters
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Dent, LowRear, Pool, caps_8_3_1, egg, spherical_cap
@@ -278,3 +280,19 @@ def test_no_pool_no_dots():
     match = exact_match(seen, rig)
     assert match.ray.shape == (0, 2)
     assert match.plane_mm.shape == (0, 2)
+
+
+def test_truth_never_comes_from_the_code_that_measures():
+    """Of the core, only the values that name a rig and a match may be used."""
+    allowed = {"labapp.core.rig", "labapp.core.values", "labapp.core.correspondence"}
+    folder = Path(forward.__file__).parent
+    used = set()
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                used.add(node.module)
+            elif isinstance(node, ast.Import):
+                used.update(name.name for name in node.names)
+    core = {name for name in used if name.startswith("labapp.core")}
+    assert "labapp.core.rig" in core
+    assert core <= allowed

@@ -1,0 +1,149 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.simulation.forward import trace
+from labapp.simulation.pools import egg
+from labapp.simulation.render import CameraView, Look, render
+
+RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0))
+VIEW = CameraView.rolled(roll_deg=1.2)
+SEEN = trace(egg(6.6, 3.0, 4.4, 0.3, (0.0, -0.6)), RIG)
+STILL = Look(
+    unevenness=0.0, speckle=0.0, glow=0.0, background=20.0, read_noise=0.0, photon_noise=0.0
+)
+
+
+def dots_alone(look, seed=0, view=VIEW):
+    frame = render(SEEN, view, look, np.random.default_rng(seed))
+    return frame, frame.image.astype(float) - 20.0
+
+
+def around(image, dot, reach=9):
+    """The window round a dot, and its pixels' offsets from it."""
+    u, v = np.rint(dot).astype(int)
+    rows, columns = np.arange(v - reach, v + reach + 1), np.arange(u - reach, u + reach + 1)
+    return image[np.ix_(rows, columns)], columns - dot[0], (rows - dot[1])[:, None]
+
+
+def lonely(frame, least=22.0):
+    """Shown dots with no other close by and well inside the picture."""
+    dots = frame.dot_px[frame.shown]
+    apart = np.linalg.norm(dots[:, None] - dots, axis=-1) + 1e9 * np.eye(len(dots))
+    inside = (np.abs(dots - (240, 320)) < (225, 305)).all(axis=-1)
+    return dots[(apart.min(axis=1) > least) & inside]
+
+
+def test_view_maps_its_three_points_and_back():
+    x = np.array([[0.0, 0.0], [VIEW.x_axis_mm, 0.0], [0.0, VIEW.z_axis_mm]])
+    expected = np.array([VIEW.origin_px, VIEW.x_axis_px, VIEW.z_axis_px])
+    np.testing.assert_allclose(VIEW.to_image(x), expected, atol=1e-10)
+    np.testing.assert_allclose(VIEW.to_plane(expected), x, atol=1e-10)
+    assert np.linalg.det(VIEW.px_per_mm) == pytest.approx(-(5.67**2)), "v grows downwards"
+    assert VIEW.x_axis_px[1] < VIEW.origin_px[1], "counter-clockwise lifts the right"
+
+
+def test_dots_are_where_the_frame_says():
+    frame, image = dots_alone(STILL)
+    alone = lonely(frame)
+    assert len(alone) > 15
+    for dot in alone:
+        window, du, dv = around(image, dot)
+        total = window.sum()
+        assert total > 300
+        assert abs((window * du).sum() / total) < 0.05
+        assert abs((window * dv).sum() / total) < 0.05
+
+
+def test_nothing_shows_where_there_is_no_dot():
+    frame, image = dots_alone(STILL)
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    for dot in frame.dot_px[frame.shown]:
+        image[np.hypot(u - dot[0], v - dot[1]) < 16] = 0
+    assert (image == 0).all()
+    assert not frame.shown[9, 9], "the centre ray is absent"
+    assert frame.shown.sum() == SEEN.visible.sum()
+
+
+def spread(image, dot):
+    window, du, dv = around(image, dot)
+    total = window.sum()
+    return np.sqrt((window * du**2).sum() / total), np.sqrt((window * dv**2).sum() / total)
+
+
+def test_dots_are_between_floor_and_ceiling_and_grow_with_the_spread_of_the_pattern():
+    look = Look(**{**vars(STILL), "blur_px": 0.3, "dot_peak": 200.0})
+    frame, image = dots_alone(look)
+    sizes = np.array([spread(image, dot) for dot in lonely(frame)])
+    assert (sizes > 0.95 * 5.67 * look.dot_floor_mm).all()
+    assert (sizes < 1.05 * np.hypot(5.67 * look.dot_ceiling_mm, 0.3)).all()
+    # At the head the rows lie four times as far apart as the columns, and the dots are long.
+    assert (sizes[:, 1] > 1.3 * sizes[:, 0]).all()
+
+
+def test_noise_has_the_variance_that_was_asked_for():
+    look = Look(dot_peak=0.0, background=30.0, glow=0.0, read_noise=2.0, photon_noise=0.1)
+    image = render(SEEN, VIEW, look, np.random.default_rng(1)).image
+    assert image.mean() == pytest.approx(30.0, abs=0.05)
+    assert image.var() == pytest.approx(4.0 + 3.0 + 1 / 12, rel=0.02)
+
+
+def test_arc_glow_is_brightest_below():
+    look = Look(dot_peak=0.0, read_noise=0.0, photon_noise=0.0)
+    image = render(SEEN, VIEW, look, np.random.default_rng(1)).image.astype(float)
+    rows = image.mean(axis=1)
+    assert (np.diff(rows) >= -1e-9).all()
+    assert rows[-1] - rows[0] > 8
+
+
+def test_speckle_and_unevenness_change_the_light_but_not_its_place():
+    look = Look(**{**vars(STILL), "speckle": 0.35, "unevenness": 0.3})
+    frame, image = dots_alone(look)
+    light, offset = [], []
+    for dot in lonely(frame):
+        window, du, dv = around(image, dot)
+        light.append(window.sum())
+        offset.append([(window * du).sum() / light[-1], (window * dv).sum() / light[-1]])
+    assert 0.15 < np.std(np.log(light)) < 0.6
+    assert np.abs(np.mean(offset, axis=0)).max() < 0.1
+    assert 0.03 < np.std(offset) < 0.3
+
+
+def test_missing_dots_are_neither_drawn_nor_claimed():
+    frame, image = dots_alone(Look(**{**vars(STILL), "missing": 0.3}))
+    gone = SEEN.visible & ~frame.shown
+    assert 10 < gone.sum() < 60
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    near_shown = np.zeros(image.shape, bool)
+    for dot in frame.dot_px[frame.shown]:
+        near_shown |= np.hypot(u - dot[0], v - dot[1]) < 16
+    assert (image[~near_shown] == 0).all()
+    assert near_shown.mean() < 0.5
+
+
+def test_false_dots_and_hot_pixels_are_added():
+    _, clean = dots_alone(STILL)
+    frame, false = dots_alone(Look(**{**vars(STILL), "false_dots": 4}))
+    assert frame.shown.sum() == SEEN.visible.sum()
+    assert (false - clean).sum() > 4 * 200
+    _, hot = dots_alone(Look(**{**vars(STILL), "hot_pixels": 6}))
+    assert ((hot - clean) >= 40).sum() == 6
+
+
+def test_dots_beyond_the_picture_are_not_shown():
+    near = CameraView.rolled(origin_px=(-150.0, 590.0))
+    frame, _ = dots_alone(STILL, view=near)
+    u = frame.dot_px[..., 0]
+    np.testing.assert_array_equal(frame.shown, SEEN.visible & (u >= -0.5))
+    assert 0 < frame.shown.sum() < SEEN.visible.sum()
+
+
+def test_the_same_seed_gives_the_same_frame():
+    look = Look(hot_pixels=3, false_dots=2, missing=0.05)
+    first, again, other = (render(SEEN, VIEW, look, np.random.default_rng(n)) for n in (5, 5, 6))
+    np.testing.assert_array_equal(first.image, again.image)
+    assert (first.image != other.image).mean() > 0.5
+    assert first.image.dtype == np.uint8
+    assert first.image.shape == (640, 480)
