@@ -8,6 +8,16 @@ import numpy as np
 
 from labapp.core.values import FloatArray
 
+TOLERANCE_MM = 1e-9
+"""How near to the surface a meeting point must come."""
+
+STEP_MM = 0.5
+"""Longest Newton step along a ray: a ray that grazes would otherwise jump off the pool."""
+
+NEWTON_STEPS = 12
+SCAN_LEVELS = 81
+HALVINGS = 50
+
 
 class Surface(Protocol):
     """A height over the work piece; NaN where it is not defined."""
@@ -34,3 +44,88 @@ class FlatSurface:
     def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
         return np.zeros((*np.shape(x_mm), 2))
+
+
+def intersect(
+    surface: Surface,
+    origin_mm: FloatArray,
+    directions: FloatArray,
+    *,
+    reach_mm: float = 2.0,
+) -> FloatArray:
+    """Where rays from one point meet a surface.
+
+    Bounded Newton steps from z = 0; the rays for which they do not settle (grazing, or starting
+    outside the surface's domain) are walked down from ``reach_mm`` to ``−reach_mm`` and the first
+    step that goes under the surface is halved.
+
+    Parameters
+    ----------
+    surface
+        The surface.
+    origin_mm
+        Where all rays start, above the surface, shape (3,), mm.
+    directions
+        Their directions, of any length but not zero, shape (n, 3).
+    reach_mm
+        The surface is looked for at |z| ≤ reach_mm.
+
+    Returns
+    -------
+    FloatArray
+        Meeting points, shape (n, 3), mm; NaN where the ray does not come down or misses the
+        surface's domain.
+    """
+    origin = np.asarray(origin_mm, float)
+    direction = np.asarray(directions, float)
+    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    distance = np.full(len(direction), np.nan)
+    falls = np.flatnonzero(direction[:, 2] < 0)
+    distance[falls] = _newton(surface, origin, direction[falls], reach_mm)
+    missed = falls[np.isnan(distance[falls])]
+    if len(missed):
+        distance[missed] = _walk(surface, origin, direction[missed], reach_mm)
+    return np.asarray(origin + distance[:, None] * direction)
+
+
+def _newton(
+    surface: Surface, origin: FloatArray, direction: FloatArray, reach: float
+) -> FloatArray:
+    """Distance to the surface along each ray, shape (n,); NaN where the steps do not settle."""
+    distance = -origin[2] / direction[:, 2]
+    above = np.full(len(direction), np.nan)
+    for _ in range(NEWTON_STEPS):
+        point = origin + distance[:, None] * direction
+        above = point[:, 2] - surface.height(point[:, 0], point[:, 1])
+        open_ = np.abs(above) > TOLERANCE_MM
+        if not open_.any():
+            break
+        slope = surface.gradient(point[:, 0], point[:, 1])
+        descent = direction[:, 2] - np.sum(slope * direction[:, :2], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.clip(-above / descent, -STEP_MM, STEP_MM)
+        # A ray that leaves the surface (descent ≥ 0) is going the wrong way.
+        distance = np.where(open_ & (descent < 0), distance + step, distance)
+    low = np.abs(origin[2] + distance * direction[:, 2]) <= reach
+    return np.where((np.abs(above) <= TOLERANCE_MM) & low, distance, np.nan)
+
+
+def _walk(surface: Surface, origin: FloatArray, direction: FloatArray, reach: float) -> FloatArray:
+    """The same by walking down in steps and halving the first that goes under, shape (n,)."""
+    levels = np.linspace(reach, -reach, SCAN_LEVELS)
+    distances = (levels[:, None] - origin[2]) / direction[:, 2]
+
+    def above(distance: FloatArray) -> FloatArray:
+        point = origin + distance[..., None] * direction
+        return np.asarray(point[..., 2] - surface.height(point[..., 0], point[..., 1]))
+
+    height = above(distances)
+    crosses = (height[:-1] > 0) & (height[1:] <= 0)
+    first = np.argmax(crosses, axis=0)
+    column = np.arange(len(direction))
+    near, far = distances[first, column], distances[first + 1, column]
+    for _ in range(HALVINGS):
+        middle = (near + far) / 2
+        under = above(middle) <= 0
+        near, far = np.where(under, near, middle), np.where(under, middle, far)
+    return np.where(crosses.any(axis=0) & (np.abs(above(far)) <= 1e-6), far, np.nan)
