@@ -109,6 +109,11 @@ def test_no_path_of_one_machine_is_written_down():
     assert not found
 
 
+def test_sample_sessions_are_small_enough_for_git():
+    sizes = [path.stat().st_size for path in (ROOT / "sample_sessions").rglob("*")]
+    assert 0 < sum(sizes) <= 5_000_000
+
+
 # --- commands ---------------------------------------------------------------------------------
 
 
