@@ -230,7 +230,7 @@ def _share_of_left(
     crossings = gap[:-1][difference[gap[:-1]] * difference[gap[1:]] <= 0]
     if len(crossings):
         beta_3 = theta[crossings[np.argmin(np.abs(theta[crossings] - 90))]]
-        return (theta > beta_3).astype(float)
+        return np.where(theta > beta_3, 1.0, 0.0)
     return np.asarray(np.clip((theta - right_end) / max(left_end - right_end, 1e-9), 0, 1))
 
 

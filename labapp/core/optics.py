@@ -69,7 +69,7 @@ def meet_plane(origin_mm: FloatArray, direction: FloatArray, plane: ImagingPlane
     along = np.asarray(direction @ plane.normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = ((plane.origin_mm - origin_mm) @ plane.normal) / along
-    distance = np.where(distance > 0, distance, np.nan)
+    distance = np.where((distance > 0) & np.isfinite(distance), distance, np.nan)
     return plane.from_universal(origin_mm + distance[..., None] * direction)
 
 

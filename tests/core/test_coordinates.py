@@ -1,0 +1,82 @@
+"""Image ↔ imaging plane: the three-point calibration and the homography."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labapp.core.coordinates import ImageCalibration
+
+pixels = st.tuples(st.floats(0.0, 640.0), st.floats(0.0, 480.0)).map(np.array)
+
+
+@st.composite
+def calibrations(draw):
+    """Cameras rolled, scaled unequally along the axes and with a little perspective."""
+    roll, scale_x, scale_z = (
+        draw(st.floats(-0.3, 0.3)),
+        *draw(st.tuples(st.floats(0.05, 0.5), st.floats(0.05, 0.5))),
+    )
+    tilt = draw(st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4)))
+    matrix = np.array(
+        [
+            [scale_x * np.cos(roll), -scale_x * np.sin(roll), -5.0],
+            [-scale_z * np.sin(roll), -scale_z * np.cos(roll), 90.0],
+            [*tilt, 1.0],
+        ]
+    )
+    return ImageCalibration(matrix)
+
+
+@given(calibrations(), pixels)
+def test_to_the_plane_and_back_is_nothing_done(calibration, pixel):
+    there = calibration.to_plane(pixel)
+    np.testing.assert_allclose(calibration.to_image(there), pixel, atol=1e-6)
+
+
+@given(calibrations(), pixels)
+def test_the_jacobian_is_the_difference_quotient(calibration, pixel):
+    step = 1e-3
+    quotient = np.stack(
+        [
+            (calibration.to_plane(pixel + d) - calibration.to_plane(pixel - d)) / (2 * step)
+            for d in np.eye(2) * step
+        ],
+        axis=-1,
+    )
+    np.testing.assert_allclose(calibration.jacobian(pixel), quotient, rtol=1e-4, atol=1e-7)
+
+
+def test_three_points_are_where_they_were_said_to_be():
+    calibration = ImageCalibration.from_three_points(
+        (44.0, 590.0), (440.0, 585.0), 69.85, (50.0, 410.0), 31.75
+    )
+    points = np.array([[44.0, 590.0], [440.0, 585.0], [50.0, 410.0]])
+    expected = [[0.0, 0.0], [69.85, 0.0], [0.0, 31.75]]
+    np.testing.assert_allclose(calibration.to_plane(points), expected, atol=1e-9)
+
+
+def test_parallels_to_the_axes_as_in_eq_4_7_to_4_13():
+    # Skewed axes; P is 2 units of X' and 3 of Z' from O', by construction.
+    origin, unit_x, unit_z = np.array([40.0, 590.0]), np.array([5.5, 0.2]), np.array([0.3, -5.7])
+    calibration = ImageCalibration.from_three_points(
+        tuple(origin), tuple(origin + 70 * unit_x), 70.0, tuple(origin + 30 * unit_z), 30.0
+    )
+    point = origin + 2 * unit_x + 3 * unit_z
+    np.testing.assert_allclose(calibration.to_plane(point), [2.0, 3.0], atol=1e-9)
+
+
+def test_axes_that_coincide_are_refused():
+    with pytest.raises(ValueError, match="one line"):
+        ImageCalibration.from_three_points((0, 0), (10, 10), 1.0, (20, 20), 2.0)
+    with pytest.raises(ValueError, match="inverted"):
+        ImageCalibration(np.ones((3, 3)))
+    with pytest.raises(ValueError, match="3 × 3"):
+        ImageCalibration(np.eye(2))
+
+
+def test_a_calibration_cannot_be_written_to():
+    with pytest.raises(ValueError, match="read-only"):
+        ImageCalibration(np.eye(3)).matrix[0, 0] = 2.0

@@ -1,0 +1,163 @@
+"""Interpolation scheme: base points, its four algorithms, and odd sets of dots."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from labapp.core import irs
+from labapp.core.measures import measure, reflection_errors
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.values import CannotMeasure
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.pools import caps_8_3_1, egg, spherical_cap
+
+RIG = Rig(
+    Laser(31.14, 31.48),
+    DotPattern(),
+    Electrode(1e9),
+    ImagingPlane.vertical(50.0, 1e4, -1e4, 2e4, 2e4),
+)
+ALGORITHMS = ("opa", "epa-r", "epa-c", "epa-rc")
+
+
+def match_of(pool, **noise):
+    return exact_match(trace(pool, RIG), RIG, **noise)
+
+
+def without(match, gone):
+    """The match without some of its dots, given as a mask."""
+    kept = ~np.asarray(gone)
+    return replace(
+        match,
+        dot=match.dot[kept],
+        ray=match.ray[kept],
+        reflected=match.reflected[kept],
+        plane_mm=match.plane_mm[kept],
+        plane_covariance_mm2=match.plane_covariance_mm2[kept],
+    )
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "median"), [("opa", 0.20), ("epa-r", 0.12), ("epa-c", 0.12), ("epa-rc", 0.08)]
+)
+def test_depths_of_the_caps(algorithm, median):
+    settings = irs.IrsSettings(algorithm=algorithm, boundary="circle")
+    error = []
+    for cap in caps_8_3_1():
+        match = match_of(cap)
+        measures = measure(irs.reconstruct(match, RIG, settings), match, RIG)
+        depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
+        error.append(abs(depth / abs(cap.peak_mm) - 1))
+    assert np.median(error) < median
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_boundary_lies_on_the_work_piece(algorithm):
+    match = match_of(egg(6.6, 3.0, 4.0, 0.35))
+    made = irs.reconstruct(match, RIG, irs.IrsSettings(algorithm=algorithm))
+    assert (made.boundary.points_mm[:, 2] == 0).all()
+    assert made.scheme == "irs"
+    assert made.points_mm.shape == (len(match.ray), 3)
+    assert np.isfinite(made.residual_mm).all()
+
+
+def test_edge_points_start_on_the_work_piece():
+    match = match_of(spherical_cap(6.0, 0.3))
+    # After one loop both ends of a row are the mean of 0 and what the other end gives.
+    made = irs.reconstruct(match, RIG, irs.IrsSettings(algorithm="epa-r", loops=1))
+    for i in np.unique(match.ray[:, 0]):
+        row = made.points_mm[match.ray[:, 0] == i]
+        row = row[np.argsort(row[:, 0])]
+        assert row[[0, -1], 2].sum() == pytest.approx(0.0, abs=0.03)
+        assert row[len(row) // 2, 2] > 0
+
+
+def test_rows_and_columns_together_are_the_mean_of_both():
+    match = match_of(spherical_cap(6.0, 0.3))
+    by = {
+        name: irs.reconstruct(match, RIG, irs.IrsSettings(algorithm=name, loops=1)).points_mm
+        for name in ("epa-r", "epa-c", "epa-rc")
+    }
+    np.testing.assert_allclose(by["epa-rc"], (by["epa-r"] + by["epa-c"]) / 2, atol=1e-9)
+
+
+@pytest.mark.parametrize("height", [-0.3, 0.0, 0.2])
+def test_the_base_point_stays_at_the_height_that_is_tried(height):
+    match = match_of(spherical_cap(6.0, 0.3))
+    made = irs.reconstruct(match, RIG, irs.IrsSettings(base_heights_mm=(height,)))
+    assert made.points_mm[irs.lower_left(match), 2] == pytest.approx(height)
+
+
+def test_of_all_heights_the_least_are_unless_they_explain_the_dots_equally_well():
+    match = match_of(spherical_cap(6.0, -0.3))
+    heights = (-0.5, -0.2, 0.0, 0.3)
+
+    def are(*tried, margin=0.0):
+        settings = irs.IrsSettings(base_heights_mm=tried, are_margin=margin)
+        return reflection_errors(irs.reconstruct(match, RIG, settings), match, RIG).are_mm
+
+    each = {height: are(height) for height in heights}
+    assert are(*heights) == min(each.values())
+    assert are(*heights, margin=10.0) == each[0.0]
+
+
+def test_the_base_point_is_the_lower_left_dot():
+    match = match_of(spherical_cap(6.0, 0.3))
+    lowest = match.reflected[:, 0] == 1
+    by_number = irs.lower_left(match)
+    assert lowest[by_number]
+    assert match.plane_mm[by_number, 0] == match.plane_mm[lowest, 0].min()
+    # Without numbers the imaging plane tells the same.
+    unnumbered = replace(match, reflected=np.zeros_like(match.reflected))
+    assert irs.lower_left(unnumbered) == by_number
+    # On an inverse pool it is the ray nearest the head.
+    inverse = match_of(spherical_cap(6.0, -0.6))
+    assert inverse.orientation in ("S/I", "I/I")
+    assert inverse.ray[irs.lower_left(inverse), 0] == inverse.ray[:, 0].max()
+
+
+def test_more_loops_never_leave_a_larger_are():
+    match = match_of(egg(6.6, 3.0, 4.0, 0.35))
+    are = [
+        reflection_errors(
+            irs.reconstruct(match, RIG, irs.IrsSettings(algorithm="epa-rc", loops=loops)),
+            match,
+            RIG,
+        ).are_mm
+        for loops in (1, 2, 4, 8)
+    ]
+    assert (np.diff(are) <= 0).all()
+    assert are[-1] < are[0]
+
+
+@examples(max_examples=25)
+@given(st.integers(0, 10_000), st.sampled_from([0.1, 0.3, 0.6, 0.9]), st.sampled_from(ALGORITHMS))
+def test_odd_sets_of_dots_are_measured_or_refused(seed, share, algorithm):
+    rng = np.random.default_rng(seed)
+    match = match_of(egg(6.6, 3.0, 4.0, rng.choice([-0.5, 0.4])), sigma_mm=0.1, rng=rng)
+    match = without(match, rng.random(len(match.ray)) > share)
+    settings = irs.IrsSettings(algorithm=algorithm, loops=10, base_heights_mm=(0.0, 0.2))
+    try:
+        made = irs.reconstruct(match, RIG, settings)
+    except CannotMeasure as error:
+        assert error.status in {"too-few-dots", "no-surface", "no-boundary"}  # noqa: PT017
+    else:
+        assert np.isfinite(made.points_mm).all()
+        assert np.isfinite(measure(made, match, RIG).volume_mm3)
+
+
+def test_too_few_dots_are_refused():
+    match = match_of(spherical_cap(6.0, 0.3))
+    for algorithm in ALGORITHMS:
+        with pytest.raises(CannotMeasure, match="too-few-dots"):
+            irs.reconstruct(
+                without(match, np.arange(len(match.ray)) >= 8),
+                RIG,
+                irs.IrsSettings(algorithm=algorithm),
+            )

@@ -1,0 +1,183 @@
+"""Reflection errors, and the sizes of pools that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labapp.core.boundary import Boundary
+from labapp.core.measures import (
+    measure,
+    reflection_errors,
+    reflection_scale,
+    surface_grid,
+    surface_mesh,
+)
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.pools import Pool, egg, spherical_cap
+
+RIG = Rig(
+    Laser(31.14, 31.48),
+    DotPattern(),
+    Electrode(1e9),
+    ImagingPlane.vertical(50.0, 1e4, -1e4, 2e4, 2e4),
+)
+
+
+def truth(pool: Pool, residual=None):
+    """What a scheme without fault would return for a pool, and its match."""
+    match = exact_match(trace(pool, RIG), RIG)
+    count = len(match.ray)
+    points = trace(pool, RIG).point_mm[match.ray[:, 0] - 1, match.ray[:, 1] - 1]
+    rim = pool.boundary_mm()
+    centre = np.array(pool.footprint.center_mm)
+    theta = np.degrees(np.arctan2(rim[:, 1] - centre[1], rim[:, 0] - centre[0]))
+    theta[theta >= 180] -= 360
+    order = np.argsort(theta)
+    reconstruction = Reconstruction(
+        scheme="ers",
+        surface=pool,
+        boundary=Boundary(centre, theta[order], rim[order]),
+        ray=match.ray,
+        points_mm=points,
+        residual_mm=np.zeros((count, 2)) if residual is None else residual(count),
+        sigma_mm=np.full(count, np.nan),
+    )
+    return reconstruction, match
+
+
+@given(
+    st.floats(5.0, 8.0),
+    st.sampled_from([-0.1, -0.05, 0.05, 0.1]),
+    st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
+)
+def test_a_spherical_cap_has_the_size_of_the_formulas(diameter, share, center):
+    height = diameter * share
+    reconstruction, match = truth(spherical_cap(diameter, height, center))
+    measures = measure(reconstruction, match, RIG)
+    assert measures.width_mm == pytest.approx(diameter, rel=1e-4)
+    assert measures.length_mm == pytest.approx(diameter, rel=1e-4)
+    assert measures.height_mm == pytest.approx(max(height, 0), abs=1e-5)
+    assert measures.depth_mm == pytest.approx(min(height, 0), abs=1e-5)
+    assert measures.area_mm2 == pytest.approx(np.pi * diameter**2 / 4, rel=1e-4)
+    volume = np.pi * height / 6 * (3 * diameter**2 / 4 + height**2)
+    assert measures.volume_mm3 == pytest.approx(volume, rel=1e-3)
+    assert (measures.center_x_mm, measures.center_y_mm) == pytest.approx(center)
+    assert (measures.peak_x_mm, measures.peak_y_mm) == pytest.approx(center, abs=1e-4)
+
+
+def test_an_egg_off_the_origin_is_measured():
+    pool = egg(6.6, 2.8, 4.6, 0.29, (0.2, -0.4))
+    reconstruction, match = truth(pool)
+    measures, size = measure(reconstruction, match, RIG), pool.size
+    assert measures.width_mm == pytest.approx(size.width_mm, rel=1e-4)
+    assert measures.length_mm == pytest.approx(size.length_mm, rel=1e-4)
+    assert measures.height_mm == pytest.approx(size.height_mm, rel=1e-4)
+    assert (measures.peak_x_mm, measures.peak_y_mm) == pytest.approx(size.peak_mm, abs=0.01)
+    x, _, z = surface_grid(reconstruction, 0.02)
+    assert measures.volume_mm3 == pytest.approx(z.sum() * 0.02**2, rel=1e-3)
+    assert measures.area_mm2 == pytest.approx(len(x) * 0.02**2, rel=1e-3)
+
+
+def test_no_variants_no_uncertainty_and_pairs_add_up_in_squares():
+    pool = spherical_cap(6.0, 0.4)
+    reconstruction, match = truth(pool)
+    assert np.isnan(measure(reconstruction, match, RIG).height_sigma_mm)
+    boundary = reconstruction.boundary
+    wider, narrower = (
+        replace(boundary, points_mm=boundary.points_mm * [s, 1.0, 1.0]) for s in (1.0, 0.98)
+    )
+    variants = (
+        (spherical_cap(6.0, 0.43), boundary),
+        (spherical_cap(6.0, 0.37), boundary),
+        (spherical_cap(6.0, 0.36), wider),
+        (spherical_cap(6.0, 0.44), narrower),
+    )
+    measures = measure(replace(reconstruction, variants=variants), match, RIG)
+    assert measures.height_sigma_mm == pytest.approx(0.05, rel=1e-3)
+    assert measures.width_sigma_mm == pytest.approx(0.06, rel=1e-3)
+    assert measures.length_sigma_mm == pytest.approx(0.0, abs=1e-9)
+
+
+def test_reflection_errors_are_eq_6_3_to_6_8():
+    reconstruction, match = truth(
+        spherical_cap(6.0, 0.3),
+        residual=lambda n: np.random.default_rng(1).normal(0.0, 1.0, (n, 2)),
+    )
+    landing = np.array(
+        [
+            RIG.laser.position_mm - RIG.laser.position_mm[2] / direction[2] * direction
+            for direction in trace(spherical_cap(6.0, 0.3), RIG).incident[
+                match.ray[:, 0] - 1, match.ray[:, 1] - 1
+            ]
+        ]
+    )
+    w = np.ptp(landing[:, 0]) / np.ptp(match.plane_mm[:, 0])
+    l_ = np.ptp(landing[:, 1]) / np.ptp(match.plane_mm[:, 1])
+    np.testing.assert_allclose(reflection_scale(match, RIG), [w, l_])
+    errors = reflection_errors(reconstruction, match, RIG)
+    each = [np.hypot(x * w, z * l_) for x, z in reconstruction.residual_mm]
+    np.testing.assert_allclose(errors.per_dot_mm, each)
+    assert errors.are_mm == pytest.approx(np.mean(each))
+    assert errors.mre_mm == pytest.approx(np.max(each))
+
+
+def test_inner_errors_leave_out_first_and_last_row_and_both_ends_of_each():
+    reconstruction, match = truth(spherical_cap(6.0, 0.3))
+    inner = []
+    for i, j in match.ray:
+        row = match.ray[match.ray[:, 0] == i, 1]
+        inner.append(
+            match.ray[:, 0].min() < i < match.ray[:, 0].max() and row.min() < j < row.max()
+        )
+    # 1 mm along X' on the ends and edges, 0.1 mm inside.
+    residual = np.where(np.array(inner)[:, None], [0.1, 0.0], [1.0, 0.0])
+    errors = reflection_errors(replace(reconstruction, residual_mm=residual), match, RIG)
+    scale = reflection_scale(match, RIG)[0]
+    assert errors.are_inner_mm == pytest.approx(0.1 * scale)
+    assert errors.mre_inner_mm == pytest.approx(0.1 * scale)
+    assert errors.mre_mm == pytest.approx(scale)
+
+
+def test_two_rows_have_no_inside():
+    reconstruction, match = truth(spherical_cap(6.0, 0.3))
+    two = (match.ray[:, 0] == 10) | (match.ray[:, 0] == 11)
+    match = replace(match, ray=match.ray[two], plane_mm=match.plane_mm[two])
+    reconstruction = replace(
+        reconstruction, ray=match.ray, residual_mm=reconstruction.residual_mm[two]
+    )
+    errors = reflection_errors(reconstruction, match, RIG)
+    assert np.isnan(errors.are_inner_mm)
+    assert errors.are_mm == 0
+
+
+def test_the_grid_is_the_nodes_inside():
+    reconstruction, _ = truth(spherical_cap(6.0, 0.3, (0.1, 0.2)))
+    x, y, z = surface_grid(reconstruction, 0.25)
+    np.testing.assert_allclose(x / 0.25, np.round(x / 0.25), atol=1e-9)
+    assert (np.hypot(x - 0.1, y - 0.2) <= 3.0).all()
+    assert len(x) == pytest.approx(np.pi * 9 / 0.25**2, rel=0.03)
+    np.testing.assert_allclose(z, reconstruction.surface.height(x, y))
+
+
+def test_the_mesh_ends_at_the_boundary_and_looks_up():
+    reconstruction, match = truth(egg(6.6, 2.8, 4.6, 0.29))
+    vertices, triangles = surface_mesh(reconstruction, 0.3)
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    assert (normal[:, 2] > 0).all()
+    measures = measure(reconstruction, match, RIG)
+    assert normal[:, 2].sum() / 2 == pytest.approx(measures.area_mm2)
+    # A sheet: every edge has two triangles but those of the boundary, which are its points.
+    edges = np.sort(np.vstack([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    pairs, count = np.unique(edges, axis=0, return_counts=True)
+    assert set(count) == {1, 2}
+    rim = np.unique(pairs[count == 1])
+    np.testing.assert_allclose(vertices[rim], reconstruction.boundary.points_mm)
+    assert vertices[:, 2].max() == pytest.approx(0.29, abs=0.01)

@@ -1,0 +1,50 @@
+"""The bench: where the laser stands, which rays there are, how the imaging plane lies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labapp.core.rig import DotPattern, ImagingPlane, Laser
+
+angles = st.floats(-np.pi, np.pi)
+lengths = st.floats(-100.0, 100.0)
+
+
+@given(st.floats(5.0, 85.0), st.floats(10.0, 100.0))
+def test_the_laser_stands_at_its_distance_and_elevation(angle, distance):
+    x, y, z = Laser(angle, distance).position_mm
+    assert x == 0
+    assert np.hypot(y, z) == pytest.approx(distance)
+    assert np.degrees(np.arctan2(z, y)) == pytest.approx(angle)
+
+
+def test_the_centre_is_the_absent_reference_unless_others_are_named():
+    assert DotPattern().absent_rays == {(10, 10)}
+    assert DotPattern(39, 39, 0.385).reference == (20, 20)
+    named = DotPattern(absent=frozenset({(3, 4)}))
+    assert named.absent_rays == {(3, 4)}
+    assert named.reference == (10, 10)
+
+
+@given(angles, angles, angles, st.tuples(lengths, lengths), st.tuples(lengths, lengths, lengths))
+def test_a_plane_of_any_pose_gives_its_coordinates_back(yaw, pitch, roll, dot, origin):
+    turn = np.eye(3)
+    for axis, angle in enumerate((yaw, pitch, roll)):
+        a, b = [k for k in range(3) if k != axis]
+        step = np.eye(3)
+        step[a, a] = step[b, b] = np.cos(angle)
+        step[a, b], step[b, a] = -np.sin(angle), np.sin(angle)
+        turn = turn @ step
+    plane = ImagingPlane(np.array(origin), turn[:, 0], turn[:, 2])
+    point = plane.to_universal(np.array(dot))
+    np.testing.assert_allclose(plane.from_universal(point), dot, atol=1e-9)
+    assert (point - plane.origin_mm) @ plane.normal == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_vertical_plane_is_eq_4_5():
+    plane = ImagingPlane.vertical(50.0, s_mm=45.0, h_mm=3.0)
+    np.testing.assert_allclose(plane.to_universal(np.array([50.0, 20.0])), [5.0, -50.0, 23.0])
+    np.testing.assert_allclose(plane.normal, [0.0, -1.0, 0.0])
