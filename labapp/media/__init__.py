@@ -9,7 +9,7 @@ import cv2
 
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage
-from labapp.media.images import open_folder, open_image
+from labapp.media.images import IMAGE_SUFFIXES, open_folder, open_image
 from labapp.media.quiet import quiet_opencv
 from labapp.media.video import VideoSource
 
@@ -17,7 +17,7 @@ __all__ = ["Frame", "FrameSource", "GreyImage", "open_source"]
 
 
 def open_source(path: str | os.PathLike[str]) -> FrameSource:
-    """Open an image, a folder of images, a TIFF stack or a video, by what is in it.
+    """Open an image, a folder of images, a TIFF stack or a video.
 
     Raises
     ------
@@ -38,6 +38,6 @@ def open_source(path: str | os.PathLike[str]) -> FrameSource:
         ) from error
     if size == 0:
         raise InputError(path, "size", "0 bytes", "an image or a video with something in it")
-    if cv2.haveImageReader(str(path)):
+    if path.suffix.lower() in IMAGE_SUFFIXES or cv2.haveImageReader(str(path)):
         return open_image(path)
     return VideoSource(path)

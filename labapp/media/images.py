@@ -136,9 +136,7 @@ def read_image(page: Page) -> GreyImage:
 def _decode(page: Page) -> npt.NDArray[Any] | None:
     try:
         if page.number is not None:
-            _, images = cv2.imreadmulti(
-                str(page.path), page.number, 1, flags=cv2.IMREAD_UNCHANGED
-            )
+            _, images = cv2.imreadmulti(str(page.path), page.number, 1, flags=cv2.IMREAD_UNCHANGED)
             return images[0] if images else None
         # Read here rather than by OpenCV: it says why a file cannot be opened.
         content = np.fromfile(page.path, np.uint8)

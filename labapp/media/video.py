@@ -15,6 +15,9 @@ from labapp.media.base import Frame, FrameSource, GreyImage, check_index, to_gre
 FAR_FRAMES = 60
 """A jump forward of more than this is made by seeking, a shorter one by decoding on."""
 
+DAMAGED_FRAMES = 50
+"""More frames than this that cannot be decoded, one after the other, are the end."""
+
 GREY_FORMATS = frozenset(
     int.from_bytes(code, "little") for code in (b"Y800", b"GREY", b"Y8  ", b"Y1\x00\x10")
 )
@@ -26,9 +29,10 @@ A_VIDEO = "a video that FFmpeg can decode: AVI, MKV or MP4 with FFV1, MJPG, H.26
 class VideoSource(FrameSource):
     """A video whose frames are known by their time stamps.
 
-    The container's number of frames is believed when its last frame can be read and carries the
-    last frame's time; otherwise the frames are counted by decoding. A seek is believed when the
-    frame it lands on carries the right time; otherwise the video is decoded from its start.
+    The container's number of frames is believed when a seek to the last finds a frame with the
+    last one's time and nothing after it; otherwise the frames are counted by decoding. Where a
+    seek has gone is told by the stamp of the frame found there. Stamps that do not grow (H.264 in
+    AVI) tell nothing: then a jump back decodes from the start.
 
     Parameters
     ----------
@@ -46,6 +50,8 @@ class VideoSource(FrameSource):
         self._path = path
         self._capture = _open(path)
         try:
+            self._reliable = False
+            self._next = 0
             rate = self._capture.get(cv2.CAP_PROP_FPS)
             self.frame_rate_hz: float | None = rate if math.isfinite(rate) and rate > 0 else None
             claimed = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -78,10 +84,8 @@ class VideoSource(FrameSource):
         while self._next <= index:
             if not self._grab():
                 self._rewind()
-                raise self._unreadable(index)
-        if not self._stands_at(index):
-            # Frames in between could not be decoded: what was grabbed is a later one.
-            self._next = int(np.searchsorted(self._stamp_ms, self._now() + self._tolerance))
+                break
+        if self._next != index + 1:
             raise self._unreadable(index)
         time_s = None if self._time_s is None else float(self._time_s[index])
         return Frame(index, time_s, self._retrieve(index))
@@ -92,31 +96,31 @@ class VideoSource(FrameSource):
         self._next = 0
 
     def _grab(self) -> bool:
-        grabbed = bool(self._capture.grab())
-        self._next += grabbed
-        return grabbed
+        """Decode the next frame that can be; False at the end.
+
+        With reliable stamps a frame that cannot be decoded is passed over without those after it
+        taking its number.
+        """
+        if not any(self._capture.grab() for _ in range(DAMAGED_FRAMES)):
+            return False
+        if self._reliable:
+            half = np.diff(self._stamp_ms).min(initial=np.inf) / 2
+            self._next = int(np.searchsorted(self._stamp_ms, self._now() + half))
+        else:
+            self._next += 1
+        return True
 
     def _jump(self, index: int) -> None:
-        """Make ``index`` the frame that was grabbed last, or the next to be."""
+        """Get to ``index`` or before it; where a seek goes is known by the stamp found there."""
         if self._reliable:
             self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
-            if self._capture.grab():
-                self._next = index + 1
-                if self._stands_at(index):
-                    return
+            if self._grab() and self._next <= index + 1:
+                return
         self._rewind()
 
     def _now(self) -> float:
         """Time stamp of the frame grabbed last, ms."""
         return float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
-
-    @property
-    def _tolerance(self) -> float:
-        """Half the shortest step between frames, ms."""
-        return float(np.diff(self._stamp_ms).min(initial=np.inf)) / 2
-
-    def _stands_at(self, index: int) -> bool:
-        return not self._reliable or abs(self._now() - self._stamp_ms[index]) < self._tolerance
 
     def _retrieve(self, index: int) -> GreyImage:
         retrieved, image = self._capture.retrieve()
@@ -129,25 +133,31 @@ class VideoSource(FrameSource):
 
     def _stamps(self, claimed: int) -> FloatArray:
         """Time stamp of every frame, shape (n,), ms."""
-        if self.frame_rate_hz and claimed > 0:
-            stamps = np.arange(claimed) * (1000.0 / self.frame_rate_hz)
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, claimed - 1)
-            if self._capture.grab():
-                late = self._now() - stamps[-1]
-                if abs(late) * self.frame_rate_hz < 500 and not self._capture.grab():
-                    return stamps
+        if self._capture.set(cv2.CAP_PROP_POS_FRAMES, claimed - 1) and self._capture.grab():
+            last = self._now()
+            if self._is_last(last, claimed) and not self._capture.grab():
+                return self._regular(claimed)
         self._rewind()
         counted = []
         while self._grab():
             counted.append(self._now())
+        # Where the last frame is in its place, those missing are holes: they keep their numbers.
+        if counted and self._is_last(counted[-1], claimed):
+            return self._regular(claimed)
         return np.array(counted)
+
+    def _is_last(self, stamp_ms: float, claimed: int) -> bool:
+        rate = self.frame_rate_hz
+        return rate is not None and abs(stamp_ms / 1000 * rate - (claimed - 1)) < 0.5
+
+    def _regular(self, count: int) -> FloatArray:
+        assert self.frame_rate_hz is not None
+        return np.arange(count) * (1000 / self.frame_rate_hz)
 
     def _ends_early(self, claimed: int) -> tuple[str, ...]:
         if len(self) >= claimed:
             return ()
-        return (
-            f"{self.name} ends early: its header says {claimed} frames, {len(self)} are whole",
-        )
+        return (f"{self.name} ends early: its header says {claimed} frames, {len(self)} are whole",)
 
     def _times(self) -> FloatArray | None:
         """Time of every frame since the first, shape (n,), s."""

@@ -1,0 +1,1 @@
+"""What is kept: the setup of the bench, and everything a measurement leaves on disk."""

@@ -1,0 +1,243 @@
+"""The setup file: what is bolted to the bench, and where its pixels are (TOML)."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from tomlkit.items import Table
+
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.errors import InputError
+from labapp.session.files import write_whole
+from labapp.session.setup_keys import SECTIONS, rules_for
+
+A_SETUP = "a setup file (TOML, UTF-8)"
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A setup file that was found right.
+
+    Parameters
+    ----------
+    rig
+        Laser, dot pattern, electrode, imaging plane.
+    calibration
+        Pixel ↔ imaging plane.
+    text
+        The file as it was read, for the record.
+    """
+
+    rig: Rig
+    calibration: ImageCalibration
+    text: str
+
+
+def read_setup(path: str | os.PathLike[str]) -> Setup:
+    """Read and check a setup file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or anything in it is unknown, missing or impossible; all that
+        was found is reported together (`InputError.problems`).
+    """
+    path = Path(path)
+    text = _text(path)
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(path, "syntax", error, A_SETUP) from error
+    problems = [
+        *_unknown_sections(path, values),
+        *(problem for section in SECTIONS for problem in _check(path, section, values)),
+    ]
+    # How values fit each other can be asked once each is right by itself.
+    problems = problems or _contradictions(path, values)
+    if problems:
+        raise InputError.gather(problems)
+    return Setup(_rig(values), _calibration(values["image_calibration"]), text)
+
+
+def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]) -> None:
+    """Put values into a setup file and leave everything else, comments included, as it was.
+
+    The file, and sections it lacks, are made. Values go in as they are: read the file back to
+    know what is still missing or wrong.
+
+    Parameters
+    ----------
+    path
+        The setup file.
+    values
+        Section → key → value; None takes the key out.
+
+    Raises
+    ------
+    InputError
+        If there is a file that is not TOML, or it cannot be written.
+    """
+    path = Path(path)
+    try:
+        document = tomlkit.parse(_text(path)) if path.exists() else tomlkit.document()
+    except tomlkit.exceptions.ParseError as error:
+        raise InputError(path, "syntax", error, A_SETUP) from error
+    for section, keys in values.items():
+        if section not in document:
+            document.add(section, tomlkit.table())
+        table = document[section]
+        if not isinstance(table, Table):
+            raise InputError(path, section, _shown(table), f"a table: [{section}]")
+        for key, value in keys.items():
+            if value is not None:
+                table[key] = value
+            elif key in table:
+                table.remove(key)
+    try:
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(13, "write-protected")
+        write_whole(path, tomlkit.dumps(document).encode())
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "a file that can be written") from error
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, A_SETUP) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "encoding", "not UTF-8", A_SETUP) from error
+
+
+def _unknown_sections(path: Path, values: dict[str, Any]) -> list[InputError]:
+    return [_unknown(path, key, key, list(SECTIONS)) for key in values if key not in SECTIONS]
+
+
+def _unknown(path: Path, full: str, key: str, known: list[str]) -> InputError:
+    near = difflib.get_close_matches(key, known, 1)
+    expected = f"{near[0]}, perhaps" if near else f"one of {', '.join(known)}"
+    return InputError(path, full, "unknown key", expected)
+
+
+def _check(path: Path, section: str, values: dict[str, Any]) -> list[InputError]:
+    """Find unknown, missing and wrong keys of one section."""
+    keys = values.get(section)
+    rules = rules_for(section, keys)
+    if not isinstance(keys, dict):
+        needed = ", ".join(key for key, rule in rules.items() if rule.required)
+        found = "missing" if keys is None else _shown(keys)
+        return [InputError(path, section, found, f"a table [{section}] with {needed}")]
+    problems = []
+    for key, value in keys.items():
+        full = f"{section}.{key}"
+        if key not in rules:
+            problems.append(_unknown(path, full, key, list(rules)))
+        elif not rules[key].accepts(value):
+            problems.append(InputError(path, full, _shown(value), rules[key].expected))
+    problems += [
+        InputError(path, f"{section}.{key}", "missing", rule.expected)
+        for key, rule in rules.items()
+        if rule.required and key not in keys
+    ]
+    return problems
+
+
+def _shown(value: object) -> str:
+    """A value as TOML writes it."""
+    shown = json.dumps(value, default=str, ensure_ascii=False)
+    return shown.replace("NaN", "nan").replace("Infinity", "inf")
+
+
+def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
+    """Find values that are right by themselves and impossible together."""
+    pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
+    rows, columns = pattern["rows"], pattern["columns"]
+    step = pattern["inter_beam_angle_deg"]
+    problems = [
+        InputError(
+            path,
+            "pattern.absent",
+            [i, j],
+            f"rays [row, column] from [1, 1] to [{rows}, {columns}]",
+        )
+        for i, j in pattern.get("absent", [])
+        if not (1 <= i <= rows and 1 <= j <= columns)
+    ]
+    steps = max(rows, columns) - 1
+    if steps * step >= 90:
+        problems.append(
+            InputError(
+                path,
+                "pattern.inter_beam_angle_deg",
+                step,
+                f"a number below {90 / steps:.4g} (degrees), so that the fan stays below 90",
+            )
+        )
+    elif (rows - 1) / 2 * step >= angle:
+        problems.append(
+            InputError(
+                path,
+                "laser.projection_angle_deg",
+                angle,
+                f"a number above half the fan, {(rows - 1) / 2 * step:.4g} (degrees): "
+                "rays above that never reach the work piece",
+            )
+        )
+    try:
+        _calibration(values["image_calibration"])
+    except ValueError as error:
+        problems.append(
+            InputError(path, "image_calibration", error, "three points that span the plane")
+        )
+    return problems
+
+
+def _rig(values: dict[str, Any]) -> Rig:
+    pattern = dict(values["pattern"])
+    absent = pattern.pop("absent", None)
+    return Rig(
+        Laser(**values["laser"]),
+        DotPattern(
+            **pattern, absent=None if absent is None else frozenset((i, j) for i, j in absent)
+        ),
+        Electrode(**values["electrode"]),
+        _imaging_plane(**values["imaging_plane"]),
+    )
+
+
+def _imaging_plane(
+    distance_mm: float,
+    s_mm: float,
+    h_mm: float,
+    width_mm: float,
+    height_mm: float,
+    pitch_deg: float = 0.0,
+    yaw_deg: float = 0.0,
+) -> ImagingPlane:
+    """The plane at O′ (−s, −distance, h), its axes turned about X by pitch, then about Z by yaw."""
+    pitch, yaw = np.radians([pitch_deg, yaw_deg])
+    z_axis = np.array([np.sin(yaw) * np.sin(pitch), -np.cos(yaw) * np.sin(pitch), np.cos(pitch)])
+    return ImagingPlane(
+        origin_mm=np.array([-s_mm, -distance_mm, h_mm], float),
+        x_axis=np.array([np.cos(yaw), np.sin(yaw), 0.0]),
+        z_axis=z_axis,
+        width_mm=width_mm,
+        height_mm=height_mm,
+    )
+
+
+def _calibration(keys: dict[str, Any]) -> ImageCalibration:
+    if "homography" in keys:
+        return ImageCalibration(np.array(keys["homography"], float))
+    return ImageCalibration.from_three_points(**keys)

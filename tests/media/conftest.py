@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+Pictures = list[npt.NDArray[np.uint8]]
+WriteVideo = Callable[[Path, Pictures, str], Path]
+
+
+@pytest.fixture
+def pictures() -> Pictures:
+    """A bright blob that moves 4 px a frame over noise: no two frames alike."""
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:48, :64]
+    return [
+        (
+            rng.integers(10, 40, x.shape) + 180 * np.exp(-((x - 4 * k) ** 2 + (y - 24) ** 2) / 40)
+        ).astype(np.uint8)
+        for k in range(16)
+    ]
+
+
+def _write_video(path: Path, pictures: Pictures, codec: str) -> Path:
+    rows, columns = pictures[0].shape
+    writer = cv2.VideoWriter(
+        str(path), cv2.VideoWriter.fourcc(*codec), 60.0, (columns, rows), isColor=False
+    )
+    assert writer.isOpened(), codec
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def write_video() -> WriteVideo:
+    """Write pictures as a video of 60 frames a second: (path, pictures, codec) -> path."""
+    return _write_video

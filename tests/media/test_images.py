@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.errors import InputError
+from labapp.media import open_source
+from labapp.media.base import to_grey
+from labapp.media.images import natural_key
+
+GREY = (np.indices((20, 30)).sum(axis=0) * 5).astype(np.uint8)
+
+
+def save(path: Path, image: np.ndarray) -> Path:
+    assert cv2.imwrite(str(path), image)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("suffix", "levels"),
+    [("png", 1), ("tiff", 1), ("bmp", 1), ("pgm", 1), ("png", 257), ("tiff", 257), ("pgm", 257)],
+)
+def test_grey_levels_are_kept(tmp_path: Path, suffix: str, levels: int) -> None:
+    image = GREY if levels == 1 else GREY.astype(np.uint16) * levels
+    with open_source(save(tmp_path / f"frame.{suffix}", image)) as source:
+        assert len(source) == 1
+        assert source.shape == (20, 30)
+        assert source.frame_rate_hz is None
+        frame = source.frame(0)
+    assert frame.image.dtype == image.dtype
+    np.testing.assert_array_equal(frame.image, image)
+    assert frame.time_s is None
+    assert not frame.image.flags.writeable
+
+
+def test_jpeg_is_read(tmp_path: Path) -> None:
+    with open_source(save(tmp_path / "frame.jpg", GREY)) as source:
+        np.testing.assert_allclose(source.frame(0).image, GREY, atol=6)
+
+
+@pytest.mark.parametrize("scale", [1, 257], ids=["8 bit", "16 bit"])
+def test_colour_becomes_luminance_and_alpha_is_dropped(tmp_path: Path, scale: int) -> None:
+    kind = np.uint8 if scale == 1 else np.uint16
+    image = np.zeros((4, 5, 4), kind)
+    image[..., :3] = np.array([10, 200, 60]) * scale  # B, G, R
+    image[..., 3] = 7
+    with open_source(save(tmp_path / "frame.png", image)) as source:
+        grey = source.frame(0).image
+    assert grey.dtype == kind
+    expected = 0.114 * 10 + 0.587 * 200 + 0.299 * 60
+    np.testing.assert_allclose(grey, expected * scale, atol=0.6 * scale)
+
+
+def test_floats_stay_floats(tmp_path: Path) -> None:
+    image = GREY.astype(np.float32) / 7
+    with open_source(save(tmp_path / "frame.tiff", image)) as source:
+        np.testing.assert_array_equal(source.frame(0).image, image)
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.int16, np.int32, np.float64])
+def test_other_types_become_float32(kind: type) -> None:
+    image = np.array([[-3, 0, 100]], kind)
+    assert to_grey(image).dtype == np.float32
+    np.testing.assert_array_equal(to_grey(image), image)
+
+
+def test_one_pixel_is_an_image(tmp_path: Path) -> None:
+    with open_source(save(tmp_path / "frame.png", np.array([[9]], np.uint8))) as source:
+        assert source.shape == (1, 1)
+        assert source.frame(0).image[0, 0] == 9
+
+
+def test_nan_is_refused(tmp_path: Path) -> None:
+    image = np.ones((3, 3), np.float32)
+    image[1, 1] = np.nan
+    with pytest.raises(InputError, match=r"frame\.tiff: grey levels: NaN or infinity"):
+        open_source(save(tmp_path / "frame.tiff", image))
+
+
+def test_each_page_of_a_stack_is_a_frame(tmp_path: Path) -> None:
+    path = tmp_path / "stack.tiff"
+    assert cv2.imwritemulti(str(path), [GREY, GREY // 2, GREY // 3])
+    with open_source(path) as source:
+        images = [frame.image for frame in source]
+    for k, image in enumerate(images, 1):
+        np.testing.assert_array_equal(image, GREY // k)
+    assert len(images) == 3
+
+
+def test_a_folder_is_read_in_natural_order(tmp_path: Path) -> None:
+    for k in (10, 9, 1, 100):
+        save(tmp_path / f"frame{k}.png", np.full((4, 4), k, np.uint8))
+    (tmp_path / "notes.txt").write_text("not an image")
+    (tmp_path / "._frame1.png").write_bytes(b"left by another system")
+    with open_source(tmp_path) as source:
+        assert [int(frame.image[0, 0]) for frame in source] == [1, 9, 10, 100]
+        assert [frame.index for frame in source] == [0, 1, 2, 3]
+
+
+def test_digits_sort_as_numbers_beside_letters() -> None:
+    names = ["b1", "a10", "A2", "2", "a", "10"]
+    assert sorted(names, key=natural_key) == ["2", "10", "a", "A2", "a10", "b1"]
+
+
+def test_one_bad_picture_in_a_folder_leaves_the_others(tmp_path: Path) -> None:
+    save(tmp_path / "1.png", GREY)
+    (tmp_path / "0.png").write_bytes(b"")
+    (tmp_path / "2.png").write_bytes((tmp_path / "1.png").read_bytes()[:60])
+    save(tmp_path / "3.png", GREY[:5])
+    with open_source(tmp_path) as source:
+        assert source.shape == GREY.shape
+        np.testing.assert_array_equal(source.frame(1).image, GREY)
+        with pytest.raises(InputError, match="0 bytes"):
+            source.frame(0)
+        with pytest.raises(InputError, match="cannot be decoded"):
+            source.frame(2)
+        with pytest.raises(InputError, match="30×5 px; expected 30×20 px"):
+            source.frame(3)
+
+
+def test_there_is_no_frame_beyond_the_last(tmp_path: Path) -> None:
+    with open_source(save(tmp_path / "frame.png", GREY)) as source:
+        for index in (-1, 1):
+            with pytest.raises(IndexError, match="frames 0 to 0"):
+                source.frame(index)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "bmp", "jpg", "pgm"])
+def test_half_an_image_is_refused(
+    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = save(tmp_path / f"frame.{suffix}", GREY)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="expected a whole image"):
+        open_source(path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    nothing = tmp_path / "frame.png"
+    nothing.touch()
+    text = tmp_path / "text.png"
+    text.write_text("not an image\n" * 50)
+    for path, said in [
+        (empty, "no image in it; expected a folder of images"),
+        (nothing, "0 bytes; expected an image or a video"),
+        (text, "cannot be decoded; expected a whole image"),
+        (tmp_path / "missing.png", "No such file or directory; expected an image, a folder"),
+        (text / "below.png", "Not a directory"),
+    ]:
+        with pytest.raises(InputError, match=said) as caught:
+            open_source(path)
+        assert os.fspath(path) in str(caught.value)
