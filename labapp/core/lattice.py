@@ -181,20 +181,24 @@ class _Growth:
                         heapq.heappush(self.queue, (claim[0], near, claim[1]))
 
     def _claim(self, site: Site) -> tuple[float, int] | None:
-        """The dot that every prediction of the site points at, and how badly they fit."""
+        """The dot that the predictions of the site point at, and how badly they fit.
+
+        Every prediction that falls on a dot must fall on the same one, and most must.
+        """
         chosen: int | None = None
         errors = []
-        for predicted, step, gate in self._predictions(site):
+        predictions = list(self._predictions(site))
+        for predicted, step, gate in predictions:
             distance, near = self.tree.query((predicted.real, predicted.imag), k=2)
             if distance[0] > gate * step:
-                return None
+                continue
             if distance[1] < self.settings.doubt * distance[0]:
                 return None
             if chosen is not None and near[0] != chosen:
                 return None
             chosen = int(near[0])
             errors.append(distance[0] / step)
-        if chosen is None or chosen in self.site_of:
+        if chosen is None or chosen in self.site_of or 2 * len(errors) < len(predictions):
             return None
         return float(np.mean(errors)) / len(errors), chosen
 

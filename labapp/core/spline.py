@@ -71,7 +71,7 @@ class SplineBasis:
         """Value (or derivative) of every spline at n points, shape (n, splines)."""
         along_x, along_y = self._splines
         product = along_x(x_mm, dx)[:, :, None] * along_y(y_mm, dy)[:, None, :]
-        return np.asarray(product.reshape(len(product), -1))
+        return np.asarray(product.reshape(len(product), product.shape[1] * product.shape[2]))
 
     def contains(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Whether points lie in the rectangle, bool array of their shape."""

@@ -1,0 +1,254 @@
+"""One smooth surface under all reflections at once: the engine of matching and of the fit.
+
+Round by round from z = 0, every matched ray is met with the surface, the bisector of the incoming
+ray and the direction to its dot gives two slopes there (Eq. 4-3), and the smooth surface that best
+has all these slopes replaces the last. Slopes leave the level open. It comes from which rays came
+back and which did not: a lit ray landed inside the contour z = 0, a dark one outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.optics import (
+    bisecting_gradient,
+    meet_level,
+    meet_plane,
+    ray_directions,
+    reflect,
+    surface_normal,
+)
+from labapp.core.rig import Rig
+from labapp.core.spline import SplineBasis, SplineSurface, fit_slopes
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How the fit decides.
+
+    Parameters
+    ----------
+    rounds
+        Most rounds of meeting rays, taking slopes and fitting.
+    knot_mm
+        Spacing of the spline knots, mm.
+    jerk
+        Third derivatives of the surface that are to be expected, mm⁻².
+    floor_mm
+        Least uncertainty of a dot on the imaging plane, mm.
+    settled_mm
+        The rounds end when no reflection point moves by more.
+    """
+
+    rounds: int = 12
+    knot_mm: float = 1.0
+    jerk: float = 0.05
+    floor_mm: float = 0.01
+    settled_mm: float = 1e-4
+
+
+@dataclass(frozen=True)
+class Level:
+    """Where z = 0 lies on a surface that is known up to its level.
+
+    Parameters
+    ----------
+    shift_mm
+        What to add to the surface's height, mm.
+    sigma_mm
+        Its standard uncertainty, mm.
+    sign
+        +1 for a pool that stands above the work piece inside its boundary, −1 for one below.
+    disagreement
+        Mean surprise of the rays near the boundary, bits: 0 where every lit ray is inside and
+        every dark one outside.
+    """
+
+    shift_mm: float
+    sigma_mm: float
+    sign: int
+    disagreement: float
+
+
+@dataclass(frozen=True)
+class FittedPool:
+    """One solution: the surface, where the matched rays meet it, and how well it is known.
+
+    Parameters
+    ----------
+    surface
+        The surface, z = 0 at the boundary.
+    covariance
+        Of the spline coefficients, the level left out, shape (splines, splines), mm².
+    level
+        The level and its uncertainty.
+    points_mm
+        Reflection points, shape (n, 3), mm.
+    residual_mm
+        Computed minus captured dot on the imaging plane (X′, Z′), shape (n, 2), mm.
+    """
+
+    surface: SplineSurface
+    covariance: FloatArray
+    level: Level
+    points_mm: FloatArray
+    residual_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def fit_pool(
+    ray: IntArray,
+    plane_mm: FloatArray,
+    plane_covariance_mm2: FloatArray,
+    witness: IntArray,
+    rig: Rig,
+    settings: FitSettings,
+) -> FittedPool:
+    """Solve for the surface that turns each ray (i, j), shape (n, 2), to its dot.
+
+    Parameters are those of `Match`.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if no surface can be fitted or it sends rays away from the plane.
+    """
+    laser = rig.laser.position_mm
+    pattern = ray_directions(rig.laser, rig.pattern)
+    rays = pattern[ray[:, 0] - 1, ray[:, 1] - 1]
+    dots = rig.imaging_plane.to_universal(plane_mm)
+    points = meet_level(laser, rays)
+    ground = meet_level(laser, pattern)[..., :2]
+    spacing = np.abs([np.median(np.diff(ground[..., 0], axis=1)), np.median(np.diff(ground[..., 1], axis=0))])
+    margin = 1.5 * spacing.max()
+    basis = SplineBasis.over(
+        points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
+    )
+    told = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
+    weights = _slope_weights(points, dots, plane_covariance_mm2, rig, settings.floor_mm)
+    out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
+    rim = out > np.median(out)
+    stiffness = 1 / (settings.jerk * settings.knot_mm) ** 2
+    for _ in range(settings.rounds):
+        slopes = bisecting_gradient(points - laser, dots - points)
+        fitted = fit_slopes(basis, points[:, :2], slopes, weights, stiffness)
+        if (witness[told] < 0).any():
+            level = find_level(fitted.surface, ground[told], witness[told], spacing)
+        else:
+            level = _rim_level(fitted.surface, points, rim)
+        surface = fitted.surface.raised(level.shift_mm)
+        if not np.isfinite(surface.coefficients).all():
+            raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
+        met = meet_surface(surface, rays, points)
+        moved = float(np.max(np.abs(met - points)))
+        points = met
+        if moved < settings.settled_mm:
+            break
+    residual = predict_dots(surface, points, rays, rig) - plane_mm
+    if not np.isfinite(residual).all():
+        raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
+    return FittedPool(surface, fitted.covariance, level, points, residual)
+
+
+def _slope_weights(
+    points: FloatArray, dots: FloatArray, covariance: FloatArray, rig: Rig, floor: float
+) -> FloatArray:
+    """Inverse covariance of the slopes that dots of the given covariance give, shape (n, 2, 2)."""
+    laser, step = rig.laser.position_mm, 1e-3
+    base = bisecting_gradient(points - laser, dots - points)
+    jacobian = np.stack(
+        [
+            (bisecting_gradient(points - laser, dots + step * axis - points) - base) / step
+            for axis in (rig.imaging_plane.x_axis, rig.imaging_plane.z_axis)
+        ],
+        axis=-1,
+    )
+    floored = covariance + floor**2 * np.eye(2)
+    return np.asarray(np.linalg.inv(jacobian @ floored @ np.swapaxes(jacobian, -1, -2)))
+
+
+def meet_surface(surface: SplineSurface, rays: FloatArray, points: FloatArray) -> FloatArray:
+    """Where rays meet the surface, by bounded Newton steps from points on them; shapes (n, 3).
+
+    Rays that leave the surface's rectangle stay at its edge.
+    """
+    low, high = surface.basis.low_mm + 1e-9, surface.basis.high_mm - 1e-9
+    for _ in range(4):
+        x, y = np.clip(points[:, :2], low, high).T
+        gap = points[:, 2] - surface.height(x, y)
+        descent = rays[:, 2] - np.sum(surface.gradient(x, y) * rays[:, :2], axis=-1)
+        step = np.clip(gap / np.maximum(-descent, 0.05), -0.5, 0.5)
+        points = points + step[:, None] * rays
+    return points
+
+
+def predict_dots(
+    surface: SplineSurface, points: FloatArray, rays: FloatArray, rig: Rig
+) -> FloatArray:
+    """Dots that the surface makes of rays meeting it at points, IPCS, shape (n, 2), mm."""
+    x, y = np.clip(points[:, :2], surface.basis.low_mm, surface.basis.high_mm).T
+    normal = surface_normal(surface.gradient(x, y))
+    return meet_plane(points, reflect(rays, normal), rig.imaging_plane)
+
+
+def _rim_level(surface: SplineSurface, points: FloatArray, rim: BoolArray) -> Level:
+    """Guess the level where nobody says where the pool ends: the outermost points lie at 0."""
+    height = surface.height(points[:, 0], points[:, 1])
+    shift = -float(np.mean(height[rim]))
+    return Level(shift, float(np.std(height)), 1 if height[~rim].mean() + shift > 0 else -1, np.inf)
+
+
+# Width of the step from inside to outside, in dot spacings: from a boundary that is known as
+# sharply as the surface is to one that half the neighbouring rays contradict.
+_BLURS = np.geomspace(1 / 200, 1 / 4, 12)
+_BLUR_PRIOR = 1.2
+
+
+def find_level(
+    surface: SplineSurface, landing_mm: FloatArray, witness: IntArray, spacing_mm: FloatArray
+) -> Level:
+    """Place z = 0 so that lit rays land inside the contour and dark ones outside.
+
+    A ray that lands a distance d inside the contour came back with probability
+    1/(1 + exp(−d/s)). The blur s is found along with the level: both are weighed on a grid, and
+    the level's mean and spread are taken over it.
+
+    Parameters
+    ----------
+    surface
+        Known up to its level.
+    landing_mm
+        Where the witnesses would land on z = 0, shape (m, 2), mm.
+    witness
+        +1 lit, −1 dark, shape (m,).
+    spacing_mm
+        Distance between neighbouring landing points along X and along Y, mm.
+    """
+    height = surface.height(*landing_mm.T)
+    slope = surface.gradient(*landing_mm.T)
+    # Height by which the surface changes from one ray to the next, straight across the contour.
+    rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
+    rise = np.maximum(rise, np.median(rise) / 4)
+    scan = np.linspace((-height).min(), (-height).max(), 300)
+    best_loss, shift, sign = np.inf, 0.0, 1
+    for trial in (1, -1):
+        inside = trial * witness[:, None] * (height[:, None] + scan) / rise[:, None]
+        loss = np.logaddexp(0.0, -4.0 * inside).sum(axis=0)
+        if loss.min() < best_loss:
+            best_loss, shift, sign = loss.min(), scan[np.argmin(loss)], trial
+    near = np.abs(height + shift) < 3.0 * rise
+    shifts = shift + np.linspace(-1.0, 1.0, 161) * np.median(rise)
+    inside = sign * witness[near, None] * (height[near, None] + shifts) / rise[near, None]
+    log_likelihood = np.stack(
+        [-np.logaddexp(0.0, -inside / s).sum(axis=0) - _BLUR_PRIOR * np.log(s) for s in _BLURS]
+    )
+    posterior = np.exp(log_likelihood - log_likelihood.max())
+    weight = posterior.sum(axis=0) / posterior.sum()
+    mean = float(weight @ shifts)
+    sigma = float(np.sqrt(weight @ (shifts - mean) ** 2))
+    surprise = -log_likelihood.max() / np.log(2) / max(int(near.sum()), 1)
+    return Level(mean, sigma, sign, float(surprise))

@@ -1,0 +1,247 @@
+"""From a few labelled dots to all of them: fit the surface, predict every ray's dot, match, again.
+
+Predicted by the surface rather than by neighbours on the picture, dots are told apart where rows
+bow, fan out or cross; a dot that two predictions could claim is given to neither.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
+
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.dots import Dots
+from labapp.core.optics import meet_level, ray_directions, reflect, surface_normal
+from labapp.core.pool_fit import (
+    FitSettings,
+    FittedPool,
+    fit_pool,
+    meet_surface,
+    predict_dots,
+)
+from labapp.core.rig import Rig
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+
+UNLABELLED = -1
+
+LEAST_LABELS = 6
+"""A quadric wants three slopes each way; the six dots nearest a hole give twice that."""
+
+# While dots are being labelled the surface is kept stiffer than in the final fit: a wrong label
+# must stand out rather than be bent to.
+_STIFF = FitSettings(rounds=5, knot_mm=1.2, jerk=0.1, floor_mm=0.03, settled_mm=2e-3)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Dots on the imaging plane, and the rig they were made with.
+
+    Parameters
+    ----------
+    plane_mm
+        Dots, IPCS (X′, Z′), shape (n, 2), mm.
+    covariance_mm2
+        Their covariance, shape (n, 2, 2), mm².
+    rig, calibration
+        The bench, and how the camera sees the plane.
+    frame_shape
+        Height and width of the frame, px.
+    """
+
+    plane_mm: FloatArray
+    covariance_mm2: FloatArray
+    rig: Rig
+    calibration: ImageCalibration
+    frame_shape: tuple[int, int]
+    rays: FloatArray = field(init=False)
+    landing_mm: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        rays = ray_directions(self.rig.laser, self.rig.pattern)
+        object.__setattr__(self, "rays", rays)
+        object.__setattr__(self, "landing_mm", meet_level(self.rig.laser.position_mm, rays))
+        freeze(self)
+
+    @classmethod
+    def of(
+        cls, dots: Dots, rig: Rig, calibration: ImageCalibration, frame_shape: tuple[int, int]
+    ) -> Scene:
+        """Put the dots of a frame on the imaging plane."""
+        jacobian = calibration.jacobian(dots.image_px)
+        sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
+        spread = jacobian * sigma[:, None, :]
+        return cls(
+            calibration.to_plane(dots.image_px),
+            spread @ np.swapaxes(spread, -1, -2),
+            rig,
+            calibration,
+            frame_shape,
+        )
+
+    @property
+    def absent(self) -> BoolArray:
+        """Rays that the lens does not make, shape (rows, columns)."""
+        mask = np.zeros(self.rays.shape[:2], bool)
+        for i, j in self.rig.pattern.absent_rays:
+            mask[i - 1, j - 1] = True
+        return mask
+
+    def fit(self, labels: IntArray, witness: IntArray, settings: FitSettings) -> FittedPool:
+        """Fit the surface to labelled dots (see `fit_pool`)."""
+        at = np.argwhere(labels != UNLABELLED)
+        dot = labels[at[:, 0], at[:, 1]]
+        return fit_pool(
+            at + 1, self.plane_mm[dot], self.covariance_mm2[dot], witness, self.rig, settings
+        )
+
+    def in_view(self, plane_mm: FloatArray) -> BoolArray:
+        """Whether places on the plane, shape (…, 2), are on it and in the frame, with a rim.
+
+        The plane reaches as far as its size says, and as far as dots are seen on it: O′ need not
+        be its very corner.
+        """
+        rim_mm, rim_px = 0.5, 4.0
+        plane = self.rig.imaging_plane
+        low = np.minimum(self.plane_mm.min(axis=0), 0.0) + rim_mm
+        high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - rim_mm
+        image = self.calibration.to_image(plane_mm)
+        limit = np.array(self.frame_shape[::-1]) - 1 - rim_px
+        on_plane = (plane_mm > low) & (plane_mm < high)
+        in_frame = (image > rim_px) & (image < limit)
+        return np.asarray((on_plane & in_frame).all(axis=-1))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the surface puts the dots of some rays, m of them.
+
+    Parameters
+    ----------
+    at
+        Rows and columns of the rays in the pattern's arrays, counted from 0, shape (m, 2).
+    points_mm
+        Reflection points, shape (m, 3), mm.
+    plane_mm
+        Dots, IPCS, shape (m, 2), mm.
+    spacing_mm
+        Distance from each to the next predicted dot, shape (m,), mm.
+    """
+
+    at: IntArray
+    points_mm: FloatArray
+    plane_mm: FloatArray
+    spacing_mm: FloatArray
+
+
+def grow_labels(scene: Scene, labels: IntArray, gate: float) -> tuple[IntArray, FittedPool] | None:
+    """Follow the surface from the labels given until nothing changes.
+
+    Parameters
+    ----------
+    scene
+        The dots and the rig.
+    labels
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+    gate
+        See `MatchSettings`.
+
+    Returns
+    -------
+    tuple or None
+        Labels and the surface they were last predicted from; None if they lead nowhere.
+    """
+    before: list[bytes] = []
+    pool: FittedPool | None = None
+    for _ in range(15):
+        labels = _without_outliers(scene, labels)
+        pool = stiff_pool(scene, labels)
+        if pool is None:
+            return None
+        labels = _matched(scene, predict(scene, pool, _around(labels)), gate)
+        state = labels.tobytes()
+        if state in before:
+            break
+        before.append(state)
+    labels = _without_outliers(scene, labels)
+    pool = stiff_pool(scene, labels)
+    return None if pool is None else (labels, pool)
+
+
+def stiff_pool(scene: Scene, labels: IntArray) -> FittedPool | None:
+    """Fit the surface to the dots labelled so far, its level guessed from their rim."""
+    if np.sum(labels != UNLABELLED) < LEAST_LABELS:
+        return None
+    try:
+        return scene.fit(labels, np.zeros(labels.shape, np.int64), _STIFF)
+    except (CannotMeasure, np.linalg.LinAlgError):
+        return None
+
+
+def predict(scene: Scene, pool: FittedPool, where: BoolArray) -> Prediction:
+    """Predict the dots of the rays in a mask, shape (rows, columns)."""
+    at = np.argwhere(where)
+    rays = scene.rays[at[:, 0], at[:, 1]]
+    points = meet_surface(pool.surface, rays, scene.landing_mm[at[:, 0], at[:, 1]])
+    plane = predict_dots(pool.surface, points, rays, scene.rig)
+    sane = np.isfinite(plane).all(axis=-1) & pool.surface.basis.contains(*points[:, :2].T)
+    at, points, plane = at[sane], points[sane], plane[sane]
+    spacing = np.full(len(plane), np.inf)
+    if len(plane) > 1:
+        spacing = cKDTree(plane).query(plane, k=2)[0][:, 1]
+    return Prediction(at, points, plane, spacing)
+
+
+def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedPool) -> BoolArray:
+    """Whether the torch may hide reflections: the ray passes above its tip, or nearly (§4.2.1).
+
+    The incident ray for points behind the electrode (y < 0), the reflected one before it.
+    """
+    x, y = np.clip(points_mm[:, :2], pool.surface.basis.low_mm, pool.surface.basis.high_mm).T
+    reflected = reflect(incident, surface_normal(pool.surface.gradient(x, y)))
+    way = np.where((points_mm[:, 1] < 0)[:, None], -incident, reflected)
+    # Both ways lead towards y = 0 and up.
+    height = points_mm[:, 2] - points_mm[:, 1] * way[:, 2] / np.where(way[:, 1] == 0, 1e-12, way[:, 1])
+    return np.asarray(height > rig.electrode.height_mm - 0.3)
+
+
+def _around(labels: IntArray) -> BoolArray:
+    """Labelled rays and their neighbours."""
+    return np.asarray(binary_dilation(labels != UNLABELLED, np.ones((3, 3), bool)))
+
+
+def _matched(scene: Scene, prediction: Prediction, gate: float) -> IntArray:
+    """Labels from mutual nearest neighbours within the gate; absent rays get none."""
+    labels = np.full(scene.rays.shape[:2], UNLABELLED, np.int64)
+    if len(prediction.at) == 0:
+        return labels
+    distance, ray = cKDTree(prediction.plane_mm).query(scene.plane_mm)
+    nearest_dot = cKDTree(scene.plane_mm).query(prediction.plane_mm)[1]
+    mutual = nearest_dot[ray] == np.arange(len(ray))
+    taken = mutual & (distance < gate * prediction.spacing_mm[ray])
+    at = prediction.at[ray[taken]]
+    labels[at[:, 0], at[:, 1]] = np.nonzero(taken)[0]
+    labels[scene.absent] = UNLABELLED
+    return labels
+
+
+def _without_outliers(scene: Scene, labels: IntArray) -> IntArray:
+    """Drop labels far from where the surface through all of them puts their dot."""
+    if len(scene.plane_mm) < 2:
+        return labels
+    spacing = cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][:, 1]
+    for _ in range(3):
+        pool = stiff_pool(scene, labels)
+        if pool is None:
+            return labels
+        at = np.argwhere(labels != UNLABELLED)
+        off = np.linalg.norm(pool.residual_mm, axis=-1)
+        allowed = 0.25 * spacing[labels[at[:, 0], at[:, 1]]]
+        bad = off > np.maximum(6.0 * float(np.median(off)), allowed)
+        if not bad.any():
+            return labels
+        labels = labels.copy()
+        labels[at[bad, 0], at[bad, 1]] = UNLABELLED
+    return labels
