@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice, Site
+from labapp.core.lattice import Lattice, Site, lattice_of_sites
 from labapp.core.pool_fit import FitSettings, FittedPool
 from labapp.core.quadric_search import search_quadrics
 from labapp.core.ray_growth import UNLABELLED, Scene, blocked, grow_labels, predict
@@ -152,6 +152,23 @@ def match_rays(
     return _verdict(scene, lattice, solutions, settings)
 
 
+def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
+    """Rows and columns of ``count`` dots as their rays have them.
+
+    They index dots that the picture alone leaves in doubt, and none that the rays do not.
+    """
+    way = _ways(match.orientation)
+    site = np.array(rig.pattern.reference) * way + (match.reflected - match.ray * way)[0]
+    return lattice_of_sites(
+        {
+            (int(k), int(t)): int(dot)
+            for (k, t), dot in zip(match.reflected, match.dot, strict=True)
+        },
+        count,
+        reference=(int(site[0]), int(site[1])),
+    )
+
+
 @dataclass(frozen=True)
 class _Solution:
     """A hypothesis followed to its end."""
@@ -183,11 +200,16 @@ def _seen_orientation(scene: Scene, solution: _Solution) -> _Solution:
     upward = np.nansum(np.sign(np.diff(place[..., 1], axis=0))) >= 0
     rightward = np.nansum(np.sign(np.diff(place[..., 0], axis=1))) >= 0
     orientation: Orientation = "S/S" if upward else "S/I" if rightward else "I/I"
-    column_way, row_way = (1 if letter == "S" else -1 for letter in orientation.split("/"))
-    way = np.array([row_way, column_way])
+    way = _ways(orientation)
     lowest = ((at + 1) * way).min(axis=0)
     k0, t0 = np.array(scene.rig.pattern.reference) * way - lowest + 1
     return replace(solution, orientation=orientation, reference=(int(k0), int(t0)))
+
+
+def _ways(orientation: Orientation) -> IntArray:
+    """+1 or −1: whether reflected rows, and columns, grow with the rays'; shape (2,)."""
+    by_column, by_row = orientation.split("/")
+    return np.array([1 if by_row == "S" else -1, 1 if by_column == "S" else -1])
 
 
 def _orientations(settings: MatchSettings) -> tuple[Orientation, ...]:
@@ -206,7 +228,7 @@ def _hypotheses(
     dot = np.nonzero(lattice.row > 0)[0]
     for k0, t0 in lattice.candidates:
         for orientation in _orientations(settings):
-            column_way, row_way = (1 if letter == "S" else -1 for letter in orientation.split("/"))
+            row_way, column_way = _ways(orientation)
             i = rig.pattern.reference[0] + row_way * (lattice.row[dot] - k0)
             j = rig.pattern.reference[1] + column_way * (lattice.column[dot] - t0)
             there = (i >= 1) & (i <= rows) & (j >= 1) & (j <= columns)
@@ -216,7 +238,11 @@ def _hypotheses(
 
 
 def _pursue(
-    scene: Scene, orientation: Orientation, reference: Site, labels: IntArray, settings: MatchSettings
+    scene: Scene,
+    orientation: Orientation,
+    reference: Site,
+    labels: IntArray,
+    settings: MatchSettings,
 ) -> _Solution | None:
     """Follow a hypothesis to its end and count what speaks against it."""
     grown = grow_labels(scene, labels, settings.gate)
@@ -295,8 +321,7 @@ def _verdict(
 
 def _reflected(ray: IntArray, orientation: Orientation) -> IntArray:
     """Reflected rows and columns (k, t) of rays, counted from 1, shape (n, 2)."""
-    column_way, row_way = (1 if letter == "S" else -1 for letter in orientation.split("/"))
-    numbers = ray * [row_way, column_way]
+    numbers = ray * _ways(orientation)
     return np.asarray(numbers - numbers.min(axis=0) + 1)
 
 

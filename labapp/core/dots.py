@@ -6,8 +6,7 @@ estimated from the frame; the text's two chains are in `threshold_dots`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -278,11 +277,3 @@ def _describe(
 
 def _band_pass_centroid(image, size):
     return _gauss(image, 0.5 * size) - _gauss(image, 3 * size)
-
-
-@dataclass(frozen=True)
-class DotSettings:
-    """Which detector, and how each decides."""
-
-    method: Literal["band-pass"] = "band-pass"
-    band_pass: BandPassSettings = field(default_factory=BandPassSettings)

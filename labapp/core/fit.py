@@ -15,6 +15,7 @@ from labapp.core.values import CannotMeasure, FloatArray
 LEAST_DOTS = 9
 """A surface from fewer reflections is a guess."""
 
+
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
     """Fit one smooth surface to all reflections (see the head of this file).
 
@@ -29,7 +30,9 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         raise CannotMeasure(
             "too-few-dots", f"{len(match.ray)} dots have a ray, a surface needs {LEAST_DOTS}"
         )
-    pool = fit_pool(match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness, rig, settings)
+    pool = fit_pool(
+        match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness, rig, settings
+    )
     x, y = pool.points_mm[:, 0], pool.points_mm[:, 1]
     center = (pool.points_mm[:, :2].min(axis=0) + pool.points_mm[:, :2].max(axis=0)) / 2
     boundary = zero_contour(pool.surface, center, pool.level.sign)

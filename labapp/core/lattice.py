@@ -94,12 +94,18 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
             best = grid
     if len(best) < settings.least:
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
-    return _as_lattice(_upright(best, points), len(dots), points, tree)
+    grid = _upright(best, points)
+    holes = _holes(grid, points, tree)
+    certain = [site for site, sides in holes if sides == 4]
+    return lattice_of_sites(
+        grid,
+        len(dots),
+        reference=certain[0] if len(certain) == 1 else None,
+        candidates=tuple(site for site, _ in holes),
+    )
 
 
-def _seeds(
-    points: FloatArray, tree: cKDTree
-) -> list[tuple[int, FloatArray, FloatArray]]:
+def _seeds(points: FloatArray, tree: cKDTree) -> list[tuple[int, FloatArray, FloatArray]]:
     """Dots that lie midway between two neighbours, the most regular first.
 
     Returns triples of the dot, the step to such a neighbour, and the step across: to the other
@@ -152,7 +158,12 @@ class _Growth:
 
     def run(self, seed: int, first: FloatArray, second: FloatArray) -> dict[Site, int]:
         self._place((0, 0), seed)
-        for site, step in (((0, 1), first), ((0, -1), -first), ((1, 0), second), ((-1, 0), -second)):
+        for site, step in (
+            ((0, 1), first),
+            ((0, -1), -first),
+            ((1, 0), second),
+            ((-1, 0), -second),
+        ):
             distance, dot = self.tree.query(self.points[seed] + step)
             if distance < 0.3 * np.linalg.norm(step) and dot not in self.site_of:
                 self._place(site, int(dot))
@@ -287,7 +298,9 @@ def _upright(grid: dict[Site, int], points: FloatArray) -> dict[Site, int]:
         return np.array(pairs).reshape(-1, 2)
 
     along, across = steps(0, 1), steps(1, 0)
-    level = [np.abs(s[:, 0]).sum() / max(np.linalg.norm(s, axis=1).sum(), 1e-9) for s in (along, across)]
+    level = [
+        np.abs(s[:, 0]).sum() / max(np.linalg.norm(s, axis=1).sum(), 1e-9) for s in (along, across)
+    ]
     if level[0] < level[1]:
         grid = {(t, k): dot for (k, t), dot in grid.items()}
         along, across = across, along
@@ -299,19 +312,18 @@ def _upright(grid: dict[Site, int], points: FloatArray) -> dict[Site, int]:
     return {(k - k0 + 1, t - t0 + 1): dot for (k, t), dot in grid.items()}
 
 
-def _as_lattice(grid: dict[Site, int], n: int, points: FloatArray, tree: cKDTree) -> Lattice:
-    row, column = np.zeros(n, np.int64), np.zeros(n, np.int64)
+def lattice_of_sites(
+    grid: dict[Site, int],
+    count: int,
+    reference: Site | None = None,
+    candidates: tuple[Site, ...] = (),
+) -> Lattice:
+    """Build the lattice of ``count`` dots from the dot at each site (k, t), counted from 1."""
+    row, column = np.zeros(count, np.int64), np.zeros(count, np.int64)
     for (k, t), dot in grid.items():
         row[dot], column[dot] = k, t
-    holes = _holes(grid, points, tree)
-    certain = [site for site, sides in holes if sides == 4]
-    return Lattice(
-        row,
-        column,
-        reference=certain[0] if len(certain) == 1 else None,
-        candidates=tuple(site for site, _ in holes),
-        blocked_rows=_blocked_rows(grid),
-    )
+    candidates = candidates or ((reference,) if reference else ())
+    return Lattice(row, column, reference, candidates, _blocked_rows(grid))
 
 
 def _holes(grid: dict[Site, int], points: FloatArray, tree: cKDTree) -> list[tuple[Site, int]]:

@@ -24,6 +24,7 @@ from labapp.core.rig import Rig
 from labapp.core.spline import SplineBasis, SplineSurface, fit_slopes
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
+
 @dataclass(frozen=True)
 class FitSettings:
     """How the fit decides.
@@ -123,7 +124,9 @@ def fit_pool(
     dots = rig.imaging_plane.to_universal(plane_mm)
     points = meet_level(laser, rays)
     ground = meet_level(laser, pattern)[..., :2]
-    spacing = np.abs([np.median(np.diff(ground[..., 0], axis=1)), np.median(np.diff(ground[..., 1], axis=0))])
+    spacing = np.abs(
+        [np.median(np.diff(ground[..., 0], axis=1)), np.median(np.diff(ground[..., 1], axis=0))]
+    )
     margin = 1.5 * spacing.max()
     basis = SplineBasis.over(
         points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm

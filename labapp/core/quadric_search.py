@@ -118,7 +118,9 @@ def _fit_hole(
     shape = rays.shape[:2]
     kappa_x = (np.array([1, -1]) * half_width - (moved[0] + moved[1]) / 2) / rate
     kappa_x = kappa_x[(np.abs(kappa_x) > _FLATTEST) & (np.abs(kappa_x) < _STEEPEST)]
-    curvatures = (kappa_x[:, None, None] * np.stack([np.ones_like(_RATIOS), _RATIOS], -1)).reshape(-1, 2)
+    curvatures = (kappa_x[:, None, None] * np.stack([np.ones_like(_RATIOS), _RATIOS], -1)).reshape(
+        -1, 2
+    )
     patterns = _quadric_dots(scene, slope, curvatures[:, None], rays.reshape(-1, 3))
     return [
         guess

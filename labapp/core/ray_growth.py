@@ -203,7 +203,9 @@ def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedP
     reflected = reflect(incident, surface_normal(pool.surface.gradient(x, y)))
     way = np.where((points_mm[:, 1] < 0)[:, None], -incident, reflected)
     # Both ways lead towards y = 0 and up.
-    height = points_mm[:, 2] - points_mm[:, 1] * way[:, 2] / np.where(way[:, 1] == 0, 1e-12, way[:, 1])
+    height = points_mm[:, 2] - points_mm[:, 1] * way[:, 2] / np.where(
+        way[:, 1] == 0, 1e-12, way[:, 1]
+    )
     return np.asarray(height > rig.electrode.height_mm - 0.3)
 
 

@@ -91,7 +91,10 @@ class SplineBasis:
             grams.append([(part * each[:, None]).T @ part for part in parts])
         x, y = grams
         return np.asarray(
-            np.kron(x[3], y[0]) + 3 * np.kron(x[2], y[1]) + 3 * np.kron(x[1], y[2]) + np.kron(x[0], y[3])
+            np.kron(x[3], y[0])
+            + 3 * np.kron(x[2], y[1])
+            + 3 * np.kron(x[1], y[2])
+            + np.kron(x[0], y[3])
         )
 
 

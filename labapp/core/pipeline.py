@@ -1,0 +1,129 @@
+"""Frame → Measurement: the seven steps of the measurement, in order, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from labapp.core import ers, fit, irs, measures
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.correspondence import Match, MatchSettings, indexed_lattice, match_rays
+from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.dots import Dots, Image
+from labapp.core.lattice import Lattice
+from labapp.core.pool_fit import FitSettings
+from labapp.core.reconstruction import Reconstruction, Scheme
+from labapp.core.rig import Rig
+from labapp.core.values import CannotMeasure
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that can be chosen about a measurement.
+
+    Parameters
+    ----------
+    scheme
+        ``fit`` (the default), ``ers`` or ``irs``.
+    algorithm
+        Of IRS: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``.
+    correspondence
+        ``auto``, or the one to use.
+    dots, lattice, match, fit, ers, irs
+        Settings of the single steps.
+    """
+
+    scheme: Scheme = "fit"
+    algorithm: irs.Algorithm = "opa"
+    correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
+    dots: DotSettings = field(default_factory=DotSettings)
+    lattice: LatticeSettings = field(default_factory=LatticeSettings)
+    match: MatchSettings = field(default_factory=MatchSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    ers: ers.ErsSettings = field(default_factory=ers.ErsSettings)
+    irs: irs.IrsSettings = field(default_factory=irs.IrsSettings)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What one frame gave, as far as it went.
+
+    Parameters
+    ----------
+    status
+        ``ok``, or one word for why there is no surface.
+    reason
+        The same in a sentence; empty if all went well.
+    scheme
+        Which scheme was asked for.
+    dots, lattice, match, reconstruction, measures
+        The steps' results; None from the step on that could not be done.
+    """
+
+    status: str
+    reason: str
+    scheme: Scheme
+    dots: Dots | None = None
+    lattice: Lattice | None = None
+    match: Match | None = None
+    reconstruction: Reconstruction | None = None
+    measures: measures.Measures | None = None
+
+
+def measure(
+    image: Image, rig: Rig, calibration: ImageCalibration, settings: Settings
+) -> Measurement:
+    """Measure the pool that a frame shows. Never raises for a bad frame: the status says why.
+
+    Parameters
+    ----------
+    image
+        Grey frame, shape (height, width), any real type.
+    rig, calibration
+        The bench, and how the camera sees the imaging plane.
+    settings
+        See `Settings`.
+    """
+    result = Measurement("ok", "", settings.scheme)
+    height, width = image.shape
+    try:
+        dots = find_dots(image, settings.dots)
+        result = replace(result, dots=dots)
+        lattice, doubt = _lattice(dots, (height, width), settings.lattice)
+        result = replace(result, lattice=lattice)
+        chosen = replace(settings.match, correspondence=settings.correspondence)
+        try:
+            match = match_rays(dots, lattice, rig, calibration, (height, width), chosen)
+        except CannotMeasure as answer:
+            raise (doubt if doubt and answer.status == "no-match" else answer) from None
+        result = replace(result, match=match, lattice=indexed_lattice(match, rig, len(dots)))
+        reconstruction = reconstruct(match, rig, settings)
+        size = measures.measure(reconstruction, match, rig)
+        return replace(result, reconstruction=reconstruction, measures=size)
+    except CannotMeasure as answer:
+        return replace(result, status=answer.status, reason=answer.reason)
+
+
+def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
+    """Reconstruct the surface by the scheme that the settings name.
+
+    Raises
+    ------
+    CannotMeasure
+        If the scheme finds no surface.
+    """
+    if settings.scheme == "irs":
+        return irs.reconstruct(match, rig, replace(settings.irs, algorithm=settings.algorithm))
+    if settings.scheme == "ers":
+        return ers.reconstruct(match, rig, settings.ers)
+    return fit.reconstruct(match, rig, settings.fit)
+
+
+def _lattice(
+    dots: Dots, frame_shape: tuple[int, int], settings: LatticeSettings
+) -> tuple[Lattice | None, CannotMeasure | None]:
+    """Rows and columns, or why there are none: the optics may still tell the rays."""
+    try:
+        return find_lattice(dots, frame_shape, settings), None
+    except CannotMeasure as answer:
+        return None, answer
