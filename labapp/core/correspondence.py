@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from labapp.core.coordinates import ImageCalibration
@@ -23,7 +22,14 @@ from labapp.core.dots import Dots
 from labapp.core.lattice import Lattice, Site, lattice_of_sites
 from labapp.core.pool_fit import FitSettings, FittedPool
 from labapp.core.quadric_search import search_quadrics
-from labapp.core.ray_growth import UNLABELLED, Scene, blocked, grow_labels, predict
+from labapp.core.ray_growth import (
+    UNLABELLED,
+    Scene,
+    blocked,
+    grow_labels,
+    predict,
+    try_fit,
+)
 from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
@@ -147,8 +153,14 @@ def match_rays(
     if not any(_explains(scene, solution) for solution in solutions):
         for guess in search_quadrics(scene, settings.gate):
             solution = _pursue(scene, "S/S", (0, 0), guess.labels, settings)
-            if solution is not None:
-                solutions.append(_seen_orientation(scene, solution))
+            if solution is None:
+                continue
+            solution = _seen_orientation(scene, solution)
+            solutions.append(solution)
+            labels = None if lattice is None else _joined(solution, lattice)
+            if labels is not None:
+                wider = _pursue(scene, solution.orientation, solution.reference, labels, settings)
+                solutions += [wider] if wider is not None else []
     return _verdict(scene, lattice, solutions, settings)
 
 
@@ -206,6 +218,26 @@ def _seen_orientation(scene: Scene, solution: _Solution) -> _Solution:
     return replace(solution, orientation=orientation, reference=(int(k0), int(t0)))
 
 
+def _joined(solution: _Solution, lattice: Lattice) -> IntArray | None:
+    """Labels for the whole grid where the rays found so far agree with it; None if they do not."""
+    at = np.argwhere(solution.labels != UNLABELLED)
+    dot = solution.labels[at[:, 0], at[:, 1]]
+    site = np.stack([lattice.row, lattice.column], axis=-1)
+    way = _ways(solution.orientation)
+    indexed = site[dot, 0] > 0
+    offset = (at + 1 - site[dot] * way)[indexed]
+    if len(offset) == 0:
+        return None
+    kinds, count = np.unique(offset, axis=0, return_counts=True)
+    if count.max() < 0.8 * len(offset):
+        return None
+    ray = site * way + kinds[np.argmax(count)]
+    there = (site[:, 0] > 0) & (ray >= 1).all(axis=1) & (ray <= solution.labels.shape).all(axis=1)
+    labels = np.where(np.isin(solution.labels, np.nonzero(there)[0]), UNLABELLED, solution.labels)
+    labels[ray[there, 0] - 1, ray[there, 1] - 1] = np.nonzero(there)[0]
+    return labels
+
+
 def _ways(orientation: Orientation) -> IntArray:
     """+1 or −1: whether reflected rows, and columns, grow with the rays'; shape (2,)."""
     by_column, by_row = orientation.split("/")
@@ -246,12 +278,12 @@ def _pursue(
 ) -> _Solution | None:
     """Follow a hypothesis to its end and count what speaks against it."""
     grown = grow_labels(scene, labels, settings.gate)
-    if grown is None:
+    pool = None if grown is None else try_fit(scene, grown)
+    if grown is None or pool is None:
         return None
-    labels, pool = grown
-    lit = labels != UNLABELLED
+    lit = grown != UNLABELLED
     try:
-        pool = scene.fit(labels, _witness(scene, labels, pool), FitSettings())
+        pool = scene.fit(grown, _witness(scene, grown, pool), FitSettings())
     except CannotMeasure:
         return None
     around = predict(scene, pool, _amid(lit) & ~lit & ~scene.absent)
@@ -259,10 +291,10 @@ def _pursue(
     hidden = blocked(around.points_mm, rays, scene.rig, pool)
     missed = int(np.sum(~hidden & scene.in_view(around.plane_mm)))
     stray = len(scene.plane_mm) - int(lit.sum())
-    variance = scene.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
+    variance = scene.covariance_mm2[grown[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
     surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, settings.stray)
     cost = float(surprise.sum()) + settings.stray * stray + settings.missed * missed
-    return _Solution(orientation, reference, labels, pool, cost, stray, missed)
+    return _Solution(orientation, reference, grown, pool, cost, stray, missed)
 
 
 def _amid(lit: BoolArray) -> BoolArray:

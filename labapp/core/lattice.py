@@ -58,13 +58,14 @@ class GrowSettings:
         the site is predicted.
     doubt
         … and is left in doubt if another dot lies within this many times that distance.
-    least
-        A grid of fewer dots is no grid.
+    least, share
+        A grid of fewer dots, or of a smaller share of them, is no grid.
     """
 
     gate: float = 0.36
     doubt: float = 1.8
     least: int = 9
+    share: float = 0.5
 
 
 def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
@@ -92,9 +93,9 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         tried.update(grid.values())
         if len(grid) > len(best):
             best = grid
-    if len(best) < settings.least:
+    if len(best) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
-    grid = _upright(best, points)
+    grid = _without_slips(_upright(best, points), plane)
     holes = _holes(grid, points, tree)
     certain = [site for site, sides in holes if sides == 4]
     return lattice_of_sites(
@@ -284,6 +285,43 @@ def _sound_part(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
         parts.setdefault(root(site), []).append(site)
     largest = max(parts.values(), key=len)
     return {site: grid[site] for site in largest} if len(largest) > 1 else {}
+
+
+def _without_slips(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
+    """Put rows back that stand a column off the row below; give up rows that may or may not.
+
+    Neighbour by neighbour a row may be joined to the next one column off all along. Its columns
+    then slant by a whole step on the average over the row, which bowed and fanned rows do not.
+    """
+    kept: dict[Site, int] = {}
+    shift, below = 0, None
+    for k in sorted({site[0] for site in grid}):
+        row = {t: plane[dot] for (row_k, t), dot in grid.items() if row_k == k}
+        slant = 0.0
+        if below is not None:
+            leans = [
+                ((row[t] - below[t]) / step).real
+                for t in row.keys() & below.keys()
+                for step in _steps_at(below, t)
+            ]
+            if not leans:
+                break
+            slant = float(np.median(leans))
+        if abs(abs(slant) % 1.0 - 0.5) < 0.15:
+            break
+        shift += round(slant)
+        kept |= {(k, t + shift): grid[k, t] for t in row}
+        below = row
+    return kept
+
+
+def _steps_at(row: dict[int, complex], t: int) -> list[complex]:
+    """Step along a row at column t: across it, or to the one neighbour there is."""
+    if t - 1 in row and t + 1 in row:
+        return [(row[t + 1] - row[t - 1]) / 2]
+    if t + 1 in row:
+        return [row[t + 1] - row[t]]
+    return [row[t] - row[t - 1]] if t - 1 in row else []
 
 
 def _upright(grid: dict[Site, int], points: FloatArray) -> dict[Site, int]:

@@ -6,7 +6,7 @@ bow, fan out or cross; a dot that two predictions could claim is given to neithe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -31,8 +31,10 @@ LEAST_LABELS = 6
 """A quadric wants three slopes each way; the six dots nearest a hole give twice that."""
 
 # While dots are being labelled the surface is kept stiffer than in the final fit: a wrong label
-# must stand out rather than be bent to.
-_STIFF = FitSettings(rounds=5, knot_mm=1.2, jerk=0.1, floor_mm=0.03, settled_mm=2e-3)
+# must stand out rather than be bent to. Shallow pools are followed farther by the stiffer of the
+# two, steep ones only by the softer.
+_STIFF = FitSettings(rounds=5, knot_mm=1.2, jerk=0.03, floor_mm=0.03, settled_mm=2e-3)
+_SOFT = replace(_STIFF, jerk=0.1)
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ class Prediction:
     spacing_mm: FloatArray
 
 
-def grow_labels(scene: Scene, labels: IntArray, gate: float) -> tuple[IntArray, FittedPool] | None:
+def grow_labels(scene: Scene, labels: IntArray, gate: float) -> IntArray | None:
     """Follow the surface from the labels given until nothing changes.
 
     Parameters
@@ -150,14 +152,26 @@ def grow_labels(scene: Scene, labels: IntArray, gate: float) -> tuple[IntArray, 
 
     Returns
     -------
-    tuple or None
-        Labels and the surface they were last predicted from; None if they lead nowhere.
+    IntArray or None
+        The labels, of the same shape; None if they lead nowhere.
     """
+    best: IntArray | None = None
+    for settings in (_STIFF, _SOFT, _STIFF):
+        grown = _settled(scene, labels, gate, settings)
+        if grown is not None and (best is None or _count(grown) > _count(best)):
+            best = grown
+        labels = labels if best is None else best
+    return best
+
+
+def _settled(
+    scene: Scene, labels: IntArray, gate: float, settings: FitSettings
+) -> IntArray | None:
+    """Predict and match until the labels no longer change, or come round again."""
     before: list[bytes] = []
-    pool: FittedPool | None = None
-    for _ in range(15):
-        labels = _without_outliers(scene, labels)
-        pool = stiff_pool(scene, labels)
+    while len(before) < 15:
+        labels = _without_outliers(scene, labels, settings)
+        pool = try_fit(scene, labels, settings)
         if pool is None:
             return None
         labels = _matched(scene, predict(scene, pool, _around(labels)), gate)
@@ -165,17 +179,20 @@ def grow_labels(scene: Scene, labels: IntArray, gate: float) -> tuple[IntArray, 
         if state in before:
             break
         before.append(state)
-    labels = _without_outliers(scene, labels)
-    pool = stiff_pool(scene, labels)
-    return None if pool is None else (labels, pool)
+    labels = _without_outliers(scene, labels, settings)
+    return labels if _count(labels) >= LEAST_LABELS else None
 
 
-def stiff_pool(scene: Scene, labels: IntArray) -> FittedPool | None:
+def _count(labels: IntArray) -> int:
+    return int(np.sum(labels != UNLABELLED))
+
+
+def try_fit(scene: Scene, labels: IntArray, settings: FitSettings = _SOFT) -> FittedPool | None:
     """Fit the surface to the dots labelled so far, its level guessed from their rim."""
-    if np.sum(labels != UNLABELLED) < LEAST_LABELS:
+    if _count(labels) < LEAST_LABELS:
         return None
     try:
-        return scene.fit(labels, np.zeros(labels.shape, np.int64), _STIFF)
+        return scene.fit(labels, np.zeros(labels.shape, np.int64), settings)
     except (CannotMeasure, np.linalg.LinAlgError):
         return None
 
@@ -229,13 +246,13 @@ def _matched(scene: Scene, prediction: Prediction, gate: float) -> IntArray:
     return labels
 
 
-def _without_outliers(scene: Scene, labels: IntArray) -> IntArray:
+def _without_outliers(scene: Scene, labels: IntArray, settings: FitSettings) -> IntArray:
     """Drop labels far from where the surface through all of them puts their dot."""
     if len(scene.plane_mm) < 2:
         return labels
     spacing = cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][:, 1]
     for _ in range(3):
-        pool = stiff_pool(scene, labels)
+        pool = try_fit(scene, labels, settings)
         if pool is None:
             return labels
         at = np.argwhere(labels != UNLABELLED)
