@@ -75,6 +75,7 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Let go of the file. Closing twice does no harm."""
+        return
 
     def __iter__(self) -> Iterator[Frame]:
         return (self.frame(index) for index in range(len(self)))

@@ -29,10 +29,10 @@ A_VIDEO = "a video that FFmpeg can decode: AVI, MKV or MP4 with FFV1, MJPG, H.26
 class VideoSource(FrameSource):
     """A video whose frames are known by their time stamps.
 
-    The container's number of frames is believed when a seek to the last finds a frame with the
-    last one's time and nothing after it; otherwise the frames are counted by decoding. Where a
-    seek has gone is told by the stamp of the frame found there. Stamps that do not grow (H.264 in
-    AVI) tell nothing: then a jump back decodes from the start.
+    The number of frames in an AVI, whose rate is constant, is believed when a seek to the last
+    finds a frame with the last one's time and nothing after it; everything else is counted by
+    decoding. Where a seek has gone is told by the stamp of the frame found there. Stamps that do
+    not grow (H.264 in AVI) tell nothing: then a jump back decodes from the start.
 
     Parameters
     ----------
@@ -58,8 +58,8 @@ class VideoSource(FrameSource):
             self._stamp_ms = self._stamps(claimed)
             if not len(self._stamp_ms):
                 raise InputError(path, "frames", "not one that is whole", A_VIDEO)
-            self.warnings = self._ends_early(claimed)
             self._reliable = bool((np.diff(self._stamp_ms) > 0).all())
+            self.warnings = self._ends_early(claimed)
             self._time_s = self._times()
             self._rewind()
             self._grab()
@@ -124,7 +124,7 @@ class VideoSource(FrameSource):
 
     def _retrieve(self, index: int) -> GreyImage:
         retrieved, image = self._capture.retrieve()
-        if not retrieved or image is None or not image.size:
+        if not retrieved:
             raise self._unreadable(index)
         return to_grey(image)
 
@@ -133,42 +133,54 @@ class VideoSource(FrameSource):
 
     def _stamps(self, claimed: int) -> FloatArray:
         """Time stamp of every frame, shape (n,), ms."""
-        if self._capture.set(cv2.CAP_PROP_POS_FRAMES, claimed - 1) and self._capture.grab():
-            last = self._now()
-            if self._is_last(last, claimed) and not self._capture.grab():
-                return self._regular(claimed)
+        if _is_avi(self._path):
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, claimed - 1)
+            if self._capture.grab():
+                last = np.array([self._now()])
+                if self._fits(last, claimed) and not self._capture.grab():
+                    return self._regular(claimed)
         self._rewind()
         counted = []
         while self._grab():
             counted.append(self._now())
-        # Where the last frame is in its place, those missing are holes: they keep their numbers.
-        if counted and self._is_last(counted[-1], claimed):
-            return self._regular(claimed)
-        return np.array(counted)
+        stamps = np.array(counted)
+        # With the last frame in its place, those missing are holes: the others keep their numbers.
+        return self._regular(claimed) if self._fits(stamps, claimed) else stamps
 
-    def _is_last(self, stamp_ms: float, claimed: int) -> bool:
-        rate = self.frame_rate_hz
-        return rate is not None and abs(stamp_ms / 1000 * rate - (claimed - 1)) < 0.5
+    def _fits(self, stamp_ms: FloatArray, claimed: int) -> bool:
+        """Whether frames stand at multiples of the interval, the last at ``claimed`` − 1."""
+        if self.frame_rate_hz is None or not len(stamp_ms):
+            return False
+        place = stamp_ms / 1000 * self.frame_rate_hz
+        on_grid = np.abs(place - place.round()).max() < 0.25
+        return bool(on_grid and round(place[-1]) == claimed - 1)
 
     def _regular(self, count: int) -> FloatArray:
         assert self.frame_rate_hz is not None
-        return np.arange(count) * (1000 / self.frame_rate_hz)
+        return np.arange(count, dtype=np.float64) * (1000 / self.frame_rate_hz)
 
     def _ends_early(self, claimed: int) -> tuple[str, ...]:
-        if len(self) >= claimed:
+        # Fewer frames over the whole time are a varying rate, not an early end.
+        last = self._stamp_ms[-1] / 1000 * (self.frame_rate_hz or 0) if self._reliable else 0
+        if max(len(self), round(last) + 1) >= claimed:
             return ()
         return (f"{self.name} ends early: its header says {claimed} frames, {len(self)} are whole",)
 
     def _times(self) -> FloatArray | None:
         """Time of every frame since the first, shape (n,), s."""
-        elapsed = (self._stamp_ms - self._stamp_ms[0]) / 1000
+        elapsed: FloatArray = (self._stamp_ms - self._stamp_ms[0]) / 1000
         if self.frame_rate_hz is None:
             return elapsed if self._reliable else None
-        regular = np.arange(len(self)) / self.frame_rate_hz
+        regular: FloatArray = self._regular(len(self)) / 1000
         # Containers round stamps (Matroska: to 1 ms); a frame later than that was later.
         if self._reliable and (np.abs(elapsed - regular) * self.frame_rate_hz >= 0.5).any():
             return elapsed
         return regular
+
+
+def _is_avi(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(4) == b"RIFF"
 
 
 def _open(path: Path) -> cv2.VideoCapture:

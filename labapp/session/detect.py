@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
+
 from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
 from labapp.core.dots import Dots
 from labapp.core.lattice import Lattice
@@ -32,8 +34,9 @@ def detect_dots(path: str | os.PathLike[str]) -> tuple[Dots, Lattice | None, str
     """
     with open_source(path) as source:
         image = source.frame(0).image
-    dots = find_dots(image, DotSettings())
+    dots = Dots(*np.empty((7, 0)))
     try:
+        dots = find_dots(image, DotSettings())
         return dots, find_lattice(dots, (image.shape[0], image.shape[1]), LatticeSettings()), ""
     except CannotMeasure as answer:
         return dots, None, str(answer)

@@ -19,6 +19,7 @@ Pictures = list[npt.NDArray[np.uint8]]
 WriteVideo = Callable[[Path, Pictures, str], Path]
 
 H264 = Path(__file__).parent / "data" / "h264.mp4"
+VARYING = Path(__file__).parent / "data" / "varying_rate.mkv"
 GREY_16 = Path(__file__).parent / "data" / "grey16.mkv"
 
 LOSSLESS = [("ffv1.avi", "FFV1"), ("ffv1.mkv", "FFV1"), ("raw.avi", "Y800"), ("png.avi", "MPNG")]
@@ -61,6 +62,17 @@ def test_h264_is_read_and_any_frame_can_be_asked_for() -> None:
         )
         for index in (39, 0, 20, 3, 38, 37, 37, 12):
             np.testing.assert_array_equal(source.frame(index).image, in_order[index])
+
+
+def test_frames_of_a_varying_rate_keep_their_times() -> None:
+    """Frame k is 10·k everywhere; the camera paused, then hurried."""
+    time_s = [0, 0.017, 0.033, 0.05, 0.25, 0.26, 0.3, 0.317, 0.333, 0.35, 0.367, 0.383]
+    with open_source(VARYING) as source:
+        assert source.warnings == ()
+        frames = [*source, source.frame(2), source.frame(10), source.frame(4)]
+    expected = [*range(12), 2, 10, 4]
+    assert [int(frame.image[0, 0]) for frame in frames] == [10 * k for k in expected]
+    assert [frame.time_s for frame in frames] == pytest.approx([time_s[k] for k in expected])
 
 
 def test_sixteen_bits_are_kept() -> None:

@@ -1,0 +1,334 @@
+"""The command line: one thin command each, over the calls that the pages make too.
+
+What measures is imported inside the commands: `labapp --help` answers at once, and Ctrl-C while
+it loads is handled like any other.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+import labapp
+from labapp.errors import InputError
+from labapp.session.log import log_file, start_log
+
+if TYPE_CHECKING:
+    from labapp.core.pipeline import Measurement, Settings
+    from labapp.session.summary import Summary
+
+INTERRUPTED, FAULT, BAD_INPUT, NO_SURFACE = 130, 3, 2, 1
+
+app = typer.Typer(
+    name="labapp",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Measure the 3-D surface of a molten weld pool from a reflected laser dot matrix. "
+    "Lengths are in mm, angles in degrees, places in an image in px (u right, v down, the "
+    "centre of the first pixel is 0, 0), times in s.",
+    epilog="Exit codes: 0 done; 1 done, but nothing could be measured; 2 bad input or output; "
+    "3 a fault in labapp; 130 stopped by Ctrl-C.",
+)
+calibrate = typer.Typer(no_args_is_help=True, help="Calibrate the laser or the imaging plane.")
+app.add_typer(calibrate, name="calibrate")
+
+SetupToChange = Annotated[
+    Path | None,
+    typer.Option("--setup", help="Setup file (TOML) to write the values into; made if missing."),
+]
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and exit: bad input in a line or two, never a traceback."""
+    log = start_log()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a terminal without "±" is no reason to stop
+    try:
+        app(args=arguments)
+    except InputError as error:
+        log.error("bad input", exc_info=True)
+        typer.echo(f"labapp: {error}", err=True)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except Exception as error:
+        log.exception("fault")
+        typer.echo(
+            f"labapp: a fault in the program: {type(error).__name__}: {error}\n"
+            f"Details are in {log_file()}",
+            err=True,
+        )
+        sys.exit(FAULT)
+    sys.exit(0)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"labapp {labapp.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def program(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Hold the options of the program itself."""
+
+
+@app.command()
+def reconstruct(
+    source: Annotated[
+        Path, typer.Argument(help="An image, a folder of images, or a video (AVI, MKV, MP4).")
+    ],
+    setup: Annotated[Path, typer.Option(help="Setup file (TOML; mm, degrees, px).")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder for the results (CSV, STL; mm). An earlier run in it is replaced."
+        ),
+    ],
+    scheme: Annotated[
+        Literal["fit", "ers", "irs"],
+        typer.Option(help="How the surface is found: least-squares fit, ERS (ch. 7), IRS (ch. 6)."),
+    ] = "fit",
+    algorithm: Annotated[
+        Literal["opa", "epa-r", "epa-c", "epa-rc"],
+        typer.Option(help="Algorithm of IRS; the other schemes have none."),
+    ] = "opa",
+    correspondence: Annotated[
+        Literal["auto", "S/S", "S/I", "I/I"],
+        typer.Option(help="Order of columns/rows of dots to that of rays: same S, inverse I."),
+    ] = "auto",
+    frames: Annotated[
+        str,
+        typer.Option(
+            metavar="A:B:STEP",
+            help="Frames A to before B, counted from 0, every STEP-th; parts may be left out.",
+        ),
+    ] = ":",
+    surfaces: Annotated[
+        Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
+    ] = "all",
+) -> None:
+    """Measure frames and write measures, dots, points, boundaries and surfaces.
+
+    Ctrl-C stops after whole frames: what was finished stays readable.
+
+    A frame that cannot be measured keeps its row in measures.csv, with the reason.
+    """
+    from labapp.core.pipeline import Settings
+
+    settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
+    summary = _run(source, setup, out, settings, frames, surfaces == "all")
+    if not summary.statuses["ok"]:
+        raise typer.Exit(NO_SURFACE)
+
+
+def _run(
+    source_path: Path,
+    setup_path: Path,
+    out: Path,
+    settings: Settings,
+    frames: str = ":",
+    surfaces: bool = True,
+) -> Summary:
+    """Measure, showing progress and failures on stderr and the summary on stdout."""
+    from labapp.media import open_source
+    from labapp.session.results import ResultsWriter
+    from labapp.session.run import measure_frames, provenance, select_frames
+    from labapp.session.setup import read_setup
+    from labapp.session.summary import Summary
+
+    setup = read_setup(setup_path)
+    summary = Summary()
+    with open_source(source_path) as source, _progress() as progress:
+        for warning in source.warnings:
+            _note(progress.console, f"warning: {warning}")
+        selected = select_frames(frames, len(source))
+        task = progress.add_task(source.name, total=len(selected))
+        origin = provenance(source, source_path, setup_path, setup, settings, selected)
+        results = ResultsWriter(out, setup.calibration, origin, surfaces)
+        try:
+            with results:
+                for frame, time_s, measurement in measure_frames(
+                    source, selected, setup, settings, results
+                ):
+                    summary.add(frame, time_s, measurement)
+                    progress.advance(task)
+                    if measurement.status != "ok":
+                        _note(progress.console, _failure(frame, measurement))
+        except KeyboardInterrupt:
+            done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
+            _note(progress.console, done)
+            raise typer.Exit(INTERRUPTED) from None
+    typer.echo(summary.text())
+    typer.echo(f"Results are in {out.absolute()}")
+    return summary
+
+
+def _failure(frame: int, measurement: Measurement) -> str:
+    return f"frame {frame}: {measurement.status}: {measurement.reason}"
+
+
+def _progress() -> Progress:
+    """A progress bar on stderr; nothing where stderr is not a terminal."""
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+def _note(console: Console, text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command()
+def detect(
+    image: Annotated[
+        Path, typer.Argument(help="An image; of a video or a folder, the first frame is taken.")
+    ],
+    out: Annotated[
+        Path, typer.Option(help="CSV file for the dots: px, reflected row and column, SNR.")
+    ],
+) -> None:
+    """Find the dots of one image and their rows and columns, without a setup.
+
+    Rows are counted from the bottom up, columns from left to right.
+
+    A dot in doubt has none: its cells are empty.
+    """
+    from labapp.session.detect import detect_dots, write_detected
+
+    dots, lattice, doubt = detect_dots(image)
+    write_detected(out, dots, lattice)
+    if doubt:
+        typer.echo(f"{image}: {doubt}", err=True)
+    placed = 0 if lattice is None else int((lattice.row > 0).sum())
+    typer.echo(f"{len(dots)} dots, {placed} with a row and a column, in {out.absolute()}")
+    if not len(dots):
+        raise typer.Exit(NO_SURFACE)
+
+
+@calibrate.command("laser")
+def calibrate_laser(
+    l1: Annotated[
+        list[float],
+        typer.Option(help="Half length of the cross on the laser's side (mm); repeat for more."),
+    ],
+    l2: Annotated[
+        list[float], typer.Option(help="Half length on the far side (mm); repeat for more.")
+    ],
+    l3: Annotated[list[float], typer.Option(help="Half length across (mm); repeat for more.")],
+    fan_angle: Annotated[
+        float, typer.Option(help="Fan angle of the cross-hair lens (degrees).")
+    ] = 10.0,
+    setup: SetupToChange = None,
+) -> None:
+    """Find the laser's angle, distance and height from its cross-hair (Appendix I)."""
+    from labapp.core import laser_calibration as core
+
+    try:
+        found = core.calibrate_laser(l1, l2, l3, fan_angle)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    typer.echo(f"projection angle {found.angle_deg:.3f} ± {found.angle_sigma_deg:.3f} degrees")
+    typer.echo(f"distance         {found.distance_mm:.3f} ± {found.distance_sigma_mm:.3f} mm")
+    typer.echo(f"height           {found.height_mm:.3f} ± {found.height_sigma_mm:.3f} mm")
+    for warning in found.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    _write_values(
+        setup,
+        {
+            "laser": {
+                "projection_angle_deg": round(found.angle_deg, 4),
+                "distance_mm": round(found.distance_mm, 4),
+            }
+        },
+    )
+
+
+@calibrate.command("plane")
+def calibrate_plane(
+    image: Annotated[Path, typer.Argument(help="Picture of the calibration target.")],
+    unit_mm: Annotated[
+        float, typer.Option(min=0.001, help="Length of a unit of the target's axes (mm).")
+    ] = 12.7,
+    setup: SetupToChange = None,
+) -> None:
+    """Find the origin and the axes of the imaging plane in a picture of the target (§5.1)."""
+    from labapp.core import plane_calibration as core
+    from labapp.core.values import CannotMeasure
+    from labapp.media import open_source
+
+    with open_source(image) as source:
+        picture = source.frame(0).image
+    try:
+        found = core.calibrate_plane(picture, core.PlaneCalibrationSettings(unit_mm=unit_mm))
+    except CannotMeasure as answer:
+        typer.echo(f"{image}: {answer}", err=True)
+        raise typer.Exit(NO_SURFACE) from answer
+    points = {
+        "origin_px": found.origin_px,
+        "x_axis_px": found.x_axis_px,
+        "z_axis_px": found.z_axis_px,
+    }
+    lengths = {"x_axis_mm": found.x_axis_mm, "z_axis_mm": found.z_axis_mm}
+    for (name, (u, v)), sigma in zip(points.items(), found.sigma_px, strict=True):
+        typer.echo(f"{name}  {u:.3f}, {v:.3f} ± {sigma:.3f} px")
+    for name, length in lengths.items():
+        typer.echo(f"{name}  {length:.4f} mm")
+    x_scale, z_scale = found.px_per_mm
+    typer.echo(
+        f"scale      {x_scale:.4f} px/mm along X′, {z_scale:.4f} px/mm along Z′, "
+        f"{found.angle_deg:.2f} degrees between them"
+    )
+    rounded = {name: [round(u, 4), round(v, 4)] for name, (u, v) in points.items()}
+    _write_values(setup, {"image_calibration": {**rounded, **lengths, "homography": None}})
+
+
+def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]) -> None:
+    """Write calibrated values into a setup file and say what the file still lacks."""
+    from labapp.session.setup import read_setup, update_setup
+
+    if setup is None:
+        return
+    update_setup(setup, values)
+    typer.echo(f"Written to [{'], ['.join(values)}] of {setup.absolute()}")
+    try:
+        read_setup(setup)
+    except InputError as lacking:
+        typer.echo(f"It is not complete yet:\n{lacking}", err=True)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo_results"),
+) -> None:
+    """Measure the sample run, write its results and draw pictures of them."""
+    from labapp.core.pipeline import Settings
+    from labapp.session.demo import draw_pictures, sample_folder
+
+    sample = sample_folder()
+    recording = sample / "recording.avi"
+    summary = _run(recording, sample / "setup.toml", out, Settings())
+    for name, done in draw_pictures(recording, summary, out):
+        typer.echo(f"  {name}" if done is None else f"  no {name}: {done}")

@@ -1,0 +1,41 @@
+"""The log file: what went wrong in detail, for whoever mends it. It never stops the program."""
+
+from __future__ import annotations
+
+import logging
+import logging.handlers
+from pathlib import Path
+
+import platformdirs
+
+NAME = "labapp"
+MAX_BYTES, KEPT = 1_000_000, 3
+
+
+def log_file() -> Path:
+    """Where the log goes."""
+    return Path(platformdirs.user_log_dir(NAME, appauthor=False)) / "labapp.log"
+
+
+def start_log() -> logging.Logger:
+    """The program's logger, writing to `log_file` where that can be written."""
+    logging.raiseExceptions = False
+    logger = logging.getLogger(NAME)
+    logger.propagate = False
+    if all(handler.get_name() != NAME for handler in logger.handlers):
+        handler = _handler()
+        handler.set_name(NAME)
+        logger.addHandler(handler)
+    return logger
+
+
+def _handler() -> logging.Handler:
+    try:
+        log_file().parent.mkdir(parents=True, exist_ok=True)
+        handler = logging.handlers.RotatingFileHandler(
+            log_file(), maxBytes=MAX_BYTES, backupCount=KEPT, encoding="utf-8", delay=True
+        )
+    except (OSError, RuntimeError):  # RuntimeError: no home folder
+        return logging.NullHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    return handler

@@ -1,0 +1,202 @@
+"""The result files of one run: whole rows, whole surfaces, whatever happens in between."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import labapp
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement
+from labapp.errors import InputError
+from labapp.session.files import write_whole
+from labapp.session.tables import (
+    TABLES,
+    boundary_rows,
+    dots_rows,
+    measures_row,
+    points_rows,
+    surface_csv,
+    surface_stl,
+)
+
+RUN_FILE = "run.json"
+OURS = re.compile(r"(measures|dots|points|boundary|surface_\d{6,})\.csv|surface_\d{6,}\.stl")
+SPACING_MM = 0.1
+"""Distance between the nodes of the surface files, mm."""
+
+
+class ResultsWriter:
+    """Writes a run's results into a folder, one frame at a time.
+
+    A frame's rows go in with one write per file, `measures.csv` last: a frame that has a row
+    there has everything else too. When a write fails or is interrupted, what was written of that
+    frame is taken back. `run.json` tells where the results come from and how the run ended.
+
+    A former run's results in the folder are replaced; a folder with files of the same names and
+    no `run.json` is refused, as they may be somebody's own.
+
+    Parameters
+    ----------
+    folder
+        Where to; made if it does not exist.
+    calibration
+        Pixel ↔ imaging plane, for the dots' places on the plane.
+    provenance
+        What `run.json` is to say of the source, the setup and the options.
+    surfaces
+        Whether to write the surface files.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be used. Every later failure to write raises it too.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        calibration: ImageCalibration,
+        provenance: Mapping[str, object],
+        surfaces: bool = True,
+    ) -> None:
+        self.folder = folder
+        self.frames = 0
+        self._calibration = calibration
+        self._surfaces = surfaces
+        self._run = {
+            "program": "labapp",
+            "version": labapp.__version__,
+            "state": "running",
+            "started": _now(),
+            "ended": None,
+            "frames_done": 0,
+            **provenance,
+        }
+        self._files: dict[str, io.FileIO] = {}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            _clear(folder)
+            self._write_run()
+            for name, columns in TABLES.items():
+                self._files[name] = io.FileIO(folder / name, "a")
+                _append(self._files[name], ",".join(columns) + "\n")
+        except OSError as error:
+            self._close_files()
+            raise self._unwritable(error) from error
+
+    def write(self, frame: int, time_s: float | None, measurement: Measurement) -> None:
+        """Write everything about one frame.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written (disk full, folder gone); the frames before are whole.
+        """
+        before = {file: os.fstat(file.fileno()).st_size for file in self._files.values()}
+        surface_files: dict[Path, bytes] = {}
+        reconstruction = measurement.reconstruction
+        if self._surfaces and reconstruction is not None:
+            stem = self.folder / f"surface_{frame:06d}"
+            surface_files[stem.with_suffix(".csv")] = surface_csv(reconstruction, SPACING_MM)
+            surface_files[stem.with_suffix(".stl")] = surface_stl(reconstruction, SPACING_MM)
+        rows = {
+            "dots.csv": dots_rows(frame, measurement, self._calibration),
+            "points.csv": points_rows(frame, reconstruction),
+            "boundary.csv": boundary_rows(frame, reconstruction),
+            "measures.csv": measures_row(frame, time_s, measurement),
+        }
+        try:
+            for path, content in surface_files.items():
+                write_whole(path, content)
+            for name, text in rows.items():
+                _append(self._files[name], text)
+        except BaseException as error:
+            for file, size in before.items():
+                file.truncate(size)
+            for path in surface_files:
+                path.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise self._unwritable(error) from error
+            raise
+        self.frames += 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Say in `run.json` how the run ended."""
+        state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        self._run |= {
+            "state": state if error else "finished",
+            "ended": _now(),
+            "frames_done": self.frames,
+        }
+        try:
+            self._close_files()
+            self._write_run()
+        except OSError as failure:
+            if error is None:
+                raise self._unwritable(failure) from failure
+
+    def _write_run(self) -> None:
+        text = json.dumps(self._run, indent=2, ensure_ascii=False) + "\n"
+        write_whole(self.folder / RUN_FILE, text.encode())
+
+    def _close_files(self) -> None:
+        for file in self._files.values():
+            file.close()
+
+    def _unwritable(self, error: OSError) -> InputError:
+        kept = f"; the {self.frames} frames before are whole" if self.frames else ""
+        return InputError(
+            self.folder,
+            "results",
+            f"{error.strerror} ({Path(error.filename or self.folder).name})",
+            f"a folder that can be written, with room on its disk{kept}",
+        )
+
+
+def _clear(folder: Path) -> None:
+    """Take away a former run's results, `measures.csv` first: no row without its files."""
+    ours = [path for path in folder.iterdir() if OURS.fullmatch(path.name)]
+    if ours and not _is_run(folder / RUN_FILE):
+        raise InputError(
+            folder,
+            "results",
+            f"holds {ours[0].name} and no {RUN_FILE}",
+            "an empty folder, or one with an earlier run (it is replaced)",
+        )
+    for path in sorted(ours, key=lambda path: path.name != "measures.csv"):
+        path.unlink()
+
+
+def _is_run(path: Path) -> bool:
+    try:
+        run = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(run, dict) and run.get("program") == "labapp"
+
+
+def _append(file: io.FileIO, text: str) -> None:
+    """Write all of it: a disk that fills takes a part first, and fails at the next try."""
+    content = text.encode()
+    while content:
+        content = content[file.write(content) :]
+
+
+def _now() -> str:
+    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

@@ -1,0 +1,71 @@
+"""What a run came to, in a few lines."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from labapp.core.measures import Measures
+from labapp.core.pipeline import Measurement
+from labapp.core.values import FloatArray
+
+TOLD = {
+    "width": "width_mm",
+    "length": "length_mm",
+    "height": "height_mm",
+    "depth": "depth_mm",
+    "ARE": "are_mm",
+}
+
+
+@dataclass
+class Summary:
+    """Adds up a run, frame by frame.
+
+    Attributes
+    ----------
+    frames
+        (frame, time in s, measures or None) of every frame, in order.
+    statuses
+        How many frames ended with which status.
+    example
+        The first frame with a surface, and its measurement.
+    """
+
+    frames: list[tuple[int, float | None, Measures | None]] = field(default_factory=list)
+    statuses: Counter[str] = field(default_factory=Counter)
+    example: tuple[int, Measurement] | None = None
+
+    def add(self, frame: int, time_s: float | None, measurement: Measurement) -> None:
+        """Count one more frame."""
+        self.frames.append((frame, time_s, measurement.measures))
+        self.statuses[measurement.status] += 1
+        if self.example is None and measurement.measures is not None:
+            self.example = (frame, measurement)
+
+    def series(self, name: str) -> FloatArray:
+        """One of the measures over the frames, shape (n,); NaN without a surface."""
+        return np.array([getattr(measures, name, np.nan) for _, _, measures in self.frames])
+
+    def text(self) -> str:
+        """Lines for the user: how many frames, and the mean of their sizes."""
+        count = len(self.frames)
+        told = f"{count} frame{'s' * (count != 1)}, {self.statuses['ok']} with a surface"
+        without = [f"{n} {status}" for status, n in self.statuses.items() if status != "ok"]
+        lines = [f"{told} ({', '.join(without)})" if without else told]
+        for label, name in TOLD.items():
+            values = self._finite(name)
+            if len(values) > 1:
+                spread = f"± {np.std(values, ddof=1):.4f} mm (mean, standard deviation)"
+                lines.append(f"{label:7}{np.mean(values):8.4f} {spread}")
+            elif len(values):
+                sigma = self._finite(name.replace("_mm", "_sigma_mm"))
+                spread = f"± {sigma[0]:.4f} " if len(sigma) else ""
+                lines.append(f"{label:7}{values[0]:8.4f} {spread}mm")
+        return "\n".join(lines)
+
+    def _finite(self, name: str) -> FloatArray:
+        values = self.series(name)
+        return np.asarray(values[np.isfinite(values)])

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from pathlib import Path
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.core.pipeline import Measurement
+from labapp.errors import InputError
+from labapp.session import demo, pictures
+from labapp.session.summary import Summary
+
+IMAGE = np.full((40, 60), 20, np.uint8)
+
+
+@pytest.fixture
+def summary(measured: Measurement, unmeasured: Measurement) -> Summary:
+    summary = Summary()
+    summary.add(0, 0.0, unmeasured)
+    summary.add(1, 0.1, measured)
+    summary.add(2, 0.2, measured)
+    return summary
+
+
+def test_dots_are_ringed_by_row_and_grey_in_doubt(measured: Measurement) -> None:
+    picture = pictures.frame_picture(IMAGE, measured)
+    assert picture.shape == (120, 180, 3)
+    bright = picture.max(axis=2) > 100
+    saturated = picture.max(axis=2) - picture.min(axis=2) > 60
+    # Dots 0 and 2 have a ray, dot 1 has none; look at the left of each ring, 4 px from its dot.
+    for u, coloured in [(10, True), (30, False), (50, True)]:
+        left = np.s_[57:66, 3 * (u - 4) - 2 : 3 * (u - 4) + 5]
+        assert bright[left].any()
+        assert saturated[left].any() == coloured
+
+
+def test_a_frame_without_dots_is_shown_as_it_is(unmeasured: Measurement) -> None:
+    blank = Measurement(status="no-dots", reason="", scheme="fit")
+    picture = pictures.frame_picture(IMAGE, blank)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 1
+    assert (pictures.frame_picture(IMAGE, unmeasured) != picture).any()
+
+
+def test_the_summary_counts_and_averages(summary: Summary) -> None:
+    first, width, *_ = summary.text().splitlines()
+    assert first == "3 frames, 2 with a surface (1 ambiguous-rows)"
+    assert width == "width    1.2500 ± 0.0000 mm (mean, standard deviation)"
+    np.testing.assert_array_equal(summary.series("width_mm"), [np.nan, 1.25, 1.25])
+
+
+def test_one_frame_is_told_with_its_uncertainty(measured: Measurement) -> None:
+    summary = Summary()
+    summary.add(0, None, measured)
+    assert summary.text().splitlines()[1] == "width    1.2500 ± 1.2500 mm"
+
+
+def test_the_sample_run_is_found() -> None:
+    assert (demo.sample_folder() / "recording.avi").exists()
+    with (
+        mock.patch.object(demo.labapp, "__file__", "/nowhere/labapp/__init__.py"),
+        pytest.raises(InputError, match="expected a checkout"),
+    ):
+        demo.sample_folder()
+
+
+def test_pictures_are_drawn(summary: Summary, tmp_path: Path) -> None:
+    pytest.importorskip("pyvista")
+    recording = demo.sample_folder() / "recording.avi"
+    drawn = dict(demo.draw_pictures(recording, summary, tmp_path))
+    assert drawn == dict.fromkeys(["frame_000001.png", "trends.png", "surface_000001.png"])
+    surface = cv2.imread(str(tmp_path / "surface_000001.png"))
+    # viridis: the pool's top is yellow, its rim violet.
+    blue, green, red = np.moveaxis(surface.astype(int), 2, 0)
+    assert ((red > 180) & (green > 150) & (blue < 90)).sum() > 2000
+    assert ((red < 110) & (green < 80) & (blue > 60)).sum() > 2000
+    trends = cv2.imread(str(tmp_path / "trends.png"))
+    assert trends.std() > 5
+
+
+def test_a_picture_that_cannot_be_drawn_stops_nothing(summary: Summary, tmp_path: Path) -> None:
+    recording = demo.sample_folder() / "recording.avi"
+    missing = ModuleNotFoundError("No module named 'pyvista'", name="pyvista")
+    with (
+        mock.patch.object(demo, "write_surface_picture", side_effect=missing),
+        mock.patch.object(demo, "write_trend_picture", side_effect=OSError(28, "disk full")),
+    ):
+        drawn = dict(demo.draw_pictures(recording, summary, tmp_path))
+    assert drawn["frame_000001.png"] is None
+    assert drawn["trends.png"] == "disk full"
+    assert "pyvista is not installed (pip install 'labapp[gui]')" in str(
+        drawn["surface_000001.png"]
+    )
+
+
+def test_a_run_without_a_surface_has_no_pictures(tmp_path: Path) -> None:
+    assert (
+        list(demo.draw_pictures(demo.sample_folder() / "recording.avi", Summary(), tmp_path)) == []
+    )

@@ -1,0 +1,442 @@
+from __future__ import annotations
+
+import csv
+import errno
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp import cli
+from labapp.core.pipeline import Measurement, Settings
+from labapp.errors import InputError
+from labapp.session import log, results, run
+from labapp.session.run import select_frames
+
+SAMPLE = Path(__file__).parents[1] / "sample_sessions" / "gtaw"
+SETUP = SAMPLE / "setup.toml"
+Run = Callable[..., tuple[int, str, str]]
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep the log out of the home folder; start each test without its handler."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    logger = log.start_log()
+    for handler in list(logger.handlers):
+        handler.close()
+        logger.removeHandler(handler)
+    return tmp_path / "state"
+
+
+@pytest.fixture
+def labapp(capfd: pytest.CaptureFixture[str]) -> Run:
+    """Run the command line: (arguments) -> (exit code, stdout, stderr)."""
+
+    def start(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as ended:
+            cli.main([str(argument) for argument in arguments])
+        out, err = capfd.readouterr()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code, out, err
+
+    return start
+
+
+def answer(status: str = "no-dots") -> Measurement:
+    return Measurement(
+        status=status,
+        reason="for the test",
+        scheme="fit",
+        dots=None,
+        lattice=None,
+        match=None,
+        reconstruction=None,
+        measures=None,
+    )
+
+
+@pytest.fixture
+def measured_images(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """Replace the measurement by one that only keeps the images it was given."""
+    images: list[np.ndarray] = []
+
+    def measure(image: np.ndarray, *_: object) -> Measurement:
+        images.append(image)
+        return answer()
+
+    monkeypatch.setattr(run, "measure", measure)
+    return images
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Six images, the fourth of them cut off; image k is grey level k."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for k in range(6):
+        cv2.imwrite(str(folder / f"{k}.png"), np.full((8, 9), k, np.uint8))
+    (folder / "3.png").write_bytes((folder / "3.png").read_bytes()[:40])
+    return folder
+
+
+# --- frames -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (":", [0, 1, 2, 3, 4, 5]),
+        ("2:4", [2, 3]),
+        ("2:", [2, 3, 4, 5]),
+        (":2", [0, 1]),
+        ("::2", [0, 2, 4]),
+        ("1:100:3", [1, 4]),
+        ("3", [3]),
+        ("-1", [5]),
+        ("-2:", [4, 5]),
+    ],
+)
+def test_frames_are_selected_like_a_slice(text: str, expected: list[int]) -> None:
+    assert list(select_frames(text, 6)) == expected
+
+
+@pytest.mark.parametrize("text", ["a", "1:2:3:4", "::0", "::-1", "6", "4:2", "1.5", "1-3"])
+def test_a_wrong_selection_of_frames_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"--frames: frames: .*; expected"):
+        select_frames(text, 6)
+
+
+# --- reconstruct ------------------------------------------------------------------------------
+
+
+def test_every_frame_has_its_row_and_a_line_if_it_failed(
+    labapp: Run, folder: Path, tmp_path: Path, measured_images: list[np.ndarray]
+) -> None:
+    out = tmp_path / "out"
+    code, said, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
+    rows = table(out / "measures.csv")
+    assert [row["frame"] for row in rows] == list("012345")
+    assert [row["status"] for row in rows] == [*["no-dots"] * 3, "unreadable", *["no-dots"] * 2]
+    assert [int(image[0, 0]) for image in measured_images] == [0, 1, 2, 4, 5]
+    lines = complained.splitlines()
+    assert len(lines) == 6
+    assert lines[0] == "frame 0: no-dots: for the test"
+    assert lines[3].startswith("frame 3: unreadable: ")
+    assert "3.png: content: cannot be decoded; expected a whole image" in lines[3]
+    assert "6 frames, 0 with a surface (5 no-dots, 1 unreadable)" in said
+    assert str(out) in said
+    assert code == 1  # done, and nothing could be measured
+
+
+def test_options_reach_the_measurement(
+    labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Settings] = []
+    monkeypatch.setattr(run, "measure", lambda *given: seen.append(given[3]) or answer())
+    out = tmp_path / "out"
+    options = "--scheme irs --algorithm epa-rc --correspondence I/I --frames 0:3:2".split()
+    labapp("reconstruct", folder, "--setup", SETUP, "--out", out, *options)
+    assert len(seen) == 2
+    assert (seen[0].scheme, seen[0].algorithm, seen[0].correspondence) == ("irs", "epa-rc", "I/I")
+    told = json.loads((out / "run.json").read_text())
+    assert told["settings"]["algorithm"] == "epa-rc"
+    assert told["frames"] == {"start": 0, "stop": 3, "step": 2}
+    assert told["setup"]["toml"] == SETUP.read_text()
+    assert told["source"]["path"] == str(folder)
+
+
+def test_a_truncated_video_is_measured_as_far_as_it_goes(
+    labapp: Run, tmp_path: Path, measured_images: list[np.ndarray]
+) -> None:
+    video = tmp_path / "v.avi"
+    content = (SAMPLE / "recording.avi").read_bytes()
+    video.write_bytes(content[: len(content) // 2])
+    out = tmp_path / "out"
+    _, _, complained = labapp("reconstruct", video, "--setup", SETUP, "--out", out)
+    rows = table(out / "measures.csv")
+    assert 10 < len(rows) < 20
+    assert float(rows[6]["time_s"]) == pytest.approx(0.1)
+    assert complained.startswith("warning: v.avi ends early: its header says 30 frames")
+    assert len(measured_images) == len(rows)
+
+
+def test_any_image_is_measured_or_answered(labapp: Run, tmp_path: Path) -> None:
+    """One pixel, 16 bit, colour, float: by the real measurement."""
+    noise = np.random.default_rng(0).integers(0, 60, (40, 50, 3))
+    images = {
+        "one.png": np.array([[7]], np.uint8),
+        "deep.png": (noise[..., 0] * 257).astype(np.uint16),
+        "colour.png": noise.astype(np.uint8),
+        "float.tiff": noise[..., 0].astype(np.float32) / 60,
+        "black.png": np.zeros((40, 50), np.uint8),
+    }
+    for name, image in images.items():
+        cv2.imwrite(str(tmp_path / name), image)
+        out = tmp_path / name.replace(".", "_")
+        code, _, _ = labapp("reconstruct", tmp_path / name, "--setup", SETUP, "--out", out)
+        (row,) = table(out / "measures.csv")
+        assert code == 1
+        assert row["status"] not in ("", "ok", "unreadable")
+        assert row["reason"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("empty.avi", b""), ("text.avi", b"not a video\n" * 99), ("empty.png", b""), ("x", b"\x00")],
+)
+def test_what_is_no_source_is_refused_in_a_line(
+    labapp: Run, tmp_path: Path, name: str, content: bytes, state: Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    code, said, complained = labapp("reconstruct", path, "--setup", SETUP, "--out", tmp_path / "o")
+    assert code == 2
+    assert said == ""
+    assert complained.startswith(f"labapp: {path}: ")
+    assert complained.count("\n") == 1
+    assert "; expected " in complained
+    assert not (tmp_path / "o").exists()
+    (logged,) = state.rglob("labapp.log")
+    assert "Traceback" in logged.read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("distance_mm = 31.48\n", "", "laser.distance_mm: missing; expected a number above 0"),
+        ("distance_mm = 31.48", "distance_mm = -31.48", "laser.distance_mm: -31.48; expected a"),
+        ("distance_mm = 31.48", "distance_mm = nan", "laser.distance_mm: nan; expected a number"),
+    ],
+)
+def test_a_wrong_setup_is_refused_in_a_line(
+    labapp: Run, folder: Path, tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_text(SETUP.read_text().replace(old, new))
+    code, _, complained = labapp("reconstruct", folder, "--setup", setup, "--out", tmp_path / "o")
+    assert code == 2
+    assert complained.startswith(f"labapp: {setup}: {said}")
+    assert complained.count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_written_is_refused(
+    labapp: Run, folder: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "out"
+    code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
+    assert code == 2
+    assert f"labapp: {out}: results: Not a directory" in complained
+
+
+def test_a_full_disk_leaves_whole_frames(
+    labapp: Run,
+    folder: Path,
+    tmp_path: Path,
+    measured_images: list[np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    append = results._append
+
+    def fill(file: object, text: str) -> None:
+        if len(measured_images) == 3:
+            append(file, text[:10])  # type: ignore[arg-type]
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(file, text)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(results, "_append", fill)
+    out = tmp_path / "out"
+    code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
+    assert code == 2
+    assert "results: No space left on device" in complained
+    assert "the 2 frames before are whole" in complained
+    assert [row["frame"] for row in table(out / "measures.csv")] == ["0", "1"]
+    assert json.loads((out / "run.json").read_text())["state"] == "failed"
+
+
+SLOW = """
+    import sys, time
+    from labapp.cli import main
+    from labapp.core.dots import Dots
+    from labapp.core.pipeline import Measurement
+    from labapp.session import run
+    import numpy as np
+
+    def slow(*given):
+        time.sleep(0.05)
+        return Measurement("no-rows", "for the test", "fit", dots=Dots(*np.ones((7, 5))))
+
+    run.measure = slow
+    main(sys.argv[1:])
+"""
+
+
+def test_ctrl_c_leaves_whole_frames(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    recording = SAMPLE / "recording.avi"
+    arguments = ["reconstruct", recording, "--setup", SETUP, "--out", out]
+    started = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(SLOW), *map(str, arguments)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    until = time.monotonic() + 60
+    measures = out / "measures.csv"
+    while not (measures.exists() and len(table(measures)) >= 3) and time.monotonic() < until:
+        time.sleep(0.01)
+    started.send_signal(signal.SIGINT)
+    _, complained = started.communicate(timeout=60)
+    rows = table(measures)
+    assert started.returncode == 130
+    assert 3 <= len(rows) < 30
+    assert complained.splitlines()[-1] == f"stopped: {len(rows)} of 30 frames are done, in {out}"
+    assert "Traceback" not in complained
+    assert len(table(out / "dots.csv")) == 5 * len(rows)
+    told = json.loads((out / "run.json").read_text())
+    assert (told["state"], told["frames_done"]) == ("interrupted", len(rows))
+    assert not list(out.glob(".*"))
+
+
+def test_a_fault_of_ours_is_told_without_a_traceback(
+    labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> Measurement:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr(run, "measure", broken)
+    code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o")
+    assert code == 3
+    assert "a fault in the program: ZeroDivisionError: by nothing" in complained
+    assert "Traceback" not in complained
+    assert "Traceback" in log.log_file().read_text()
+
+
+def test_a_log_that_cannot_be_written_stops_nothing(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    code, _, complained = labapp("detect", tmp_path / "missing.png", "--out", tmp_path / "d.csv")
+    assert code == 2
+    assert complained.count("\n") == 1
+
+
+# --- detect, calibrate ------------------------------------------------------------------------
+
+
+def test_detect_writes_its_columns(labapp: Run, tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "dots.csv"
+    code, said, _ = labapp("detect", SAMPLE / "recording.avi", "--out", out)
+    rows = table(out)
+    assert code == 0
+    assert ",".join(rows[0]) == (
+        "u_px,v_px,reflected_row,reflected_column,snr,u_sigma_px,v_sigma_px"
+    )
+    truth = [row for row in table(SAMPLE / "dots_truth.csv") if row["frame"] == "0"]
+    assert len(rows) == pytest.approx(sum(row["visible"] == "1" for row in truth), abs=5)
+    assert said.startswith(f"{len(rows)} dots, ")
+
+
+def test_detect_on_a_picture_without_dots_says_so(labapp: Run, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "flat.png"), np.full((60, 80), 9, np.uint8))
+    code, said, _ = labapp("detect", tmp_path / "flat.png", "--out", tmp_path / "d.csv")
+    assert code == 1
+    assert said.startswith("0 dots")
+    assert table(tmp_path / "d.csv") == []
+
+
+def test_calibrate_laser_prints_and_writes(labapp: Run, tmp_path: Path) -> None:
+    """A laser 90 mm away at 30° with a 10° fan draws l₂ = 18.561 and l₃ = 7.874 mm."""
+    setup = tmp_path / "new.toml"
+    lengths = "--l1 13.675 --l1 13.675 --l2 18.561 --l2 18.561 --l3 7.874 --l3 7.874".split()
+    code, said, complained = labapp("calibrate", "laser", *lengths, "--setup", setup)
+    assert code == 0, complained
+    found = [float(number) for number in re.findall(r"([\d.]+) ±", said)]
+    assert found == pytest.approx([30, 90, 45], abs=0.01)
+    written = tomllib.loads(setup.read_text())
+    assert written == {
+        "laser": {
+            "projection_angle_deg": pytest.approx(30, abs=0.01),
+            "distance_mm": pytest.approx(90, abs=0.01),
+        }
+    }
+    assert f"{setup}: pattern: missing" in complained
+
+
+@pytest.mark.parametrize("l1", ["nan", "-1", "3", "x"])
+def test_lengths_that_cannot_be_are_refused(labapp: Run, l1: str) -> None:
+    code, _, complained = labapp(*f"calibrate laser --l1 {l1} --l2 18.561 --l3 7.874".split())
+    assert code == 2
+    assert "Traceback" not in complained
+
+
+def test_calibrate_plane_puts_its_values_into_a_setup(labapp: Run, tmp_path: Path) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_text(SETUP.read_text())
+    picture = SAMPLE / "calibration.png"
+    code, said, complained = labapp(
+        "calibrate", "plane", picture, "--unit-mm", 6.35, "--setup", setup
+    )
+    assert (code, complained) == (0, "")
+    assert said.count("±") == 3
+    from labapp.session.setup import read_setup
+
+    corners = np.array([[0.0, 0.0], [480, 0], [0, 640], [480, 640]])
+    found = read_setup(setup).calibration.to_plane(corners)
+    np.testing.assert_allclose(found, read_setup(SETUP).calibration.to_plane(corners), atol=0.15)
+    assert setup.read_text().startswith(SETUP.read_text().split("[image_calibration]")[0])
+
+
+def test_a_picture_without_a_target_is_answered(labapp: Run, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "flat.png"), np.full((200, 200), 90, np.uint8))
+    code, _, complained = labapp("calibrate", "plane", tmp_path / "flat.png")
+    assert code == 1
+    assert "flat.png: no-target: " in complained
+
+
+# --- help -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "command", ["", "reconstruct", "detect", "calibrate laser", "calibrate plane", "demo"]
+)
+def test_help_tells_units(labapp: Run, command: str) -> None:
+    code, said, _ = labapp(*command.split(), "--help")
+    assert code == 0
+    if command not in ("demo", ""):
+        assert "mm" in said or "px" in said
+
+
+def test_the_version_is_told(labapp: Run) -> None:
+    code, said, _ = labapp("--version")
+    assert (code, said) == (0, "labapp 0.1.0\n")
+
+
+def test_help_loads_nothing_heavy() -> None:
+    """So that it answers at once."""
+    loaded = subprocess.run(
+        [sys.executable, "-c", "import labapp.cli, sys; print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    ).stdout.split()
+    assert not {"numpy", "scipy", "cv2", "pyvista", "matplotlib"} & set(loaded)
