@@ -151,7 +151,7 @@ def match_rays(
         if (solution := _pursue(scene, orientation, reference, labels, settings)) is not None
     ]
     if not any(_explains(scene, solution) for solution in solutions):
-        for guess in search_quadrics(scene, settings.gate):
+        for guess in search_quadrics(scene):
             solution = _pursue(scene, "S/S", (0, 0), guess.labels, settings)
             if solution is None:
                 continue
@@ -277,7 +277,7 @@ def _pursue(
     settings: MatchSettings,
 ) -> _Solution | None:
     """Follow a hypothesis to its end and count what speaks against it."""
-    grown = grow_labels(scene, labels, settings.gate)
+    grown = grow_labels(scene, labels)
     pool = None if grown is None else try_fit(scene, grown)
     if grown is None or pool is None:
         return None

@@ -25,6 +25,11 @@ from labapp.core.spline import SplineBasis, SplineSurface, fit_slopes
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
 
+REACH = 2.5
+"""How far beyond the outermost dots the surface goes on, in rows of rays: the torch may hide some
+before the boundary is reached."""
+
+
 @dataclass(frozen=True)
 class FitSettings:
     """How the fit decides.
@@ -127,12 +132,12 @@ def fit_pool(
     spacing = np.abs(
         [np.median(np.diff(ground[..., 0], axis=1)), np.median(np.diff(ground[..., 1], axis=0))]
     )
-    margin = 1.5 * spacing.max()
+    margin = REACH * spacing.max()
     basis = SplineBasis.over(
         points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
     )
     told = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
-    weights = _slope_weights(points, dots, plane_covariance_mm2, rig, settings.floor_mm)
+    weights = _slope_weights(points, plane_mm, plane_covariance_mm2, rig, settings.floor_mm)
     out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
     rim = out > np.median(out)
     stiffness = 1 / (settings.jerk * settings.knot_mm) ** 2
@@ -158,20 +163,25 @@ def fit_pool(
 
 
 def _slope_weights(
-    points: FloatArray, dots: FloatArray, covariance: FloatArray, rig: Rig, floor: float
+    points: FloatArray, plane_mm: FloatArray, covariance: FloatArray, rig: Rig, floor: float
 ) -> FloatArray:
     """Inverse covariance of the slopes that dots of the given covariance give, shape (n, 2, 2)."""
-    laser, step = rig.laser.position_mm, 1e-3
-    base = bisecting_gradient(points - laser, dots - points)
-    jacobian = np.stack(
-        [
-            (bisecting_gradient(points - laser, dots + step * axis - points) - base) / step
-            for axis in (rig.imaging_plane.x_axis, rig.imaging_plane.z_axis)
-        ],
-        axis=-1,
-    )
+    jacobian = slope_of_dot(points, plane_mm, rig)
     floored = covariance + floor**2 * np.eye(2)
     return np.asarray(np.linalg.inv(jacobian @ floored @ np.swapaxes(jacobian, -1, -2)))
+
+
+def slope_of_dot(points_mm: FloatArray, plane_mm: FloatArray, rig: Rig) -> FloatArray:
+    """∂(slopes at a reflection point)/∂(its dot on the plane, X′ and Z′), shape (n, 2, 2), mm⁻¹."""
+    laser, plane, step = rig.laser.position_mm, rig.imaging_plane, 1e-3
+    dots = plane.to_universal(plane_mm)
+    incident = points_mm - laser
+    base = bisecting_gradient(incident, dots - points_mm)
+    moved = [
+        bisecting_gradient(incident, dots + step * axis - points_mm)
+        for axis in (plane.x_axis, plane.z_axis)
+    ]
+    return np.asarray(np.stack([(slope - base) / step for slope in moved], axis=-1))
 
 
 def meet_surface(surface: SplineSurface, rays: FloatArray, points: FloatArray) -> FloatArray:
@@ -246,10 +256,9 @@ def find_level(
     near = np.abs(height + shift) < 3.0 * rise
     shifts = shift + np.linspace(-1.0, 1.0, 161) * np.median(rise)
     inside = sign * witness[near, None] * (height[near, None] + shifts) / rise[near, None]
-    log_likelihood = np.stack(
-        [-np.logaddexp(0.0, -inside / s).sum(axis=0) - _BLUR_PRIOR * np.log(s) for s in _BLURS]
-    )
-    posterior = np.exp(log_likelihood - log_likelihood.max())
+    log_likelihood = np.stack([-np.logaddexp(0.0, -inside / s).sum(axis=0) for s in _BLURS])
+    log_posterior = log_likelihood - _BLUR_PRIOR * np.log(_BLURS)[:, None]
+    posterior = np.exp(log_posterior - log_posterior.max())
     weight = posterior.sum(axis=0) / posterior.sum()
     mean = float(weight @ shifts)
     sigma = float(np.sqrt(weight @ (shifts - mean) ** 2))

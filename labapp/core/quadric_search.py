@@ -1,8 +1,9 @@
 """Hypotheses from the optics: quadrics whose rays round the absent centre fall on dots.
 
 Where rows bow so far that no grid grows on the picture, the surface can still be told from the
-few dots round the hole: near its middle a pool is a quadric z = g·x + ½(κ_x x² + κ_y y²). The
-hole fixes g, the two dots beside it κ_x, and κ_y is tried out.
+few dots round the hole: near its middle a pool is a quadric. The hole fixes its slope, the two
+dots beside it the curvature across, and the curvature along is tried out. What then falls near
+the dots round the hole is fitted to them and held against more of them.
 """
 
 from __future__ import annotations
@@ -15,62 +16,85 @@ from scipy.spatial import cKDTree
 
 from labapp.core.optics import bisecting_gradient, meet_plane, reflect, surface_normal
 from labapp.core.ray_growth import UNLABELLED, Scene
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 REACH = 3
 """Rows and columns each way from the reference that a quadric is held against."""
 
+LOOSE, TIGHT = 0.5, 0.33
+"""A ray finds its dot within this fraction of the spacing of the predicted dots: at first, and
+once the quadric is fitted."""
+
 _LIFTS = np.array([0.0, 0.2, -0.2, 0.4, -0.4])
 """How far the hole may lie off the middle of the two dots beside it, in their distance."""
 
-_RATIOS = np.geomspace(0.35, 2.2, 14)
-"""κ_y/κ_x that are tried."""
+_RATIOS = np.geomspace(0.35, 2.2, 12)
+"""Curvature along over curvature across that is tried."""
 
-_FLATTEST = 0.004
-"""|κ| below which a pool is flat: its dots could not be told apart, mm⁻¹."""
+_FLATTEST, _STEEPEST = 0.004, 0.6
+"""Curvature below which no dots could be told apart, and above which no pool is, mm⁻¹."""
 
-_STEEPEST = 0.6
-"""|κ| above which no pool is, mm⁻¹."""
+
+@dataclass(frozen=True)
+class Quadric:
+    """z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), through the origin.
+
+    Parameters
+    ----------
+    slope
+        g, shape (2,).
+    curvature
+        (κ_x, κ_xy, κ_y), shape (3,) or, for several, (m, 1, 3), mm⁻¹.
+    """
+
+    slope: FloatArray
+    curvature: FloatArray
+
+    def gradient(self, xy: FloatArray) -> FloatArray:
+        """Slopes at (x, y), shape (…, 2), mm."""
+        x, y = xy[..., 0], xy[..., 1]
+        bend = np.moveaxis(self.curvature, -1, 0)
+        along_x = self.slope[0] + bend[0] * x + bend[1] * y
+        return np.stack([along_x, self.slope[1] + bend[1] * x + bend[2] * y], axis=-1)
+
+    def height(self, xy: FloatArray) -> FloatArray:
+        """Height at (x, y), shape (…), mm."""
+        return np.asarray(np.sum((self.slope + self.gradient(xy)) * xy, axis=-1) / 2)
 
 
 @dataclass(frozen=True)
 class QuadricGuess:
-    """One quadric and the dots its rays fall on.
+    """The dots that a quadric's rays fall on.
 
     Parameters
     ----------
-    curvature
-        (κ_x, κ_y), mm⁻¹.
     labels
-        Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+        Index of the dot of each ray next to the reference or `UNLABELLED`, shape (rows, columns).
     hits
         How many rays found their dot, less those that should have and did not.
     """
 
-    curvature: tuple[float, float]
     labels: IntArray
     hits: float
 
 
-def search_quadrics(scene: Scene, gate: float, most: int = 12) -> list[QuadricGuess]:
+def search_quadrics(scene: Scene, most: int = 8) -> list[QuadricGuess]:
     """Find the quadrics that explain the dots round some hole best, the best first.
 
     Parameters
     ----------
     scene
         The dots and the rig.
-    gate
-        A ray finds its dot within this fraction of the spacing of the predicted dots.
     most
         How many to return at most; no two with the same labels.
     """
-    i0, j0 = (n - 1 for n in scene.rig.pattern.reference)
-    rows = slice(max(i0 - REACH, 0), i0 + REACH + 1)
-    columns = slice(max(j0 - REACH, 0), j0 + REACH + 1)
-    tree = cKDTree(scene.plane_mm)
+    window = _Window(scene)
     found: dict[bytes, QuadricGuess] = {}
-    for hole, half_width in _holes(scene, tree):
-        for guess in _fit_hole(scene, tree, hole, half_width, (rows, columns), gate):
+    for hole, half_width in _holes(scene, window.tree):
+        for quadric in _quadrics(window, hole, half_width):
+            guess = window.judge(window.fitted(quadric))
+            if guess is None:
+                continue
             key = guess.labels.tobytes()
             if key not in found or found[key].hits < guess.hits:
                 found[key] = guess
@@ -95,92 +119,124 @@ def _holes(scene: Scene, tree: cKDTree) -> Iterator[tuple[FloatArray, float]]:
                     yield hole, step[0] / 2
 
 
-def _fit_hole(
-    scene: Scene,
-    tree: cKDTree,
-    hole: FloatArray,
-    half_width: float,
-    window: tuple[slice, slice],
-    gate: float,
-) -> list[QuadricGuess]:
-    """Try every κ_y, and both signs of κ_x that put the neighbouring dots where they are."""
-    laser = scene.rig.laser.position_mm
-    slope = bisecting_gradient(-laser[None], scene.rig.imaging_plane.to_universal(hole)[None])[0]
-    i0, j0 = (n - 1 for n in scene.rig.pattern.reference)
-    beside = scene.rays[i0, j0 + 1 : j0 + 2]
-    # The dot beside the hole moves linearly with κ_x: two trials give both solutions.
-    moved = [
-        float(_quadric_dots(scene, slope, np.array([[kappa, kappa]]), beside)[0, 0] - hole[0])
-        for kappa in (-0.02, 0.02)
-    ]
-    rate = (moved[1] - moved[0]) / 0.04
-    rays = scene.rays[window]
-    shape = rays.shape[:2]
-    kappa_x = (np.array([1, -1]) * half_width - (moved[0] + moved[1]) / 2) / rate
-    kappa_x = kappa_x[(np.abs(kappa_x) > _FLATTEST) & (np.abs(kappa_x) < _STEEPEST)]
-    curvatures = (kappa_x[:, None, None] * np.stack([np.ones_like(_RATIOS), _RATIOS], -1)).reshape(
-        -1, 2
-    )
-    patterns = _quadric_dots(scene, slope, curvatures[:, None], rays.reshape(-1, 3))
-    return [
-        guess
-        for curvature, pattern in zip(curvatures, patterns.reshape(-1, *shape, 2), strict=True)
-        if (guess := _score(scene, tree, pattern, window, gate, tuple(curvature))) is not None
-    ]
+def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> list[Quadric]:
+    """Quadrics that put the reference into the hole, and loosely the dots round it in place.
 
-
-def _quadric_dots(
-    scene: Scene, slope: FloatArray, curvature: FloatArray, rays: FloatArray
-) -> FloatArray:
-    """Dots that quadrics through the origin make of rays, IPCS, shape (…, n, 2), mm.
-
-    ``slope`` has shape (2,), ``curvature`` (…, 1, 2), ``rays`` (n, 3).
+    Every curvature along is tried, and both signs of the curvature across that put the
+    neighbouring dots where they are.
     """
-    laser = scene.rig.laser.position_mm
-    points = laser - laser[2] / rays[:, 2:] * rays
-    for _ in range(3):
-        xy = points[..., :2]
-        gap = points[..., 2] - np.sum((slope + 0.5 * curvature * xy) * xy, axis=-1)
-        descent = rays[:, 2] - np.sum((slope + xy * curvature) * rays[:, :2], axis=-1)
-        step = np.clip(gap / np.maximum(-descent, 0.05), -1.0, 1.0)
-        points = points + step[..., None] * rays
-    normal = surface_normal(slope + points[..., :2] * curvature)
-    return meet_plane(points, reflect(rays, normal), scene.rig.imaging_plane)
+    scene = window.scene
+    laser, plane = scene.rig.laser.position_mm, scene.rig.imaging_plane
+    slope = bisecting_gradient(-laser, plane.to_universal(hole))
+    middle = window.middle
+    beside = window.rays[middle[0], middle[1] + 1][None]
+    # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.
+    trial = np.array([[[-0.02, 0.0, -0.02]], [[0.02, 0.0, 0.02]]])
+    moved = window.dots(Quadric(slope, trial), beside)[:, 0, 0] - hole[0]
+    across = (np.array([1, -1]) * half_width - moved.mean()) / ((moved[1] - moved[0]) / 0.04)
+    across = across[(np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST)]
+    curvatures = np.zeros((len(across), len(_RATIOS), 3))
+    curvatures[..., 0] = across[:, None]
+    curvatures[..., 2] = across[:, None] * _RATIOS
+    curvatures = curvatures.reshape(-1, 1, 3)
+    patterns = window.dots(Quadric(slope, curvatures), window.rays.reshape(-1, 3))
+    patterns = patterns.reshape(-1, *window.rays.shape[:2], 2)
+    return [
+        Quadric(slope, curvature[0])
+        for curvature, pattern in zip(curvatures, patterns, strict=True)
+        if window.hits(pattern, LOOSE)[0][window.core].sum() >= 5
+    ]
 
 
-def _score(
-    scene: Scene,
-    tree: cKDTree,
-    dots: FloatArray,
-    window: tuple[slice, slice],
-    gate: float,
-    curvature: tuple[float, float],
-) -> QuadricGuess | None:
-    """Hold predicted dots, shape (rows, columns, 2), against those found."""
-    absent = scene.absent[window]
-    sane = np.isfinite(dots).all(axis=-1)
-    flat = np.where(sane[..., None], dots, 1e6)
-    spacing = np.full(sane.shape, np.inf)
-    for axis in (0, 1):
-        step = np.linalg.norm(np.diff(flat, axis=axis), axis=-1)
-        pad = [(0, 0), (0, 0)]
-        for side in ((1, 0), (0, 1)):
-            pad[axis] = side
-            spacing = np.minimum(spacing, np.pad(step, pad, constant_values=np.inf))
-    distance, dot = tree.query(flat)
-    hit = (distance < gate * spacing) & ~absent & sane
-    middle = tuple(slice(n // 2 - 1, n // 2 + 2) for n in sane.shape)
-    if hit[middle].sum() < 6:
-        return None
-    labels = np.full(scene.rays.shape[:2], UNLABELLED, np.int64)
-    part = np.where(hit, dot, UNLABELLED)
-    chosen, count = np.unique(part[hit], return_counts=True)
-    part[np.isin(part, chosen[count > 1])] = UNLABELLED
-    labels[window] = part
-    seen = scene.in_view(flat) & ~absent & sane
-    # A ray near the hole that should show its dot and does not speaks against the quadric.
-    i, j = np.indices(sane.shape)
-    close = np.hypot(i - sane.shape[0] // 2, j - sane.shape[1] // 2) < 1.5
-    nearness = 1 - np.mean(distance[hit] / (gate * spacing[hit]))
-    score = np.sum(part != UNLABELLED) - 3.0 * np.sum(seen & close & ~hit) + 4.0 * nearness
-    return QuadricGuess(curvature, labels, float(score))
+class _Window:
+    """The rays round the reference, and the dots they may fall on."""
+
+    def __init__(self, scene: Scene) -> None:
+        i, j = (n - 1 for n in scene.rig.pattern.reference)
+        reach = min(REACH, i, j)
+        self.scene = scene
+        self.tree = cKDTree(scene.plane_mm)
+        self.part = slice(i - reach, i + reach + 1), slice(j - reach, j + reach + 1)
+        self.rays = scene.rays[self.part]
+        self.absent = scene.absent[self.part]
+        self.middle = (reach, reach)
+        self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
+
+    def dots(self, quadric: Quadric, rays: FloatArray) -> FloatArray:
+        """Dots that quadrics make of rays, shape (n, 3): IPCS, shape (…, n, 2), mm."""
+        points = self._points(quadric, rays)
+        normal = surface_normal(quadric.gradient(points[..., :2]))
+        return meet_plane(points, reflect(rays, normal), self.scene.rig.imaging_plane)
+
+    def _points(self, quadric: Quadric, rays: FloatArray) -> FloatArray:
+        laser = self.scene.rig.laser.position_mm
+        points = laser - laser[2] / rays[..., 2:] * rays
+        for _ in range(3):
+            xy = points[..., :2]
+            gap = points[..., 2] - quadric.height(xy)
+            descent = rays[..., 2] - np.sum(quadric.gradient(xy) * rays[..., :2], axis=-1)
+            step = np.clip(gap / np.maximum(-descent, 0.05), -1.0, 1.0)
+            points = points + step[..., None] * rays
+        return points
+
+    def hits(self, pattern: FloatArray, gate: float) -> tuple[BoolArray, IntArray, FloatArray]:
+        """Which predicted dots, shape (rows, columns, 2), fall on a dot, on which, how far off.
+
+        The last is in units of the gate.
+        """
+        sane = np.isfinite(pattern).all(axis=-1)
+        flat = np.where(sane[..., None], pattern, 1e6)
+        spacing = np.full(sane.shape, np.inf)
+        for axis in (0, 1):
+            step = np.linalg.norm(np.diff(flat, axis=axis), axis=-1)
+            for side in ((1, 0), (0, 1)):
+                pad = [(0, 0), (0, 0)]
+                pad[axis] = side
+                spacing = np.minimum(spacing, np.pad(step, pad, constant_values=np.inf))
+        distance, dot = self.tree.query(flat)
+        off = distance / np.maximum(gate * spacing, 1e-9)
+        return (off < 1) & ~self.absent & sane, np.asarray(dot), off
+
+    def fitted(self, quadric: Quadric) -> Quadric:
+        """Fit the quadric to the dots that its rays next to the reference fall near."""
+        for _ in range(2):
+            rays = self.rays[self.core]
+            hit, dot, _ = self.hits(self._pattern(quadric), LOOSE)
+            hit, dot = hit[self.core], dot[self.core]
+            if hit.sum() < 4:
+                return quadric
+            points = self._points(quadric, rays[hit])
+            laser, plane = self.scene.rig.laser.position_mm, self.scene.rig.imaging_plane
+            dots = plane.to_universal(self.scene.plane_mm[dot[hit]])
+            slopes = bisecting_gradient(points - laser, dots - points)
+            x, y, zero, one = *points[:, :2].T, np.zeros(len(points)), np.ones(len(points))
+            rows = [np.stack([one, zero, x, y, zero], -1), np.stack([zero, one, zero, x, y], -1)]
+            values = np.linalg.lstsq(np.concatenate(rows), slopes.T.ravel(), rcond=None)[0]
+            quadric = Quadric(values[:2], values[2:])
+        return quadric
+
+    def _pattern(self, quadric: Quadric) -> FloatArray:
+        dots = self.dots(quadric, self.rays.reshape(-1, 3))
+        return dots.reshape(*self.rays.shape[:2], 2)
+
+    def judge(self, quadric: Quadric) -> QuadricGuess | None:
+        """Hold a quadric against the dots; None if it does not explain those round the hole."""
+        pattern = self._pattern(quadric)
+        hit, dot, off = self.hits(pattern, TIGHT)
+        if hit[self.core].sum() < 6:
+            return None
+        own = np.where(hit, dot, UNLABELLED)
+        chosen, count = np.unique(own[hit], return_counts=True)
+        own[np.isin(own, chosen[count > 1])] = UNLABELLED
+        # A ray next to the hole that should show its dot and does not speaks against the quadric.
+        seen = self.scene.in_view(np.nan_to_num(pattern, nan=1e6)) & ~self.absent
+        silent = np.sum((seen & ~hit)[self.core])
+        nearness = 1 - np.mean(off[hit])
+        # Farther out the pool is no quadric, and the next row's dots may be hit instead.
+        core = (self.core[0], slice(self.core[1].start - 1, self.core[1].stop + 1))
+        near = np.full(own.shape, UNLABELLED)
+        near[core] = own[core]
+        labels = np.full(self.scene.rays.shape[:2], UNLABELLED, np.int64)
+        labels[self.part] = near
+        hits = float(np.sum(own != UNLABELLED) - 3.0 * silent + 4.0 * nearness)
+        return QuadricGuess(labels, hits)

@@ -21,11 +21,19 @@ from labapp.core.pool_fit import (
     fit_pool,
     meet_surface,
     predict_dots,
+    slope_of_dot,
 )
 from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
 UNLABELLED = -1
+
+NEAR, CLEAR = 20.0, 8.0
+"""A dot is a ray's if its squared distance, in σ², is below the one and every rival is less likely
+by the other, in −2 log likelihood."""
+
+MODEL_MM = 0.06
+"""How far the right surface's dots may be off for no fault of theirs, mm."""
 
 LEAST_LABELS = 6
 """A quadric wants three slopes each way; the six dots nearest a hole give twice that."""
@@ -128,6 +136,8 @@ class Prediction:
         Reflection points, shape (m, 3), mm.
     plane_mm
         Dots, IPCS, shape (m, 2), mm.
+    covariance_mm2
+        Of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm².
     spacing_mm
         Distance from each to the next predicted dot, shape (m,), mm.
     """
@@ -135,10 +145,11 @@ class Prediction:
     at: IntArray
     points_mm: FloatArray
     plane_mm: FloatArray
+    covariance_mm2: FloatArray
     spacing_mm: FloatArray
 
 
-def grow_labels(scene: Scene, labels: IntArray, gate: float) -> IntArray | None:
+def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
     """Follow the surface from the labels given until nothing changes.
 
     Parameters
@@ -147,8 +158,6 @@ def grow_labels(scene: Scene, labels: IntArray, gate: float) -> IntArray | None:
         The dots and the rig.
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
-    gate
-        See `MatchSettings`.
 
     Returns
     -------
@@ -157,24 +166,21 @@ def grow_labels(scene: Scene, labels: IntArray, gate: float) -> IntArray | None:
     """
     best: IntArray | None = None
     for settings in (_STIFF, _SOFT, _STIFF):
-        grown = _settled(scene, labels, gate, settings)
+        grown = _settled(scene, labels, settings)
         if grown is not None and (best is None or _count(grown) > _count(best)):
             best = grown
         labels = labels if best is None else best
     return best
 
 
-def _settled(
-    scene: Scene, labels: IntArray, gate: float, settings: FitSettings
-) -> IntArray | None:
+def _settled(scene: Scene, labels: IntArray, settings: FitSettings) -> IntArray | None:
     """Predict and match until the labels no longer change, or come round again."""
     before: list[bytes] = []
     while len(before) < 15:
-        labels = _without_outliers(scene, labels, settings)
         pool = try_fit(scene, labels, settings)
         if pool is None:
             return None
-        labels = _matched(scene, predict(scene, pool, _around(labels)), gate)
+        labels = _matched(scene, pool, labels)
         state = labels.tobytes()
         if state in before:
             break
@@ -204,11 +210,15 @@ def predict(scene: Scene, pool: FittedPool, where: BoolArray) -> Prediction:
     points = meet_surface(pool.surface, rays, scene.landing_mm[at[:, 0], at[:, 1]])
     plane = predict_dots(pool.surface, points, rays, scene.rig)
     sane = np.isfinite(plane).all(axis=-1) & pool.surface.basis.contains(*points[:, :2].T)
-    at, points, plane = at[sane], points[sane], plane[sane]
+    at, points, plane, rays = at[sane], points[sane], plane[sane], rays[sane]
     spacing = np.full(len(plane), np.inf)
     if len(plane) > 1:
         spacing = cKDTree(plane).query(plane, k=2)[0][:, 1]
-    return Prediction(at, points, plane, spacing)
+    basis, (x, y) = pool.surface.basis, points[:, :2].T
+    slopes = np.stack([basis.matrix(x, y, 1, 0), basis.matrix(x, y, 0, 1)], axis=1)
+    moved = np.linalg.inv(slope_of_dot(points, plane, scene.rig)) @ slopes
+    covariance = moved @ pool.covariance @ np.swapaxes(moved, -1, -2)
+    return Prediction(at, points, plane, covariance, spacing)
 
 
 def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedPool) -> BoolArray:
@@ -226,24 +236,38 @@ def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedP
     return np.asarray(height > rig.electrode.height_mm - 0.3)
 
 
-def _around(labels: IntArray) -> BoolArray:
-    """Labelled rays and their neighbours."""
-    return np.asarray(binary_dilation(labels != UNLABELLED, np.ones((3, 3), bool)))
+def _around(labels: IntArray, rings: int) -> BoolArray:
+    """Labelled rays and their neighbours, so many rings of them."""
+    ring = np.ones((3, 3), bool)
+    return np.asarray(binary_dilation(labels != UNLABELLED, ring, iterations=rings))
 
 
-def _matched(scene: Scene, prediction: Prediction, gate: float) -> IntArray:
-    """Labels from mutual nearest neighbours within the gate; absent rays get none."""
-    labels = np.full(scene.rays.shape[:2], UNLABELLED, np.int64)
-    if len(prediction.at) == 0:
-        return labels
-    distance, ray = cKDTree(prediction.plane_mm).query(scene.plane_mm)
-    nearest_dot = cKDTree(scene.plane_mm).query(prediction.plane_mm)[1]
-    mutual = nearest_dot[ray] == np.arange(len(ray))
-    taken = mutual & (distance < gate * prediction.spacing_mm[ray])
-    at = prediction.at[ray[taken]]
-    labels[at[:, 0], at[:, 1]] = np.nonzero(taken)[0]
-    labels[scene.absent] = UNLABELLED
-    return labels
+def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
+    """Labels for dots that one ray alone can have made, and rays that made one dot alone.
+
+    Likelihoods follow from what dot and prediction are uncertain by. Rays a ring farther out
+    than any that is given a dot stand as rivals: where the prediction is so uncertain that the
+    dots of the next row but one come into question, nobody gets them.
+    """
+    matched = np.full(labels.shape, UNLABELLED, np.int64)
+    far = predict(scene, pool, _around(labels, 2))
+    if len(far.at) == 0:
+        return matched
+    offset = scene.plane_mm[:, None] - far.plane_mm
+    spread = scene.covariance_mm2[:, None] + far.covariance_mm2 + MODEL_MM**2 * np.eye(2)
+    distance = np.einsum("nma,nmab,nmb->nm", offset, np.linalg.inv(spread), offset)
+    surprise = distance + np.log(np.linalg.det(spread))
+    ray = np.argmin(surprise, axis=1)
+    dot = np.arange(len(ray))
+    least = surprise[dot, ray]
+    taken = (np.argmin(surprise, axis=0)[ray] == dot) & (distance[dot, ray] < NEAR)
+    for axis, rivals in ((1, surprise), (0, surprise[:, ray])):
+        if surprise.shape[axis] > 1:
+            taken &= np.partition(rivals, 1, axis=axis).take(1, axis=axis) > least + CLEAR
+    at = far.at[ray]
+    taken &= _around(labels, 1)[at[:, 0], at[:, 1]] & ~scene.absent[at[:, 0], at[:, 1]]
+    matched[at[taken, 0], at[taken, 1]] = dot[taken]
+    return matched
 
 
 def _without_outliers(scene: Scene, labels: IntArray, settings: FitSettings) -> IntArray:
