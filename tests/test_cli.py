@@ -272,7 +272,7 @@ def test_a_full_disk_leaves_whole_frames(
 
 
 SLOW = """
-    import sys, time
+    import signal, sys, time
     from labapp.cli import main
     from labapp.core.dots import Dots
     from labapp.core.pipeline import Measurement
@@ -284,6 +284,7 @@ SLOW = """
         return Measurement("no-rows", "for the test", "fit", dots=Dots(*np.ones((7, 5))))
 
     run.measure = slow
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     main(sys.argv[1:])
 """
 

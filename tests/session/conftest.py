@@ -45,10 +45,9 @@ def pool() -> Reconstruction:
 
 
 def dots(count: int) -> Dots:
-    step = np.arange(count, dtype=float)
-    return Dots(
-        10 + step, 20 + 2 * step, *(np.full(count, value) for value in (0.1, 0.2, 2, 40, 9))
-    )
+    """Dots 20 px apart from (10, 20) on."""
+    same = (np.full(count, value) for value in (20.0, 0.1, 0.2, 2.0, 40.0, 9.0))
+    return Dots(10 + 20.0 * np.arange(count), *same)
 
 
 @pytest.fixture

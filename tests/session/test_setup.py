@@ -72,6 +72,13 @@ def test_a_setup_is_read(path: Path) -> None:
     assert setup.text == SETUP
 
 
+def test_the_documented_setup_is_one(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "command-line.md").read_text(encoding="utf-8")
+    path = tmp_path / "setup.toml"
+    path.write_text(text.split("```toml\n")[1].split("```")[0], encoding="utf-8")
+    assert read_setup(path).rig.pattern.absent_rays == {(10, 10)}
+
+
 def test_absent_dots_can_be_named(path: Path) -> None:
     change(path, "rows = 19\n", "rows = 19\nabsent = [[1, 2], [10, 10]]\n")
     assert read_setup(path).rig.pattern.absent_rays == {(1, 2), (10, 10)}
