@@ -332,3 +332,5 @@ def demo(
     summary = _run(recording, sample / "setup.toml", out, Settings())
     for name, done in draw_pictures(recording, summary, out):
         typer.echo(f"  {name}" if done is None else f"  no {name}: {done}")
+    if not summary.statuses["ok"]:
+        raise typer.Exit(NO_SURFACE)

@@ -340,6 +340,20 @@ def test_a_log_that_cannot_be_written_stops_nothing(
     assert complained.count("\n") == 1
 
 
+def test_the_demo_measures_the_sample_run(
+    labapp: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    measured_images: list[np.ndarray],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, said, complained = labapp("demo")
+    assert code == 1  # the measurement is replaced by one that finds nothing
+    assert len(measured_images) == 30 == complained.count("no-dots")
+    assert f"Results are in {tmp_path / 'demo_results'}" in said
+    assert len(table(tmp_path / "demo_results" / "measures.csv")) == 30
+
+
 # --- detect, calibrate ------------------------------------------------------------------------
 
 
