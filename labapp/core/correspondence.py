@@ -286,15 +286,31 @@ def _pursue(
         pool = scene.fit(grown, _witness(scene, grown, pool), FitSettings())
     except CannotMeasure:
         return None
-    around = predict(scene, pool, _amid(lit) & ~lit & ~scene.absent)
-    rays = scene.rays[around.at[:, 0], around.at[:, 1]]
-    hidden = blocked(around.points_mm, rays, scene.rig, pool)
-    missed = int(np.sum(~hidden & scene.in_view(around.plane_mm)))
-    stray = len(scene.plane_mm) - int(lit.sum())
+    missed, stray = _unexplained(scene, grown, pool)
     variance = scene.covariance_mm2[grown[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
     surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, settings.stray)
     cost = float(surprise.sum()) + settings.stray * stray + settings.missed * missed
     return _Solution(orientation, reference, grown, pool, cost, stray, missed)
+
+
+def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int, int]:
+    """Count rays that should have a dot and have none, and dots that have no ray.
+
+    Where the surface lets dots run into each other there is nothing to be told of either.
+    """
+    lit = labels != UNLABELLED
+    among = predict(scene, pool, _amid(lit) & ~scene.absent)
+    resolution = float(np.median(scene.resolution_mm))
+    merged = among.spacing_mm < resolution
+    rays = scene.rays[among.at[:, 0], among.at[:, 1]]
+    hidden = blocked(among.points_mm, rays, scene.rig, pool)
+    silent = ~lit[among.at[:, 0], among.at[:, 1]] & ~merged & ~hidden
+    missed = int(np.sum(silent & scene.in_view(among.plane_mm)))
+    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
+    if merged.any() and len(stray):
+        off = np.asarray(cKDTree(among.plane_mm[merged]).query(scene.plane_mm[stray])[0])
+        stray = stray[off > resolution]
+    return missed, len(stray)
 
 
 def _amid(lit: BoolArray) -> BoolArray:

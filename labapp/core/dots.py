@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
 Image = npt.NDArray[np.generic]
+Grey = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -105,11 +106,13 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
     u, v = u[keep], v[keep]
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
-    bright = band[v, u]
+    bright = band[v, u].astype(float)
     keep = bright >= settings.contrast * _typical(bright)
-    return _describe(image, band, noise, u[keep], v[keep], size, settings)
+    keep[keep] = _first_of_each(u[keep], v[keep], size)
+    return _describe(image, band, noise, u[keep], v[keep], size, settings.speckle_px)
 
 
+# Sizes of dot that are looked for: from the sharpest a camera gives to a dozen pixels across.
 _SCALES_PX = 0.75 * 2 ** (np.arange(15) / 4)
 
 
@@ -120,10 +123,9 @@ def _typical(brightness: FloatArray) -> float:
     return float(order[np.searchsorted(light, 0.5 * light[-1])])
 
 
-def _gauss(image: npt.NDArray[np.float32], sigma: float) -> npt.NDArray[np.float32]:
-    return np.asarray(
-        cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT), np.float32
-    )
+def _gauss(image: Grey, sigma: float) -> Grey:
+    blurred = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(blurred, np.float32)
 
 
 # What a Gaussian dot of the band's own size keeps of its height: 1/(1 + 0.8²) − 1/(1 + 1.6²).
@@ -137,12 +139,12 @@ def _noise_gain(size: float) -> float:
     return float(1 / np.sqrt(power))
 
 
-def _band_pass(image: npt.NDArray[np.float32], size: float) -> npt.NDArray[np.float32]:
+def _band_pass(image: Grey, size: float) -> Grey:
     """Difference of Gaussians that answers most to a Gaussian dot of the given size."""
     return _gauss(image, 0.8 * size) - _gauss(image, 1.6 * size)
 
 
-def _estimate_size(image: npt.NDArray[np.float32]) -> float:
+def _estimate_size(image: Grey) -> float:
     """Standard deviation of the frame's dots, px: the scale at which most of its blobs peak.
 
     A blob is a maximum over place and scale of the scale-normalised band-pass. Hot pixels peak
@@ -169,7 +171,7 @@ def _estimate_size(image: npt.NDArray[np.float32]) -> float:
     return float(np.exp(log_size))
 
 
-def _local_noise(image: npt.NDArray[np.float32], size: float) -> npt.NDArray[np.float32]:
+def _local_noise(image: Grey, size: float) -> Grey:
     """Standard deviation of the camera's noise round each pixel, grey levels.
 
     Taken from a difference that smooth structure, dots included, does not pass (Immerkær 1996),
@@ -187,14 +189,12 @@ def _local_noise(image: npt.NDArray[np.float32], size: float) -> npt.NDArray[np.
         np.float32,
     )
     if min(medians.shape) >= 3:
-        medians = cv2.medianBlur(medians, 3)
+        medians = np.asarray(cv2.medianBlur(medians, 3), np.float32)
     height, width = image.shape
     return np.asarray(1.4826 * cv2.resize(medians, (width, height)), np.float32)
 
 
-def _band_noise(
-    band: npt.NDArray[np.float32], noise: npt.NDArray[np.float32], size: float
-) -> npt.NDArray[np.float32]:
+def _band_noise(band: Grey, noise: Grey, size: float) -> Grey:
     """Standard deviation of the noise in the band-passed frame.
 
     White noise passes the band with a known gain. Noise with grain (compression, a soft sensor)
@@ -206,9 +206,7 @@ def _band_noise(
     return np.asarray(np.maximum(white * min(max(1.0, excess), 3.0), floor), np.float32)
 
 
-def _local_maxima(
-    band: npt.NDArray[np.float32], floor: npt.NDArray[np.float32] | float, size: float
-) -> tuple[IntArray, IntArray]:
+def _local_maxima(band: Grey, floor: Grey | float, size: float) -> tuple[IntArray, IntArray]:
     reach = 2 * max(1, round(1.2 * size)) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     peak = (band >= cv2.dilate(band, disc)) & (band > floor)
@@ -216,9 +214,19 @@ def _local_maxima(
     return v.astype(np.int64), u.astype(np.int64)
 
 
+def _first_of_each(u: IntArray, v: IntArray, size: float) -> BoolArray:
+    """One of several pixels that share a peak: the top of a dot may be flat."""
+    place = np.stack([u, v], axis=1)
+    keep = np.ones(len(u), bool)
+    for first, second in sorted(cKDTree(place).query_pairs(max(1.5, size))):
+        if keep[first]:
+            keep[second] = False
+    return keep
+
+
 def _dot_like(
-    image: npt.NDArray[np.float32],
-    band: npt.NDArray[np.float32],
+    image: Grey,
+    band: Grey,
     u: IntArray,
     v: IntArray,
     size: float,
@@ -230,50 +238,44 @@ def _dot_like(
 
 
 def _describe(
-    image: npt.NDArray[np.float32],
-    band: npt.NDArray[np.float32],
-    noise: npt.NDArray[np.float32],
-    u: IntArray,
-    v: IntArray,
-    size: float,
-    settings: BandPassSettings,
+    image: Grey, band: Grey, noise: Grey, u: IntArray, v: IntArray, size: float, speckle_px: float
 ) -> Dots:
-    """Centroid, its uncertainty, size, peak and signal-to-noise of each peak."""
-    n = len(u)
-    reach = np.full(n, 2.2 * size)
-    if n > 1:  # a window that reaches half-way to the next dot keeps its light out
-        spacing = cKDTree(np.stack([u, v], axis=1)).query(np.stack([u, v], axis=1), k=2)[0][:, 1]
-        reach = np.minimum(reach, np.maximum(0.55 * spacing, 1.5))
+    """Centroid, its uncertainty, size, peak and signal-to-noise of each peak.
+
+    The centroid is weighted by the light above its surroundings under a Gaussian window, which is
+    moved onto the centroid it gives until it stays.
+    """
+    width = 1.1 * np.full(len(u), size)
+    if len(u) > 1:  # a window that ends half-way to the next dot keeps its light out
+        place = np.stack([u, v], axis=1)
+        nearest = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
+        width = np.minimum(width, np.maximum(0.275 * nearest, 0.75))
     margin = int(np.ceil(2.2 * size)) + 1
-    dv, du = np.mgrid[-margin : margin + 1, -margin : margin + 1].astype(np.float32)
-    smooth = _band_pass_centroid(image, size)
-    padded = np.pad(smooth, margin)
-    offset_u, offset_v = np.zeros(n), np.zeros(n)
-    patches = np.stack(
-        [padded[b : b + 2 * margin + 1, a : a + 2 * margin + 1] for a, b in zip(u, v, strict=True)]
-    )
-    for _ in range(4):  # recentre the window on the centroid it gives
-        ru, rv = du - offset_u[:, None, None], dv - offset_v[:, None, None]
-        window = np.exp(-0.5 * (ru**2 + rv**2) / (0.5 * reach[:, None, None]) ** 2)
-        weight = np.maximum(patches, 0.0) * window
+    across = np.arange(-margin, margin + 1.0)
+    light = np.pad(np.maximum(_gauss(image, 0.5 * size) - _gauss(image, 3.0 * size), 0.0), margin)
+    views = np.lib.stride_tricks.sliding_window_view(light, (len(across), len(across)))
+    patches = views[v, u].astype(float)
+    offset = np.zeros((2, len(u)))
+    for _ in range(4):
+        pull = np.exp(-0.5 * ((across - offset[..., None]) / width[:, None]) ** 2)
+        weight = patches * pull[1][:, :, None] * pull[0][:, None, :]
         total = weight.sum(axis=(1, 2)) + 1e-12
-        step_u = (weight * ru).sum(axis=(1, 2)) / total
-        step_v = (weight * rv).sum(axis=(1, 2)) / total
-        offset_u = np.clip(offset_u + 1.5 * step_u, -size, size)
-        offset_v = np.clip(offset_v + 1.5 * step_v, -size, size)
-    peak = band[v, u] / _PEAK_GAIN
+        sums = weight.sum(axis=1), weight.sum(axis=2)
+        mean = np.stack([part @ across for part in sums]) / total
+        # The window holds the mean back; half as much again brings it home in a few steps.
+        offset = np.clip(offset + 1.5 * (mean - offset), -size, size)
+    moment = sum(part @ across**2 for part in sums) / total - np.sum(mean**2, axis=0)
+    moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
+    spread = 1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2
+    peak = band[v, u].astype(float) / _PEAK_GAIN
     snr = peak / np.maximum(noise[v, u], 1e-3 * np.max(peak))
-    sigma = np.hypot(0.8 / snr, settings.speckle_px)
+    sigma = np.hypot(0.8 / snr, speckle_px)
     return Dots(
-        u_px=u + offset_u,
-        v_px=v + offset_v,
+        u_px=u + offset[0],
+        v_px=v + offset[1],
         u_sigma_px=sigma,
-        v_sigma_px=sigma,
-        size_px=np.full(n, size),
-        peak=peak.astype(float),
-        snr=snr.astype(float),
+        v_sigma_px=sigma.copy(),
+        size_px=np.sqrt(np.clip(spread, (0.3 * size) ** 2, (3.0 * size) ** 2)),
+        peak=peak,
+        snr=snr,
     )
-
-
-def _band_pass_centroid(image, size):
-    return _gauss(image, 0.5 * size) - _gauss(image, 3 * size)

@@ -24,7 +24,6 @@ from labapp.core.rig import Rig
 from labapp.core.spline import SplineBasis, SplineSurface, fit_slopes
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
-
 REACH = 2.5
 """How far beyond the outermost dots the surface goes on, in rows of rays: the torch may hide some
 before the boundary is reached."""

@@ -32,6 +32,17 @@ NEAR, CLEAR = 20.0, 8.0
 """A dot is a ray's if its squared distance, in σ², is below the one and every rival is less likely
 by the other, in −2 log likelihood."""
 
+RESOLVED = 2.7
+"""Dots nearer to each other than this many of their standard deviations are one."""
+
+CAUTION = 2.0
+"""By how much the surface's own uncertainty is enlarged while dots are labelled: beyond the last
+labelled row it rests on how smooth pools are expected to be."""
+
+FALSE_PER_MM2 = 5e-4
+"""False dots to be expected on the imaging plane: a few in a frame. Where a prediction is vague,
+one of them is as likely a cause of a dot as the ray."""
+
 MODEL_MM = 0.06
 """How far the right surface's dots may be off for no fault of theirs, mm."""
 
@@ -55,6 +66,8 @@ class Scene:
         Dots, IPCS (X′, Z′), shape (n, 2), mm.
     covariance_mm2
         Their covariance, shape (n, 2, 2), mm².
+    resolution_mm
+        How near another dot may be before the two run into each other, shape (n,), mm.
     rig, calibration
         The bench, and how the camera sees the plane.
     frame_shape
@@ -63,6 +76,7 @@ class Scene:
 
     plane_mm: FloatArray
     covariance_mm2: FloatArray
+    resolution_mm: FloatArray
     rig: Rig
     calibration: ImageCalibration
     frame_shape: tuple[int, int]
@@ -86,6 +100,7 @@ class Scene:
         return cls(
             calibration.to_plane(dots.image_px),
             spread @ np.swapaxes(spread, -1, -2),
+            RESOLVED * dots.size_px * np.sqrt(np.abs(np.linalg.det(jacobian))),
             rig,
             calibration,
             frame_shape,
@@ -254,18 +269,22 @@ def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
     if len(far.at) == 0:
         return matched
     offset = scene.plane_mm[:, None] - far.plane_mm
-    spread = scene.covariance_mm2[:, None] + far.covariance_mm2 + MODEL_MM**2 * np.eye(2)
+    cautious = CAUTION**2 * far.covariance_mm2
+    spread = scene.covariance_mm2[:, None] + cautious + MODEL_MM**2 * np.eye(2)
     distance = np.einsum("nma,nmab,nmb->nm", offset, np.linalg.inv(spread), offset)
     surprise = distance + np.log(np.linalg.det(spread))
     ray = np.argmin(surprise, axis=1)
     dot = np.arange(len(ray))
     least = surprise[dot, ray]
     taken = (np.argmin(surprise, axis=0)[ray] == dot) & (distance[dot, ray] < NEAR)
+    taken &= least + CLEAR < -2 * np.log(2 * np.pi * FALSE_PER_MM2)
     for axis, rivals in ((1, surprise), (0, surprise[:, ray])):
         if surprise.shape[axis] > 1:
             taken &= np.partition(rivals, 1, axis=axis).take(1, axis=axis) > least + CLEAR
     at = far.at[ray]
     taken &= _around(labels, 1)[at[:, 0], at[:, 1]] & ~scene.absent[at[:, 0], at[:, 1]]
+    # Dots that run into each other have no place of their own.
+    taken &= far.spacing_mm[ray] > scene.resolution_mm[dot]
     matched[at[taken, 0], at[taken, 1]] = dot[taken]
     return matched
 
