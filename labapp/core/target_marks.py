@@ -1,0 +1,316 @@
+"""Calibration picture → the three marks of the imaging plane: a dot and two bars (§5.1.2).
+
+The steps of the text: segmentation, median filter, dilation until three objects are left,
+thinning. `plane_calibration` measures the marks and holds them to the design.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, freeze
+
+Image = npt.NDArray[Any]
+
+
+@dataclass(frozen=True)
+class MarkSettings:
+    """How the three marks are looked for.
+
+    Parameters
+    ----------
+    threshold
+        Grey level below which a pixel is dark (the text's T = 14); None tries several.
+    median_px
+        Side of the median filter in a picture of 640 px; scaled with the picture.
+    dilations
+        Most dilations by 3 × 3, likewise scaled.
+    speck_fraction
+        An object smaller than this part of the largest is a speck.
+    roll_deg
+        The bars may be turned by this much from the horizontal and the vertical.
+    """
+
+    threshold: float | None = None
+    median_px: int = 7
+    dilations: int = 12
+    speck_fraction: float = 0.02
+    roll_deg: float = 30.0
+
+
+class Refusal(Exception):
+    """One threshold gave no calibration: how far it came, and why it stopped."""
+
+    def __init__(self, stage: int, reason: str) -> None:
+        super().__init__(reason)
+        self.stage = stage
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One of the three objects.
+
+    Parameters
+    ----------
+    mask
+        Its pixels after dilation, shape of the picture.
+    center, direction
+        (u, v) of its centre, px; unit vector of its longest extent. Of all pixels, then of the
+        thinned ones.
+    length, width
+        Extents along and across that, px.
+    """
+
+    mask: BoolArray
+    center: FloatArray
+    direction: FloatArray
+    length: float
+    width: float
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def grey_levels(image: Image) -> FloatArray:
+    """Grey levels of a picture without its impulse noise, shape (rows, columns).
+
+    Raises
+    ------
+    ValueError
+        If the image is no picture.
+    CannotMeasure
+        ``no-target`` if it is too small to hold one.
+    """
+    image = np.asarray(image)
+    if image.ndim == 3 and image.shape[2] in (1, 3, 4):
+        # Rec. 601 luminance of blue, green, red: what OpenCV takes a colour picture to.
+        weights = np.array([0.114, 0.587, 0.299]) if image.shape[2] > 1 else np.ones(1)
+        image = image[..., : len(weights)].astype(np.float64) @ weights
+    if image.ndim != 2:
+        raise ValueError(f"a picture has shape (rows, columns[, channels]), not {image.shape}")
+    grey = image.astype(np.float64)
+    if not np.isfinite(grey).all():
+        raise ValueError("a picture holds finite grey levels only")
+    if min(grey.shape) < 60:
+        raise CannotMeasure(
+            "no-target", f"A picture of {grey.shape[1]} × {grey.shape[0]} px is too small."
+        )
+    # Impulse noise (Eq. 5-2) would reach the sub-pixel places; straight edges do not move.
+    return np.asarray(cv2.medianBlur(grey.astype(np.float32), 3), np.float64)
+
+
+def levelled(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Light of the bare plane, and the part of it that each pixel lacks; both shaped as given.
+
+    The plane's light is the median over a window that any mark fills by less than half.
+    """
+    height, width = grey.shape
+    factor = max(2, max(height, width) // 160)
+    small = cv2.resize(
+        grey, (max(1, width // factor), max(1, height // factor)), interpolation=cv2.INTER_AREA
+    )
+    low, high = float(small.min()), float(small.max())
+    if high - low < 1e-9:
+        return grey, np.zeros_like(grey)
+    window = _odd(max(small.shape) / 7.0)
+    eight_bit = np.round((small - low) / (high - low) * 255.0).astype(np.uint8)
+    median = cv2.medianBlur(eight_bit, window).astype(np.float64)
+    median = np.asarray(cv2.GaussianBlur(median, (0, 0), window / 6.0), np.float64)
+    background = low + (high - low) / 255.0 * cv2.resize(
+        median, (width, height), interpolation=cv2.INTER_LINEAR
+    )
+    background = np.maximum(background, 1e-3 * high)
+    return background, 1.0 - grey / background
+
+
+def segmented(
+    grey: FloatArray, darkness: FloatArray, settings: MarkSettings
+) -> list[tuple[float | None, npt.NDArray[np.uint8]]]:
+    """Binary pictures to try, the text's way first (Eq. 5-1, 5-3).
+
+    Parameters
+    ----------
+    grey, darkness
+        Grey levels, and the part of the light lacking, shape (rows, columns).
+    settings
+        With a threshold, only this one is tried.
+
+    Returns
+    -------
+    list
+        (part of the light lacking, or None for the fixed threshold; picture of 0 and 1).
+    """
+    scale = max(grey.shape) / 640.0
+    median = _odd(settings.median_px * scale)
+    if settings.threshold is not None:
+        # Eq. 5-1 on the grey levels themselves.
+        pairs: list[tuple[float | None, BoolArray]] = [(None, grey < settings.threshold)]
+    else:
+        smooth = np.asarray(cv2.GaussianBlur(darkness, (0, 0), max(scale, 0.5)), np.float64)
+        pairs = [(level, smooth > level) for level in _levels(smooth)]
+    binaries = [(level, binary.astype(np.uint8)) for level, binary in pairs]
+    # The text's filter first; half of it for bars so thin that the filter takes them too.
+    return [
+        (level, np.asarray(cv2.medianBlur(binary, side), np.uint8))
+        for side in dict.fromkeys((median, _odd(median / 2.0)))
+        for level, binary in binaries
+    ]
+
+
+def _levels(darkness: FloatArray) -> list[float]:
+    """Thresholds to try: Otsu's, the triangle's, then steps from clear marks to faint ones."""
+    low, high = 0.0, float(np.quantile(darkness, 0.998))
+    noise = 1.4826 * float(np.median(np.abs(darkness)))
+    if high <= 3.0 * noise or high < 1e-6:
+        return []
+    eight_bit = np.clip(np.round((darkness - low) / (high - low) * 255.0), 0, 255)
+    named = [
+        low + (high - low) * cv2.threshold(eight_bit.astype(np.uint8), 0, 255, kind)[0] / 255.0
+        for kind in (cv2.THRESH_OTSU, cv2.THRESH_TRIANGLE)
+    ]
+    steps = [part * high for part in (0.5, 0.4, 0.6, 0.3, 0.7, 0.2)]
+    return [float(level) for level in named + steps if level > 2.0 * noise]
+
+
+def three_marks(binary: npt.NDArray[np.uint8], settings: MarkSettings) -> tuple[Mark, Mark, Mark]:
+    """Dot, bar on O′X′ and bar on O′Z′ in a binary picture.
+
+    Raises
+    ------
+    Refusal
+        If it does not hold these three.
+    """
+    labels, touching = _three_objects(binary, settings)
+    marks = [_mark(labels == label) for label in (1, 2, 3)]
+    dots = [mark for mark in marks if mark.length < 1.8 * mark.width]
+    bars = [mark for mark in marks if mark.length > 3.0 * mark.width]
+    note = " One object runs out of the picture." if touching else ""
+    if not dots:
+        raise Refusal(2, "The dot of O′ was not found: no mark is as wide as long." + note)
+    if len(dots) > 1 or len(bars) != 2:
+        raise Refusal(
+            2, f"{len(bars)} bars of an axis were found beside the dot of O′, not 2." + note
+        )
+    tilt = [abs(np.degrees(np.arctan2(bar.direction[1], bar.direction[0]))) for bar in bars]
+    flat = [min(angle, 180.0 - angle) for angle in tilt]
+    x_bar, z_bar = (bars[k] for k in np.argsort(flat))
+    if min(flat) > settings.roll_deg or max(flat) < 90.0 - settings.roll_deg:
+        raise Refusal(
+            3,
+            "The two bars are not one across and one upright: they are "
+            f"{flat[0]:.0f}° and {flat[1]:.0f}° from the horizontal.",
+        )
+    (dot,) = dots
+    if x_bar.center[0] < dot.center[0] or z_bar.center[1] > dot.center[1]:
+        raise Refusal(
+            3,
+            "O′ is not at the lower left of its bars: the picture is mirrored or upside down, or "
+            "something else dark is in it.",
+        )
+    return _thin(dot), _thin(x_bar), _thin(z_bar)
+
+
+def _three_objects(
+    binary: npt.NDArray[np.uint8], settings: MarkSettings
+) -> tuple[npt.NDArray[np.int32], bool]:
+    """Labels 1, 2, 3 of the objects, and whether another runs out of the picture."""
+    kept, touching = _without_specks(binary, settings.speck_fraction)
+    square = np.ones((3, 3), np.uint8)
+    count, labels = cv2.connectedComponents(kept, connectivity=8)
+    for _ in range(round(settings.dilations * max(binary.shape) / 640.0)):
+        if count <= 4:
+            break
+        kept = np.asarray(cv2.dilate(kept, square), np.uint8)
+        count, labels = cv2.connectedComponents(kept, connectivity=8)
+    if count != 4:
+        note = ", and one runs out of the picture" if touching else ""
+        raise Refusal(
+            1 if count > 1 else 0,
+            f"Three marks are expected (dot and two bars), {count - 1} were found{note}.",
+        )
+    return np.asarray(labels, np.int32), touching
+
+
+def _without_specks(
+    binary: npt.NDArray[np.uint8], fraction: float
+) -> tuple[npt.NDArray[np.uint8], bool]:
+    """Take out specks and what touches the edge; also whether anything sizeable touches it."""
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
+    left, top, width, height, area = boxes[1:].T
+    if area.size == 0:
+        return binary, False
+    rows, columns = binary.shape
+    inside = (left > 0) & (top > 0) & (left + width < columns) & (top + height < rows)
+    sizeable = area >= fraction * area[inside].max(initial=1)
+    keep = np.concatenate([[False], inside & sizeable])
+    return keep[labels].astype(np.uint8), bool((~inside & sizeable).any())
+
+
+def _mark(mask: BoolArray) -> Mark:
+    v, u = np.nonzero(mask)
+    center = np.array([u.mean(), v.mean()])
+    _, axes = np.linalg.eigh(np.cov(np.stack([u, v])) if len(u) > 1 else np.eye(2))
+    direction = axes[:, 1]
+    length = float(np.ptp(np.stack([u, v], -1) @ direction)) + 1.0
+    return Mark(mask, center, direction, length, len(u) / length)
+
+
+def _thin(mark: Mark) -> Mark:
+    """Take the mark's centre and direction from its thinned pixels (Eq. 5-5 without floor)."""
+    v, u = np.nonzero(mark.mask)
+    top, left = int(v.min()), int(u.min())
+    line = _mark(thinned(mark.mask[top : v.max() + 1, left : u.max() + 1]))
+    bar = line.length > 1.0
+    return replace(
+        mark,
+        center=line.center + np.array([left, top]),
+        direction=line.direction if bar else mark.direction,
+    )
+
+
+def thinned(mask: BoolArray) -> BoolArray:
+    """Thin an object to lines of one pixel, until nothing changes (§5.1.2, step 3).
+
+    Zhang and Suen's two passes, each on all pixels at once. (OpenCV has thinning in its contrib
+    modules only; it is 20 lines.)
+
+    Parameters
+    ----------
+    mask
+        The object, shape (rows, columns).
+    """
+    image = np.pad(np.asarray(mask, bool), 1)
+    changed = True
+    while changed:
+        changed = False
+        for first in (True, False):
+            around = [
+                np.roll(image, shift, (0, 1))
+                for shift in [(1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1)]
+            ]  # p2 … p9: north, then clockwise
+            count = np.sum(around, axis=0)
+            begins = np.sum(
+                [~a & b for a, b in zip(around, [*around[1:], around[0]], strict=True)], axis=0
+            )
+            north, _, east, _, south, _, west, _ = around
+            if first:
+                open_side = ~(north & east & south) & ~(east & south & west)
+            else:
+                open_side = ~(north & east & west) & ~(north & south & west)
+            remove = image & (count >= 2) & (count <= 6) & (begins == 1) & open_side
+            # The passes would wipe out a square of 2 × 2, which no longer can be thinned.
+            if remove.any() and (image & ~remove).any():
+                image = image & ~remove
+                changed = True
+    return np.asarray(image[1:-1, 1:-1])
+
+
+def _odd(side: float) -> int:
+    """Return the odd number nearest to a side, 3 at least."""
+    return max(3, 2 * int(side / 2.0) + 1)

@@ -1,0 +1,244 @@
+"""§5.1: O′ and both axes found in calibration pictures whose truth is known, or refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.core.plane_calibration import (
+    PlaneCalibration,
+    PlaneCalibrationSettings,
+    calibrate_plane,
+)
+from labapp.core.target_marks import thinned
+from labapp.core.values import CannotMeasure
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A target in a picture, drawn from distances to its edges; nothing of the package in it."""
+
+    roll_deg: float = 3.0
+    unit_px: float = 34.0
+    origin: tuple[float, float] = (60.3, 560.7)
+    shape: tuple[int, int] = (640, 480)
+    light: float = 32.0
+    dark: float = 14.0
+    noise: float = 1.3
+    vignetting: float = 0.35
+    slope: float = 0.2
+    x_units: tuple[float, float] = (1.0, 10.0)
+    z_units: tuple[float, float] = (1.0, 4.0)
+    squeeze: float = 1.0
+    shear_deg: float = 0.0
+    has_dot: bool = True
+    has_x: bool = True
+    has_z: bool = True
+    seed: int = 0
+
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v) of one unit along O′X′ and O′Z′."""
+        x, z = np.radians(self.roll_deg), np.radians(self.roll_deg + self.shear_deg)
+        along_x = self.unit_px * np.array([np.cos(x), -np.sin(x)])
+        return along_x, self.squeeze * self.unit_px * np.array([-np.sin(z), -np.cos(z)])
+
+    @property
+    def truth(self) -> np.ndarray:
+        """(u, v) of O′, (5.5, 0) and (0, 2.5), shape (3, 2)."""
+        origin = np.array(self.origin)
+        return np.array([origin, origin + 5.5 * self.axes[0], origin + 2.5 * self.axes[1]])
+
+    def render(self) -> np.ndarray:
+        v, u = np.mgrid[: self.shape[0], : self.shape[1]].astype(float)
+        place = np.stack([u, v], -1) - self.origin
+        x, z = np.moveaxis(place @ np.linalg.inv(np.stack(self.axes)), -1, 0)
+        bar, dot, flag_out = 0.13, 0.32, 0.19
+
+        def box(x0: float, x1: float, z0: float, z1: float) -> np.ndarray:
+            return np.maximum.reduce([x0 - x, x - x1, z0 - z, z - z1])
+
+        outside = [np.full(self.shape, np.inf)]
+        if self.has_dot:
+            outside.append(np.hypot(x, z) - dot)
+        if self.has_x:
+            outside.append(box(*self.x_units, -bar, bar))
+            # Flags on one side only: they would pull a plain centroid.
+            outside += [box(n - 0.03, n + 0.03, 0, bar + flag_out) for n in range(2, 10)]
+        if self.has_z:
+            outside.append(box(-bar, bar, *self.z_units))
+            outside += [box(0, bar + flag_out, n - 0.03, n + 0.03) for n in range(2, 4)]
+        distance_px = np.minimum.reduce(outside) * self.unit_px
+        ink = np.clip(0.5 - distance_px / 2.0, 0.0, 1.0)
+        across, down = (np.linspace(-1, 1, n) for n in self.shape[::-1])
+        fall = 1 - self.vignetting * (across**2 + down[:, None] ** 2) / 2
+        fall = fall + self.slope * across / 2
+        rng = np.random.default_rng(self.seed)
+        grey = (self.light + (self.dark - self.light) * ink) * fall
+        grey += rng.normal(0, self.noise, grey.shape)
+        grey.flat[rng.integers(0, grey.size, 60)] = rng.choice([0.0, 255.0], 60)
+        return np.clip(np.round(grey), 0, 255).astype(np.uint8)
+
+
+def points(found: PlaneCalibration) -> np.ndarray:
+    return np.array([found.origin_px, found.x_axis_px, found.z_axis_px])
+
+
+def random_scene(seed: int) -> Scene:
+    rng = np.random.default_rng(seed)
+    light = rng.uniform(25, 220)
+    contrast = rng.uniform(0.35, 0.9)
+    roll = float(rng.uniform(-10, 10))
+    return Scene(
+        roll_deg=roll,
+        unit_px=rng.uniform(26, 33),
+        origin=(rng.uniform(60, 80) + max(roll, 0) * 3, rng.uniform(500, 530)),
+        light=light,
+        dark=light * (1 - contrast),
+        noise=rng.uniform(0.02, 0.12) * light * contrast,
+        vignetting=rng.uniform(0, 0.6),
+        slope=rng.uniform(-0.4, 0.4),
+        seed=seed,
+    )
+
+
+def test_the_points_of_eq_5_6_in_a_dim_picture() -> None:
+    scene = Scene()
+    found = calibrate_plane(scene.render())
+    assert np.abs(points(found) - scene.truth).max() < 0.3
+    assert found.x_axis_mm == pytest.approx(69.85)
+    assert found.z_axis_mm == pytest.approx(31.75)
+    assert found.px_per_mm == pytest.approx((34 / 12.7, 34 / 12.7), rel=5e-3)
+    assert found.angle_deg == pytest.approx(90.0, abs=0.3)
+    assert 12 < found.threshold < 32
+    plane = found.image_calibration.to_plane(scene.truth)
+    assert plane == pytest.approx(np.array([[0, 0], [69.85, 0], [0, 31.75]]), abs=0.15)
+
+
+def test_random_pictures_are_right_to_half_a_pixel() -> None:
+    errors, ratios = [], []
+    for seed in range(15):
+        scene = random_scene(seed)
+        found = calibrate_plane(scene.render())
+        errors.append(points(found) - scene.truth)
+        ratios.append(errors[-1] / np.array(found.sigma_px)[:, None])
+    assert np.hypot(*np.moveaxis(errors, -1, 0)).max() < 0.5
+    assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+
+
+@pytest.mark.parametrize("kind", ["uint16", "colour", "alpha", "float"])
+def test_any_kind_of_picture_gives_the_same_points(kind: str) -> None:
+    grey = Scene().render()
+    image = {
+        "uint16": grey.astype(np.uint16) * 180,
+        "colour": cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR),
+        "alpha": cv2.cvtColor(grey, cv2.COLOR_GRAY2BGRA),
+        "float": grey / 255.0,
+    }[kind]
+    assert points(calibrate_plane(image)) == pytest.approx(points(calibrate_plane(grey)), abs=0.02)
+
+
+def test_the_unit_is_the_one_that_was_measured() -> None:
+    found = calibrate_plane(Scene().render(), PlaneCalibrationSettings(unit_mm=6.35))
+    assert found.x_axis_mm == pytest.approx(5.5 * 6.35)
+    assert found.px_per_mm[0] == pytest.approx(34 / 6.35, rel=5e-3)
+
+
+def test_the_fixed_threshold_and_whole_pixels_of_the_text() -> None:
+    scene = Scene(vignetting=0.0, slope=0.0)
+    settings = PlaneCalibrationSettings(threshold=23.0, subpixel=False)
+    found = calibrate_plane(scene.render(), settings)
+    assert found.threshold == 23.0
+    assert np.array_equal(points(found), np.floor(points(found)))
+    assert np.abs(points(found) + 0.5 - scene.truth).max() < 1.5
+    assert min(found.sigma_px) >= 1 / np.sqrt(12)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"has_dot": False}, "Three marks are expected"),
+        ({"has_x": False}, "Three marks are expected"),
+        ({"has_z": False}, "Three marks are expected"),
+        ({"has_dot": False, "has_x": False, "has_z": False}, "Three marks are expected|no dark"),
+        ({"unit_px": 45.0}, "runs out of the picture"),
+        ({"x_units": (1.0, 9.0)}, "bar on O′X′ is .* px long"),
+        ({"x_units": (1.5, 10.0)}, "bar on O′X′ is .* px long"),
+        ({"z_units": (1.0, 3.6)}, "bar on O′Z′ is .* px long"),
+        ({"squeeze": 0.7}, "scales disagree"),
+        ({"roll_deg": 10.0, "shear_deg": -20.0}, "apart, which should be about 90"),
+        ({"light": 14.0}, "Three marks are expected|no dark"),
+    ],
+)
+def test_what_is_not_the_target_is_refused_with_the_reason(
+    change: dict[str, object], words: str
+) -> None:
+    scene = replace(Scene(), **change)
+    with pytest.raises(CannotMeasure, match=words) as caught:
+        calibrate_plane(scene.render(), PlaneCalibrationSettings(angle_tolerance_deg=15.0))
+    assert caught.value.status == "no-target"
+
+
+@pytest.mark.parametrize("turn", ["mirrored", "upside down", "on its side"])
+def test_a_turned_picture_is_refused(turn: str) -> None:
+    image = Scene().render()
+    turned = {
+        "mirrored": image[:, ::-1],
+        "upside down": image[::-1],
+        "on its side": np.rot90(image),
+    }[turn]
+    with pytest.raises(CannotMeasure, match="lower left of its bars"):
+        calibrate_plane(turned)
+
+
+def test_a_bar_partly_covered_is_never_measured_wrong() -> None:
+    scene = Scene(noise=0.5)
+    along = scene.axes[0] / scene.unit_px
+    for begin in (3.0, 7.0, 8.5, 9.4, 9.7):
+        image = scene.render().astype(float)
+        near, far = (np.round(scene.truth[0] + along * scene.unit_px * at) for at in (begin, 11))
+        ends = (tuple(int(c) for c in near), tuple(int(c) for c in far))
+        cv2.line(image, *ends, float(np.median(image)), 24)
+        try:
+            found = calibrate_plane(image)
+        except CannotMeasure:
+            continue
+        assert np.hypot(*(points(found) - scene.truth).T).max() < 3.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_alone_is_no_target(seed: int) -> None:
+    noise = np.random.default_rng(seed).integers(0, 255, (640, 480)).astype(np.uint8)
+    with pytest.raises(CannotMeasure, match="no-target"):
+        calibrate_plane(noise)
+
+
+def test_what_is_no_picture_is_refused() -> None:
+    with pytest.raises(ValueError, match="a picture has shape"):
+        calibrate_plane(np.zeros((4, 5, 6, 7)))
+    with pytest.raises(ValueError, match="finite"):
+        calibrate_plane(np.full((100, 100), np.nan))
+    with pytest.raises(CannotMeasure, match="too small"):
+        calibrate_plane(np.zeros((1, 1), np.uint8))
+    with pytest.raises(CannotMeasure, match="no dark marks"):
+        calibrate_plane(np.full((200, 200), 90, np.uint8))
+
+
+def test_thinning_leaves_a_line_of_one_pixel_along_the_middle() -> None:
+    mask = np.zeros((15, 60), bool)
+    mask[4:11, 5:55] = True
+    line = thinned(mask)
+    assert not (line & ~mask).any()
+    assert line.sum(axis=0).max() == 1
+    v, u = np.nonzero(line)
+    assert (v == 7).all()
+    assert np.ptp(u) > 40
+    assert u.mean() == pytest.approx(29.5, abs=1.0)
+
+
+def test_thinning_never_wipes_an_object_out() -> None:
+    assert thinned(np.ones((2, 2), bool)).any()
+    assert thinned(np.ones((1, 1), bool)).sum() == 1
