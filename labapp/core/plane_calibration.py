@@ -49,10 +49,9 @@ class PlaneCalibrationSettings(MarkSettings):
         Largest standard uncertainty of a point that is accepted, px.
     pointing_tolerance
         A bar's line may pass by O′ this many units off.
-    length_tolerance
-        Half of a bar may be this many units longer or shorter than its middle's distance from O′
-        asks for. This is what tells a bar that is partly hidden; a bar on O′X′ of which a fifth
-        of a unit is hidden is 0.02 units off, and its middle a tenth of a unit.
+    middle_tolerance
+        A bar's middle may be this many units from where its length and O′ have it. This tells a
+        bar that is partly hidden: its middle moves by half of what is.
     """
 
     unit_mm: float = 12.7
@@ -63,7 +62,7 @@ class PlaneCalibrationSettings(MarkSettings):
     angle_tolerance_deg: float = 30.0
     sigma_limit_px: float = 0.5
     pointing_tolerance: float = 0.08
-    length_tolerance: float = 0.02
+    middle_tolerance: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -329,8 +328,9 @@ def _check_bar(
             4, f"The bar on {axis} does not point at O′: it passes {passes_by:.2g} units off."
         )
     expected = (end - begin) / 2.0 * unit_px
-    # Half a pixel is what an end may be off in a coarse picture of a true target.
-    tolerance = max(settings.length_tolerance * unit_px, 0.5)
+    # With 2s of it hidden a bar's half is s shorter, but s·(end - begin) / (end + begin) of that
+    # is expected of its new middle. Half a pixel an end may be off even in a coarse picture.
+    tolerance = max(settings.middle_tolerance * 2.0 * begin / (begin + end) * unit_px, 0.5)
     if abs(bar.half_length - expected) > tolerance:
         raise Refusal(
             5,
