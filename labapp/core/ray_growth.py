@@ -28,14 +28,14 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, f
 
 UNLABELLED = -1
 
-NEAR, CLEAR = 20.0, 8.0
+NEAR, CLEAR = 20.0, 6.0
 """A dot is a ray's if its squared distance, in σ², is below the one and every rival is less likely
 by the other, in −2 log likelihood."""
 
 RESOLVED = 2.7
 """Dots nearer to each other than this many of their standard deviations are one."""
 
-CAUTION = 2.0
+CAUTION = 1.4
 """By how much the surface's own uncertainty is enlarged while dots are labelled: beyond the last
 labelled row it rests on how smooth pools are expected to be."""
 

@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from threadpoolctl import ThreadpoolController
+
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.errors import InputError
 from labapp.media import FrameSource
@@ -78,6 +80,7 @@ def measure_frames(
     InputError
         If a frame's results cannot be written.
     """
+    threads = ThreadpoolController()
     for index in frames:
         time_s = None
         try:
@@ -88,6 +91,8 @@ def measure_frames(
             )
         else:
             time_s = frame.time_s
-            measurement = measure(frame.image, setup.rig, setup.calibration, settings)
+            # The matrices are small: more threads than one get in each other's way.
+            with threads.limit(limits=1, user_api="blas"):
+                measurement = measure(frame.image, setup.rig, setup.calibration, settings)
         results.write(index, time_s, measurement)
         yield index, time_s, measurement

@@ -1,0 +1,195 @@
+"""One way to label all dots of a frame with rays, and what speaks against it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from labapp.core.lattice import Lattice, Site
+from labapp.core.orientation import Orientation, ways
+from labapp.core.pool_fit import FitSettings, FittedPool
+from labapp.core.ray_growth import UNLABELLED, Scene, blocked, grow_labels, predict, try_fit
+from labapp.core.values import BoolArray, CannotMeasure, IntArray
+
+MODEL_MM = 0.03
+"""How far the right surface's dots may be off for no fault of theirs, mm."""
+
+STRAY, MISSED = 16.0, 12.0
+"""What a dot without a ray, and a ray without its dot amid the others, cost in units of χ²."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Labels, the surface fitted to them, and what that leaves unexplained.
+
+    Parameters
+    ----------
+    labels
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+    pool
+        The surface.
+    witness
+        See `Match.witness`.
+    stray, missed
+        How many dots have no ray; how many rays amid the others have no dot.
+    cost
+        χ² of the dots, plus `STRAY` and `MISSED` for those.
+    """
+
+    labels: IntArray
+    pool: FittedPool
+    witness: IntArray
+    stray: int
+    missed: int
+    cost: float
+
+    @property
+    def count(self) -> int:
+        """How many dots have a ray."""
+        return int(np.sum(self.labels != UNLABELLED))
+
+    @property
+    def residual_mm(self) -> float:
+        """Root mean square distance of computed from captured dots, mm."""
+        return float(np.sqrt(np.mean(np.sum(self.pool.residual_mm**2, axis=-1))))
+
+    def orientation(self, scene: Scene) -> Orientation:
+        """Say which correspondence the labels amount to."""
+        at = np.argwhere(self.labels != UNLABELLED)
+        place = np.full((*self.labels.shape, 2), np.nan)
+        place[at[:, 0], at[:, 1]] = scene.plane_mm[self.labels[at[:, 0], at[:, 1]]]
+        if np.nansum(np.sign(np.diff(place[..., 1], axis=0))) >= 0:
+            return "S/S"
+        return "S/I" if np.nansum(np.sign(np.diff(place[..., 0], axis=1))) >= 0 else "I/I"
+
+
+def pursue(scene: Scene, labels: IntArray) -> Hypothesis | None:
+    """Follow labels to where the surface leads, and weigh what comes of it."""
+    grown = grow_labels(scene, labels)
+    return None if grown is None else weigh(scene, grown)
+
+
+def weigh(scene: Scene, labels: IntArray) -> Hypothesis | None:
+    """Fit the surface to labels as they are and count what speaks against them."""
+    pool = try_fit(scene, labels)
+    if pool is None:
+        return None
+    try:
+        pool = scene.fit(labels, _witness(scene, labels, pool), FitSettings())
+    except CannotMeasure:
+        return None
+    lit = labels != UNLABELLED
+    missed, stray = _unexplained(scene, labels, pool)
+    variance = scene.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
+    surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY)
+    cost = float(surprise.sum()) + STRAY * stray + MISSED * missed
+    return Hypothesis(labels, pool, _witness(scene, labels, pool), stray, missed, cost)
+
+
+def from_grid(
+    lattice: Lattice, reference: Site, orientation: Orientation, shape: tuple[int, int]
+) -> IntArray:
+    """Label the whole grid with one of its sites taken for the centre reference."""
+    dot = np.nonzero(lattice.row > 0)[0]
+    site = np.stack([lattice.row[dot], lattice.column[dot]], axis=-1)
+    center = (np.array(shape) + 1) // 2
+    return _labelled(center + (site - reference) * ways(orientation), dot, shape)
+
+
+def joined(hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation) -> IntArray | None:
+    """Labels for the whole grid where the rays found so far agree with it; None if they do not."""
+    labels = hypothesis.labels
+    at = np.argwhere(labels != UNLABELLED)
+    dot = labels[at[:, 0], at[:, 1]]
+    site = np.stack([lattice.row, lattice.column], axis=-1)
+    indexed = site[dot, 0] > 0
+    offset = (at + 1 - site[dot] * ways(orientation))[indexed]
+    if len(offset) == 0:
+        return None
+    kinds, count = np.unique(offset, axis=0, return_counts=True)
+    if count.max() < 0.8 * len(offset):
+        return None
+    on_grid = np.nonzero(site[:, 0] > 0)[0]
+    ray = site[on_grid] * ways(orientation) + kinds[np.argmax(count)]
+    grid = _labelled(ray, on_grid, labels.shape)
+    others = np.where(np.isin(labels, on_grid), UNLABELLED, labels)
+    return np.where(grid != UNLABELLED, grid, others)
+
+
+def moved(scene: Scene, labels: IntArray) -> Iterator[IntArray]:
+    """Yield the same labels a row or a column further on: what a single frame tells worst."""
+    at = np.argwhere(labels != UNLABELLED)
+    dot = labels[at[:, 0], at[:, 1]]
+    for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        shifted = _labelled(at + 1 + step, dot, labels.shape)
+        shifted[scene.absent] = UNLABELLED
+        yield shifted
+
+
+def turned(scene: Scene, labels: IntArray, before: Orientation, after: Orientation) -> IntArray:
+    """Label the same dots the other way round the centre reference."""
+    at = np.argwhere(labels != UNLABELLED)
+    center = np.array(scene.rig.pattern.reference)
+    ray = center + (at + 1 - center) * ways(before) * ways(after)
+    return _labelled(ray, labels[at[:, 0], at[:, 1]], labels.shape)
+
+
+def _labelled(ray: IntArray, dot: IntArray, shape: tuple[int, ...]) -> IntArray:
+    there = ((ray >= 1) & (ray <= shape)).all(axis=-1)
+    labels = np.full(shape, UNLABELLED, np.int64)
+    labels[ray[there, 0] - 1, ray[there, 1] - 1] = dot[there]
+    return labels
+
+
+def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int, int]:
+    """Count rays that should have a dot and have none, and dots that have no ray.
+
+    Where the surface lets dots run into each other there is nothing to be told of either.
+    """
+    lit = labels != UNLABELLED
+    among = predict(scene, pool, _amid(lit) & ~scene.absent)
+    resolution = float(np.median(scene.resolution_mm))
+    merged = among.spacing_mm < resolution
+    rays = scene.rays[among.at[:, 0], among.at[:, 1]]
+    hidden = blocked(among.points_mm, rays, scene.rig, pool)
+    silent = ~lit[among.at[:, 0], among.at[:, 1]] & ~merged & ~hidden
+    missed = int(np.sum(silent & scene.in_view(among.plane_mm)))
+    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
+    if merged.any() and len(stray):
+        off = np.asarray(cKDTree(among.plane_mm[merged]).query(scene.plane_mm[stray])[0])
+        stray = stray[off > resolution]
+    return missed, len(stray)
+
+
+def _amid(lit: BoolArray) -> BoolArray:
+    """Rays between lit ones in their row or in their column."""
+    between = np.zeros_like(lit)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(lit, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(lit, axis), axis=axis), axis)
+        between |= before & after
+    return between
+
+
+def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
+    """Say which rays came back, which did not, and which cannot tell (see `Match.witness`)."""
+    lit = labels != UNLABELLED
+    witness = np.zeros(lit.shape, np.int64)
+    around = predict(scene, pool, np.ones_like(lit))
+    rays = scene.rays[around.at[:, 0], around.at[:, 1]]
+    hidden = blocked(around.points_mm, rays, scene.rig, pool)
+    seen = scene.in_view(around.plane_mm) & ~hidden
+    witness[around.at[seen, 0], around.at[seen, 1]] = -1
+    witness[_amid(lit) | scene.absent] = 0
+    witness[lit] = 1
+    # A dot that no ray was given may be the dot of a ray that seems dark.
+    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
+    if len(stray):
+        distance = cKDTree(scene.plane_mm[stray]).query(around.plane_mm)[0]
+        doubt = around.at[distance < around.spacing_mm]
+        doubt = doubt[witness[doubt[:, 0], doubt[:, 1]] < 0]
+        witness[doubt[:, 0], doubt[:, 1]] = 0
+    return witness
