@@ -181,7 +181,7 @@ def _local_noise(image: Grey, size: float) -> Grey:
     fine = np.abs(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REFLECT))
     tile = max(24.0, 16.0 * size)
     rows, columns = (max(1, round(n / tile)) for n in fine.shape)
-    medians = np.array(
+    medians: Grey = np.array(
         [
             [np.median(part) for part in np.array_split(strip, columns, axis=1)]
             for strip in np.array_split(fine, rows, axis=0)
@@ -233,8 +233,8 @@ def _dot_like(
 ) -> BoolArray:
     """Not a hot pixel: those answer more to a much finer band than to the dots' own."""
     fine = _band_pass(image, max(0.4, size / 3.0))
-    fine = cv2.dilate(fine, np.ones((3, 3), np.uint8))
-    return np.asarray(fine[v, u] < 1.6 * band[v, u])
+    strongest = np.asarray(cv2.dilate(fine, np.ones((3, 3), np.uint8)))
+    return np.asarray(strongest[v, u] < 1.6 * band[v, u])
 
 
 def _describe(

@@ -17,18 +17,22 @@ LEAST_DOTS = 9
 
 
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
-    """Fit one smooth surface to all reflections (see the head of this file).
+    """Fit one smooth surface to all reflections (`fit_pool`), and follow it to its boundary.
 
     Raises
     ------
     CannotMeasure
         ``too-few-dots`` for fewer than nine matched dots; ``no-surface`` if the rays cannot be
         met with a surface; ``open-boundary`` if the surface does not come down to the work piece
-        all round.
+        all round, or no ray tells where it does.
     """
     if len(match.ray) < LEAST_DOTS:
         raise CannotMeasure(
             "too-few-dots", f"{len(match.ray)} dots have a ray, a surface needs {LEAST_DOTS}"
+        )
+    if not (match.witness < 0).any():
+        raise CannotMeasure(
+            "open-boundary", "no ray that would show stayed away: where the pool ends is not seen"
         )
     pool = fit_pool(
         match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness, rig, settings

@@ -57,8 +57,7 @@ class CloughTocherSurface:
     @property
     def point_gradient(self) -> FloatArray:
         """(∂z/∂x, ∂z/∂y) at the points it passes through, shape (n, 2)."""
-        gradient = self._cubic.grad  # type: ignore[attr-defined] # public, but not in the stubs
-        return np.asarray(gradient, np.float64)[:, 0, :]
+        return np.asarray(self._cubic.grad, np.float64)[:, 0, :]
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height z at (x, y), arrays of one shape, mm; NaN outside the hull of the points."""

@@ -4,6 +4,9 @@ Round by round from z = 0, every matched ray is met with the surface, the bisect
 ray and the direction to its dot gives two slopes there (Eq. 4-3), and the smooth surface that best
 has all these slopes replaces the last. Slopes leave the level open. It comes from which rays came
 back and which did not: a lit ray landed inside the contour z = 0, a dark one outside.
+
+Slopes are weighted by what the dots' places are uncertain by on the imaging plane, so that it is
+the reflection residual there whose squares are least.
 """
 
 from __future__ import annotations
@@ -27,6 +30,10 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, f
 REACH = 2.5
 """How far beyond the outermost dots the surface goes on, in rows of rays: the torch may hide some
 before the boundary is reached."""
+
+
+UNSETTLED_MM = 0.05
+"""A reflection point that still moves as far in the last round has not been found."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +162,8 @@ def fit_pool(
         points = met
         if moved < settings.settled_mm:
             break
+    if moved > UNSETTLED_MM:
+        raise CannotMeasure("no-surface", "the surface does not settle")
     residual = predict_dots(surface, points, rays, rig) - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")

@@ -177,14 +177,14 @@ class _Window:
             descent = rays[..., 2] - np.sum(quadric.gradient(xy) * rays[..., :2], axis=-1)
             step = np.clip(gap / np.maximum(-descent, 0.05), -1.0, 1.0)
             points = points + step[..., None] * rays
-        return points
+        return np.asarray(points)
 
     def hits(self, pattern: FloatArray, gate: float) -> tuple[BoolArray, IntArray, FloatArray]:
         """Which predicted dots, shape (rows, columns, 2), fall on a dot, on which, how far off.
 
         The last is in units of the gate.
         """
-        sane = np.isfinite(pattern).all(axis=-1)
+        sane = np.asarray(np.isfinite(pattern).all(axis=-1))
         flat = np.where(sane[..., None], pattern, 1e6)
         spacing = np.full(sane.shape, np.inf)
         for axis in (0, 1):

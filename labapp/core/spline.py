@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import BoolArray, FloatArray, freeze
 
 DEGREE = 3
 
@@ -73,8 +73,8 @@ class SplineBasis:
         product = along_x(x_mm, dx)[:, :, None] * along_y(y_mm, dy)[:, None, :]
         return np.asarray(product.reshape(len(product), product.shape[1] * product.shape[2]))
 
-    def contains(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Whether points lie in the rectangle, bool array of their shape."""
+    def contains(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+        """Whether points lie in the rectangle, of their shape."""
         point = np.stack([x_mm, y_mm], axis=-1)
         return np.asarray(((point >= self.low_mm) & (point <= self.high_mm)).all(axis=-1))
 
