@@ -17,6 +17,10 @@ from labapp.core.values import BoolArray, CannotMeasure, IntArray
 MODEL_MM = 0.03
 """How far the right surface's dots may be off for no fault of theirs, mm."""
 
+BEYOND, FEW = 0.25, 2
+"""A lit ray is beyond the boundary when it lands so far outside, in spacings of the rays; so many
+of them are put down to false dots."""
+
 STRAY, MISSED = 16.0, 12.0
 """What a dot without a ray, and a ray without its dot amid the others, cost in units of χ²."""
 
@@ -69,7 +73,26 @@ class Hypothesis:
 def pursue(scene: Scene, labels: IntArray) -> Hypothesis | None:
     """Follow labels to where the surface leads, and weigh what comes of it."""
     grown = grow_labels(scene, labels)
-    return None if grown is None else weigh(scene, grown)
+    hypothesis = None if grown is None else weigh(scene, grown)
+    if hypothesis is None:
+        return None
+    outside = _outside(scene, hypothesis)
+    # Many lit rays beyond the contour are a rear that lies low; one or two are false dots.
+    if not 0 < len(outside) <= FEW:
+        return hypothesis
+    labels = hypothesis.labels.copy()
+    labels[outside[:, 0], outside[:, 1]] = UNLABELLED
+    return weigh(scene, labels)
+
+
+def _outside(scene: Scene, hypothesis: Hypothesis) -> IntArray:
+    """Labelled rays that landed well beyond where all the others put the boundary."""
+    at = np.argwhere(hypothesis.labels != UNLABELLED)
+    x, y = scene.landing_mm[at[:, 0], at[:, 1], :2].T
+    surface, sign = hypothesis.pool.surface, hypothesis.pool.level.sign
+    slope = surface.gradient(x, y)
+    rise = np.linalg.norm(slope * scene.spacing_mm, axis=-1)
+    return np.asarray(at[sign * surface.height(x, y) < -BEYOND * rise])
 
 
 def weigh(scene: Scene, labels: IntArray) -> Hypothesis | None:
@@ -181,7 +204,8 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     around = predict(scene, pool, np.ones_like(lit))
     rays = scene.rays[around.at[:, 0], around.at[:, 1]]
     hidden = blocked(around.points_mm, rays, scene.rig, pool)
-    seen = scene.in_view(around.plane_mm) & ~hidden
+    merged = around.spacing_mm < float(np.median(scene.resolution_mm))
+    seen = scene.in_view(around.plane_mm) & ~hidden & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
     witness[_amid(lit) | scene.absent] = 0
     witness[lit] = 1

@@ -93,9 +93,10 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         tried.update(grid.values())
         if len(grid) > len(best):
             best = grid
-    if len(best) < max(settings.least, settings.share * len(dots)):
+    grid = _without_slips(_upright(_unsheared(best, plane), points), plane) if best else best
+    if len(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
-    grid = _without_slips(_upright(best, points), plane)
+    grid = _from_one(grid)
     holes = _holes(grid, points, tree)
     certain = [site for site, sides in holes if sides == 4]
     return lattice_of_sites(
@@ -287,32 +288,61 @@ def _sound_part(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
     return {site: grid[site] for site in largest} if len(largest) > 1 else {}
 
 
-def _without_slips(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
-    """Put rows back that stand a column off the row below; give up rows that may or may not.
+def _unsheared(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
+    """Index by the two shortest steps: a grid grown next to a hole may run along diagonals.
 
-    Neighbour by neighbour a row may be joined to the next one column off all along. Its columns
-    then slant by a whole step on the average over the row, which bowed and fanned rows do not.
+    Lagrange's reduction of the lattice, its inner products summed over the cells.
     """
-    kept: dict[Site, int] = {}
-    shift, below = 0, None
-    for k in sorted({site[0] for site in grid}):
-        row = {t: plane[dot] for (row_k, t), dot in grid.items() if row_k == k}
-        slant = 0.0
-        if below is not None:
-            leans = [
-                ((row[t] - below[t]) / step).real
-                for t in row.keys() & below.keys()
-                for step in _steps_at(below, t)
-            ]
-            if not leans:
-                break
-            slant = float(np.median(leans))
-        if abs(abs(slant) % 1.0 - 0.5) < 0.15:
+    along, across, mixed = 0.0, 0.0, 0.0
+    for (k, t), dot in grid.items():
+        if (k, t + 1) in grid and (k + 1, t) in grid:
+            a, b = plane[grid[k, t + 1]] - plane[dot], plane[grid[k + 1, t]] - plane[dot]
+            size = abs(a) * abs(b)
+            along, across = along + abs(a) ** 2 / size, across + abs(b) ** 2 / size
+            mixed += (a * b.conjugate()).real / size
+    for _ in range(8):
+        if 2 * abs(mixed) <= 1.05 * min(along, across):
             break
-        shift += round(slant)
-        kept |= {(k, t + shift): grid[k, t] for t in row}
-        below = row
-    return kept
+        if along <= across:  # step over rows less as many steps along them
+            m = round(mixed / along)
+            grid = {(k, t + m * k): dot for (k, t), dot in grid.items()}
+            mixed, across = mixed - m * along, across - 2 * m * mixed + m * m * along
+        else:
+            m = round(mixed / across)
+            grid = {(k + m * t, t): dot for (k, t), dot in grid.items()}
+            mixed, along = mixed - m * across, along - 2 * m * mixed + m * m * across
+    return grid
+
+
+def _without_slips(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
+    """Keep the most rows that hang together without a slip.
+
+    Neighbour by neighbour a row may be joined to the next one column off all along, or by dots of
+    two rows in turn. Its columns then slant by a whole step more than those of other rows, which
+    bowed and fanned rows do not.
+    """
+    rows: dict[int, dict[int, complex]] = {}
+    for (k, t), dot in grid.items():
+        rows.setdefault(k, {})[t] = plane[dot]
+    slants = {}
+    for k in sorted(rows):
+        below = rows.get(k - 1, {})
+        leans = [
+            ((rows[k][t] - below[t]) / step).real
+            for t in rows[k].keys() & below.keys()
+            for step in _steps_at(below, t)
+        ]
+        if leans:
+            slants[k] = float(np.median(leans))
+    usual = float(np.median(list(slants.values()))) if slants else 0.0
+    parts: list[list[int]] = []
+    for k in sorted(rows):
+        if k in slants and abs(slants[k] - usual) < 0.55 and abs(slants[k]) < 0.7 and parts:
+            parts[-1].append(k)
+        else:
+            parts.append([k])
+    kept = max(parts, key=lambda part: sum(len(rows[k]) for k in part))
+    return {site: dot for site, dot in grid.items() if site[0] in kept}
 
 
 def _steps_at(row: dict[int, complex], t: int) -> list[complex]:
@@ -346,6 +376,11 @@ def _upright(grid: dict[Site, int], points: FloatArray) -> dict[Site, int]:
         grid = {(k, -t): dot for (k, t), dot in grid.items()}
     if across[:, 1].sum() < 0:
         grid = {(-k, t): dot for (k, t), dot in grid.items()}
+    return grid
+
+
+def _from_one(grid: dict[Site, int]) -> dict[Site, int]:
+    """Count rows and columns from 1."""
     k0, t0 = (min(site[axis] for site in grid) for axis in (0, 1))
     return {(k - k0 + 1, t - t0 + 1): dot for (k, t), dot in grid.items()}
 

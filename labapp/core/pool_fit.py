@@ -135,9 +135,7 @@ def fit_pool(
     dots = rig.imaging_plane.to_universal(plane_mm)
     points = meet_level(laser, rays)
     ground = meet_level(laser, pattern)[..., :2]
-    spacing = np.abs(
-        [np.median(np.diff(ground[..., 0], axis=1)), np.median(np.diff(ground[..., 1], axis=0))]
-    )
+    spacing = landing_spacing(ground)
     margin = REACH * spacing.max()
     basis = SplineBasis.over(
         points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
@@ -168,6 +166,13 @@ def fit_pool(
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
     return FittedPool(surface, fitted.covariance, level, points, residual)
+
+
+def landing_spacing(landing_mm: FloatArray) -> FloatArray:
+    """Distance between neighbours of a grid of landing points along X and along Y, (2,), mm."""
+    across = np.median(np.diff(landing_mm[..., 0], axis=1))
+    along = np.median(np.diff(landing_mm[..., 1], axis=0))
+    return np.asarray(np.abs([across, along]), float)
 
 
 def _slope_weights(

@@ -19,6 +19,7 @@ from labapp.core.pool_fit import (
     FitSettings,
     FittedPool,
     fit_pool,
+    landing_spacing,
     meet_surface,
     predict_dots,
     slope_of_dot,
@@ -72,6 +73,13 @@ class Scene:
         The bench, and how the camera sees the plane.
     frame_shape
         Height and width of the frame, px.
+
+    Attributes
+    ----------
+    rays, landing_mm
+        Directions of the rays, and where they would land on z = 0, mm, shape (rows, columns, 3).
+    spacing_mm
+        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
     """
 
     plane_mm: FloatArray
@@ -82,11 +90,14 @@ class Scene:
     frame_shape: tuple[int, int]
     rays: FloatArray = field(init=False)
     landing_mm: FloatArray = field(init=False)
+    spacing_mm: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         rays = ray_directions(self.rig.laser, self.rig.pattern)
+        landing = meet_level(self.rig.laser.position_mm, rays)
         object.__setattr__(self, "rays", rays)
-        object.__setattr__(self, "landing_mm", meet_level(self.rig.laser.position_mm, rays))
+        object.__setattr__(self, "landing_mm", landing)
+        object.__setattr__(self, "spacing_mm", landing_spacing(landing))
         freeze(self)
 
     @classmethod

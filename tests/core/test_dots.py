@@ -1,0 +1,114 @@
+"""The default detector: found, placed as well as the noise allows, and honest about it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.dots import BandPassSettings, band_pass_dots
+from labapp.core.values import CannotMeasure, FloatArray
+
+SHAPE = (240, 320)
+
+
+def grid(spacing: float = 24.0) -> FloatArray:
+    """Places off the pixel centres by all sorts of fractions, shape (n, 2)."""
+    u, v = np.meshgrid(
+        np.arange(30.0, 300.0, spacing + 0.37), np.arange(30.0, 220.0, spacing - 0.21)
+    )
+    return np.stack([u.ravel(), v.ravel()], axis=-1)
+
+
+def draw(places: FloatArray, size: float, peak: float) -> FloatArray:
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    frame = np.zeros(SHAPE)
+    for a, b in places:
+        frame += peak * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (2 * size**2))
+    return frame
+
+
+def offsets(found: FloatArray, true: FloatArray) -> FloatArray:
+    """From each true place to the nearest found one, shape (n, 2)."""
+    difference = found[None] - true[:, None]
+    nearest = np.argmin(np.linalg.norm(difference, axis=-1), axis=1)
+    return difference[np.arange(len(true)), nearest]
+
+
+@pytest.mark.parametrize("size", [1.0, 2.0, 3.5, 6.0])
+def test_dots_of_any_size_are_found_and_measured(size: float) -> None:
+    places = grid(max(24.0, 8.0 * size))
+    noise = np.random.default_rng(1).normal(20.0, 1.0, SHAPE)
+    dots = band_pass_dots(draw(places, size, 40.0) + noise, BandPassSettings())
+    assert len(dots) == len(places)
+    assert np.abs(offsets(dots.image_px, places)).max() < 0.3
+    assert np.median(dots.size_px) == pytest.approx(size, rel=0.15)
+    assert np.median(dots.peak) == pytest.approx(40.0, rel=0.15)
+
+
+@pytest.mark.parametrize("snr", [6.0, 12.0, 25.0])
+def test_places_are_as_good_as_white_noise_allows_and_said_to_be(snr: float) -> None:
+    rng = np.random.default_rng(2)
+    settings = BandPassSettings(speckle_px=0.0)
+    errors, sigmas = [], []
+    for _ in range(6):
+        frame = draw(grid(), 2.2, 10.0 * snr) + rng.normal(100.0, 10.0, SHAPE)
+        dots = band_pass_dots(frame, settings)
+        errors.append(offsets(dots.image_px, grid()))
+        sigmas.append(np.median(dots.u_sigma_px))
+    rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+    assert rms < 1.25 * 0.80 / snr  # the white-noise limit
+    assert np.mean(sigmas) == pytest.approx(rms, rel=0.25)
+
+
+def test_noise_alone_is_not_a_dot() -> None:
+    rng = np.random.default_rng(3)
+    false = 0
+    for _ in range(10):
+        frame = draw(grid(), 2.0, 30.0) + rng.normal(0.0, 3.0, SHAPE)
+        false += len(band_pass_dots(frame, BandPassSettings())) - len(grid())
+    assert false == 0
+
+
+def test_hot_pixels_and_a_glow_are_not_dots() -> None:
+    rng = np.random.default_rng(4)
+    frame = draw(grid(), 2.2, 40.0) + rng.normal(10.0, 1.0, SHAPE)
+    frame += np.linspace(0.0, 80.0, SHAPE[0])[:, None]
+    hot = rng.integers(5, 200, (12, 2))
+    frame[hot[:, 0], hot[:, 1]] = 255.0
+    dots = band_pass_dots(frame, BandPassSettings())
+    assert np.abs(offsets(dots.image_px, grid())).max() < 0.5
+    assert len(dots) == len(grid())
+
+
+def test_dots_close_together_do_not_pull_at_each_other() -> None:
+    places = np.array(
+        [[100.0, 100.0], [110.4, 100.3], [120.7, 100.9], [160.0, 140.0], [60.0, 60.0]]
+    )
+    frame = draw(places, 2.1, 60.0) + np.random.default_rng(5).normal(0.0, 0.5, SHAPE)
+    dots = band_pass_dots(frame, BandPassSettings())
+    assert len(dots) == len(places)
+    assert np.abs(offsets(dots.image_px, places)).max() < 0.15
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_the_type_of_the_frame_does_not_matter(dtype: type) -> None:
+    frame = draw(grid(), 2.0, 60.0) + np.random.default_rng(6).normal(40.0, 2.0, SHAPE)
+    scale = 200.0 if dtype is np.uint16 else 1.0
+    dots = band_pass_dots((frame * scale).astype(dtype), BandPassSettings())
+    assert np.abs(offsets(dots.image_px, grid())).max() < 0.2
+    assert np.median(dots.snr) == pytest.approx(30.0, rel=0.2)
+
+
+def test_a_dot_with_a_flat_top_is_one_dot() -> None:
+    places = np.array([[100.5, 100.0], [150.0, 120.5], [60.0, 180.0], [220.0, 60.0]])
+    frame = np.minimum(draw(places, 2.5, 400.0), 255.0)
+    dots = band_pass_dots(frame, BandPassSettings())
+    assert len(dots) == len(places)
+    assert np.abs(offsets(dots.image_px, places)).max() < 0.1
+
+
+@pytest.mark.parametrize("frame", [np.zeros((1, 1)), np.zeros((5, 400)), np.full((200, 200), 7.0)])
+def test_nothing_to_be_seen_is_said(frame: FloatArray) -> None:
+    with pytest.raises(CannotMeasure) as answer:
+        band_pass_dots(frame, BandPassSettings())
+    assert answer.value.status == "no-dots"

@@ -1,0 +1,121 @@
+"""The default search for rows and columns: right or silent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.lattice import GrowSettings, Lattice, grow_lattice
+from labapp.core.values import CannotMeasure, FloatArray, IntArray
+from labapp.simulation.pools import egg, ellipsoidal_cap, spherical_cap
+from tests.scenes import as_dots, see
+
+ROWS, COLUMNS = 9, 14
+
+
+def sites() -> IntArray:
+    """(k, t) of a full grid, counted from 1, rows from the bottom up, shape (n, 2)."""
+    k, t = np.mgrid[1 : ROWS + 1, 1 : COLUMNS + 1]
+    return np.stack([k.ravel(), t.ravel()], axis=-1)
+
+
+def bowed(site: IntArray, bow: float = 0.0, fan: float = 0.0, roll_deg: float = 0.0) -> FloatArray:
+    """Places (u, v) of sites: rows arched by ``bow``, columns spread upwards by ``fan``."""
+    k, t = site.T - np.array([[5.0], [7.5]])
+    x = 22.0 * t * (1 + fan * k)
+    y = 34.0 * k - bow * t**2
+    roll = np.radians(roll_deg)
+    u = 240.0 + np.cos(roll) * x - np.sin(roll) * y
+    v = 320.0 - np.sin(roll) * x - np.cos(roll) * y
+    return np.stack([u, v], axis=-1)
+
+
+def wrong(lattice: Lattice, true: IntArray) -> int:
+    """How many indexed dots are off the others, by what step and turn suits most of them."""
+    indexed = lattice.row > 0
+    site = np.stack([lattice.row, lattice.column], axis=-1)[indexed]
+    agreeing = 0
+    for way in ((1, 1), (-1, 1), (-1, -1)):
+        count = np.unique(site * way - true[indexed], axis=0, return_counts=True)[1]
+        agreeing = max(agreeing, int(count.max()))
+    return int(indexed.sum()) - agreeing
+
+
+@pytest.mark.parametrize(
+    ("bow", "fan", "roll_deg"),
+    [(0, 0, 0), (1.2, 0, 0), (0, 0.06, 0), (1.2, 0.06, 3), (-1.0, 0.04, -3), (0, 0, 20)],
+)
+def test_a_whole_grid_is_indexed_from_the_lower_left(
+    bow: float, fan: float, roll_deg: float
+) -> None:
+    order = np.random.default_rng(0).permutation(ROWS * COLUMNS)
+    site = sites()[order]
+    lattice = grow_lattice(as_dots(bowed(site, bow, fan, roll_deg)), GrowSettings())
+    np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), site)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_missing_and_false_dots_never_cause_a_wrong_index(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    site = sites()[rng.permutation(ROWS * COLUMNS)[rng.integers(0, 18) :]]
+    place = bowed(site, rng.uniform(-1, 1.3), rng.uniform(-0.05, 0.07), rng.uniform(-3, 3))
+    place = place + rng.normal(0.0, 0.6, place.shape)
+    false = rng.uniform(0.0, 480.0, (int(rng.integers(0, 7)), 2))
+    lattice = grow_lattice(as_dots(np.concatenate([place, false])), GrowSettings())
+    own = Lattice(lattice.row[: len(site)], lattice.column[: len(site)])
+    assert wrong(own, site) == 0
+    assert np.mean(own.row > 0) > 0.8
+
+
+def test_the_absent_centre_stands_out() -> None:
+    site = np.array([s for s in sites() if tuple(s) != (5, 7)])
+    lattice = grow_lattice(as_dots(bowed(site, 1.0, 0.04)), GrowSettings())
+    assert lattice.reference == (5, 7)
+    assert lattice.candidates == ((5, 7),)
+
+
+def test_of_two_holes_none_is_chosen() -> None:
+    site = np.array([s for s in sites() if tuple(s) not in {(5, 7), (3, 9)}])
+    lattice = grow_lattice(as_dots(bowed(site, 1.0)), GrowSettings())
+    assert lattice.reference is None
+    assert set(lattice.candidates) == {(5, 7), (3, 9)}
+
+
+def test_a_row_behind_the_torch_is_marked() -> None:
+    hidden = {(8, t) for t in range(6, 10)} | {(9, t) for t in range(6, 10)}
+    site = np.array([s for s in sites() if tuple(s) not in hidden])
+    lattice = grow_lattice(as_dots(bowed(site, 0.8)), GrowSettings())
+    assert lattice.blocked_rows == {8, 9}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_dots_of_real_pools_are_indexed_right_or_not_at_all(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    width, peak = rng.uniform(5.5, 7.5), rng.uniform(0.2, 0.4)
+    pool = [
+        spherical_cap(width, peak),
+        ellipsoidal_cap(width, 1.15 * width, peak),
+        egg(width, 0.45 * width, 0.6 * width, peak),
+        spherical_cap(width, -1.6 * peak),
+    ][seed % 4]
+    seen = see(pool, rng, missing=2, false=3)
+    try:
+        lattice = grow_lattice(seen.dots, GrowSettings())
+    except CannotMeasure as answer:
+        assert answer.status == "no-rows"
+        return
+    own = seen.ray[:, 0] > 0
+    assert wrong(Lattice(lattice.row[own], lattice.column[own]), seen.ray[own]) == 0
+
+
+def test_scattered_dots_are_no_grid() -> None:
+    scattered = np.random.default_rng(1).uniform(0.0, 480.0, (60, 2))
+    with pytest.raises(CannotMeasure) as answer:
+        grow_lattice(as_dots(scattered), GrowSettings())
+    assert answer.value.status == "no-rows"
+
+
+def test_a_handful_of_dots_is_no_grid() -> None:
+    with pytest.raises(CannotMeasure) as answer:
+        grow_lattice(as_dots(bowed(sites()[:5])), GrowSettings())
+    assert answer.value.status == "too-few-dots"

@@ -1,0 +1,89 @@
+"""Scenes of known truth for the tests of matching: exact reflections, seen by a made-up camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.dots import Dots
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.values import FloatArray, IntArray
+from labapp.simulation.forward import PoolSurface, Reflections, trace
+
+# The set-up of Fig. 3-17, its plane wide enough for every dot and its torch out of the way.
+OPEN_RIG = Rig(
+    Laser(31.14, 31.48),
+    DotPattern(),
+    Electrode(500.0),
+    ImagingPlane.vertical(50.0, 500.0, -300.0, 1000.0, 1000.0),
+)
+
+# The same as it stood on the bench.
+BENCH_RIG = Rig(
+    Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0)
+)
+BENCH_VIEW = ImageCalibration.from_three_points(
+    (44.0, 590.0), (440.0, 582.3), 69.85, (40.5, 410.0), 31.75
+)
+FRAME_SHAPE = (640, 480)
+
+
+@dataclass(frozen=True)
+class SeenDots:
+    """Dots as a perfect detector would find them, and the ray that made each.
+
+    Parameters
+    ----------
+    dots
+        The dots, in no order.
+    ray
+        Ray (i, j) of each, shape (n, 2); 0 for a dot that no ray made.
+    """
+
+    dots: Dots
+    ray: IntArray
+
+
+def see(
+    pool: PoolSurface,
+    rng: np.random.Generator,
+    *,
+    sigma_px: float = 0.15,
+    missing: int = 0,
+    false: int = 0,
+    rig: Rig = BENCH_RIG,
+) -> SeenDots:
+    """Trace a pool and see its dots in the bench's view, some of them missing, some false."""
+    reflections = trace(pool, rig)
+    image, ray = visible_dots(reflections)
+    keep = rng.permutation(len(image))[missing:]
+    image, ray = image[keep] + rng.normal(0.0, sigma_px, (len(keep), 2)), ray[keep]
+    stray = rng.uniform(10.0, np.array(FRAME_SHAPE[::-1]) - 10.0, (false, 2))
+    image = np.concatenate([image, stray])
+    ray = np.concatenate([ray, np.zeros((false, 2), np.int64)])
+    return SeenDots(as_dots(image, sigma_px), ray)
+
+
+def visible_dots(reflections: Reflections) -> tuple[FloatArray, IntArray]:
+    """Place of each dot in the bench's view, px, and its ray."""
+    image = BENCH_VIEW.to_image(np.nan_to_num(reflections.plane_mm, nan=-1e3))
+    limit = np.array(FRAME_SHAPE[::-1]) - 1
+    shown = reflections.visible & ((image > 0) & (image < limit)).all(axis=-1)
+    return image[shown], np.argwhere(shown) + 1
+
+
+def as_dots(image_px: FloatArray, sigma_px: float = 0.15) -> Dots:
+    """Dots of one brightness at given places, shape (n, 2), px."""
+    n = len(image_px)
+    sigma = np.full(n, max(sigma_px, 0.02))
+    return Dots(
+        u_px=image_px[:, 0],
+        v_px=image_px[:, 1],
+        u_sigma_px=sigma,
+        v_sigma_px=sigma,
+        size_px=np.full(n, 2.0),
+        peak=np.full(n, 50.0),
+        snr=np.full(n, 20.0),
+    )
