@@ -105,7 +105,7 @@ class MatchSettings:
     """
 
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
-    margin: float = 8.0
+    margin: float = 14.0
     stray: tuple[int, float] = (5, 0.06)
     missed: tuple[int, float] = (2, 0.06)
 
@@ -217,18 +217,25 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
             break
         best = better
     own = best.orientation(scene)
+    doubtful: list[int] = []
     for other in [*found, *neighbours]:
-        if np.array_equal(other.labels, best.labels) or other.cost >= best.cost + settings.margin:
+        if other.cost >= best.cost + settings.margin:
             continue
-        if other.orientation(scene) != own:
+        differing, shared = _differing(best, other)
+        if len(differing) <= 0.2 * shared:
+            doubtful += differing
+        elif other.orientation(scene) != own:
             raise CannotMeasure(
                 "ambiguous-orientation",
                 f"{own} and {other.orientation(scene)} explain the dots alike",
             )
-        if not _agree(other, best):
+        else:
             raise CannotMeasure(
                 "ambiguous-rows", "several holes in the rows can be the absent centre dot"
             )
+    if doubtful:
+        certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
+        best = weigh(scene, certain) or best
     strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
     if best.stray > strays or best.missed > settings.missed[0] + settings.missed[1] * best.count:
         raise CannotMeasure(
@@ -239,12 +246,11 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     return best
 
 
-def _agree(one: Hypothesis, other: Hypothesis) -> bool:
-    """No dot has different rays in the two."""
-    both = (one.labels != UNLABELLED) & (other.labels != UNLABELLED)
-    same = one.labels[both] == other.labels[both]
-    shared = np.intersect1d(one.labels, other.labels)
-    return bool(same.all()) and len(shared[shared != UNLABELLED]) == int(both.sum())
+def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
+    """Dots that have different rays in the two, and how many have a ray in both."""
+    rays = [{int(dot): at for at, dot in np.ndenumerate(h.labels)} for h in (one, other)]
+    shared = rays[0].keys() & rays[1].keys() - {UNLABELLED}
+    return [dot for dot in shared if rays[0][dot] != rays[1][dot]], len(shared)
 
 
 def _as_match(scene: Scene, best: Hypothesis) -> Match:

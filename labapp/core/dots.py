@@ -132,6 +132,10 @@ def _gauss(image: Grey, sigma: float) -> Grey:
 _PEAK_GAIN = 1 / 1.64 - 1 / 3.56
 
 
+# What is left of a Gaussian dot's width when its surroundings are taken off before it is measured.
+_WIDTH_KEPT = 0.8
+
+
 def _noise_gain(size: float) -> float:
     """White noise before the band over white noise after it, for a dot of the given size."""
     a, b = (0.8 * size) ** 2, (1.6 * size) ** 2
@@ -266,7 +270,7 @@ def _describe(
         offset = np.clip(offset + 1.5 * (mean - offset), -size, size)
     moment = sum(part @ across**2 for part in sums) / total - np.sum(mean**2, axis=0)
     moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
-    spread = 1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2
+    spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / _WIDTH_KEPT**2
     peak = band[v, u].astype(float) / _PEAK_GAIN
     snr = peak / np.maximum(noise[v, u], 1e-3 * np.max(peak))
     sigma = np.hypot(0.8 / snr, speckle_px)

@@ -15,6 +15,9 @@ from labapp.core.values import CannotMeasure, FloatArray
 LEAST_DOTS = 9
 """A surface from fewer reflections is a guess."""
 
+UNSETTLED_MM = 0.02
+"""A reflection point that still moves as far in the last round has not been found."""
+
 
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
     """Fit one smooth surface to all reflections (`fit_pool`), and follow it to its boundary.
@@ -37,6 +40,8 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
     pool = fit_pool(
         match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness, rig, settings
     )
+    if pool.unsettled_mm > UNSETTLED_MM:
+        raise CannotMeasure("no-surface", "the surface does not settle")
     x, y = pool.points_mm[:, 0], pool.points_mm[:, 1]
     center = (pool.points_mm[:, :2].min(axis=0) + pool.points_mm[:, :2].max(axis=0)) / 2
     boundary = zero_contour(pool.surface, center, pool.level.sign)

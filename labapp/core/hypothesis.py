@@ -174,8 +174,7 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int,
     """
     lit = labels != UNLABELLED
     among = predict(scene, pool, _amid(lit) & ~scene.absent)
-    resolution = float(np.median(scene.resolution_mm))
-    merged = among.spacing_mm < resolution
+    merged = among.spacing_mm < scene.resolution_mm
     rays = scene.rays[among.at[:, 0], among.at[:, 1]]
     hidden = blocked(among.points_mm, rays, scene.rig, pool)
     silent = ~lit[among.at[:, 0], among.at[:, 1]] & ~merged & ~hidden
@@ -183,7 +182,7 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int,
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
     if merged.any() and len(stray):
         off = np.asarray(cKDTree(among.plane_mm[merged]).query(scene.plane_mm[stray])[0])
-        stray = stray[off > resolution]
+        stray = stray[off > scene.resolution_mm]
     return missed, len(stray)
 
 
@@ -204,7 +203,7 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     around = predict(scene, pool, np.ones_like(lit))
     rays = scene.rays[around.at[:, 0], around.at[:, 1]]
     hidden = blocked(around.points_mm, rays, scene.rig, pool)
-    merged = around.spacing_mm < float(np.median(scene.resolution_mm))
+    merged = around.spacing_mm < scene.resolution_mm
     seen = scene.in_view(around.plane_mm) & ~hidden & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
     witness[_amid(lit) | scene.absent] = 0

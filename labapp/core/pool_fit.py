@@ -32,10 +32,6 @@ REACH = 2.5
 before the boundary is reached."""
 
 
-UNSETTLED_MM = 0.05
-"""A reflection point that still moves as far in the last round has not been found."""
-
-
 @dataclass(frozen=True)
 class FitSettings:
     """How the fit decides.
@@ -100,6 +96,8 @@ class FittedPool:
         Reflection points, shape (n, 3), mm.
     residual_mm
         Computed minus captured dot on the imaging plane (X′, Z′), shape (n, 2), mm.
+    unsettled_mm
+        How far the reflection point that moved most moved in the last round, mm.
     """
 
     surface: SplineSurface
@@ -107,6 +105,7 @@ class FittedPool:
     level: Level
     points_mm: FloatArray
     residual_mm: FloatArray
+    unsettled_mm: float
 
     def __post_init__(self) -> None:
         freeze(self)
@@ -160,12 +159,10 @@ def fit_pool(
         points = met
         if moved < settings.settled_mm:
             break
-    if moved > UNSETTLED_MM:
-        raise CannotMeasure("no-surface", "the surface does not settle")
     residual = predict_dots(surface, points, rays, rig) - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
-    return FittedPool(surface, fitted.covariance, level, points, residual)
+    return FittedPool(surface, fitted.covariance, level, points, residual, moved)
 
 
 def landing_spacing(landing_mm: FloatArray) -> FloatArray:
