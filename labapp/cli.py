@@ -6,8 +6,12 @@ it loads is handled like any other.
 
 from __future__ import annotations
 
+import errno
+import signal
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -24,6 +28,9 @@ if TYPE_CHECKING:
     from labapp.session.summary import Summary
 
 INTERRUPTED, FAULT, BAD_INPUT, NO_SURFACE = 130, 3, 2, 1
+
+IMPATIENT_S = 2.0
+"""Ctrl-C again within this time does nothing: the first is being obeyed."""
 
 app = typer.Typer(
     name="labapp",
@@ -52,23 +59,52 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without "±" is no reason to stop
-    try:
-        app(args=arguments)
-    except InputError as error:
-        log.error("bad input", exc_info=True)
-        typer.echo(f"labapp: {error}", err=True)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
-    except Exception as error:
-        log.exception("fault")
-        typer.echo(
-            f"labapp: a fault in the program: {type(error).__name__}: {error}\n"
-            f"Details are in {log_file()}",
-            err=True,
-        )
-        sys.exit(FAULT)
+    with _ctrl_c() as pressed_s:
+        try:
+            app(args=arguments)
+        except InputError as error:
+            log.error("bad input", exc_info=True)
+            typer.echo(f"labapp: {error}", err=True)
+            sys.exit(BAD_INPUT)
+        except KeyboardInterrupt:
+            sys.exit(INTERRUPTED)
+        except Exception as error:
+            log.exception("fault")
+            if pressed_s:
+                # Compiled modules that are being loaded turn the interrupt into an ImportError.
+                sys.exit(INTERRUPTED)
+            if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+                typer.echo("labapp: output: no space left where it goes; make some", err=True)
+                sys.exit(BAD_INPUT)
+            typer.echo(
+                f"labapp: a fault in the program: {type(error).__name__}: {error}\n"
+                f"Details are in {log_file()}",
+                err=True,
+            )
+            sys.exit(FAULT)
     sys.exit(0)
+
+
+@contextmanager
+def _ctrl_c() -> Iterator[list[float]]:
+    """Interrupt at Ctrl-C, but not what the first one set going; yields when it was pressed, s."""
+    pressed_s: list[float] = []
+
+    def interrupt(*_: object) -> None:
+        now = time.monotonic()
+        if not pressed_s or now - pressed_s[-1] > IMPATIENT_S:
+            pressed_s.append(now)
+            raise KeyboardInterrupt
+
+    former = signal.getsignal(signal.SIGINT)
+    if former is not signal.default_int_handler:  # a job in the background ignores Ctrl-C
+        yield pressed_s
+        return
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield pressed_s
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN if pressed_s else former)
 
 
 def _print_version(wanted: bool) -> None:
@@ -132,6 +168,8 @@ def reconstruct(
     """
     from labapp.core.pipeline import Settings
 
+    if algorithm != "opa" and scheme != "irs":
+        raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     summary = _run(source, setup, out, settings, frames, surfaces == "all")
     if not summary.statuses["ok"]:
@@ -219,6 +257,8 @@ def detect(
     from labapp.session.detect import detect_dots, write_detected
 
     dots, lattice, doubt = detect_dots(image)
+    if out.exists() and out.samefile(image):
+        raise InputError(out, "--out", "the image itself", "another file, for the dots (CSV)")
     write_detected(out, dots, lattice)
     if doubt:
         typer.echo(f"{image}: {doubt}", err=True)
@@ -270,7 +310,13 @@ def calibrate_laser(
 def calibrate_plane(
     image: Annotated[Path, typer.Argument(help="Picture of the calibration target.")],
     unit_mm: Annotated[
-        float, typer.Option(min=0.001, help="Length of a unit of the target's axes (mm).")
+        float,
+        typer.Option(
+            min=0.001,
+            max=1000,
+            help="Length of a unit of the target's axes, from one flag of a bar to the next (mm): "
+            "measure it on the target. labapp's printed target and its sample run have 6.35.",
+        ),
     ] = 12.7,
     setup: SetupToChange = None,
 ) -> None:
@@ -296,6 +342,7 @@ def calibrate_plane(
         typer.echo(f"{name}  {u:.3f}, {v:.3f} ± {sigma:.3f} px")
     for name, length in lengths.items():
         typer.echo(f"{name}  {length:.4f} mm")
+    typer.echo(f"unit       {unit_mm:g} mm between flags (--unit-mm)")
     x_scale, z_scale = found.px_per_mm
     typer.echo(
         f"scale      {x_scale:.4f} px/mm along X′, {z_scale:.4f} px/mm along Z′, "

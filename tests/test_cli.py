@@ -316,6 +316,76 @@ def test_ctrl_c_leaves_whole_frames(tmp_path: Path) -> None:
     assert not list(out.glob(".*"))
 
 
+def test_ctrl_c_again_and_again_is_no_more_than_once(tmp_path: Path) -> None:
+    """What the first one set going, the taking back of half a frame, is left to end."""
+    program = """
+        import os, signal, sys
+        from labapp import cli
+        from labapp.session import run
+
+        def pressed(*given):
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            finally:
+                os.kill(os.getpid(), signal.SIGINT)
+                print("tidied up", flush=True)
+
+        run.measure = pressed
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        cli.main(sys.argv[1:])
+    """
+    out = tmp_path / "out"
+    arguments = ["reconstruct", SAMPLE / "calibration.png", "--setup", SETUP, "--out", out]
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert (done.returncode, done.stdout) == (130, "tidied up\n")
+    assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
+
+
+def test_ctrl_c_while_modules_load_is_no_fault(
+    labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A compiled module turns the interrupt into an ImportError."""
+
+    def loading(*_: object) -> Measurement:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+        return answer()
+
+    monkeypatch.setattr(run, "measure", loading)
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code, _, complained = labapp(
+            "reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o"
+        )
+    finally:
+        signal.signal(signal.SIGINT, former)
+    assert (code, complained) == (130, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_output_that_finds_no_space_is_no_fault(tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        arguments = ["detect", SAMPLE / "calibration.png", "--out", tmp_path / "dots.csv"]
+        done = subprocess.run(
+            [sys.executable, "-m", "labapp", *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith("labapp: output: no space left")
+
+
 def test_a_fault_of_ours_is_told_without_a_traceback(
     labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,6 +440,24 @@ def test_detect_writes_its_columns(labapp: Run, tmp_path: Path) -> None:
     assert said.startswith(f"{len(rows)} dots, ")
 
 
+def test_detect_does_not_write_over_its_image(labapp: Run, tmp_path: Path) -> None:
+    image = tmp_path / "frame.png"
+    cv2.imwrite(str(image), np.full((40, 40), 90, np.uint8))
+    before = image.read_bytes()
+    code, _, complained = labapp("detect", image, "--out", tmp_path / "." / "frame.png")
+    assert code == 2
+    assert "--out: the image itself; expected another file" in complained
+    assert image.read_bytes() == before
+
+
+def test_an_algorithm_without_irs_is_refused(labapp: Run, folder: Path, tmp_path: Path) -> None:
+    code, _, complained = labapp(
+        "reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o", "--algorithm", "epa-r"
+    )
+    assert code == 2
+    assert "--algorithm: algorithm: epa-r; expected --scheme irs" in complained
+
+
 def test_detect_on_a_picture_without_dots_says_so(labapp: Run, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((60, 80), 9, np.uint8))
     code, said, _ = labapp("detect", tmp_path / "flat.png", "--out", tmp_path / "d.csv")
@@ -412,12 +500,23 @@ def test_calibrate_plane_puts_its_values_into_a_setup(labapp: Run, tmp_path: Pat
     )
     assert (code, complained) == (0, "")
     assert said.count("±") == 3
+    assert "6.35 mm between flags" in said
+    assert "scale      5.66" in said
     from labapp.session.setup import read_setup
 
     corners = np.array([[0.0, 0.0], [480, 0], [0, 640], [480, 640]])
     found = read_setup(setup).calibration.to_plane(corners)
     np.testing.assert_allclose(found, read_setup(SETUP).calibration.to_plane(corners), atol=0.15)
     assert setup.read_text().startswith(SETUP.read_text().split("[image_calibration]")[0])
+
+
+@pytest.mark.parametrize("unit", ["0", "-1", "nan", "inf"])
+def test_a_unit_that_cannot_be_is_refused(labapp: Run, unit: str) -> None:
+    code, _, complained = labapp(
+        "calibrate", "plane", SAMPLE / "calibration.png", "--unit-mm", unit
+    )
+    assert code == 2
+    assert "--unit-mm" in complained
 
 
 def test_a_picture_without_a_target_is_answered(labapp: Run, tmp_path: Path) -> None:

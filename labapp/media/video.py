@@ -164,7 +164,9 @@ class VideoSource(FrameSource):
         last = self._stamp_ms[-1] / 1000 * (self.frame_rate_hz or 0) if self._reliable else 0
         if max(len(self), round(last) + 1) >= claimed:
             return ()
-        return (f"{self.name} ends early: its header says {claimed} frames, {len(self)} are whole",)
+        return (
+            f"{self.name} ends early: its header says {claimed} frames, {len(self)} of them whole",
+        )
 
     def _times(self) -> FloatArray | None:
         """Time of every frame since the first, shape (n,), s."""

@@ -160,7 +160,8 @@ class ResultsWriter:
             file.close()
 
     def _unwritable(self, error: OSError) -> InputError:
-        kept = f"; the {self.frames} frames before are whole" if self.frames else ""
+        plural = "frame before is" if self.frames == 1 else f"{self.frames} frames before are"
+        kept = f"; the {plural} whole" if self.frames else ""
         return InputError(
             self.folder,
             "results",

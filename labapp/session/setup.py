@@ -23,6 +23,9 @@ from labapp.session.setup_keys import SECTIONS, rules_for
 
 A_SETUP = "a setup file (TOML, UTF-8)"
 
+LEAST_ANGLE_DEG = 10.0
+"""Axes of the imaging plane that look closer together than this are a slip."""
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -200,7 +203,29 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
         problems.append(
             InputError(path, "image_calibration", error, "three points that span the plane")
         )
+    else:
+        problems += _nearly_one_line(path, values["image_calibration"])
     return problems
+
+
+def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
+    """Find axes that no camera in front of the plane can see so close together."""
+    if "homography" in keys:
+        return []
+    x_arm, z_arm = (
+        np.subtract(keys[f"{axis}_axis_px"], keys["origin_px"], dtype=float) for axis in "xz"
+    )
+    sine = (x_arm[0] * z_arm[1] - x_arm[1] * z_arm[0]) / np.hypot(*x_arm) / np.hypot(*z_arm)
+    if abs(sine) >= np.sin(np.radians(LEAST_ANGLE_DEG)):
+        return []
+    return [
+        InputError(
+            path,
+            "image_calibration",
+            "O′, x_axis_px and z_axis_px lie nearly on one line",
+            f"at least {LEAST_ANGLE_DEG:g} degrees between O′X′ and O′Z′ in the picture",
+        )
+    ]
 
 
 def _rig(values: dict[str, Any]) -> Rig:

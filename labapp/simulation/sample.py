@@ -88,7 +88,7 @@ makes it from exact rays on a known pool, so that every measured figure can be h
 | `recording.avi` | the frames, 480 × 640 grey, FFV1 (lossless) |
 | `calibration.png` | the imaging plane with its marks: unit {TARGET.unit_mm:g} mm, middle of the \
 X′ bar at {TARGET.x_middle_mm:g} mm (5.5 units), of the Z′ bar at {TARGET.z_middle_mm:g} mm \
-(2.5 units) |
+(2.5 units): `labapp calibrate plane calibration.png --unit-mm {TARGET.unit_mm:g}` |
 | `setup.toml` | rig and image calibration, exact |
 | `truth.csv` | size of the pool in each frame |
 | `dots_truth.csv` | each lit ray in each frame: where its dot is, whether it shows, where it met \

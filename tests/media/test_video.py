@@ -123,7 +123,7 @@ def test_a_truncated_video_gives_its_whole_frames(
         images = [frame.image for frame in source]
         assert 0 < len(images) == len(source) < 16
         assert source.warnings == (
-            f"{name} ends early: its header says 16 frames, {len(source)} are whole",
+            f"{name} ends early: its header says 16 frames, {len(source)} of them whole",
         )
     # Not a frame too few: one more would need more bytes than there are (AVI's header is 5.6 kB).
     for image, picture in zip(images, whole, strict=False):

@@ -139,6 +139,7 @@ def test_a_homography_stands_for_the_three_points(path: Path) -> None:
         ("[44.0, 590.0]", "[44.0, nan]", r"image_calibration.origin_px: \[44.0, nan\]"),
         ("[440.0, 590.0]", "[44.0, 590.0]", "image_calibration: .* lie on one line"),
         ("[440.0, 590.0]", "[44.0, 500.0]", "image_calibration: .* lie on one line"),
+        ("[440.0, 590.0]", "[50.0, 500.0]", "image_calibration: .* nearly on one line; .* 10 deg"),
         ("x_axis_mm = 69.85", "x_axis_mm = 0", "image_calibration.x_axis_mm: 0; .* not 0"),
         ("[electrode]\nheight_mm = 5.0\n", "", r"electrode: missing; expected a table \[electrode"),
         ("[electrode]", "[elektrode]", "elektrode: unknown key; expected electrode, perhaps"),
