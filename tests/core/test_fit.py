@@ -1,0 +1,203 @@
+"""The fit on exact reflections, on noisy ones, and what it says of its own uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core import ers, fit
+from labapp.core.correspondence import Match
+from labapp.core.measures import Measures, measure, reflection_errors
+from labapp.core.pool_fit import FitSettings
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.values import FloatArray
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.pools import (
+    Dent,
+    Oscillation,
+    Pool,
+    Term,
+    caps_8_3_1,
+    egg,
+    ellipsoidal_cap,
+    spherical_cap,
+)
+from tests.scenes import OPEN_RIG
+
+NOISE_MM = 0.053
+"""0.3 px in the bench's view."""
+
+
+def fitted(
+    pool: Pool, sigma_mm: float = 0.0, rng: np.random.Generator | None = None
+) -> tuple[Reconstruction, Match]:
+    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG, sigma_mm=sigma_mm, rng=rng)
+    return fit.reconstruct(match, OPEN_RIG, FitSettings()), match
+
+
+def measured(pool: Pool) -> Measures:
+    return measure(*fitted(pool), OPEN_RIG)
+
+
+def extreme(pool: Pool, measures: Measures) -> float:
+    """Height of a convex pool, depth of a concave one, both positive, mm."""
+    return measures.height_mm if pool.peak_mm > 0 else -measures.depth_mm
+
+
+def inside(pool: Pool) -> FloatArray:
+    """Points all over a pool, up to a fiftieth of the way from its boundary, shape (n, 2)."""
+    center = np.array(pool.footprint.center_mm)
+    spokes = pool.boundary_mm(180)[:, :2] - center
+    return (center + np.linspace(0.02, 0.98, 25)[:, None, None] * spokes).reshape(-1, 2)
+
+
+def test_the_28_caps_of_8_3_1() -> None:
+    depth, width, length, ratio = [], [], [], []
+    for cap in caps_8_3_1():
+        made, match = fitted(cap)
+        measures = measure(made, match, OPEN_RIG)
+        depth.append(abs(extreme(cap, measures) / abs(cap.peak_mm) - 1))
+        width.append(abs(measures.width_mm / cap.footprint.width_mm - 1))
+        length.append(abs(measures.length_mm / cap.footprint.width_mm - 1))
+        text = ers.reconstruct(match, OPEN_RIG, ers.ErsSettings(boundary="circle"))
+        error = reflection_errors(text, match, OPEN_RIG).are_mm
+        ratio.append(error / measures.are_mm)
+    assert len(depth) == 28
+    assert np.mean(depth) <= 0.01
+    assert np.max(depth) <= 0.04
+    assert np.max(width) <= 0.02
+    assert np.max(length) <= 0.02
+    # The bar is five; exact dots leave next to nothing, on every single cap (least found: 620).
+    assert np.min(ratio) >= 100
+
+
+@pytest.mark.parametrize(
+    ("term", "rms_mm"),
+    [
+        (Dent(0.1, 1.2), 0.0015),
+        (Dent(0.08, 1.5, (0.2, 0.3)), 0.0015),
+        (Oscillation(0.1, 30.0, 0.0), 0.0015),
+        (Oscillation(0.1, 30.0, 0.008), 0.0015),
+        (Oscillation(0.15, 30.0, 0.004), 0.0015),
+    ],
+)
+def test_a_dent_and_an_oscillation_are_followed(term: Term, rms_mm: float) -> None:
+    pool = egg(6.6, 3.2, 4.2, 0.3, terms=(term,))
+    made, match = fitted(pool)
+    xy = inside(pool)
+    error = made.surface.height(*xy.T) - pool.height(*xy.T)
+    assert np.sqrt(np.mean(error**2)) < rms_mm
+    measures = measure(made, match, OPEN_RIG)
+    assert measures.height_mm == pytest.approx(pool.size.height_mm, abs=0.01)
+    assert measures.width_mm == pytest.approx(pool.size.width_mm, rel=0.02)
+    assert measures.length_mm == pytest.approx(pool.size.length_mm, rel=0.02)
+
+
+def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
+    pool = ellipsoidal_cap(6.4, 7.4, 0.35, (0.3, -0.2))
+    made, match = fitted(pool)
+    assert made.scheme == "fit"
+    np.testing.assert_array_equal(made.ray, match.ray)
+    x, y, z = made.points_mm.T
+    np.testing.assert_allclose(z, made.surface.height(x, y), atol=1e-6)
+    true = trace(pool, OPEN_RIG).point_mm[tuple(match.ray.T - 1)]
+    np.testing.assert_allclose(made.points_mm, true, atol=0.02)
+    assert np.linalg.norm(made.residual_mm, axis=-1).max() < 0.02
+    outline = made.boundary.points_mm
+    np.testing.assert_allclose(outline[:, 2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(made.surface.height(*outline[:, :2].T), 0.0, atol=1e-6)
+    assert made.boundary.contains(x, y).mean() > 0.97
+
+
+def test_variants_lie_on_both_sides_and_end_where_they_reach_the_work_piece() -> None:
+    made, _ = fitted(spherical_cap(6.0, 0.35), NOISE_MM, np.random.default_rng(0))
+    assert len(made.variants) >= 4
+    assert len(made.variants) % 2 == 0
+    at = made.points_mm[:, :2].T
+    for (up, _), (down, _) in zip(made.variants[0::2], made.variants[1::2], strict=True):
+        middle = (up.height(*at) + down.height(*at)) / 2
+        np.testing.assert_allclose(middle, made.surface.height(*at), atol=1e-9)
+    for surface, boundary in made.variants:
+        height = surface.height(*boundary.points_mm[:, :2].T)
+        assert np.abs(height).max() < 1e-3
+    # Together they are the σ that the points carry.
+    spread = sum((up.height(*at) - made.surface.height(*at)) ** 2 for up, _ in made.variants[0::2])
+    np.testing.assert_allclose(np.sqrt(spread), made.sigma_mm, rtol=0.35)
+    assert np.median(np.sqrt(spread) / made.sigma_mm) > 0.9
+
+
+def random_pool(rng: np.random.Generator, kind: int) -> Pool:
+    """Caps, ellipses, eggs and concave caps by turns, off the origin by up to half a millimetre."""
+    width = rng.uniform(4.5, 8.0)
+    peak = width * rng.uniform(0.03, 0.1)
+    center = (rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5))
+    if kind == 0:
+        return spherical_cap(width, peak, center)
+    if kind == 1:
+        return ellipsoidal_cap(width, width * rng.uniform(0.9, 1.3), peak, center)
+    if kind == 2:
+        return egg(
+            width, width * rng.uniform(0.4, 0.5), width * rng.uniform(0.5, 0.7), peak, center
+        )
+    return spherical_cap(width, -peak, center)
+
+
+def area(pool: Pool) -> float:
+    x, y = pool.boundary_mm()[:, :2].T
+    return float(np.abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))) / 2
+
+
+def volume(pool: Pool) -> float:
+    """By the midpoint rule on a fine grid, mm³."""
+    center, reach = pool.footprint.center_mm, 6.0
+    axis = (np.arange(240) + 0.5) / 240 * 2 * reach - reach
+    z = pool.height(*np.meshgrid(center[0] + axis, center[1] + axis))
+    return float(np.nansum(z)) * (2 * reach / 240) ** 2
+
+
+def test_uncertainties_are_honest() -> None:
+    # 240 such pools: 97.5 % of heights within ±1.96 σ; RMS of error/σ 0.75 … 0.80 for width,
+    # length, height and area.
+    rng = np.random.default_rng(0)
+    within, surprise = [], []
+    for k in range(40):
+        pool = random_pool(rng, k % 4)
+        made, match = fitted(pool, NOISE_MM, rng)
+        error = made.points_mm[:, 2] - pool.height(*made.points_mm[:, :2].T)
+        known = np.isfinite(error)
+        assert known.mean() > 0.9
+        within.append(np.abs(error[known]) < 1.96 * made.sigma_mm[known])
+        measures, true = measure(made, match, OPEN_RIG), pool.size
+        convex = pool.peak_mm > 0
+        sigma = measures.height_sigma_mm if convex else measures.depth_sigma_mm
+        surprise.append(
+            [
+                (measures.width_mm - true.width_mm) / measures.width_sigma_mm,
+                (measures.length_mm - true.length_mm) / measures.length_sigma_mm,
+                (extreme(pool, measures) - max(true.height_mm, -true.depth_mm)) / sigma,
+                (measures.area_mm2 - area(pool)) / measures.area_sigma_mm2,
+                (measures.volume_mm3 - volume(pool)) / measures.volume_sigma_mm3,
+            ]
+        )
+    assert 0.87 < np.mean(np.concatenate(within)) < 0.995
+    rms = np.sqrt(np.mean(np.square(surprise), axis=0))
+    assert rms.min() > 0.5
+    assert rms.max() < 1.6
+
+
+def test_uncertainty_grows_with_the_noise() -> None:
+    pool = spherical_cap(6.3, 0.35)
+    sigma = [
+        np.median(fitted(pool, noise, np.random.default_rng(1))[0].sigma_mm)
+        for noise in (0.02, 0.2, 0.8)
+    ]
+    assert sigma[0] < sigma[1] < sigma[2]
+    assert sigma[2] > 1.25 * sigma[0]
+
+
+def test_the_same_dots_give_the_same_surface() -> None:
+    one, other = (
+        fitted(egg(6.6, 3.0, 4.0, 0.3), NOISE_MM, np.random.default_rng(4))[0] for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.points_mm, other.points_mm)
+    np.testing.assert_array_equal(one.boundary.points_mm, other.boundary.points_mm)

@@ -1,0 +1,279 @@
+"""The engine of the fit: the level from who came back, any plane, and answers to bad dots."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from labapp.core import fit
+from labapp.core.correspondence import Match
+from labapp.core.optics import meet_plane, reflect, surface_normal
+from labapp.core.pool_fit import (
+    FitSettings,
+    FittedPool,
+    Level,
+    find_level,
+    fit_pool,
+    meet_surface,
+    predict_dots,
+    slope_of_dot,
+)
+from labapp.core.rig import ImagingPlane
+from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.values import CannotMeasure, FloatArray, IntArray
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.pools import Pool, egg, spherical_cap
+from tests.scenes import OPEN_RIG
+
+RADIUS = 3.0
+POOL = egg(6.6, 3.0, 3.9, 0.33)
+STATUSES = {"no-surface", "open-boundary", "too-few-dots"}
+
+
+def dome(sign: int = 1) -> SplineSurface:
+    """A paraboloid whose height is 0 at `RADIUS`, moved up by 0.5: that shift must be undone."""
+    basis = SplineBasis.over(np.array([-5.0, -5.0]), np.array([5.0, 5.0]), 1.0)
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-5, 5, 40)] * 2))
+    z = sign * 0.05 * (RADIUS**2 - x**2 - y**2) + 0.5
+    return SplineSurface(basis, np.linalg.lstsq(basis.matrix(x, y), z, rcond=None)[0])
+
+
+def rays_landing(spacing: float, seed: int = 0) -> tuple[FloatArray, IntArray]:
+    """Landing points of a square grid laid anyhow, and +1 for those inside the circle."""
+    axis = np.arange(-4.5, 4.5, spacing)
+    shift = np.random.default_rng(seed).uniform(-0.5, 0.5, 2) * spacing
+    landing = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + shift
+    return landing, np.where(np.linalg.norm(landing, axis=-1) < RADIUS, 1, -1)
+
+
+def level_of(landing: FloatArray, witness: IntArray, spacing: float, sign: int = 1) -> Level:
+    return find_level(dome(sign), landing, witness, np.array([spacing, spacing]))
+
+
+def fitted(match: Match, **changes: object) -> FittedPool:
+    match = replace(match, **changes)  # type: ignore[arg-type]
+    return fit_pool(
+        match.ray,
+        match.plane_mm,
+        match.plane_covariance_mm2,
+        match.witness,
+        OPEN_RIG,
+        FitSettings(),
+    )
+
+
+@pytest.fixture(scope="module")
+def match() -> Match:
+    return exact_match(trace(POOL, OPEN_RIG), OPEN_RIG)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_contour_lies_between_lit_and_dark_rays(sign: int, seed: int) -> None:
+    landing, witness = rays_landing(0.45, seed)
+    level = level_of(landing, witness, 0.45, sign)
+    assert level.sign == sign
+    height = sign * (dome(sign).height(*landing.T) + level.shift_mm)
+    assert height[witness > 0].min() > height[witness < 0].max()
+    assert height[witness > 0].min() > -level.sigma_mm
+    assert height[witness < 0].max() < level.sigma_mm
+    assert abs(level.shift_mm + 0.5) < 4 * level.sigma_mm
+    assert level.disagreement < 0.15
+
+
+def test_more_witnesses_know_the_level_better() -> None:
+    sigmas, errors = [], []
+    for spacing in (1.0, 0.5, 0.25):
+        levels = [level_of(*rays_landing(spacing, seed), spacing) for seed in range(8)]
+        sigmas.append(np.mean([level.sigma_mm for level in levels]))
+        errors.append(np.sqrt(np.mean([(level.shift_mm + 0.5) ** 2 for level in levels])))
+    assert sigmas[0] > 1.8 * sigmas[1] > 1.8**2 * sigmas[2]
+    assert errors[0] > errors[2]
+    # What is said of the level is neither boast nor excuse.
+    assert 0.3 < np.sqrt(np.mean(np.square(np.divide(errors, sigmas)))) < 2.0
+
+
+@pytest.mark.parametrize("lies", ["dark inside", "lit outside"])
+def test_one_false_witness_moves_the_level_little(lies: str) -> None:
+    landing, witness = rays_landing(0.45)
+    honest = level_of(landing, witness, 0.45)
+    radius = np.linalg.norm(landing, axis=-1)
+    liar = np.argmin(np.abs(radius - (RADIUS - 0.9 if lies == "dark inside" else RADIUS + 0.9)))
+    witness = witness.copy()
+    witness[liar] *= -1
+    level = level_of(landing, witness, 0.45)
+    assert level.sign == 1
+    # A ray's spacing is 0.3 × 0.45 mm of height at the contour.
+    assert abs(level.shift_mm - honest.shift_mm) < 0.15 * 0.3 * 0.45
+    assert level.sigma_mm > honest.sigma_mm
+    assert level.disagreement > honest.disagreement
+
+
+def test_a_boundary_that_the_surface_contradicts_is_known_less_well() -> None:
+    landing, witness = rays_landing(0.45)
+    honest = level_of(landing, witness, 0.45)
+    squeezed = np.where(np.linalg.norm(landing * [1.15, 0.87], axis=-1) < RADIUS, 1, -1)
+    level = level_of(landing, squeezed, 0.45)
+    assert level.sigma_mm > 2 * honest.sigma_mm
+    assert abs(level.shift_mm + 0.5) < 3 * level.sigma_mm
+
+
+def test_rays_meet_the_surface_and_give_back_the_dots(match: Match) -> None:
+    pool = fitted(match)
+    offset = pool.points_mm - OPEN_RIG.laser.position_mm
+    rays = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
+    i, j = match.ray.T - 1
+    np.testing.assert_allclose(rays, trace(POOL, OPEN_RIG).incident[i, j], atol=1e-12)
+    x, y, z = pool.points_mm.T
+    np.testing.assert_allclose(z, pool.surface.height(x, y), atol=1e-6)
+    normal = surface_normal(pool.surface.gradient(x, y))
+    dots = meet_plane(pool.points_mm, reflect(rays, normal), OPEN_RIG.imaging_plane)
+    np.testing.assert_allclose(pool.residual_mm, dots - match.plane_mm, atol=1e-6)
+    np.testing.assert_allclose(
+        predict_dots(pool.surface, pool.points_mm, rays, OPEN_RIG), dots, atol=1e-9
+    )
+    # From wherever the walk along the rays begins.
+    start = OPEN_RIG.laser.position_mm + (np.linalg.norm(offset, axis=-1)[:, None] - 0.5) * rays
+    met = meet_surface(pool.surface, rays, start)
+    np.testing.assert_allclose(met, pool.points_mm, atol=1e-4)
+
+
+def test_slopes_follow_the_dots_as_said(match: Match) -> None:
+    # The dots that a surface turned by a little more makes lie where its slopes' change puts them.
+    points = trace(POOL, OPEN_RIG).point_mm[tuple(match.ray.T - 1)]
+    incident = points - OPEN_RIG.laser.position_mm
+    slopes = POOL.gradient(points[:, 0], points[:, 1])
+    jacobian = slope_of_dot(points, match.plane_mm, OPEN_RIG)
+    step = np.array([2e-5, -1e-5])
+    turned = meet_plane(
+        points, reflect(incident, surface_normal(slopes + step)), OPEN_RIG.imaging_plane
+    )
+    moved = np.einsum("nab,nb->na", jacobian, turned - match.plane_mm)
+    np.testing.assert_allclose(moved, np.broadcast_to(step, moved.shape), rtol=0.02)
+
+
+def test_the_surface_does_not_depend_on_the_order_of_the_dots(match: Match) -> None:
+    order = np.random.default_rng(0).permutation(len(match.ray))
+    one = fitted(match)
+    other = fitted(
+        match,
+        ray=match.ray[order],
+        plane_mm=match.plane_mm[order],
+        plane_covariance_mm2=match.plane_covariance_mm2[order],
+    )
+    np.testing.assert_allclose(other.points_mm, one.points_mm[order], atol=1e-7)
+
+
+def test_a_dot_that_is_known_less_well_pulls_less(match: Match) -> None:
+    plane = match.plane_mm.copy()
+    plane[40] += [0.8, -0.8]
+    covariance = match.plane_covariance_mm2.copy()
+    trusted = fitted(match, plane_mm=plane)
+    covariance[40] *= 1e6
+    doubted = fitted(match, plane_mm=plane, plane_covariance_mm2=covariance)
+    true = fitted(match)
+
+    def off(pool: FittedPool) -> float:
+        return float(np.abs(pool.points_mm[:, 2] - true.points_mm[:, 2]).max())
+
+    assert off(doubted) < 0.1 * off(trusted)
+
+
+def tilted_plane(roll_deg: float, lean_deg: float) -> ImagingPlane:
+    """Lean the plane back about X′ and turn it in itself, wide enough for every dot."""
+    roll, lean = np.radians([roll_deg, lean_deg])
+    x = np.array([1.0, 0.0, 0.0])
+    z = np.array([0.0, -np.sin(lean), np.cos(lean)])
+    x_axis, z_axis = np.cos(roll) * x + np.sin(roll) * z, np.cos(roll) * z - np.sin(roll) * x
+    middle = np.array([0.0, -55.0, 25.0])
+    return ImagingPlane(middle - 500 * x_axis - 500 * z_axis, x_axis, z_axis, 1000.0, 1000.0)
+
+
+@pytest.mark.parametrize(("roll_deg", "lean_deg"), [(0, 25), (12, -10), (180, 0), (90, 15)])
+def test_the_pose_of_the_plane_does_not_matter(
+    match: Match, roll_deg: float, lean_deg: float
+) -> None:
+    rig = replace(OPEN_RIG, imaging_plane=tilted_plane(roll_deg, lean_deg))
+    tilted = exact_match(trace(POOL, rig), rig)
+    np.testing.assert_array_equal(tilted.ray, match.ray)
+    upright = fit.reconstruct(match, OPEN_RIG, FitSettings())
+    made = fit.reconstruct(tilted, rig, FitSettings())
+    # Weights differ with the pose: exact dots leave no room for them to matter.
+    np.testing.assert_allclose(made.points_mm, upright.points_mm, atol=1e-3)
+    np.testing.assert_allclose(made.boundary.points_mm, upright.boundary.points_mm, atol=0.005)
+
+
+def refused(match: Match) -> str:
+    """Status of the fit's answer."""
+    with pytest.raises(CannotMeasure) as answer:
+        fit.reconstruct(match, OPEN_RIG, FitSettings())
+    assert answer.value.reason
+    return answer.value.status
+
+
+def part(match: Match, kept: FloatArray | IntArray) -> Match:
+    """The match with some of its dots only."""
+    return replace(
+        match,
+        dot=match.dot[kept],
+        ray=match.ray[kept],
+        reflected=match.reflected[kept],
+        plane_mm=match.plane_mm[kept],
+        plane_covariance_mm2=match.plane_covariance_mm2[kept],
+    )
+
+
+def test_where_no_ray_stayed_away_the_boundary_is_open(match: Match) -> None:
+    assert refused(replace(match, witness=np.maximum(match.witness, 0))) == "open-boundary"
+
+
+def test_where_the_tail_is_not_seen_the_boundary_is_open(match: Match) -> None:
+    witness = match.witness.copy()
+    witness[:9] = 0
+    head = part(match, np.flatnonzero(match.ray[:, 0] > 9))
+    assert refused(replace(head, witness=witness)) == "open-boundary"
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_too_few_dots_are_refused(match: Match, count: int) -> None:
+    assert refused(part(match, np.arange(count))) == "too-few-dots"
+
+
+def test_a_corner_of_the_pool_is_not_taken_for_the_pool(match: Match) -> None:
+    corner = part(match, np.flatnonzero((match.ray[:, 1] > 10) & (match.ray[:, 0] > 8)))
+    assert len(corner.ray) > fit.LEAST_DOTS
+    assert refused(corner) == "open-boundary"
+
+
+@examples(max_examples=25)
+@given(st.integers(0, 10_000), st.sampled_from([1.0, 8.0, 40.0, 400.0]))
+def test_garbage_is_answered_with_a_surface_or_a_reason(seed: int, noise_mm: float) -> None:
+    rng = np.random.default_rng(seed)
+    pool: Pool = spherical_cap(6.0, float(rng.choice([0.4, -0.5])))
+    good = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+    garbage = replace(
+        good,
+        plane_mm=good.plane_mm + rng.normal(0.0, noise_mm, good.plane_mm.shape),
+        witness=np.where(rng.random(good.witness.shape) < 0.1, -good.witness, good.witness),
+    )
+    try:
+        made = fit.reconstruct(garbage, OPEN_RIG, FitSettings())
+    except CannotMeasure as answer:
+        assert answer.status in STATUSES  # noqa: PT017
+        assert answer.reason  # noqa: PT017
+    else:
+        assert np.isfinite(made.points_mm).all()
+        assert np.isfinite(made.boundary.points_mm).all()
+        assert (made.sigma_mm > 0).all()
+        assert noise_mm < 40.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_dots_with_the_wrong_rays_make_no_surface(match: Match, seed: int) -> None:
+    shuffled = np.random.default_rng(seed).permutation(len(match.ray))
+    assert refused(replace(match, plane_mm=match.plane_mm[shuffled])) in STATUSES
