@@ -6,7 +6,7 @@ import numpy as np
 
 from labapp.core.boundary import Boundary
 from labapp.core.correspondence import Match
-from labapp.core.pool_fit import FitSettings, fit_pool
+from labapp.core.pool_fit import FitSettings, FittedPool, Level, Rear, fit_pool
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
 from labapp.core.spline import SplineSurface
@@ -44,7 +44,7 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         raise CannotMeasure("no-surface", "the surface does not settle")
     x, y = pool.points_mm[:, 0], pool.points_mm[:, 1]
     center = (pool.points_mm[:, :2].min(axis=0) + pool.points_mm[:, :2].max(axis=0)) / 2
-    boundary = zero_contour(pool.surface, center, pool.level.sign)
+    boundary = contour(pool.surface, center, pool.level)
     at_points = pool.surface.basis.matrix(x, y)
     # Level and slopes are known independently of each other, so their variances add.
     ones = np.ones(at_points.shape[1])
@@ -58,19 +58,21 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         points_mm=pool.points_mm,
         residual_mm=pool.residual_mm,
         sigma_mm=np.sqrt(np.diag(spread)),
-        variants=_variants(pool.surface, boundary, covariance, at_points, spread),
+        variants=_variants(pool, boundary, covariance, at_points, spread),
     )
 
 
-def zero_contour(
-    surface: SplineSurface, center_mm: FloatArray, sign: int, count: int = 360
+def contour(
+    surface: SplineSurface, center_mm: FloatArray, level: Level, count: int = 360
 ) -> Boundary:
-    """The first contour z = 0 met on the way out from the centre, in polar coordinates.
+    """The first place on the way out from the centre where the surface comes down to its rim.
+
+    That is the work piece, z = 0, or a rear that lies below it.
 
     Raises
     ------
     CannotMeasure
-        ``open-boundary`` if there is none in some direction, within the surface's rectangle.
+        ``open-boundary`` if it does not in some direction, within the surface's rectangle.
     """
     theta = np.linspace(-np.pi, np.pi, count, endpoint=False)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
@@ -78,8 +80,9 @@ def zero_contour(
     limit = (np.abs(edge) / np.maximum(np.abs(way), 1e-9)).min(axis=-1) * (1 - 1e-9)
     fraction = np.linspace(0.0, 1.0, 64)
     reach = limit[:, None] * fraction
-    at = center_mm + reach[..., None] * way[:, None]
-    inside = sign * surface.height(at[..., 0].ravel(), at[..., 1].ravel()).reshape(reach.shape) > 0
+    x, y = np.moveaxis(center_mm + reach[..., None] * way[:, None], -1, 0)
+    height = surface.height(x.ravel(), y.ravel()).reshape(reach.shape)
+    inside = level.sign * (height - level.rear.height(y)) > 0
     # The centre of a dented pool may lie below the work piece: start where the pool is reached.
     entered = np.cumsum(inside, axis=1) > 0
     crossing = entered[:, :-1] & inside[:, :-1] & ~inside[:, 1:]
@@ -89,30 +92,38 @@ def zero_contour(
         )
     first = np.argmax(crossing, axis=1)
     radius = reach[np.arange(count), first] + 0.5 * limit * fraction[1]
-    radius = _refine_radius(surface, center_mm, way, radius, limit * fraction[1])
-    points = np.column_stack([center_mm + radius[:, None] * way, np.zeros(count)])
-    return Boundary(np.asarray(center_mm, float), np.degrees(theta), points)
+    radius = _refine_radius(surface, level.rear, center_mm, way, radius, limit * fraction[1])
+    return _boundary(level.rear, center_mm, way, radius)
+
+
+def _boundary(rear: Rear, center_mm: FloatArray, way: FloatArray, radius: FloatArray) -> Boundary:
+    place = center_mm + radius[:, None] * way
+    points = np.column_stack([place, rear.height(place[:, 1])])
+    theta = np.degrees(np.arctan2(way[:, 1], way[:, 0]))
+    theta[0] = -180.0  # arctan2 has it at either end
+    return Boundary(np.asarray(center_mm, float), theta, points)
 
 
 def _refine_radius(
     surface: SplineSurface,
+    rear: Rear,
     center: FloatArray,
     way: FloatArray,
     radius: FloatArray,
     bound: FloatArray | float,
 ) -> FloatArray:
-    """Newton steps along each direction to z = 0, none longer than ``bound``."""
+    """Newton steps along each direction to the rim, none longer than ``bound``."""
     for _ in range(4):
-        at = center + radius[:, None] * way
-        outward = np.sum(surface.gradient(at[:, 0], at[:, 1]) * way, axis=-1)
-        height = surface.height(at[:, 0], at[:, 1])
+        x, y = (center + radius[:, None] * way).T
+        outward = np.sum(surface.gradient(x, y) * way, axis=-1) - rear.slope(y) * way[:, 1]
+        height = surface.height(x, y) - rear.height(y)
         safe = np.where(np.abs(outward) > 1e-6, outward, np.inf)
         radius = radius + np.clip(np.nan_to_num(-height / safe), -bound, bound)
     return radius
 
 
 def _variants(
-    surface: SplineSurface,
+    pool: FittedPool,
     boundary: Boundary,
     covariance: FloatArray,
     at_points: FloatArray,
@@ -122,7 +133,8 @@ def _variants(
     """Surfaces one σ away along the principal directions of the heights' covariance."""
     variance, direction = np.linalg.eigh(spread)
     variants = []
-    radius = np.linalg.norm(boundary.points_mm[:, :2] - boundary.center_mm, axis=-1)
+    surface, rear, center = pool.surface, pool.level.rear, boundary.center_mm
+    radius = np.linalg.norm(boundary.points_mm[:, :2] - center, axis=-1)
     theta = np.radians(boundary.theta_deg)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     for k in range(1, min(modes, len(variance)) + 1):
@@ -131,7 +143,6 @@ def _variants(
         mode = covariance @ at_points.T @ direction[:, -k] / np.sqrt(variance[-k])
         for step in (mode, -mode):
             moved = SplineSurface(surface.basis, surface.coefficients + step)
-            out = _refine_radius(moved, boundary.center_mm, way, radius, 0.3)
-            points = np.column_stack([boundary.center_mm + out[:, None] * way, np.zeros(len(out))])
-            variants.append((moved, Boundary(boundary.center_mm, boundary.theta_deg, points)))
+            out = _refine_radius(moved, rear, center, way, radius, 0.3)
+            variants.append((moved, _boundary(rear, center, way, out)))
     return tuple(variants)

@@ -89,10 +89,11 @@ def _outside(scene: Scene, hypothesis: Hypothesis) -> IntArray:
     """Labelled rays that landed well beyond where all the others put the boundary."""
     at = np.argwhere(hypothesis.labels != UNLABELLED)
     x, y = scene.landing_mm[at[:, 0], at[:, 1], :2].T
-    surface, sign = hypothesis.pool.surface, hypothesis.pool.level.sign
+    surface, level = hypothesis.pool.surface, hypothesis.pool.level
     slope = surface.gradient(x, y)
     rise = np.linalg.norm(slope * scene.spacing_mm, axis=-1)
-    return np.asarray(at[sign * surface.height(x, y) < -BEYOND * rise])
+    over = surface.height(x, y) - level.rear.height(y)
+    return np.asarray(at[level.sign * over < -BEYOND * rise])
 
 
 def weigh(scene: Scene, labels: IntArray) -> Hypothesis | None:

@@ -58,6 +58,34 @@ class FitSettings:
 
 
 @dataclass(frozen=True)
+class Rear:
+    """How far the boundary lies below the work piece towards the pool's end (§7.2).
+
+    Parameters
+    ----------
+    drop_mm
+        Depth at the end, mm; 0 for a boundary on the work piece all round.
+    start_mm, end_mm
+        Where the boundary leaves the work piece, and where the pool ends, along Y, mm.
+    """
+
+    drop_mm: float = 0.0
+    start_mm: float = 0.0
+    end_mm: float = -1.0
+
+    def _part(self, y_mm: FloatArray) -> FloatArray:
+        return np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
+
+    def height(self, y_mm: FloatArray) -> FloatArray:
+        """Height of the boundary at y, of the shape of ``y_mm``, mm."""
+        return -self.drop_mm * self._part(y_mm) ** 2
+
+    def slope(self, y_mm: FloatArray) -> FloatArray:
+        """Its derivative by y."""
+        return 2 * self.drop_mm * self._part(y_mm) / (self.start_mm - self.end_mm)
+
+
+@dataclass(frozen=True)
 class Level:
     """Where z = 0 lies on a surface that is known up to its level.
 
@@ -69,6 +97,8 @@ class Level:
         Its standard uncertainty, mm.
     sign
         +1 for a pool that stands above the work piece inside its boundary, −1 for one below.
+    rear
+        Where the boundary lies below the work piece.
     disagreement
         Mean surprise of the rays near the boundary, bits: 0 where every lit ray is inside and
         every dark one outside.
@@ -77,6 +107,7 @@ class Level:
     shift_mm: float
     sigma_mm: float
     sign: int
+    rear: Rear
     disagreement: float
 
 
@@ -222,13 +253,18 @@ def _rim_level(surface: SplineSurface, points: FloatArray, rim: BoolArray) -> Le
     """Guess the level where nobody says where the pool ends: the outermost points lie at 0."""
     height = surface.height(points[:, 0], points[:, 1])
     shift = -float(np.mean(height[rim]))
-    return Level(shift, float(np.std(height)), 1 if height[~rim].mean() + shift > 0 else -1, np.inf)
+    sign = 1 if height[~rim].mean() + shift > 0 else -1
+    return Level(shift, float(np.std(height)), sign, Rear(), np.inf)
 
 
 # Width of the step from inside to outside, in dot spacings: from a boundary that is known as
 # sharply as the surface is to one that half the neighbouring rays contradict.
-_BLURS = np.geomspace(1 / 200, 1 / 4, 12)
+_BLURS = np.geomspace(1 / 200, 1 / 4, 9)
 _BLUR_PRIOR = 1.2
+
+# How deep a rear may lie, mm, and how often one lies below the work piece at all.
+_DROPS = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
+_SINKS = 0.2
 
 
 def find_level(
@@ -264,13 +300,25 @@ def find_level(
         if loss.min() < best_loss:
             best_loss, shift, sign = loss.min(), scan[np.argmin(loss)], trial
     near = np.abs(height + shift) < 3.0 * rise
-    shifts = shift + np.linspace(-1.0, 1.0, 161) * np.median(rise)
-    inside = sign * witness[near, None] * (height[near, None] + shifts) / rise[near, None]
-    log_likelihood = np.stack([-np.logaddexp(0.0, -inside / s).sum(axis=0) for s in _BLURS])
+    shifts = shift + np.linspace(-1.0, 1.0, 121) * np.median(rise)
+    y = landing_mm[:, 1]
+    lit = y[witness > 0]
+    start, end = (lit.max() + lit.min()) / 2, lit.min()
+    # Only a pool that stands above the work piece is seen to sink at its rear.
+    drops = _DROPS if sign > 0 and np.any(near & (witness < 0) & (y < end)) else _DROPS[:1]
+    log_likelihood = np.empty((len(drops), len(_BLURS), len(shifts)))
+    for k, drop in enumerate(drops):
+        over = height[near] - Rear(drop, start, end).height(y[near])
+        inside = sign * witness[near, None] * (over[:, None] + shifts) / rise[near, None]
+        log_likelihood[k] = [-np.logaddexp(0.0, -inside / s).sum(axis=0) for s in _BLURS]
     log_posterior = log_likelihood - _BLUR_PRIOR * np.log(_BLURS)[:, None]
-    posterior = np.exp(log_posterior - log_posterior.max())
-    weight = posterior.sum(axis=0) / posterior.sum()
-    mean = float(weight @ shifts)
-    sigma = float(np.sqrt(weight @ (shifts - mean) ** 2))
+    log_posterior[1:] += np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1))
+    posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
+    posterior /= posterior.sum()
+    sinks = posterior[0].sum() < 0.5
+    part = posterior[1:] if sinks else posterior[:1]
+    drop = float(part.sum(axis=1) @ drops[1:] / part.sum()) if sinks else 0.0
+    mean = float(part.sum(axis=0) @ shifts / part.sum())
+    sigma = float(np.sqrt(posterior.sum(axis=0) @ (shifts - mean) ** 2))
     surprise = -log_likelihood.max() / np.log(2) / max(int(near.sum()), 1)
-    return Level(mean, sigma, sign, float(surprise))
+    return Level(mean, sigma, sign, Rear(drop, start, end), float(surprise))
