@@ -539,6 +539,18 @@ def test_help_tells_units(labapp: Run, command: str) -> None:
         assert "mm" in said or "px" in said
 
 
+def test_every_status_is_explained() -> None:
+    root = Path(cli.__file__).parent
+    raised = {
+        status
+        for path in root.rglob("*.py")
+        for status in re.findall(r'CannotMeasure\(\s*"([^"]+)"', path.read_text(encoding="utf-8"))
+    }
+    assert "ambiguous-rows" in raised
+    explained = (root.parent / "docs" / "method.md").read_text(encoding="utf-8")
+    assert not {status for status in raised if f"| `{status}` |" not in explained}
+
+
 def test_the_version_is_told(labapp: Run) -> None:
     code, said, _ = labapp("--version")
     assert (code, said) == (0, "labapp 0.1.0\n")
