@@ -49,9 +49,7 @@ def draw_pictures(recording: Path, summary: Summary, out: Path) -> Iterator[tupl
     timed = all(time_s is not None for _, time_s, _ in summary.frames)
     axis = [time_s if timed else index for index, time_s, _ in summary.frames]
     label = "time (s)" if timed else "frame"
-    series = {
-        f"{name} (mm)": summary.series(f"{name}_mm") for name in ("width", "length", "height")
-    }
+    series = {name: summary.series(f"{name}_mm") for name in ("width", "length", "height")}
     pictures: dict[str, Callable[[Path], None]] = {
         f"frame_{frame:06d}.png": partial(
             write_frame_picture, image=image, measurement=measurement

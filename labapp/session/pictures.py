@@ -36,16 +36,18 @@ FROM_CAMERA = (0.5, -1.5, 0.9)
 
 UNKNOWN = (150, 150, 150)
 
+LEGEND = "left: row of the ray; above: its column; grey ring: in doubt, no ray"
+
 
 def frame_picture(image: npt.NDArray[Any], measurement: Measurement) -> npt.NDArray[np.uint8]:
-    """The frame with its dots ringed and their rays (row, column) written beside them.
+    """The frame with its dots ringed, rays' columns above them and rows left of the first.
 
     Parameters
     ----------
     image
         Grey levels, shape (rows, columns).
     measurement
-        What was found in it. A dot without a ray is ringed in grey.
+        What was found in it. A dot without a ray is ringed in grey; the legend says so.
 
     Returns
     -------
@@ -60,16 +62,32 @@ def frame_picture(image: npt.NDArray[Any], measurement: Measurement) -> npt.NDAr
     if dots is None:
         return np.asarray(picture, np.uint8)
     rays = {} if match is None else dict(zip(match.dot.tolist(), match.ray.tolist(), strict=True))
+    leftmost: dict[int, list[tuple[int, int]]] = {}
     for k, at in enumerate(dots.image_px):
         u, v = ((at + 0.5) * ENLARGED - 0.5).round().astype(int).tolist()
         ray = rays.get(k)
         colour = UNKNOWN if ray is None else _row_colour(ray[0])
         cv2.circle(picture, (u, v), 4 * ENLARGED, colour, 1, cv2.LINE_AA)
         if ray is not None:
-            text = f"{ray[0]},{ray[1]}"
-            place = (u + 4 * ENLARGED, v - 3 * ENLARGED)
-            cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+            # Dots of one row stand closest, and the number above must fit between them.
+            _write(picture, str(ray[1]), (u - 7, v - 6 * ENLARGED), colour, 0.45)
+            leftmost.setdefault(ray[0], []).append((u, v))
+    for row, places in leftmost.items():
+        u, v = min(places)
+        _write(picture, f"row {row}", (u - 70, v + 5), _row_colour(row), 0.5)
+    if rays:
+        _write(picture, LEGEND, (12, 24), (255, 255, 255), 0.5)
     return np.asarray(picture, np.uint8)
+
+
+def _write(
+    picture: npt.NDArray[Any],
+    text: str,
+    place: tuple[int, int],
+    colour: tuple[int, int, int],
+    size: float,
+) -> None:
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 
 def _row_colour(row: int) -> tuple[int, int, int]:
@@ -87,7 +105,7 @@ def write_frame_picture(path: Path, image: npt.NDArray[Any], measurement: Measur
 def write_trend_picture(
     path: Path, axis: Sequence[float | None], label: str, series: Mapping[str, FloatArray]
 ) -> None:
-    """Write a PNG of one plot per series (named with its unit) over a common axis.
+    """Write a PNG of one plot per series of lengths over a common axis.
 
     NaN leaves a gap.
 
@@ -104,12 +122,11 @@ def write_trend_picture(
     plots = figure.subplots(len(series), sharex=True, squeeze=False)[:, 0]
     for plot, (name, values) in zip(plots, series.items(), strict=True):
         plot.plot(axis, values, "o-", markersize=3, linewidth=1)
-        plot.set_title(
-            f"mean {np.nanmean(values):.3f}, standard deviation {np.nanstd(values):.3f}",
-            fontsize="small",
-            loc="right",
-        )
-        plot.set_ylabel(name)
+        known = values[np.isfinite(values)]
+        if len(known) > 1:
+            spread = f"mean {known.mean():.4f}, standard deviation {known.std(ddof=1):.4f} mm"
+            plot.set_title(spread, fontsize="small", loc="right")
+        plot.set_ylabel(f"{name} (mm)")
         plot.grid(alpha=0.3)
     plots[-1].set_xlabel(label)
     content = io.BytesIO()
@@ -152,6 +169,12 @@ def draw_surface(
     import pyvista
 
     stretch = np.array([1.0, 1.0, EXAGGERATION])
+    # Whole millimetres, so that the numbers along the axes are; tenths upwards.
+    step = np.array([1.0, 1.0, 0.1])
+    box = np.stack(
+        [np.floor(vertices_mm.min(0) / step + 1e-6), np.ceil(vertices_mm.max(0) / step - 1e-6)]
+    )
+    box = box * step
     mesh = pyvista.PolyData.from_regular_faces(vertices_mm * stretch, triangles.astype(int))
     plotter: Any = pyvista.Plotter(off_screen=True, window_size=[1200, 800])
     plotter.add_mesh(
@@ -171,16 +194,24 @@ def draw_surface(
         points_mm * stretch, color="white", point_size=7, render_points_as_spheres=True
     )
     plotter.show_bounds(
-        axes_ranges=np.column_stack([vertices_mm.min(0), vertices_mm.max(0)]).ravel().tolist(),
+        bounds=(box * stretch).T.ravel().tolist(),
+        axes_ranges=box.T.ravel().tolist(),
+        n_xlabels=int(np.ptp(box[:, 0])) + 1,
+        n_ylabels=int(np.ptp(box[:, 1])) + 1,
         xtitle="X (mm)",
         ytitle="Y, welding direction (mm)",
         ztitle="Z (mm)",
         fmt="%.1f",
         n_zlabels=2,
         location="outer",
-        font_size=9,
+        font_size=12,
+        use_3d_text=False,
     )
-    plotter.add_text(f"heights drawn {EXAGGERATION:g} times as high", font_size=9)
+    plotter.add_text(
+        f"heights drawn {EXAGGERATION:g} times as high; white: reflection points; "
+        "the electrode is above X = Y = 0",
+        font_size=10,
+    )
     plotter.view_vector(FROM_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.camera.zoom(1.3)
     picture = plotter.screenshot(return_img=True)
