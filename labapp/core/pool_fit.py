@@ -11,7 +11,7 @@ the reflection residual there whose squares are least.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -175,13 +175,20 @@ def fit_pool(
     out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
     rim = out > np.median(out)
     stiffness = 1 / (settings.jerk * settings.knot_mm) ** 2
-    for _ in range(settings.rounds):
+    level = Level(0.0, np.inf, 1, Rear(), np.inf)
+    for count in range(settings.rounds):
         slopes = bisecting_gradient(points - laser, dots - points)
         fitted = fit_slopes(basis, points[:, :2], slopes, weights, stiffness)
-        if (witness[told] < 0).any():
+        if not (witness[told] < 0).any():
+            level = _rim_level(fitted.surface, points, rim)
+        elif 2 * count <= settings.rounds:
             level = find_level(fitted.surface, ground[told], witness[told], spacing)
         else:
-            level = _rim_level(fitted.surface, points, rim)
+            # Whether the rear sinks is settled half-way, or the rounds might go to and fro; how
+            # far it leaves the level open stays as it was.
+            drop, sigma = level.rear.drop_mm, level.sigma_mm
+            level = find_level(fitted.surface, ground[told], witness[told], spacing, drop)
+            level = replace(level, sigma_mm=max(level.sigma_mm, sigma))
         surface = fitted.surface.raised(level.shift_mm)
         if not np.isfinite(surface.coefficients).all():
             raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
@@ -268,7 +275,11 @@ _SINKS = 0.2
 
 
 def find_level(
-    surface: SplineSurface, landing_mm: FloatArray, witness: IntArray, spacing_mm: FloatArray
+    surface: SplineSurface,
+    landing_mm: FloatArray,
+    witness: IntArray,
+    spacing_mm: FloatArray,
+    drop_mm: float | None = None,
 ) -> Level:
     """Place z = 0 so that lit rays land inside the contour and dark ones outside.
 
@@ -286,6 +297,8 @@ def find_level(
         +1 lit, −1 dark, shape (m,).
     spacing_mm
         Distance between neighbouring landing points along X and along Y, mm.
+    drop_mm
+        How deep the rear lies, mm; None: found along with the level.
     """
     height = surface.height(*landing_mm.T)
     slope = surface.gradient(*landing_mm.T)
@@ -305,20 +318,21 @@ def find_level(
     lit = y[witness > 0]
     start, end = (lit.max() + lit.min()) / 2, lit.min()
     # Only a pool that stands above the work piece is seen to sink at its rear.
-    drops = _DROPS if sign > 0 and np.any(near & (witness < 0) & (y < end)) else _DROPS[:1]
+    seen = sign > 0 and bool(np.any(near & (witness < 0) & (y < end)))
+    drops = (_DROPS if seen else _DROPS[:1]) if drop_mm is None else np.array([drop_mm])
     log_likelihood = np.empty((len(drops), len(_BLURS), len(shifts)))
-    for k, drop in enumerate(drops):
-        over = height[near] - Rear(drop, start, end).height(y[near])
+    for k, depth in enumerate(drops):
+        over = height[near] - Rear(depth, start, end).height(y[near])
         inside = sign * witness[near, None] * (over[:, None] + shifts) / rise[near, None]
         log_likelihood[k] = [-np.logaddexp(0.0, -inside / s).sum(axis=0) for s in _BLURS]
     log_posterior = log_likelihood - _BLUR_PRIOR * np.log(_BLURS)[:, None]
     log_posterior[1:] += np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1))
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
     posterior /= posterior.sum()
-    sinks = posterior[0].sum() < 0.5
-    part = posterior[1:] if sinks else posterior[:1]
-    drop = float(part.sum(axis=1) @ drops[1:] / part.sum()) if sinks else 0.0
-    mean = float(part.sum(axis=0) @ shifts / part.sum())
+    part = slice(1, None) if posterior[0].sum() < 0.5 else slice(0, 1)
+    chosen = posterior[part] / posterior[part].sum()
+    drop = float(chosen.sum(axis=1) @ drops[part])
+    mean = float(chosen.sum(axis=0) @ shifts)
     sigma = float(np.sqrt(posterior.sum(axis=0) @ (shifts - mean) ** 2))
     surprise = -log_likelihood.max() / np.log(2) / max(int(near.sum()), 1)
     return Level(mean, sigma, sign, Rear(drop, start, end), float(surprise))
