@@ -1,7 +1,7 @@
 """Frame → Dots: find the reflected dots and say how well each is known (§5.2.1, §5.3).
 
-Three detectors share one result. The default is a band-pass at the dots' own size, which is
-estimated from the frame; the text's two chains are in `threshold_dots`.
+The default detector is a band-pass at the dots' own size, which is estimated from the frame. The
+text's two chains are in `threshold_dots`; `detection` chooses.
 """
 
 from __future__ import annotations
