@@ -143,8 +143,8 @@ def match_rays(
     if not any(_explains(scene, hypothesis) for hypothesis in found):
         found += _by_optics(scene, lattice, orientations)
     if not found:
-        if lattice is not None and not lattice.candidates:
-            raise CannotMeasure("no-reference", "no hole in the rows can be the absent centre dot")
+        if rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
+            raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
         raise CannotMeasure("no-match", "no surface explains the reflected dots")
     best = _settled(scene, found, settings)
     return _as_match(scene, best)
@@ -156,7 +156,10 @@ def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
     They index dots that the picture alone leaves in doubt, and none that the rays do not.
     """
     way = ways(match.orientation)
-    k, t = np.array(rig.pattern.reference) * way + (match.reflected - match.ray * way)[0]
+    k, t = (
+        np.array(rig.pattern.marker or rig.pattern.reference) * way
+        + (match.reflected - match.ray * way)[0]
+    )
     sites = (tuple(map(int, site)) for site in match.reflected)
     grid = {(k, t): int(dot) for (k, t), dot in zip(sites, match.dot, strict=True)}
     return lattice_of_sites(grid, count, reference=(int(k), int(t)))
@@ -166,15 +169,16 @@ def _by_grid(
     scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
     """Follow every site of the grid that could be the reference, each way round."""
-    if lattice is None:
+    pattern = scene.rig.pattern
+    if lattice is None or pattern.marker is None:
         return []
-    shape = (scene.rig.pattern.rows, scene.rig.pattern.columns)
-    return [
-        hypothesis
-        for site in lattice.candidates
+    shape = (pattern.rows, pattern.columns)
+    labelled = (
+        from_grid(lattice, hole, pattern.marker, orientation, shape)
+        for hole in lattice.candidates
         for orientation in orientations
-        if (hypothesis := pursue(scene, from_grid(lattice, site, orientation, shape))) is not None
-    ]
+    )
+    return [hypothesis for labels in labelled if (hypothesis := pursue(scene, labels)) is not None]
 
 
 def _by_optics(

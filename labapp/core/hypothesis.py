@@ -114,13 +114,12 @@ def weigh(scene: Scene, labels: IntArray) -> Hypothesis | None:
 
 
 def from_grid(
-    lattice: Lattice, reference: Site, orientation: Orientation, shape: tuple[int, int]
+    lattice: Lattice, hole: Site, ray: Site, orientation: Orientation, shape: tuple[int, int]
 ) -> IntArray:
-    """Label the whole grid with one of its sites taken for the centre reference."""
+    """Label the whole grid with one of its sites taken for an absent ray's."""
     dot = np.nonzero(lattice.row > 0)[0]
     site = np.stack([lattice.row[dot], lattice.column[dot]], axis=-1)
-    center = (np.array(shape) + 1) // 2
-    return _labelled(center + (site - reference) * ways(orientation), dot, shape)
+    return _labelled(np.array(ray) + (site - hole) * ways(orientation), dot, shape)
 
 
 def joined(hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation) -> IntArray | None:
@@ -154,9 +153,9 @@ def moved(scene: Scene, labels: IntArray) -> Iterator[IntArray]:
 
 
 def turned(scene: Scene, labels: IntArray, before: Orientation, after: Orientation) -> IntArray:
-    """Label the same dots the other way round the centre reference."""
+    """Label the same dots the other way round the absent ray."""
     at = np.argwhere(labels != UNLABELLED)
-    center = np.array(scene.rig.pattern.reference)
+    center = np.array(scene.rig.pattern.marker or scene.rig.pattern.reference)
     ray = center + (at + 1 - center) * ways(before) * ways(after)
     return _labelled(ray, labels[at[:, 0], at[:, 1]], labels.shape)
 

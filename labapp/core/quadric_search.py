@@ -37,29 +37,33 @@ _FLATTEST, _STEEPEST = 0.004, 0.6
 
 @dataclass(frozen=True)
 class Quadric:
-    """z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), through the origin.
+    """z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), x and y from a centre on the work piece.
 
     Parameters
     ----------
+    center
+        The centre, shape (2,), mm.
     slope
         g, shape (2,).
     curvature
         (κ_x, κ_xy, κ_y), shape (3,) or, for several, (m, 1, 3), mm⁻¹.
     """
 
+    center: FloatArray
     slope: FloatArray
     curvature: FloatArray
 
     def gradient(self, xy: FloatArray) -> FloatArray:
         """Slopes at (x, y), shape (…, 2), mm."""
-        x, y = xy[..., 0], xy[..., 1]
+        x, y = xy[..., 0] - self.center[0], xy[..., 1] - self.center[1]
         bend = np.moveaxis(self.curvature, -1, 0)
         along_x = self.slope[0] + bend[0] * x + bend[1] * y
         return np.stack([along_x, self.slope[1] + bend[1] * x + bend[2] * y], axis=-1)
 
     def height(self, xy: FloatArray) -> FloatArray:
         """Height at (x, y), shape (…), mm."""
-        return np.asarray(np.sum((self.slope + self.gradient(xy)) * xy, axis=-1) / 2)
+        mean = (self.slope + self.gradient(xy)) / 2
+        return np.asarray(np.sum(mean * (xy - self.center), axis=-1))
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,10 @@ def search_quadrics(scene: Scene, most: int = 8) -> list[QuadricGuess]:
     most
         How many to return at most; no two with the same labels.
     """
-    window = _Window(scene)
+    marker = scene.rig.pattern.marker
+    if marker is None or min(marker) < 2 or np.any(np.array(marker) >= scene.rays.shape[:2]):
+        return []  # without rays all round it, a hole cannot be told
+    window = _Window(scene, marker)
     found: dict[bytes, QuadricGuess] = {}
     for hole, half_width in _holes(scene, window.tree):
         for quadric in _quadrics(window, hole, half_width):
@@ -127,22 +134,25 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> list[Quad
     """
     scene = window.scene
     laser, plane = scene.rig.laser.position_mm, scene.rig.imaging_plane
-    slope = bisecting_gradient(-laser, plane.to_universal(hole))
+    slope = bisecting_gradient(
+        window.landing_mm - laser, plane.to_universal(hole) - window.landing_mm
+    )
+    center = window.landing_mm[:2]
     middle = window.middle
     beside = window.rays[middle[0], middle[1] + 1][None]
     # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.
     trial = np.array([[[-0.02, 0.0, -0.02]], [[0.02, 0.0, 0.02]]])
-    moved = window.dots(Quadric(slope, trial), beside)[:, 0, 0] - hole[0]
+    moved = window.dots(Quadric(center, slope, trial), beside)[:, 0, 0] - hole[0]
     across = (np.array([1, -1]) * half_width - moved.mean()) / ((moved[1] - moved[0]) / 0.04)
     across = across[(np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST)]
     curvatures = np.zeros((len(across), len(_RATIOS), 3))
     curvatures[..., 0] = across[:, None]
     curvatures[..., 2] = across[:, None] * _RATIOS
     curvatures = curvatures.reshape(-1, 1, 3)
-    patterns = window.dots(Quadric(slope, curvatures), window.rays.reshape(-1, 3))
+    patterns = window.dots(Quadric(center, slope, curvatures), window.rays.reshape(-1, 3))
     patterns = patterns.reshape(-1, *window.rays.shape[:2], 2)
     return [
-        Quadric(slope, curvature[0])
+        Quadric(center, slope, curvature[0])
         for curvature, pattern in zip(curvatures, patterns, strict=True)
         if window.hits(pattern, LOOSE)[0][window.core].sum() >= 5
     ]
@@ -151,13 +161,15 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> list[Quad
 class _Window:
     """The rays round the reference, and the dots they may fall on."""
 
-    def __init__(self, scene: Scene) -> None:
-        i, j = (n - 1 for n in scene.rig.pattern.reference)
-        reach = min(REACH, i, j)
+    def __init__(self, scene: Scene, marker: tuple[int, int]) -> None:
+        i, j = (n - 1 for n in marker)
+        rows, columns = scene.rays.shape[:2]
+        reach = min(REACH, i, j, rows - 1 - i, columns - 1 - j)
         self.scene = scene
         self.tree = cKDTree(scene.plane_mm)
         self.part = slice(i - reach, i + reach + 1), slice(j - reach, j + reach + 1)
         self.rays = scene.rays[self.part]
+        self.landing_mm = scene.landing_mm[i, j]
         self.absent = scene.absent[self.part]
         self.middle = (reach, reach)
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
@@ -209,10 +221,11 @@ class _Window:
             laser, plane = self.scene.rig.laser.position_mm, self.scene.rig.imaging_plane
             dots = plane.to_universal(self.scene.plane_mm[dot[hit]])
             slopes = bisecting_gradient(points - laser, dots - points)
-            x, y, zero, one = *points[:, :2].T, np.zeros(len(points)), np.ones(len(points))
+            x, y = (points[:, :2] - quadric.center).T
+            zero, one = np.zeros(len(points)), np.ones(len(points))
             rows = [np.stack([one, zero, x, y, zero], -1), np.stack([zero, one, zero, x, y], -1)]
             values = np.linalg.lstsq(np.concatenate(rows), slopes.T.ravel(), rcond=None)[0]
-            quadric = Quadric(values[:2], values[2:])
+            quadric = Quadric(quadric.center, values[:2], values[2:])
         return quadric
 
     def _pattern(self, quadric: Quadric) -> FloatArray:

@@ -64,6 +64,16 @@ class DotPattern:
         return (self.rows + 1) // 2, (self.columns + 1) // 2
 
     @property
+    def marker(self) -> tuple[int, int] | None:
+        """The absent ray whose hole tells the rows: the one nearest the centre, or None."""
+        center = np.array(self.reference)
+        return min(
+            sorted(self.absent_rays),
+            key=lambda ray: float(np.linalg.norm(np.array(ray) - center)),
+            default=None,
+        )
+
+    @property
     def absent_rays(self) -> frozenset[tuple[int, int]]:
         """Rays ``(i, j)`` that are not there."""
         assert self.absent is not None
