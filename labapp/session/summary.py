@@ -59,11 +59,11 @@ class Summary:
             values = self._finite(name)
             if len(values) > 1:
                 spread = f"± {np.std(values, ddof=1):.4f} mm (mean, standard deviation)"
-                lines.append(f"{label:7}{np.mean(values):8.4f} {spread}")
+                lines.append(f"{label:7}{np.mean(values):z8.4f} {spread}")
             elif len(values):
                 sigma = self._finite(name.replace("_mm", "_sigma_mm"))
                 spread = f"± {sigma[0]:.4f} " if len(sigma) else ""
-                lines.append(f"{label:7}{values[0]:8.4f} {spread}mm")
+                lines.append(f"{label:7}{values[0]:z8.4f} {spread}mm")
         return "\n".join(lines)
 
     def _finite(self, name: str) -> FloatArray:

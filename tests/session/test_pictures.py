@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -54,6 +56,15 @@ def test_one_frame_is_told_with_its_uncertainty(measured: Measurement) -> None:
     summary = Summary()
     summary.add(0, None, measured)
     assert summary.text().splitlines()[1] == "width    1.2500 ± 1.2500 mm"
+
+
+def test_a_size_that_rounds_to_nothing_has_no_sign(measured: Measurement) -> None:
+    assert measured.measures is not None
+    summary = Summary()
+    for frame in range(2):
+        sizes = replace(measured.measures, depth_mm=-1e-9)
+        summary.add(frame, None, replace(measured, measures=sizes))
+        assert re.search(r"^depth +0\.0000 ", summary.text(), re.MULTILINE)
 
 
 def test_the_sample_run_is_found() -> None:
