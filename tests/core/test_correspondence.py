@@ -96,7 +96,7 @@ def answers() -> list[Answer]:
     made = []
     for seed, (kind, rig) in enumerate(SCENES):
         rng = np.random.default_rng(seed)
-        pool = kind(rng, rng.uniform(5.2, 6.8), tuple(rng.uniform(-0.3, 0.3, 2)))
+        pool = kind(rng, rng.uniform(4.8, 6.0), tuple(rng.uniform(-0.3, 0.3, 2)))
         missing, false = int(rng.integers(0, 4)), int(rng.integers(0, 5))
         seen = see(pool, rng, missing=missing, false=false, rig=rig)
         made.append(Answer(pool, rig, trace(pool, rig), seen, *matched(seen.dots, rig)))

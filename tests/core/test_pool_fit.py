@@ -115,10 +115,11 @@ def test_one_false_witness_moves_the_level_little(lies: str) -> None:
 
 
 def test_a_boundary_that_the_surface_contradicts_is_known_less_well() -> None:
+    # Of a concave pool: a convex one that seems long may have a rear that sinks.
     landing, witness = rays_landing(0.45)
-    honest = level_of(landing, witness, 0.45)
+    honest = level_of(landing, witness, 0.45, -1)
     squeezed = np.where(np.linalg.norm(landing * [1.15, 0.87], axis=-1) < RADIUS, 1, -1)
-    level = level_of(landing, squeezed, 0.45)
+    level = level_of(landing, squeezed, 0.45, -1)
     assert level.sigma_mm > 2 * honest.sigma_mm
     assert abs(level.shift_mm + 0.5) < 3 * level.sigma_mm
 
@@ -250,7 +251,7 @@ def test_a_corner_of_the_pool_is_not_taken_for_the_pool(match: Match) -> None:
     assert refused(corner) == "open-boundary"
 
 
-@examples(max_examples=25)
+@examples(max_examples=16)
 @given(st.integers(0, 10_000), st.sampled_from([1.0, 8.0, 40.0, 400.0]))
 def test_garbage_is_answered_with_a_surface_or_a_reason(seed: int, noise_mm: float) -> None:
     rng = np.random.default_rng(seed)
