@@ -21,7 +21,7 @@ from labapp.core.hypothesis import Hypothesis, from_grid, joined, moved, pursue,
 from labapp.core.lattice import Lattice, lattice_of_sites
 from labapp.core.orientation import ORIENTATIONS, Orientation, ways
 from labapp.core.quadric_search import search_quadrics
-from labapp.core.ray_growth import UNLABELLED, Scene
+from labapp.core.ray_growth import LEAST_LABELS, UNLABELLED, Scene
 from labapp.core.rig import Rig
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, freeze
 
@@ -134,9 +134,14 @@ def match_rays(
     Raises
     ------
     CannotMeasure
-        ``no-reference`` if no hole can be the absent centre dot, ``ambiguous-rows`` if several
-        can, ``ambiguous-orientation``, ``no-match`` if no surface explains the dots.
+        ``too-few-dots``; ``no-reference`` if no hole can be the absent centre dot,
+        ``ambiguous-rows`` if several can; ``ambiguous-orientation``; ``no-match`` if no surface
+        explains the dots.
     """
+    if len(dots) < LEAST_LABELS:
+        raise CannotMeasure(
+            "too-few-dots", f"{len(dots)} dots were found, telling rays needs {LEAST_LABELS}"
+        )
     scene = Scene.of(dots, rig, calibration, frame_shape)
     orientations = ORIENTATIONS if settings.correspondence == "auto" else (settings.correspondence,)
     found = _by_grid(scene, lattice, orientations)
@@ -220,6 +225,13 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
         if better is None or better.cost >= best.cost:
             break
         best = better
+    strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
+    if best.stray > strays or best.missed > settings.missed[0] + settings.missed[1] * best.count:
+        raise CannotMeasure(
+            "no-match",
+            f"the best surface leaves {best.stray} dots without a ray and {best.missed} rays "
+            f"without a dot amid {best.count} pairs",
+        )
     own = best.orientation(scene)
     doubtful: list[int] = []
     for other in [*found, *neighbours]:
@@ -240,13 +252,6 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     if doubtful:
         certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
         best = weigh(scene, certain) or best
-    strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
-    if best.stray > strays or best.missed > settings.missed[0] + settings.missed[1] * best.count:
-        raise CannotMeasure(
-            "no-match",
-            f"the best surface leaves {best.stray} dots without a ray and {best.missed} rays "
-            f"without a dot amid {best.count} pairs",
-        )
     return best
 
 

@@ -14,6 +14,7 @@ from labapp.core.threshold_dots import (
     block_threshold_dots,
     wavelet_dots,
 )
+from labapp.core.values import CannotMeasure
 
 
 @dataclass(frozen=True)
@@ -57,10 +58,14 @@ def find_dots(frame: Image, settings: DotSettings) -> Dots:
         ``no-dots`` if nothing stands out of the noise.
     """
     if settings.method == "block-threshold":
-        return block_threshold_dots(frame, settings.block_threshold)
-    if settings.method == "wavelet":
-        return wavelet_dots(frame, settings.wavelet)
-    return band_pass_dots(frame, settings.band_pass)
+        dots = block_threshold_dots(frame, settings.block_threshold)
+    elif settings.method == "wavelet":
+        dots = wavelet_dots(frame, settings.wavelet)
+    else:
+        dots = band_pass_dots(frame, settings.band_pass)
+    if len(dots) == 0:
+        raise CannotMeasure("no-dots", "no dot stands out of the frame's background")
+    return dots
 
 
 def find_lattice(dots: Dots, frame_shape: tuple[int, int], settings: LatticeSettings) -> Lattice:

@@ -17,6 +17,8 @@ from labapp.core.values import BoolArray, CannotMeasure, IntArray
 MODEL_MM = 0.03
 """How far the right surface's dots may be off for no fault of theirs, mm."""
 
+_WEIGHED = FitSettings(knot_mm=1.0)  # fine enough to tell hypotheses apart
+
 BEYOND, FEW = 0.25, 2
 """A lit ray is beyond the boundary when it lands so far outside, in spacings of the rays; so many
 of them are put down to false dots."""
@@ -102,7 +104,7 @@ def weigh(scene: Scene, labels: IntArray) -> Hypothesis | None:
     if pool is None:
         return None
     try:
-        pool = scene.fit(labels, _witness(scene, labels, pool), FitSettings())
+        pool = scene.fit(labels, _witness(scene, labels, pool), _WEIGHED)
     except CannotMeasure:
         return None
     lit = labels != UNLABELLED

@@ -32,6 +32,10 @@ REACH = 2.5
 before the boundary is reached."""
 
 
+CORRELATED_MM2 = 1.0
+"""Area over which a pool's third derivatives go together, mm²."""
+
+
 @dataclass(frozen=True)
 class FitSettings:
     """How the fit decides.
@@ -51,7 +55,7 @@ class FitSettings:
     """
 
     rounds: int = 12
-    knot_mm: float = 1.0
+    knot_mm: float = 0.7
     jerk: float = 0.05
     floor_mm: float = 0.01
     settled_mm: float = 1e-4
@@ -174,7 +178,7 @@ def fit_pool(
     weights = _slope_weights(points, plane_mm, plane_covariance_mm2, rig, settings.floor_mm)
     out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
     rim = out > np.median(out)
-    stiffness = 1 / (settings.jerk * settings.knot_mm) ** 2
+    stiffness = CORRELATED_MM2 / settings.jerk**2
     level = Level(0.0, np.inf, 1, Rear(), np.inf)
     for count in range(settings.rounds):
         slopes = bisecting_gradient(points - laser, dots - points)

@@ -56,8 +56,8 @@ LEAST_LABELS = 6
 # While dots are being labelled the surface is kept stiffer than in the final fit: a wrong label
 # must stand out rather than be bent to. Shallow pools are followed farther by the stiffer of the
 # two, steep ones only by the softer.
-_STIFF = FitSettings(rounds=5, knot_mm=1.2, jerk=0.03, floor_mm=0.03, settled_mm=2e-3)
-_SOFT = replace(_STIFF, jerk=0.1)
+_STIFF = FitSettings(rounds=5, knot_mm=1.2, jerk=0.036, floor_mm=0.03, settled_mm=2e-3)
+_SOFT = replace(_STIFF, jerk=0.12)
 
 
 @dataclass(frozen=True)

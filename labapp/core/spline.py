@@ -174,8 +174,8 @@ def fit_slopes(
     weights
         Inverse of each slope's covariance, shape (n, 2, 2).
     stiffness
-        Weight of the roughness, mm²: the inverse variance expected of the third derivatives times
-        the inverse area over which they go together.
+        Weight of the roughness, mm⁶: the area over which the third derivatives go together, over
+        their expected variance.
     """
     x, y = points_mm.T
     by = np.stack([basis.matrix(x, y, 1, 0), basis.matrix(x, y, 0, 1)], axis=1)

@@ -201,9 +201,6 @@ def test_a_frame_that_shows_nothing_has_a_status_and_a_reason(
     assert result.measures is None
 
 
-@pytest.mark.xfail(
-    raises=(ValueError, RuntimeWarning), reason="no dots from the text's chains are not answered"
-)
 @pytest.mark.parametrize("method", ["block-threshold", "wavelet"])
 def test_the_text_s_detectors_say_that_a_blank_frame_has_no_dots(method: str) -> None:
     settings = Settings(dots=DotSettings(method=method))  # type: ignore[arg-type]
@@ -213,7 +210,7 @@ def test_the_text_s_detectors_say_that_a_blank_frame_has_no_dots(method: str) ->
 
 @pytest.mark.parametrize(
     "count",
-    [pytest.param(1, marks=pytest.mark.xfail(raises=IndexError, reason="no next dot")), 2, 3],
+    [1, 2, 3],
 )
 def test_a_frame_of_one_or_a_few_dots_is_answered(count: int) -> None:
     v, u = np.mgrid[:640, :480]
