@@ -151,11 +151,9 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> list[Quad
     curvatures = curvatures.reshape(-1, 1, 3)
     patterns = window.dots(Quadric(center, slope, curvatures), window.rays.reshape(-1, 3))
     patterns = patterns.reshape(-1, *window.rays.shape[:2], 2)
-    return [
-        Quadric(center, slope, curvature[0])
-        for curvature, pattern in zip(curvatures, patterns, strict=True)
-        if window.hits(pattern, LOOSE)[0][window.core].sum() >= 5
-    ]
+    hit = window.hits(patterns, LOOSE)[0][(slice(None), *window.core)]
+    likely = curvatures[hit.sum(axis=(1, 2)) >= 5]
+    return [Quadric(center, slope, curvature[0]) for curvature in likely]
 
 
 class _Window:
@@ -192,19 +190,22 @@ class _Window:
         return np.asarray(points)
 
     def hits(self, pattern: FloatArray, gate: float) -> tuple[BoolArray, IntArray, FloatArray]:
-        """Which predicted dots, shape (rows, columns, 2), fall on a dot, on which, how far off.
+        """Which predicted dots, shape (…, rows, columns, 2), fall on a dot, on which, how far off.
 
         The last is in units of the gate.
         """
         sane = np.asarray(np.isfinite(pattern).all(axis=-1))
         flat = np.where(sane[..., None], pattern, 1e6)
         spacing = np.full(sane.shape, np.inf)
-        for axis in (0, 1):
-            step = np.linalg.norm(np.diff(flat, axis=axis), axis=-1)
-            for side in ((1, 0), (0, 1)):
-                pad = [(0, 0), (0, 0)]
-                pad[axis] = side
-                spacing = np.minimum(spacing, np.pad(step, pad, constant_values=np.inf))
+        across = np.linalg.norm(np.diff(flat, axis=-2), axis=-1)
+        along = np.linalg.norm(np.diff(flat, axis=-3), axis=-1)
+        for part, step in (
+            (spacing[..., :, 1:], across),
+            (spacing[..., :, :-1], across),
+            (spacing[..., 1:, :], along),
+            (spacing[..., :-1, :], along),
+        ):
+            np.minimum(part, step, out=part)
         distance, dot = self.tree.query(flat)
         off = distance / np.maximum(gate * spacing, 1e-9)
         return (off < 1) & ~self.absent & sane, np.asarray(dot), off
