@@ -257,9 +257,9 @@ def test_a_full_disk_leaves_whole_frames(
 
     def fill(file: object, text: str) -> None:
         if len(measured_images) == 3:
-            append(file, text[:10])  # type: ignore[arg-type]
+            append(file, text[:10])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        append(file, text)  # type: ignore[arg-type]
+        append(file, text)
 
     monkeypatch.setattr(results, "_append", fill)
     out = tmp_path / "out"

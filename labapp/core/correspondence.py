@@ -2,10 +2,10 @@
 
 The absent centre dot gives the rays of a whole grid at once, for each orientation. Every such
 hypothesis is followed by what the surface itself says: fit it to the dots labelled so far,
-predict where every ray's dot should be, match mutual nearest neighbours, and fit again until
-nothing changes. That finds the dots the grid left in doubt and drops the ones it got wrong. Where
-rows bow too much for a grid to grow, hypotheses come from the optics instead: quadrics whose nine
-rays round a hole fall on dots.
+predict where every ray's dot should be, label the dots that one ray alone can have made, and fit
+again until nothing changes. That finds the dots the grid left in doubt and drops the ones it got
+wrong. Where rows bow too much for a grid to grow, hypotheses come from the optics instead: quadrics
+whose rays round a hole fall on dots.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Match:
     ray
         Its ray (i, j), counted from 1, shape (n, 2).
     reflected
-        Its reflected row and column (k, t), counted from 1, shape (n, 2); 0 where the dot was
-        matched by prediction only.
+        Its reflected row and column (k, t), counted from 1, shape (n, 2); 0 where it is
+        not known.
     plane_mm
         The dot on the imaging plane, IPCS (X′, Z′), shape (n, 2), mm.
     plane_covariance_mm2
@@ -147,6 +147,8 @@ def match_rays(
     found = _by_grid(scene, lattice, orientations)
     if not any(_explains(scene, hypothesis) for hypothesis in found):
         found += _by_optics(scene, lattice, orientations)
+    # Followed to its end, a hypothesis may have come round to a correspondence not asked for.
+    found = [hypothesis for hypothesis in found if hypothesis.orientation(scene) in orientations]
     if not found:
         if rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
@@ -193,7 +195,7 @@ def _by_optics(
     found = []
     for guess in search_quadrics(scene):
         hypothesis = pursue(scene, guess.labels)
-        if hypothesis is None or hypothesis.orientation(scene) not in orientations:
+        if hypothesis is None:
             continue
         found.append(hypothesis)
         if lattice is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import numpy as np
 
@@ -33,7 +34,7 @@ class Rule:
     required: bool = True
 
 
-def is_number(value: object) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Whether this is a finite number (true, false, nan and inf are not)."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
 
@@ -41,7 +42,7 @@ def is_number(value: object) -> bool:
 def _between(low: float, high: float, unit: str, required: bool = True) -> Rule:
     return Rule(
         f"a number above {low:g} and below {high:g} ({unit})",
-        lambda value: is_number(value) and low < value < high,  # type: ignore[operator]
+        lambda value: is_number(value) and low < value < high,
         required,
     )
 
@@ -80,7 +81,7 @@ def _is_matrix(value: object) -> bool:
 _PIXEL = Rule("[u, v], two numbers (px)", _is_pixel)
 _ON_AXIS = Rule(
     f"a number from -{LARGEST_MM:g} to {LARGEST_MM:g} (mm) that is not 0",
-    lambda value: is_number(value) and 0 < abs(value) <= LARGEST_MM,  # type: ignore[arg-type]
+    lambda value: is_number(value) and 0 < abs(value) <= LARGEST_MM,
 )
 
 THREE_POINTS = {
@@ -111,7 +112,7 @@ SECTIONS = {
     "electrode": {
         "height_mm": Rule(
             f"a number from 0 to {LARGEST_MM:g} (mm)",
-            lambda value: is_number(value) and 0 <= value <= LARGEST_MM,  # type: ignore[operator]
+            lambda value: is_number(value) and 0 <= value <= LARGEST_MM,
         ),
     },
     "imaging_plane": {

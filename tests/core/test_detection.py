@@ -34,7 +34,7 @@ def frame() -> FloatArray:
 
 @pytest.mark.parametrize("method", ["band-pass", "block-threshold", "wavelet"])
 def test_every_detector_finds_the_dots(frame: FloatArray, method: str) -> None:
-    dots = find_dots(frame, DotSettings(method=method))  # type: ignore[arg-type]
+    dots = find_dots(frame, DotSettings(method=method))
     true = places()
     distance = np.linalg.norm(dots.image_px[None] - true[:, None], axis=-1)
     assert distance.min(axis=1).max() < 1.0
@@ -51,7 +51,7 @@ def test_the_detector_is_the_one_that_is_named(frame: FloatArray) -> None:
         "wavelet": wavelet_dots(frame, settings.wavelet),
     }
     for name, dots in by_name.items():
-        chosen = find_dots(frame, DotSettings(method=name))  # type: ignore[arg-type]
+        chosen = find_dots(frame, DotSettings(method=name))
         np.testing.assert_array_equal(chosen.image_px, dots.image_px)
     # … and they differ, so that a wrong one would show.
     first = [np.sort(dots.u_px)[:20] for dots in by_name.values()]
@@ -64,7 +64,7 @@ def test_the_detector_is_the_one_that_is_named(frame: FloatArray) -> None:
 @pytest.mark.parametrize(("method", "share"), [("grow", 1.0), ("masks", 0.9)])
 def test_a_search_indexes_the_dots(method: str, share: float) -> None:
     dots = as_dots(places())
-    lattice = find_lattice(dots, SHAPE, LatticeSettings(method=method))  # type: ignore[arg-type]
+    lattice = find_lattice(dots, SHAPE, LatticeSettings(method=method))
     u, v = dots.image_px.T
     indexed = lattice.row > 0
     assert indexed.mean() >= share
@@ -82,7 +82,7 @@ def test_the_search_is_the_one_that_is_named() -> None:
         "masks": mask_rows(dots, SHAPE, settings.masks),
     }
     for name, lattice in by_name.items():
-        chosen = find_lattice(dots, SHAPE, LatticeSettings(method=name))  # type: ignore[arg-type]
+        chosen = find_lattice(dots, SHAPE, LatticeSettings(method=name))
         np.testing.assert_array_equal(chosen.row, lattice.row)
         assert chosen.candidates == lattice.candidates
     assert settings.method == "grow"
@@ -99,7 +99,7 @@ def test_the_search_is_the_one_that_is_named() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (120, 160)])
 def test_a_blank_frame_has_no_dots(method: str, shape: tuple[int, int]) -> None:
     with pytest.raises(CannotMeasure) as answer:
-        find_dots(np.full(shape, 9, np.uint8), DotSettings(method=method))  # type: ignore[arg-type]
+        find_dots(np.full(shape, 9, np.uint8), DotSettings(method=method))
     assert answer.value.status == "no-dots"
     assert answer.value.reason
 
@@ -110,6 +110,6 @@ def test_a_single_dot_is_no_row(method: str) -> None:
         find_lattice(
             as_dots(places()[:1]),
             SHAPE,
-            LatticeSettings(method=method),  # type: ignore[arg-type]
+            LatticeSettings(method=method),
         )
     assert answer.value.status in {"too-few-dots", "no-rows"}

@@ -191,7 +191,7 @@ def test_a_frame_that_shows_nothing_has_a_status_and_a_reason(
         image,
         SETUP.rig,
         SETUP.calibration,
-        Settings(scheme=scheme),  # type: ignore[arg-type]
+        Settings(scheme=scheme),
     )
     assert result.status != "ok"
     assert " " not in result.status
@@ -203,7 +203,7 @@ def test_a_frame_that_shows_nothing_has_a_status_and_a_reason(
 
 @pytest.mark.parametrize("method", ["block-threshold", "wavelet"])
 def test_the_text_s_detectors_say_that_a_blank_frame_has_no_dots(method: str) -> None:
-    settings = Settings(dots=DotSettings(method=method))  # type: ignore[arg-type]
+    settings = Settings(dots=DotSettings(method=method))
     result = measure(np.zeros((640, 480), np.uint8), SETUP.rig, SETUP.calibration, settings)
     assert result.status == "no-dots"
 
@@ -248,4 +248,4 @@ def test_a_scheme_that_finds_no_surface_says_so(measurements: dict[int, Measurem
     )
     for scheme in ("fit", "ers", "irs"):
         with pytest.raises(CannotMeasure, match="too-few-dots"):
-            reconstruct(few, SETUP.rig, Settings(scheme=scheme))  # type: ignore[arg-type]
+            reconstruct(few, SETUP.rig, Settings(scheme=scheme))

@@ -145,7 +145,7 @@ def test_run_json_tells_where_results_come_from(written: Path) -> None:
 
 
 def test_surfaces_can_be_left_out(out: Path, measured: Measurement, calibration: object) -> None:
-    with ResultsWriter(out, calibration, {}, surfaces=False) as files:  # type: ignore[arg-type]
+    with ResultsWriter(out, calibration, {}, surfaces=False) as files:
         files.write(0, 0.0, measured)
     assert not list(out.glob("surface_*"))
     assert table(out / "measures.csv")[0]["status"] == "ok"
@@ -209,9 +209,9 @@ def test_a_frame_that_fails_leaves_no_trace(
 
     def fail_append(file: object, text: str) -> None:
         if next(calls) == at:
-            append(file, text[: len(text) // 2])  # type: ignore[arg-type]
+            append(file, text[: len(text) // 2])
             raise failure
-        append(file, text)  # type: ignore[arg-type]
+        append(file, text)
 
     expected = InputError if isinstance(failure, OSError) else type(failure)
     with pytest.raises(expected), writer(out) as files:  # noqa: PT012 - the frame before counts
