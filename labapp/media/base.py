@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import TracebackType
@@ -52,12 +53,23 @@ class FrameSource(Protocol):
         (rows, columns) of every frame.
     warnings
         What the user should know about it, one sentence each.
+    description
+        What was read, in words: "AVI, FFV1, 640×480 px, 8 bit grey, 60 frames/s".
+    bit_depth
+        Significant bits of a grey level: 8, 10, 12, 16; 32 for float.
+    index
+        What opening had to find out by reading through the file (time stamps, key frames …):
+        ``open_source(path, index)`` opens it again at once. None where opening is cheap. An index
+        that does not fit the file is ignored.
     """
 
     name: str
     frame_rate_hz: float | None
     shape: tuple[int, int]
     warnings: tuple[str, ...]
+    description: str = ""
+    bit_depth: int = 8
+    index: bytes | None = None
 
     def __len__(self) -> int: ...
 
@@ -72,6 +84,13 @@ class FrameSource(Protocol):
             If there is no such frame.
         """
         ...
+
+    def reopen(self) -> Self:
+        """Open the same frames once more, with nothing left of what was read before.
+
+        A reader that keeps a place in its file opens the file again.
+        """
+        return copy.copy(self)
 
     def close(self) -> None:
         """Let go of the file. Closing twice does no harm."""
