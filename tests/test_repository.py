@@ -110,8 +110,12 @@ def test_no_path_of_one_machine_is_written_down():
 
 
 def test_sample_sessions_are_small_enough_for_git():
-    sizes = [path.stat().st_size for path in (ROOT / "sample_sessions").rglob("*")]
-    assert 0 < sum(sizes) <= 5_000_000
+    sizes = {
+        folder.name: sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        for folder in (ROOT / "sample_sessions").iterdir()
+    }
+    assert {name: size for name, size in sizes.items() if not 0 < size <= 5_000_000} == {}
+    assert sum(sizes.values()) <= 10_000_000
 
 
 # --- commands ---------------------------------------------------------------------------------

@@ -24,8 +24,8 @@ class PoolSize:
         Extent of the boundary along X and along Y.
     height_mm, depth_mm
         Largest and smallest z, the boundary included.
-    peak_mm
-        (x, y) of the largest z.
+    peak_mm, bottom_mm
+        (x, y) of the largest and of the smallest z.
     """
 
     width_mm: float
@@ -33,6 +33,7 @@ class PoolSize:
     height_mm: float
     depth_mm: float
     peak_mm: tuple[float, float]
+    bottom_mm: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -271,8 +272,8 @@ class Pool:
         """True size; the peak is found by ever finer grids, to about 1e-6 mm."""
         foot = self.footprint
         high, peak = self._largest(1.0)
-        low, _ = self._largest(-1.0)
-        return PoolSize(foot.width_mm, foot.head_mm + foot.tail_mm, high, -low, peak)
+        low, bottom = self._largest(-1.0)
+        return PoolSize(foot.width_mm, foot.head_mm + foot.tail_mm, high, -low, peak, bottom)
 
     def boundary_mm(self, count: int = 720) -> FloatArray:
         """Points of the boundary at even steps of angle in (p, q), shape (count, 3), mm."""

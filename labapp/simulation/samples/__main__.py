@@ -1,0 +1,34 @@
+"""Write the sample recordings, and the printable target where a file for it is named."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from labapp.simulation.samples.recording import TARGET
+from labapp.simulation.samples.runs import samples
+from labapp.simulation.target import target_svg
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write each sample into a folder of its own."""
+    every = {sample.name: sample for sample in samples()}
+    parser = argparse.ArgumentParser(
+        prog="python -m labapp.simulation.samples", description=__doc__
+    )
+    parser.add_argument("folder", type=Path, help="where the folders of the samples go")
+    parser.add_argument("--only", choices=every, metavar="NAME", help="write this sample alone")
+    parser.add_argument(
+        "--target", type=Path, metavar="SVG", help="also write the printable target"
+    )
+    chosen = parser.parse_args(arguments)
+    for name in [chosen.only] if chosen.only else every:
+        every[name].write(chosen.folder / name)
+    if chosen.target is not None:
+        chosen.target.parent.mkdir(parents=True, exist_ok=True)
+        chosen.target.write_text(target_svg(TARGET), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

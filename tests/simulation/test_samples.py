@@ -1,0 +1,285 @@
+from __future__ import annotations
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.core.correction import block_row, set_reference
+from labapp.core.pipeline import Settings, measure, start_correction
+from labapp.media import open_source
+from labapp.session.setup import read_setup
+from labapp.simulation.samples.__main__ import main
+from labapp.simulation.samples.recording import TARGET
+from labapp.simulation.samples.runs import blocked_rows, concave, gtaw, samples, thumb_tack
+from labapp.simulation.samples.torch import Torch
+
+FOLDER = Path(__file__).parents[2] / "sample_sessions"
+
+every_sample = pytest.mark.parametrize("sample", samples(), ids=lambda sample: sample.name)
+
+
+def rows(name, file="truth.csv"):
+    with (FOLDER / name / file).open(encoding="utf-8") as kept:
+        return list(csv.DictReader(kept))
+
+
+def column(name, key):
+    return np.array([float(row[key]) for row in rows(name)])
+
+
+def recorded(sample, index):
+    with open_source(FOLDER / sample.name / sample.file) as source:
+        return source.frame(index).image
+
+
+def measured(sample, index, correction=None):
+    setup = read_setup(FOLDER / sample.name / "setup.toml")
+    image = recorded(sample, index)
+    return measure(image, setup.rig, setup.calibration, Settings(), correction)
+
+
+def same_picture(made, kept):
+    """Equal, but for a rounding that another processor or library may do otherwise."""
+    apart = np.abs(made.astype(int) - kept.astype(int))
+    return apart.max() <= 1 and (apart > 0).mean() < 1e-3
+
+
+# --- what is kept is what the program makes ---------------------------------------------------
+
+
+@every_sample
+def test_recording_is_what_the_program_makes(sample):
+    with open_source(FOLDER / sample.name / sample.file) as source:
+        assert len(source) == len(sample.pools)
+        assert source.frame_rate_hz == sample.frame_rate_hz
+        assert source.shape == (sample.view.height_px, sample.view.width_px)
+        for index in (1, len(source) - 1):
+            kept, made = source.frame(index).image, sample.frame(index).image
+            assert kept.dtype == made.dtype
+            assert same_picture(made, kept)
+            assert not same_picture(made, source.frame(0).image)
+
+
+@every_sample
+def test_pictures_and_texts_are_what_the_program_makes(sample):
+    folder = FOLDER / sample.name
+    kept = cv2.imread(str(folder / "calibration.png"), cv2.IMREAD_UNCHANGED)
+    assert same_picture(sample.calibration_picture(), kept)
+    assert (folder / "setup.toml").read_text(encoding="utf-8") == sample.setup()
+    assert (folder / "README.md").read_text(encoding="utf-8") == sample.readme()
+
+
+@every_sample
+def test_truth_is_that_of_the_pools(sample):
+    truth = rows(sample.name)
+    assert [row["frame"] for row in truth] == [str(n) for n in range(len(sample.pools))]
+    for n, (row, pool) in enumerate(zip(truth, sample.pools, strict=True)):
+        size = pool.size
+        for key in ("width_mm", "length_mm", "height_mm", "depth_mm"):
+            assert float(row[key]) == pytest.approx(getattr(size, key), abs=2e-5)
+        peak = np.array([float(row["peak_x_mm"]), float(row["peak_y_mm"])])
+        assert abs(pool.height(*peak)) == pytest.approx(
+            max(size.height_mm, -size.depth_mm), abs=2e-5
+        )
+        rate = sample.frame_rate_hz
+        assert row["time_s"] == ("" if rate is None else f"{n / rate:.5f}")
+
+
+@every_sample
+def test_dots_truth_is_that_of_the_rays(sample):
+    index = len(sample.pools) - 1
+    frame = sample.frame(index)
+    truth = [row for row in rows(sample.name, "dots_truth.csv") if row["frame"] == str(index)]
+    rays = np.array([[int(row["ray_row"]), int(row["ray_column"])] for row in truth]) - 1
+    np.testing.assert_array_equal(rays, np.argwhere(frame.reflections.lit))
+    shown = np.array([row["visible"] == "1" for row in truth])
+    np.testing.assert_array_equal(shown, frame.shown[tuple(rays.T)])
+    assert shown.sum() == int(rows(sample.name)[index]["dots"])
+    dots = np.array([[float(row["u_px"]), float(row["v_px"])] for row in truth])
+    np.testing.assert_allclose(dots, frame.dot_px[tuple(rays.T)], atol=2e-3)
+    points = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in truth])
+    np.testing.assert_allclose(points[:, 2], frame.pool.height(*points[:, :2].T), atol=5e-5)
+
+
+@every_sample
+def test_dots_truth_agrees_with_the_picture(sample):
+    truth = [row for row in rows(sample.name, "dots_truth.csv") if row["frame"] == "2"]
+    image = cv2.GaussianBlur(recorded(sample, 2).astype(float), (0, 0), 1.5) / sample.exposures
+    shown = np.array([row["visible"] == "1" for row in truth])
+    dots = np.array([[float(row["u_px"]), float(row["v_px"])] for row in truth])
+    light = image[tuple(np.rint(dots[shown][:, ::-1]).astype(int).T)]
+    assert shown.sum() > 60
+    # Not by their surroundings: the concave pool's dots lie close.
+    assert np.mean(light > np.median(image) + 8) == 1.0
+    assert ("10", "10") not in {(row["ray_row"], row["ray_column"]) for row in truth}
+
+
+@every_sample
+def test_writing_loses_nothing(sample, tmp_path):
+    short = replace(sample, pools=sample.pools[:2], exposures=min(sample.exposures, 2))
+    short.write(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        path.name for path in (FOLDER / sample.name).iterdir()
+    }
+    with open_source(tmp_path / sample.file) as source:
+        assert len(source) == 2
+        for frame in source:
+            np.testing.assert_array_equal(frame.image, short.frame(frame.index).image)
+
+
+def test_command_writes_a_folder_for_each(tmp_path):
+    target = tmp_path / "targets" / "target.svg"
+    main([str(tmp_path / "all"), "--only", "concave", "--target", str(target)])
+    assert [path.name for path in (tmp_path / "all").iterdir()] == ["concave"]
+    assert target.read_text(encoding="utf-8").startswith("<svg")
+    assert {path.name for path in FOLDER.iterdir()} == {sample.name for sample in samples()}
+
+
+@every_sample
+def test_setup_file_says_what_was_rendered(sample):
+    setup = read_setup(FOLDER / sample.name / "setup.toml")
+    assert setup.rig.laser == sample.rig.laser
+    assert setup.rig.pattern == sample.rig.pattern
+    assert setup.rig.electrode == sample.rig.electrode
+    np.testing.assert_allclose(
+        setup.rig.imaging_plane.origin_mm, sample.rig.imaging_plane.origin_mm
+    )
+    place = np.array([[0.0, 0.0], [40.0, 12.0]])
+    np.testing.assert_allclose(
+        setup.calibration.to_image(place), sample.view.to_image(place), atol=1e-9
+    )
+    assert sample.view.x_axis_mm == TARGET.x_middle_mm
+
+
+# --- the GTAW run -----------------------------------------------------------------------------
+
+
+def test_pool_fluctuates_as_7_3_reports():
+    for key, mean, sigma in (
+        ("width_mm", 6.66, 0.15),
+        ("length_mm", 7.45, 0.46),
+        ("height_mm", 0.294, 0.019),
+    ):
+        course = column("gtaw", key)
+        assert course.mean() == pytest.approx(mean, abs=1e-3)
+        assert course.std() == pytest.approx(sigma, abs=1e-3)
+        # Smooth: a frame is far more like the next than like any other.
+        assert np.abs(np.diff(course)).mean() < 0.6 * sigma
+
+
+def test_head_is_nearer_to_the_torch_than_the_tail():
+    for pool in gtaw().pools:
+        y = pool.boundary_mm()[:, 1]
+        assert 0 < y.max() < -y.min()
+
+
+def test_torch_hides_nothing_and_the_plane_catches_all():
+    for index in range(0, 30, 7):
+        reflections = gtaw().frame(index).reflections
+        np.testing.assert_array_equal(reflections.visible, reflections.lit)
+
+
+# --- the thumb tack ---------------------------------------------------------------------------
+
+
+def test_thumb_tack_is_that_of_8_2_and_stands_still():
+    diameter, height = 9.75, 0.91
+    for row in rows("thumb_tack"):
+        assert float(row["width_mm"]) == float(row["length_mm"]) == diameter
+        assert float(row["height_mm"]) == pytest.approx(height, abs=1e-5)
+        assert float(row["area_mm2"]) == pytest.approx(np.pi * diameter**2 / 4, rel=1e-3)
+        cap = np.pi * height / 6 * (3 * (diameter / 2) ** 2 + height**2)
+        assert float(row["volume_mm3"]) == pytest.approx(cap, rel=1e-3)
+    setup = read_setup(FOLDER / "thumb_tack" / "setup.toml")
+    assert (setup.rig.laser.projection_angle_deg, setup.rig.laser.distance_mm) == (30.56, 46.4)
+    assert setup.rig.imaging_plane.origin_mm[1] == -40.69
+
+
+def test_thumb_tack_is_measured():
+    result = measured(thumb_tack(), 0)
+    assert result.status == "ok"
+    assert result.measures.height_mm == pytest.approx(0.91, rel=0.03)
+    assert result.measures.width_mm == pytest.approx(9.75, rel=0.015)
+
+
+# --- rows blocked by the torch ----------------------------------------------------------------
+
+
+def test_torch_hides_what_it_stands_in_the_way_of():
+    torch = Torch((1.0, 2.0, 3.0), tip_radius_mm=0.3, radius_mm=1.0, half_angle_deg=45.0)
+    below = np.array([[1.0, 2.0, 0.0], [1.29, 2.0, 0.0], [1.9, 2.0, 0.0], [2.1, 2.0, 0.0]])
+    up = np.tile([0.0, 0.0, 1.0], (4, 1))
+    assert torch.hides(below, up).tolist() == [True, True, True, False]
+    assert not torch.hides(below, -up).any()
+    # Level rays, past the flat end and under it.
+    beside = np.array([[-4.0, 2.0, 3.1], [-4.0, 2.0, 2.9], [-4.0, 2.45, 3.1], [-4.0, 2.45, 3.3]])
+    along = np.tile([1.0, 0.0, 0.0], (4, 1))
+    assert torch.hides(beside, along).tolist() == [True, False, False, True]
+
+
+def test_lowered_torch_hides_the_references_neighbourhood():
+    sample = blocked_rows()
+    for index in range(len(sample.pools)):
+        reflections = sample.frame(index).reflections
+        hidden = reflections.lit & reflections.blocked
+        beside = hidden[[8, 9, 9, 10], [9, 8, 10, 9]]
+        if index < 2:
+            assert not hidden.any()
+        else:
+            assert beside.any()
+            # The middle of rows, never a whole one but the front's and the rear's ends.
+            assert 10 <= hidden.sum() <= 20
+            assert (reflections.visible.sum(axis=1)[5:12] >= 6).all()
+
+
+def advised(index):
+    """Reference, place on the picture and blocked rows that the README has for a frame."""
+    text = (FOLDER / "blocked_rows" / "README.md").read_text(encoding="utf-8")
+    cells = re.search(rf"^\| {index} \|(.*)\|$", text, re.MULTILINE)[1].split("|")
+    status, reference, place, blocked = cells
+    numbers = [[int(n) for n in re.findall(r"\d+", cell)] for cell in (reference, place, blocked)]
+    return status.strip(" `"), tuple(numbers[0]), numbers[1], numbers[2]
+
+
+def test_torch_out_of_the_way_is_no_matter():
+    result = measured(blocked_rows(), 1)
+    assert result.status == advised(1)[0] == "ok"
+    assert result.lattice.reference == advised(1)[1]
+    height = blocked_rows().pools[1].size.height_mm
+    assert result.measures.height_mm == pytest.approx(height, rel=0.03)
+
+
+@pytest.mark.parametrize(("index", "mark"), [(2, True), (5, False)])
+def test_blocked_frame_is_refused_and_put_right_by_hand(index, mark):
+    sample, frame = blocked_rows(), blocked_rows().frame(index)
+    result = measured(sample, index)
+    status, reference, place, blocked = advised(index)
+    assert result.status == status != "ok"
+    np.testing.assert_allclose(place, frame.dot_px[9, 9], atol=1.0)
+    correction = set_reference(start_correction(result), reference)
+    for row in blocked if mark else ():
+        correction = block_row(correction, row)
+    again = measured(sample, index, correction)
+    assert again.status == "ok"
+    assert again.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=0.03)
+    true = frame.reflections.plane_mm[tuple(again.match.ray.T - 1)]
+    np.testing.assert_allclose(again.match.plane_mm, true, atol=0.3)
+
+
+# --- the concave pool -------------------------------------------------------------------------
+
+
+def test_concave_pool_is_measured_the_right_way_round():
+    sample = concave()
+    result = measured(sample, 3)
+    assert result.status == "ok"
+    assert result.match.orientation == "I/I"
+    size = sample.pools[3].size
+    assert result.measures.depth_mm == pytest.approx(size.depth_mm, rel=0.03)
+    place = np.array([result.measures.peak_x_mm, result.measures.peak_y_mm])
+    np.testing.assert_allclose(place, size.bottom_mm, atol=0.05)
