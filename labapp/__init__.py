@@ -1,3 +1,23 @@
-"""labapp measures the surface of a molten weld pool in 3-D from a reflected dot matrix."""
+"""labapp measures the surface of a molten weld pool in 3-D from a reflected dot matrix.
 
+`labapp.Session` is the way in for scripts (docs/python.md).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from labapp.session.session import Session
+
+__all__ = ["Session", "__version__"]
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> object:
+    # Loaded when asked for: `labapp --version` needs no numpy.
+    if name == "Session":
+        from labapp.session.session import Session
+
+        return Session
+    raise AttributeError(f"module 'labapp' has no attribute {name!r}")

@@ -46,7 +46,7 @@ class CloughTocherSurface:
     """
 
     def __init__(self, points_mm: FloatArray) -> None:
-        points_mm = np.asarray(points_mm, float)
+        self.points_mm = points_mm = np.asarray(points_mm, float)
         try:
             self._cubic = CloughTocher2DInterpolator(points_mm[:, :2], points_mm[:, 2])
         except (QhullError, ValueError) as error:
@@ -94,7 +94,7 @@ class ThinPlateSurface:
     """
 
     def __init__(self, points_mm: FloatArray) -> None:
-        points_mm = np.asarray(points_mm, float)
+        self.points_mm = points_mm = np.asarray(points_mm, float)
         self._center = points_mm[:, :2].mean(axis=0)
         self._nodes = points_mm[:, :2] - self._center
         if np.linalg.matrix_rank(self._nodes) < 2:

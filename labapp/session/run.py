@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from threadpoolctl import ThreadpoolController
 
+from labapp.core.correction import Correction
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.errors import InputError
-from labapp.media import FrameSource
+from labapp.media import Frame, FrameSource
 from labapp.session.results import ResultsWriter
 from labapp.session.setup import Setup
 
@@ -64,6 +65,41 @@ def provenance(
     }
 
 
+def measure_each(
+    frames: Iterable[int],
+    read: Callable[[int], Frame],
+    setup: Setup,
+    settings: Settings,
+    correction: Callable[[int], Correction | None] = lambda _: None,
+) -> Iterator[tuple[int, float | None, Measurement]]:
+    """Measure frames one after the other; yields (frame, time in s, measurement).
+
+    Parameters
+    ----------
+    frames
+        Their numbers.
+    read
+        Reads a frame; one that raises `InputError` gets the status ``unreadable``.
+    setup, settings
+        What they are measured with.
+    correction
+        The dots and rows of a frame as they were corrected by hand, or None.
+    """
+    threads = ThreadpoolController()
+    for number in frames:
+        try:
+            frame = read(number)
+        except InputError as error:
+            yield number, None, Measurement("unreadable", str(error), settings.scheme)
+            continue
+        # The matrices are small: more threads than one get in each other's way.
+        with threads.limit(limits=1, user_api="blas"):
+            measurement = measure(
+                frame.image, setup.rig, setup.calibration, settings, correction(number)
+            )
+        yield number, frame.time_s, measurement
+
+
 def measure_frames(
     source: FrameSource,
     frames: Iterable[int],
@@ -71,28 +107,13 @@ def measure_frames(
     settings: Settings,
     results: ResultsWriter,
 ) -> Iterator[tuple[int, float | None, Measurement]]:
-    """Measure frames and write each; yields (frame, time in s, measurement) once it is written.
-
-    A frame that cannot be decoded is written with the status ``unreadable``.
+    """Measure frames of a source and write each; yields as `measure_each` does, once written.
 
     Raises
     ------
     InputError
         If a frame's results cannot be written.
     """
-    threads = ThreadpoolController()
-    for index in frames:
-        time_s = None
-        try:
-            frame = source.frame(index)
-        except InputError as error:
-            measurement = Measurement(
-                status="unreadable", reason=str(error), scheme=settings.scheme
-            )
-        else:
-            time_s = frame.time_s
-            # The matrices are small: more threads than one get in each other's way.
-            with threads.limit(limits=1, user_api="blas"):
-                measurement = measure(frame.image, setup.rig, setup.calibration, settings)
-        results.write(index, time_s, measurement)
-        yield index, time_s, measurement
+    for number, time_s, measurement in measure_each(frames, source.frame, setup, settings):
+        results.write(number, time_s, measurement)
+        yield number, time_s, measurement

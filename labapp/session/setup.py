@@ -56,10 +56,15 @@ def read_setup(path: str | os.PathLike[str]) -> Setup:
         was found is reported together (`InputError.problems`).
     """
     path = Path(path)
-    text = _text(path)
+    return parse_setup(_text(path), path)
+
+
+def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
+    """Check a setup that was read from ``path``; see `read_setup`."""
+    path = Path(path)
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(path, "syntax", error, A_SETUP) from error
     problems = [
         *_unknown_sections(path, values),
@@ -91,9 +96,22 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
         If there is a file that is not TOML, or it cannot be written.
     """
     path = Path(path)
+    text = updated_setup(_text(path) if path.exists() else "", path, values)
     try:
-        document = tomlkit.parse(_text(path)) if path.exists() else tomlkit.document()
-    except tomlkit.exceptions.ParseError as error:
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(13, "write-protected")
+        write_whole(path, text.encode())
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "a file that can be written") from error
+
+
+def updated_setup(
+    text: str, path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]
+) -> str:
+    """Put values into a setup's text, read from ``path``; see `update_setup`."""
+    try:
+        document = tomlkit.parse(text)
+    except (tomlkit.exceptions.TOMLKitError, RecursionError) as error:
         raise InputError(path, "syntax", error, A_SETUP) from error
     for section, keys in values.items():
         if section not in document:
@@ -106,12 +124,7 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
                 table[key] = value
             elif key in table:
                 table.remove(key)
-    try:
-        if path.exists() and not os.access(path, os.W_OK):
-            raise PermissionError(13, "write-protected")
-        write_whole(path, tomlkit.dumps(document).encode())
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that can be written") from error
+    return tomlkit.dumps(document)
 
 
 def _text(path: Path) -> str:

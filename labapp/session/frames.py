@@ -1,0 +1,391 @@
+"""The frames of a session: taken in once from a recording, checked at every reading.
+
+The recording stays where it is, named by its place relative to the session; or its frames are
+kept in the session itself, lossless.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.values import FloatArray, IntArray
+from labapp.errors import InputError
+from labapp.media import Frame, FrameSource, GreyImage, open_source
+from labapp.media.survey import frame_checksum, survey
+from labapp.session.blobs import Damaged, pack, unpack
+from labapp.session.database import Database
+from labapp.session.record import Recording
+from labapp.session.run import select_frames
+
+Progress = Callable[[int, int], None]
+"""Called with how much is done and of how much; may raise to stop."""
+
+READ_BYTES = 1 << 20
+PAIRED = frozenset({".cih", ".cihx", ".mraw"})
+
+
+class Frames:
+    """The recording of a session and its frames; may be used from several threads.
+
+    Parameters
+    ----------
+    database
+        The session file.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._turn = threading.RLock()
+        self._source: FrameSource | None = None
+
+    @property
+    def recording(self) -> Recording | None:
+        """The recording; None before one was imported."""
+        blob = self._database.value("SELECT content FROM recording")
+        return None if blob is None else self._unpacked(blob, "recording")
+
+    @property
+    def numbers(self) -> IntArray:
+        """Numbers of the session's frames in the recording, from 0, ascending, shape (n,)."""
+        return np.array(
+            [number for (number,) in self._database.rows("SELECT number FROM frame")], np.int64
+        )
+
+    @property
+    def times_s(self) -> FloatArray:
+        """Time of each since the recording's first frame, shape (n,), s; NaN where unknown."""
+        rows = self._database.rows("SELECT time_s FROM frame ORDER BY number")
+        return np.array([np.nan if time_s is None else time_s for (time_s,) in rows], np.float64)
+
+    def time_s(self, number: int) -> float | None:
+        """Time of one frame, s; None where unknown.
+
+        Raises
+        ------
+        InputError
+            If the session has no such frame.
+        """
+        found = self._database.rows("SELECT time_s FROM frame WHERE number = ?", number)
+        if not found:
+            raise InputError(self._database.path, "frame", number, self._which())
+        (time_s,) = found[0]
+        return None if time_s is None else float(time_s)
+
+    def take_in(
+        self,
+        path: str | os.PathLike[str],
+        frames: str = ":",
+        *,
+        frame_rate_hz: float | None = None,
+        embed: bool = False,
+        progress: Progress | None = None,
+    ) -> Recording:
+        """Import a recording: read it through, check that it is frame-exact, note all of that.
+
+        Parameters
+        ----------
+        path
+            A video, an image, a folder of images, a stack.
+        frames
+            Which of its frames the session uses, ``A:B:STEP``.
+        frame_rate_hz
+            The rate it was filmed at, where the recording does not say so or says it wrongly.
+        embed
+            Keep the frames in the session itself.
+        progress
+            Called with frames done and frames in all.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read, or frames measured or corrected in this session are not in it.
+        """
+        path = Path(path).absolute()
+        if frame_rate_hz is not None and not 0 < frame_rate_hz < 1e8:
+            raise InputError(path, "frame rate", frame_rate_hz, "frames a second above 0")
+        with open_source(path) as source:
+            selected = select_frames(frames, len(source))
+            found = survey(source, progress)
+            size, sha256 = identify(path)
+            recording = Recording(
+                path=self._relative(path),
+                size=size,
+                sha256=sha256,
+                description=source.description,
+                frames=len(source),
+                rows=source.shape[0],
+                columns=source.shape[1],
+                bit_depth=source.bit_depth,
+                frame_rate_hz=frame_rate_hz or source.frame_rate_hz,
+                rate_is_given=frame_rate_hz is not None,
+                frame_exact=found.frame_exact,
+                selected=(selected.start, selected.stop, selected.step),
+                embedded=embed,
+                warnings=source.warnings,
+                index=source.index,
+                imported=datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+            )
+            checksum = {k: int(found.checksum[k]) for k in selected if found.readable[k]}
+            self._store(recording, source, selected, checksum)
+        return recording
+
+    def _store(
+        self,
+        recording: Recording,
+        source: FrameSource,
+        selected: range,
+        checksum: dict[int, int],
+    ) -> None:
+        before = self.recording
+        rate = recording.frame_rate_hz if recording.rate_is_given else None
+        with self._database.transaction() as connection:
+            kept = {
+                frame
+                for (frame,) in connection.execute(
+                    "SELECT frame FROM result UNION SELECT frame FROM document WHERE frame >= 0"
+                )
+            }
+            if kept and before is not None and before.sha256 != recording.sha256:
+                raise InputError(
+                    self._database.path,
+                    "recording",
+                    f"frames of {Path(before.path).name} are measured or corrected in it",
+                    "a new session for another recording",
+                )
+            if not kept <= set(selected):
+                raise InputError(
+                    self._database.path,
+                    "frames",
+                    f"frame {min(kept - set(selected))} is measured or corrected and left out",
+                    "frames that include these",
+                )
+            connection.execute("INSERT OR REPLACE INTO recording VALUES (1, ?)", (pack(recording),))
+            connection.executemany(
+                "DELETE FROM frame WHERE number = ?",
+                [(int(k),) for k in self.numbers if int(k) not in selected],
+            )
+            connection.execute("DELETE FROM frame_image")
+            for number in selected:
+                time_s = None if rate is None else number / rate
+                if rate is None or recording.embedded:
+                    try:
+                        frame = source.frame(number)
+                    except InputError:
+                        frame = None
+                    if frame is not None and rate is None:
+                        time_s = frame.time_s
+                connection.execute(
+                    "INSERT INTO frame VALUES (?, ?, ?) ON CONFLICT (number) DO UPDATE "
+                    "SET time_s = excluded.time_s, checksum = excluded.checksum",
+                    (number, time_s, checksum.get(number)),
+                )
+                if recording.embedded and frame is not None:
+                    connection.execute(
+                        "INSERT INTO frame_image VALUES (?, ?)", (number, _encoded(frame.image))
+                    )
+        self.close()
+
+    def read(self, number: int) -> Frame:
+        """Frame ``number`` as it was imported.
+
+        Raises
+        ------
+        InputError
+            If the session has no such frame, or its recording is missing, cannot be read, or is
+            no longer the one that was imported.
+        """
+        time_s = self.time_s(number)
+        (checksum,) = self._database.rows("SELECT checksum FROM frame WHERE number = ?", number)[0]
+        held = self._database.value("SELECT content FROM frame_image WHERE frame = ?", number)
+        with self._turn:
+            image = (
+                self._opened().frame(number).image
+                if held is None
+                else self._decoded(held, f"image of frame {number}")
+            )
+        if checksum is not None and frame_checksum(image) != checksum:
+            raise InputError(
+                self._database.path if held is not None else self._place(),
+                f"frame {number}",
+                "is not the one that was imported",
+                "the recording as it was at import",
+            )
+        return Frame(number, time_s, image)
+
+    @property
+    def missing(self) -> Path | None:
+        """Where the recording should be and is not; None if frames can be read."""
+        recording = self.recording
+        if recording is None or recording.embedded or self._place().exists():
+            return None
+        return self._place()
+
+    def relink(self, path: str | os.PathLike[str]) -> None:
+        """Say where the recording is now.
+
+        Raises
+        ------
+        InputError
+            If what is there is another recording.
+        """
+        path = Path(path).absolute()
+        recording = self.recording
+        if recording is None:
+            raise InputError(self._database.path, "recording", "none", "one to be imported first")
+        size, sha256 = identify(path)
+        if (size, sha256) != (recording.size, recording.sha256):
+            raise InputError(
+                path,
+                "content",
+                f"another recording ({size} bytes)",
+                f"{Path(recording.path).name} as it was imported ({recording.size} bytes)",
+            )
+        values = {**vars(recording), "path": self._relative(path)}
+        with self._database.transaction() as connection:
+            connection.execute("UPDATE recording SET content = ?", (pack(Recording(**values)),))
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the recording; it is opened again when needed."""
+        with self._turn:
+            if self._source is not None:
+                self._source.close()
+            self._source = None
+
+    def problems(self, progress: Progress | None = None) -> list[str]:
+        """What is wrong with the recording or the frames kept; empty if all is well."""
+        try:
+            recording = self.recording
+        except InputError as error:
+            return [str(error)]
+        if recording is None:
+            return []
+        if not recording.embedded:
+            try:
+                if identify(self._place()) != (recording.size, recording.sha256):
+                    return [f"{self._place().name} is not what was imported"]
+            except InputError as error:
+                return [str(error)]
+            return []
+        found = []
+        for done, number in enumerate(self.numbers):
+            try:
+                self.read(int(number))
+            except InputError as error:
+                found.append(str(error))
+            if progress is not None:
+                progress(done + 1, len(self.numbers))
+        return found
+
+    def _opened(self) -> FrameSource:
+        if self._source is None:
+            recording, place = self.recording, self._place()
+            assert recording is not None
+            if not place.exists():
+                raise InputError(
+                    place, "recording", "is not there", "the recording; say where it is now"
+                )
+            source = open_source(place, recording.index)
+            if (len(source), source.shape) != (
+                recording.frames,
+                (recording.rows, recording.columns),
+            ):
+                found = f"{len(source)} frames of {source.shape[1]}×{source.shape[0]} px"
+                source.close()
+                raise InputError(
+                    place,
+                    "recording",
+                    found,
+                    f"{recording.frames} frames of {recording.columns}×{recording.rows} px, "
+                    "as they were imported",
+                )
+            self._source = source
+        return self._source
+
+    def _place(self) -> Path:
+        """Where the recording is: where it was, else beside the session."""
+        recording = self.recording
+        assert recording is not None
+        folder = self._database.path.parent
+        place = Path(os.path.normpath(folder / recording.path))
+        beside = folder / Path(recording.path).name
+        return beside if not place.exists() and beside.exists() else place
+
+    def _relative(self, path: Path) -> str:
+        try:
+            return Path(os.path.relpath(path, self._database.path.parent)).as_posix()
+        except ValueError:  # another drive
+            return path.as_posix()
+
+    def _which(self) -> str:
+        numbers = self.numbers
+        if not len(numbers):
+            return "a recording to be imported first"
+        return f"one of the session's {len(numbers)} frames, {numbers[0]} to {numbers[-1]}"
+
+    def _unpacked(self, blob: bytes, named: str) -> Any:
+        try:
+            return unpack(blob)
+        except Damaged as error:
+            raise InputError(self._database.path, named, error, "what was written there") from error
+
+    def _decoded(self, content: bytes, named: str) -> GreyImage:
+        if not content.startswith(b"LAB1"):
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+            if image is None or image.ndim != 2:
+                raise InputError(self._database.path, named, "damaged", "what was written there")
+            return np.asarray(image)
+        return np.asarray(self._unpacked(content, named))
+
+
+def identify(path: Path) -> tuple[int, str]:
+    """Size in bytes and SHA-256 of a recording; of a folder or a pair, over all its files.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        files = _files(path)
+        digests = []
+        for file in files:
+            digest = hashlib.sha256()
+            with file.open("rb") as stream:
+                while part := stream.read(READ_BYTES):
+                    digest.update(part)
+            digests.append((file.name, digest.hexdigest()))
+        size = sum(file.stat().st_size for file in files)
+    except OSError as error:
+        raise InputError(path, "recording", error.strerror, "one that can be read") from error
+    if len(files) == 1 and files[0] == path:
+        return size, digests[0][1]
+    return size, hashlib.sha256(repr(digests).encode()).hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_dir():
+        return sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+    if path.suffix.lower() in PAIRED:
+        return sorted(
+            p for p in path.parent.iterdir() if p.stem == path.stem and p.suffix.lower() in PAIRED
+        )
+    return [path]
+
+
+def _encoded(image: npt.NDArray[Any]) -> bytes:
+    """A frame as a lossless blob: PNG where its levels fit."""
+    if image.dtype in (np.uint8, np.uint16):
+        _, content = cv2.imencode(".png", image)
+        return content.tobytes()
+    return pack(np.asarray(image))

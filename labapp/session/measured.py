@@ -1,0 +1,333 @@
+"""The results of a session: what was measured, from what, and whether that still stands."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+import labapp
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.errors import InputError
+from labapp.session.blobs import Damaged, fingerprint, pack, unpack
+from labapp.session.database import Database
+from labapp.session.schema import MEASURES
+from labapp.session.setup import Setup, parse_setup
+
+SETUP_CHANGED = "the rig or a calibration was changed"
+SETTINGS_CHANGED = "the settings were changed"
+CORRECTION_CHANGED = "the dots or rows were corrected"
+
+
+@dataclass(frozen=True)
+class Basis:
+    """What a frame is measured from, besides its image.
+
+    Parameters
+    ----------
+    setup
+        Rig and image calibration.
+    settings
+        Of every step, the scheme included.
+    """
+
+    setup: Setup
+    settings: Settings
+
+    @property
+    def scheme(self) -> str:
+        """Name that results are kept under; see `scheme_name`."""
+        return scheme_name(self.settings)
+
+    def fingerprints(self) -> tuple[str, str]:
+        """SHA-256 of what the setup says (comments aside) and of the settings."""
+        setup = fingerprint((self.setup.rig, self.setup.calibration))
+        return setup, fingerprint(self.settings)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What is kept of one frame by one scheme.
+
+    Parameters
+    ----------
+    frame
+        Its number in the recording.
+    measurement
+        What it gave.
+    scheme
+        Name of the scheme, as in `Basis.scheme`.
+    version
+        Of labapp, which measured it.
+    measured
+        When, ISO 8601.
+    setup
+        The setup it was measured with, TOML.
+    settings
+        The settings it was measured with.
+    stale
+        Why it no longer stands, a clause each; empty while it does.
+    """
+
+    frame: int
+    measurement: Measurement
+    scheme: str
+    version: str
+    measured: str
+    setup: str
+    settings: Settings
+    stale: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Overview:
+    """All frames of a session at a glance; n frames.
+
+    Parameters
+    ----------
+    frame
+        Numbers in the recording, ascending, shape (n,).
+    time_s
+        Times, shape (n,), s; NaN where unknown.
+    status
+        Each frame's status; empty where it was not measured.
+    corrected
+        Which frames have a correction by hand, shape (n,).
+    stale
+        Which results no longer stand, shape (n,).
+    measures
+        Name → values, shape (n,), of `Measures`; NaN where there is none.
+    """
+
+    frame: IntArray
+    time_s: FloatArray
+    status: tuple[str, ...]
+    corrected: BoolArray
+    stale: BoolArray
+    measures: dict[str, FloatArray]
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+class Results:
+    """The results of a session.
+
+    Parameters
+    ----------
+    database
+        The session file.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def put(
+        self, frame: int, measurement: Measurement, basis: Basis, correction: str | None
+    ) -> None:
+        """Keep what a frame gave; what the same scheme gave before is replaced.
+
+        All of it but the surfaces one σ away (`Reconstruction.variants`): they are five times the
+        rest, and what they are for, the ± of points and sizes, is kept.
+
+        Parameters
+        ----------
+        frame, measurement
+            The frame's number and what it gave.
+        basis
+            What it was measured from.
+        correction
+            SHA-256 of the correction it was measured with; None without.
+
+        Raises
+        ------
+        InputError
+            If it cannot be saved; then nothing has changed.
+        """
+        setup, settings = pack(basis.setup.text), pack(basis.settings)
+        reconstruction = measurement.reconstruction
+        if reconstruction is not None:
+            reconstruction = replace(reconstruction, variants=())
+        content = pack(replace(measurement, reconstruction=reconstruction))
+        sizes = [getattr(measurement.measures, name, None) for name in MEASURES]
+        with self._database.transaction() as connection:
+            key = (labapp.__version__, setup, settings)
+            connection.execute(
+                "INSERT OR IGNORE INTO inputs (version, setup, settings) VALUES (?, ?, ?)", key
+            )
+            (inputs,) = connection.execute(
+                "SELECT id FROM inputs WHERE version = ? AND setup = ? AND settings = ?", key
+            ).fetchone()
+            connection.execute(
+                "DELETE FROM result WHERE frame = ? AND scheme = ?", (frame, basis.scheme)
+            )
+            result = connection.execute(
+                "INSERT INTO result (frame, scheme, inputs, correction, measured, status, "
+                f"correspondence, {', '.join(MEASURES)}) "
+                f"VALUES ({', '.join('?' * (7 + len(MEASURES)))})",
+                (
+                    *(frame, basis.scheme, inputs, correction, _now(), measurement.status),
+                    None if measurement.match is None else measurement.match.orientation,
+                    *sizes,
+                ),
+            ).lastrowid
+            connection.execute("INSERT INTO detail VALUES (?, ?)", (result, content))
+            connection.execute(
+                "DELETE FROM inputs WHERE NOT EXISTS "
+                "(SELECT 1 FROM result WHERE result.inputs = inputs.id)"
+            )
+
+    def get(
+        self, frame: int, scheme: str, basis: Basis | None, correction: str | None
+    ) -> Result | None:
+        """What a scheme gave for a frame; None if it was not measured.
+
+        Parameters
+        ----------
+        frame, scheme
+            Which result.
+        basis, correction
+            What it would be measured from now; no basis where the setup is not complete.
+
+        Raises
+        ------
+        InputError
+            If it is damaged.
+        """
+        found = self._database.rows(
+            "SELECT result.inputs, version, setup, settings, correction, measured, content "
+            "FROM result JOIN inputs ON inputs.id = result.inputs "
+            "JOIN detail ON detail.result = result.id WHERE frame = ? AND scheme = ?",
+            frame,
+            scheme,
+        )
+        if not found:
+            return None
+        inputs, version, setup, settings, corrected, measured, content = found[0]
+        named = f"result of frame {frame}"
+        outdated = self._outdated(basis).get(inputs, ())
+        return Result(
+            frame=frame,
+            measurement=self._unpacked(content, named),
+            scheme=scheme,
+            version=version,
+            measured=measured,
+            setup=self._unpacked(setup, named),
+            settings=self._unpacked(settings, named),
+            stale=(*outdated, *((CORRECTION_CHANGED,) if corrected != correction else ())),
+        )
+
+    def schemes(self, frame: int) -> tuple[str, ...]:
+        """Names of the schemes that a frame was measured by."""
+        rows = self._database.rows(
+            "SELECT scheme FROM result WHERE frame = ? ORDER BY scheme", frame
+        )
+        return tuple(scheme for (scheme,) in rows)
+
+    def overview(self, scheme: str, basis: Basis | None, corrections: dict[int, str]) -> Overview:
+        """All frames at a glance; see `get` for the parameters."""
+        outdated = self._outdated(basis)
+        rows = self._database.rows(
+            f"SELECT number, time_s, inputs, correction, status, {', '.join(MEASURES)} "
+            "FROM frame LEFT JOIN result ON frame = number AND scheme = ? ORDER BY number",
+            scheme,
+        )
+        sizes = np.array([row[5:] for row in rows], np.float64).reshape(-1, len(MEASURES))
+        return Overview(
+            frame=np.array([row[0] for row in rows], np.int64),
+            time_s=np.array([row[1] for row in rows], np.float64),
+            status=tuple(row[4] or "" for row in rows),
+            corrected=np.array([row[0] in corrections for row in rows], bool),
+            stale=np.array(
+                [
+                    row[2] is not None
+                    and bool(outdated.get(row[2]) or row[3] != corrections.get(row[0]))
+                    for row in rows
+                ],
+                bool,
+            ),
+            measures=dict(zip(MEASURES, sizes.T, strict=True)),
+        )
+
+    def problems(self) -> list[str]:
+        """Results that are damaged; empty if all is well."""
+        found = []
+        for number, version, setup, settings in self._database.rows("SELECT * FROM inputs"):
+            try:
+                parse_setup(unpack(setup), self._database.path)
+                unpack(settings)
+            except (Damaged, InputError) as error:
+                found.append(f"inputs {number} of version {version} are damaged: {error}")
+        names = ", ".join(MEASURES)
+        for result, frame, scheme, status, *sizes in self._database.rows(
+            f"SELECT id, frame, scheme, status, {names} FROM result"
+        ):
+            content = self._database.value("SELECT content FROM detail WHERE result = ?", result)
+            named = f"result of frame {frame} ({scheme})"
+            try:
+                measurement = unpack(content or b"")
+            except Damaged as error:
+                found.append(f"{named} is damaged: {error}")
+                continue
+            held = [getattr(measurement.measures, name, None) for name in MEASURES]
+            held = [None if size is None or np.isnan(size) else size for size in held]
+            if (measurement.status, held) != (status, sizes):
+                found.append(f"{named} is not what its frame gave")
+        return found
+
+    def _outdated(self, basis: Basis | None) -> dict[int, tuple[str, ...]]:
+        """Why results of each row of `inputs` no longer stand."""
+        rows = self._database.rows("SELECT id, setup, settings FROM inputs")
+        return {
+            number: _differences(basis, self._inputs(setup, settings))
+            for number, setup, settings in rows
+        }
+
+    def _inputs(self, setup: bytes, settings: bytes) -> Basis:
+        try:
+            return _read_inputs(setup, settings)
+        except (Damaged, InputError) as error:
+            raise InputError(
+                self._database.path, "inputs", error, "what was written there"
+            ) from error
+
+    def _unpacked(self, blob: bytes, named: str) -> Any:
+        try:
+            return unpack(blob)
+        except Damaged as error:
+            raise InputError(self._database.path, named, error, "what was written there") from error
+
+
+@functools.lru_cache(maxsize=64)
+def _read_inputs(setup: bytes, settings: bytes) -> Basis:
+    return Basis(parse_setup(unpack(setup), "setup"), unpack(settings))
+
+
+def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:
+    if now is None:
+        return (SETUP_CHANGED,)
+    # Results of another scheme than the chosen one stand by what else the settings say.
+    chosen = replace(now.settings, scheme=then.settings.scheme, algorithm=then.settings.algorithm)
+    setup, settings = Basis(now.setup, chosen).fingerprints()
+    before = then.fingerprints()
+    return tuple(
+        reason
+        for reason, changed in (
+            (SETUP_CHANGED, setup != before[0]),
+            (SETTINGS_CHANGED, settings != before[1]),
+        )
+        if changed
+    )
+
+
+def scheme_name(settings: Settings) -> str:
+    """``fit``, ``ers``, or ``irs-`` with its algorithm."""
+    return f"irs-{settings.algorithm}" if settings.scheme == "irs" else settings.scheme
+
+
+def _now() -> str:
+    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

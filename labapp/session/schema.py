@@ -1,0 +1,90 @@
+"""Tables of the session file, and how files of earlier versions are brought up to date.
+
+What the operator says is in `document`, one row per thing; every change of it is in `change` with
+the value before and after. What was filmed is in `recording` and `frame`, what was measured in
+`result`, with the `inputs` it was measured from. Nothing is stored that follows from these.
+"""
+
+from __future__ import annotations
+
+APPLICATION_ID = 0x4C414250
+"""“LABP”, in SQLite's header: what makes a database a session."""
+
+VERSION = 1
+"""Of the tables below. A change to them adds 1, and a step to `MIGRATIONS`."""
+
+MEASURES = (
+    "are_mm mre_mm are_inner_mm mre_inner_mm width_mm length_mm height_mm depth_mm area_mm2 "
+    "volume_mm3 center_x_mm center_y_mm peak_x_mm peak_y_mm width_sigma_mm length_sigma_mm "
+    "height_sigma_mm depth_sigma_mm area_sigma_mm2 volume_sigma_mm3"
+).split()
+"""Columns of `result` that repeat `Measures`, so that trends need not unpack every frame."""
+
+TABLES = (
+    """CREATE TABLE document (
+        kind TEXT NOT NULL,
+        frame INTEGER NOT NULL DEFAULT -1,
+        sha256 TEXT NOT NULL,
+        content BLOB NOT NULL,
+        PRIMARY KEY (kind, frame)
+    )""",
+    """CREATE TABLE change (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        label TEXT NOT NULL,
+        made TEXT NOT NULL,
+        undone INTEGER NOT NULL DEFAULT 0 CHECK (undone IN (0, 1))
+    )""",
+    """CREATE TABLE change_part (
+        change INTEGER NOT NULL REFERENCES change (id) ON DELETE CASCADE,
+        kind TEXT NOT NULL,
+        frame INTEGER NOT NULL,
+        before BLOB,
+        after BLOB,
+        PRIMARY KEY (change, kind, frame)
+    )""",
+    """CREATE TABLE picture (
+        sha256 TEXT PRIMARY KEY,
+        name TEXT NOT NULL,
+        content BLOB NOT NULL
+    )""",
+    """CREATE TABLE recording (
+        id INTEGER PRIMARY KEY CHECK (id = 1),
+        content BLOB NOT NULL
+    )""",
+    """CREATE TABLE frame (
+        number INTEGER PRIMARY KEY CHECK (number >= 0),
+        time_s REAL,
+        checksum INTEGER
+    )""",
+    """CREATE TABLE frame_image (
+        frame INTEGER PRIMARY KEY REFERENCES frame (number) ON DELETE CASCADE,
+        content BLOB NOT NULL
+    )""",
+    """CREATE TABLE inputs (
+        id INTEGER PRIMARY KEY,
+        version TEXT NOT NULL,
+        setup BLOB NOT NULL,
+        settings BLOB NOT NULL,
+        UNIQUE (version, setup, settings)
+    )""",
+    f"""CREATE TABLE result (
+        id INTEGER PRIMARY KEY,
+        frame INTEGER NOT NULL REFERENCES frame (number) ON DELETE CASCADE,
+        scheme TEXT NOT NULL,
+        inputs INTEGER NOT NULL REFERENCES inputs (id),
+        correction TEXT,
+        measured TEXT NOT NULL,
+        status TEXT NOT NULL,
+        correspondence TEXT,
+        {", ".join(f"{name} REAL" for name in MEASURES)},
+        UNIQUE (frame, scheme)
+    )""",
+    "CREATE INDEX result_inputs ON result (inputs)",
+    """CREATE TABLE detail (
+        result INTEGER PRIMARY KEY REFERENCES result (id) ON DELETE CASCADE,
+        content BLOB NOT NULL
+    )""",
+)
+
+MIGRATIONS: dict[int, tuple[str, ...]] = {}
+"""From each earlier version, the statements that lead to the next."""

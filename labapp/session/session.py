@@ -1,0 +1,433 @@
+"""A session: one file with an experiment from its record to its results, for scripts and windows.
+
+Every call that changes something is one transaction: when it returns, the change is on the disk,
+and whatever happens before it returns leaves the session as it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from labapp.core.correction import Correction
+from labapp.core.laser_calibration import LaserCalibration, calibrate_laser
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.plane_calibration import (
+    PlaneCalibration,
+    PlaneCalibrationSettings,
+    calibrate_plane,
+)
+from labapp.core.values import IntArray
+from labapp.errors import InputError
+from labapp.media import Frame, GreyImage, open_source
+from labapp.session.blobs import fingerprint
+from labapp.session.database import Database
+from labapp.session.documents import WHOLE, Change, Documents, Key
+from labapp.session.frames import Frames, Progress
+from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
+from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
+from labapp.session.run import measure_each
+from labapp.session.setup import Setup, parse_setup, updated_setup
+
+
+class Session:
+    """An open session; make it with `Session.create` or `Session.open`, use it in a ``with``.
+
+    Attributes
+    ----------
+    path
+        The session file.
+    read_only
+        Whether it was opened so.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self.path = database.path
+        self.read_only = database.read_only
+        self._database = database
+        self._documents = Documents(database)
+        self._frames = Frames(database)
+        self._results = Results(database)
+
+    @classmethod
+    def create(cls, path: str | os.PathLike[str], record: Record | None = None) -> Session:
+        """Make a new session file, ``….labsession``.
+
+        Raises
+        ------
+        InputError
+            If there is a file of that name, or it cannot be written.
+        """
+        session = cls(Database.create(path))
+        if record is not None:
+            session.set_record(record)
+        return session
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str], read_only: bool = False) -> Session:
+        """Open a session file.
+
+        Raises
+        ------
+        SessionInUse
+            If another program has it open for writing; it can still be opened read-only.
+        InputError
+            If it cannot be read, is no session, or is one of a newer labapp.
+        """
+        return cls(Database.open(path, read_only))
+
+    def close(self) -> None:
+        """Let go of the file. Closing twice does no harm."""
+        self._frames.close()
+        self._database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # --- what the operator says; every change can be undone ---------------------------------
+
+    @property
+    def record(self) -> Record:
+        """The experiment record."""
+        found = self._documents.get("record")
+        return Record() if found is None else found
+
+    def set_record(self, record: Record) -> None:
+        """Replace the experiment record."""
+        self._change("experiment record", {("record", WHOLE): record})
+
+    @property
+    def setup_text(self) -> str:
+        """The setup as TOML, as far as it goes."""
+        return self._documents.get("setup") or ""
+
+    @property
+    def setup(self) -> Setup:
+        """Rig and image calibration.
+
+        Raises
+        ------
+        InputError
+            If it is not complete yet; it says what is missing.
+        """
+        return parse_setup(self.setup_text, self.path)
+
+    def set_setup(self, text: str, label: str = "setup") -> None:
+        """Replace the setup by that of a setup file.
+
+        Raises
+        ------
+        InputError
+            If anything in it is unknown, missing or impossible.
+        """
+        parse_setup(text, self.path)
+        self._change(label, {("setup", WHOLE): text})
+
+    def update_setup(
+        self, values: Mapping[str, Mapping[str, object]], label: str = "setup"
+    ) -> None:
+        """Put values (section → key → value; None takes it out) into the setup; it may stay open.
+
+        Raises
+        ------
+        InputError
+            If a section is not one; whether values are possible is told by `setup`.
+        """
+        self._change(label, {("setup", WHOLE): self._updated(values)})
+
+    @property
+    def laser_calibration(self) -> LaserReadings | None:
+        """The laser calibration in use, and what it was found from; None before one."""
+        found: LaserReadings | None = self._documents.get("laser-calibration")
+        return found
+
+    def calibrate_laser(
+        self,
+        l1_mm: Sequence[float],
+        l2_mm: Sequence[float],
+        l3_mm: Sequence[float],
+        fan_angle_deg: float = 10.0,
+    ) -> LaserCalibration:
+        """Find the laser from its cross-hair (Appendix I) and put it into the rig.
+
+        Raises
+        ------
+        ValueError
+            If no laser can have drawn such a cross.
+        """
+        found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg)
+        readings = LaserReadings(tuple(l1_mm), tuple(l2_mm), tuple(l3_mm), fan_angle_deg, found)
+        laser = {"projection_angle_deg": found.angle_deg, "distance_mm": found.distance_mm}
+        self._change(
+            "laser calibration",
+            {
+                ("laser-calibration", WHOLE): readings,
+                ("setup", WHOLE): self._updated({"laser": laser}),
+            },
+        )
+        return found
+
+    @property
+    def plane_calibration(self) -> PlanePicture | None:
+        """The imaging-plane calibration in use, and what it was found from; None before one."""
+        found: PlanePicture | None = self._documents.get("plane-calibration")
+        return found
+
+    def calibrate_plane(self, picture: str | os.PathLike[str], unit_mm: float) -> PlaneCalibration:
+        """Find the imaging plane in a picture of the target (§5.1), keep both and use it.
+
+        Parameters
+        ----------
+        picture
+            The calibration picture.
+        unit_mm
+            Length of a unit of the target's axes, mm.
+
+        Raises
+        ------
+        CannotMeasure
+            If the target is not found in it.
+        InputError
+            If it cannot be read.
+        """
+        with open_source(picture) as source:
+            image = source.frame(0).image
+        found = calibrate_plane(image, PlaneCalibrationSettings(unit_mm=unit_mm))
+        sha256 = self._keep_picture(Path(picture).name, image)
+        calibration = {
+            **{f"{name}_px": list(getattr(found, f"{name}_px")) for name in POINTS},
+            **{f"{name}_mm": getattr(found, f"{name}_mm") for name in POINTS[1:]},
+            "homography": None,
+        }
+        self._change(
+            "imaging-plane calibration",
+            {
+                ("plane-calibration", WHOLE): PlanePicture(unit_mm, found, sha256),
+                ("setup", WHOLE): self._updated({"image_calibration": calibration}),
+            },
+        )
+        return found
+
+    def picture(self, sha256: str) -> GreyImage:
+        """A calibration picture that the session keeps, grey levels, shape (rows, columns).
+
+        Raises
+        ------
+        InputError
+            If it does not keep it, or it is damaged.
+        """
+        content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)
+        if content is None or hashlib.sha256(content).hexdigest() != sha256:
+            value = "missing" if content is None else "damaged"
+            raise InputError(self.path, "calibration picture", value, "what was kept there")
+        return np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED))
+
+    @property
+    def settings(self) -> Settings:
+        """How frames are measured."""
+        found = self._documents.get("settings")
+        return Settings() if found is None else found
+
+    def set_settings(self, settings: Settings, label: str = "settings") -> None:
+        """Choose how frames are measured: the scheme, and the settings of every step."""
+        self._change(label, {("settings", WHOLE): settings})
+
+    def correction(self, frame: int) -> Correction | None:
+        """A frame's dots and rows as they were corrected by hand; None where they were not."""
+        found: Correction | None = self._documents.get("correction", frame)
+        return found
+
+    def correct(
+        self, corrections: Mapping[int, Correction | None], label: str = "correction"
+    ) -> None:
+        """Correct the dots and rows of frames, in one step; None goes back to automatic.
+
+        Raises
+        ------
+        InputError
+            If the session has no such frame.
+        """
+        for frame in corrections:
+            self._frames.time_s(frame)
+        self._change(label, {("correction", frame): value for frame, value in corrections.items()})
+
+    def undo(self) -> Change | None:
+        """Take back the last change that stands; None if there is none."""
+        return self._documents.undo()
+
+    def redo(self) -> Change | None:
+        """Make the last change again that was taken back; None if there is none."""
+        return self._documents.redo()
+
+    @property
+    def history(self) -> tuple[Change, ...]:
+        """Changes that can be undone or redone, the oldest first."""
+        return self._documents.history()
+
+    # --- what was filmed --------------------------------------------------------------------
+
+    def import_recording(
+        self,
+        path: str | os.PathLike[str],
+        frames: str = ":",
+        *,
+        frame_rate_hz: float | None = None,
+        embed: bool = False,
+        progress: Progress | None = None,
+    ) -> Recording:
+        """Import a recording; see `Frames.take_in`."""
+        return self._frames.take_in(
+            path, frames, frame_rate_hz=frame_rate_hz, embed=embed, progress=progress
+        )
+
+    @property
+    def recording(self) -> Recording | None:
+        """Where the frames come from; None before a recording was imported."""
+        return self._frames.recording
+
+    @property
+    def missing_recording(self) -> Path | None:
+        """Where the recording should be and is not; None if frames can be read."""
+        return self._frames.missing
+
+    def relink(self, path: str | os.PathLike[str]) -> None:
+        """Say where the recording is now; see `Frames.relink`."""
+        self._frames.relink(path)
+
+    @property
+    def frames(self) -> IntArray:
+        """Numbers of the session's frames, ascending, shape (n,)."""
+        return self._frames.numbers
+
+    def frame(self, number: int) -> Frame:
+        """One frame as it was imported; see `Frames.read`."""
+        return self._frames.read(number)
+
+    # --- what was measured ------------------------------------------------------------------
+
+    def measure(self, frames: Iterable[int] | None = None) -> Iterator[tuple[int, Measurement]]:
+        """Measure frames and keep what they give; yields (frame, measurement) once it is kept.
+
+        A frame that cannot be read is kept with the status ``unreadable``.
+
+        Parameters
+        ----------
+        frames
+            Which ones; None: those not measured yet, or measured from what was changed since.
+
+        Raises
+        ------
+        InputError
+            If the setup is not complete, or a result cannot be saved.
+        """
+        chosen = self.stale_frames() if frames is None else frames
+        basis = Basis(self.setup, self.settings)
+        if (missing := self.missing_recording) is not None:
+            raise InputError(missing, "recording", "is not there", "say where it is now (relink)")
+        corrections: dict[int, Correction | None] = {}
+
+        def correction(number: int) -> Correction | None:
+            return corrections.setdefault(number, self.correction(number))
+
+        numbers = (int(number) for number in chosen)
+        for number, _, measurement in measure_each(
+            numbers, self.frame, basis.setup, basis.settings, correction
+        ):
+            # What it was measured with, whatever has been corrected meanwhile.
+            used = corrections.pop(number, None)
+            self._results.put(
+                number, measurement, basis, None if used is None else fingerprint(used)
+            )
+            yield number, measurement
+
+    def result(self, frame: int, scheme: str | None = None) -> Result | None:
+        """What a frame gave, and what it was measured from; None if it was not measured.
+
+        Parameters
+        ----------
+        frame
+            Its number.
+        scheme
+            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+        """
+        return self._results.get(
+            frame,
+            scheme or scheme_name(self.settings),
+            self._basis(),
+            self._documents.fingerprint("correction", frame),
+        )
+
+    def overview(self, scheme: str | None = None) -> Overview:
+        """All frames at a glance: status, corrections, what no longer stands, measures."""
+        return self._results.overview(
+            scheme or scheme_name(self.settings),
+            self._basis(),
+            self._documents.fingerprints("correction"),
+        )
+
+    def stale_frames(self) -> IntArray:
+        """Frames that are not measured, or whose measures no longer stand, shape (n,)."""
+        seen = self.overview()
+        missing = np.array([status == "" for status in seen.status], bool)
+        return np.asarray(seen.frame[seen.stale | missing], np.int64)
+
+    def problems(self, progress: Progress | None = None) -> list[str]:
+        """Check the whole session, its recording included: what is wrong, a sentence each."""
+        found = self._database.problems()
+        if found:
+            return found
+        return [
+            *self._documents.problems(),
+            *self._pictures_problems(),
+            *self._frames.problems(progress),
+            *self._results.problems(),
+        ]
+
+    # --- within -----------------------------------------------------------------------------
+
+    def _change(self, label: str, values: Mapping[Key, Any]) -> None:
+        self._documents.change(label, values)
+
+    def _updated(self, values: Mapping[str, Mapping[str, object]]) -> str:
+        return updated_setup(self.setup_text, self.path, values)
+
+    def _basis(self) -> Basis | None:
+        try:
+            return Basis(self.setup, self.settings)
+        except InputError:
+            return None
+
+    def _keep_picture(self, name: str, image: GreyImage) -> str:
+        _, encoded = cv2.imencode(".png", image)
+        content = encoded.tobytes()
+        sha256 = hashlib.sha256(content).hexdigest()
+        with self._database.transaction() as connection:
+            connection.execute(
+                "INSERT OR IGNORE INTO picture VALUES (?, ?, ?)", (sha256, name, content)
+            )
+        return sha256
+
+    def _pictures_problems(self) -> list[str]:
+        return [
+            f"calibration picture {name} is damaged"
+            for sha256, name, content in self._database.rows("SELECT * FROM picture")
+            if hashlib.sha256(content).hexdigest() != sha256
+        ]
+
+
+POINTS = ("origin", "x_axis", "z_axis")

@@ -1,0 +1,243 @@
+"""Changes to a session, cut off at any moment: run by `test_crash.py`, or by hand for longer.
+
+``python crash.py kill FOLDER KILLS CHANGES SEED`` forks a child that makes random changes and
+kills it at random moments; ``disk`` lets its disk fill instead. After each the session must open,
+be whole, and hold what the last acknowledged change left: a model of plain values, which knows
+nothing of the session's code, tells what that is. A change that was finished but not acknowledged
+yet may be there as well.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from labapp.core.correction import Correction
+from labapp.core.dots import Dots
+from labapp.core.lattice import Lattice
+from labapp.core.pipeline import Settings
+from labapp.errors import InputError
+from labapp.session.record import Record
+from labapp.session.session import Session
+
+FRAMES = 40
+PLAIN = {"notes": "", "setup": "", "scheme": "fit", "corrections": {}}
+
+
+def step(number: int, seed: int) -> tuple[str, object]:
+    """Change ``number`` of the sequence, counted from 0."""
+    rng = random.Random(f"{seed} {number}")
+    kind = rng.choice(
+        ["notes", "setup", "scheme", "correction", "correction", "several", "undo", "undo", "redo"]
+    )
+    if kind == "notes":
+        return kind, f"note {number} " + "x" * rng.randrange(20_000)
+    if kind == "setup":
+        return kind, rng.uniform(20, 40)
+    if kind == "scheme":
+        return kind, rng.choice(["fit", "ers", "irs"])
+    if kind == "correction":
+        return kind, {rng.randrange(FRAMES): rng.choice([None, number])}
+    if kind == "several":
+        return kind, dict.fromkeys(rng.sample(range(FRAMES), 8), number)
+    return kind, None
+
+
+class Model:
+    """What the session must hold, in plain values."""
+
+    def __init__(self) -> None:
+        self.state: dict[str, object] = dict(PLAIN)
+        self.done: list[dict[str, object]] = []
+        self.undone: list[dict[str, object]] = []
+
+    def apply(self, number: int, seed: int) -> None:
+        kind, value = step(number, seed)
+        before = self.state
+        if kind == "undo":
+            if self.done:
+                self.undone.append(before)
+                self.state = self.done.pop()
+            return
+        if kind == "redo":
+            if self.undone:
+                self.done.append(before)
+                self.state = self.undone.pop()
+            return
+        if kind in ("correction", "several"):
+            assert isinstance(value, dict)
+            assert isinstance(before["corrections"], dict)
+            merged = {**before["corrections"], **value}
+            value = {frame: of for frame, of in merged.items() if of is not None}
+            kind = "corrections"
+        after = {**before, kind: value}
+        if after != before:
+            self.done.append(before)
+            self.undone.clear()
+            self.state = after
+
+
+def correction_of(number: int) -> Correction:
+    rng = np.random.default_rng(number)
+    dots = Dots(*rng.uniform(0, 400, (7, 120)))
+    return Correction(dots, Lattice(np.arange(120), np.arange(120)), np.ones(120, bool))
+
+
+def apply(session: Session, number: int, seed: int) -> None:
+    kind, value = step(number, seed)
+    if kind == "notes":
+        session.set_record(Record(notes=str(value)))
+    elif kind == "setup":
+        session.update_setup({"laser": {"distance_mm": value}})
+    elif kind == "scheme":
+        session.set_settings(Settings(scheme=value))  # type: ignore[arg-type]
+    elif kind in ("correction", "several"):
+        assert isinstance(value, dict)
+        session.correct(
+            {frame: None if of is None else correction_of(of) for frame, of in value.items()}
+        )
+    elif kind == "undo":
+        session.undo()
+    else:
+        session.redo()
+
+
+def differences(session: Session, state: dict[str, object]) -> list[str]:
+    """How the session differs from a state of the model."""
+    found = []
+    if session.record.notes != state["notes"]:
+        found.append("notes")
+    text = session.setup_text
+    setup = float(text.split("=")[1]) if text else ""
+    if setup != state["setup"]:
+        found.append("setup")
+    if session.settings.scheme != state["scheme"]:
+        found.append("scheme")
+    assert isinstance(state["corrections"], dict)
+    for frame in range(FRAMES):
+        held, of = session.correction(frame), state["corrections"].get(frame)
+        expected = None if of is None else correction_of(of)
+        if (held is None) != (expected is None) or not (
+            held is None
+            or expected is None
+            or np.array_equal(held.dots.image_px, expected.dots.image_px)
+        ):
+            found.append(f"correction {frame}")
+    return found
+
+
+def check(path: Path, acknowledged: int, seed: int) -> tuple[int, list[str]]:
+    """How many changes the session holds, and what is wrong with it."""
+    wrong = []
+    with Session.open(path, read_only=True) as reading:
+        before = differences_from(reading, acknowledged, seed)
+    with Session.open(path) as session:
+        wrong += session.problems()
+        held, differing = differences_from(session, acknowledged, seed)
+        wrong += differing
+    if before != (held, differing):
+        wrong.append(f"read-only it showed something else: {before}")
+    return held, wrong
+
+
+def differences_from(session: Session, acknowledged: int, seed: int) -> tuple[int, list[str]]:
+    model = Model()
+    for number in range(acknowledged):
+        model.apply(number, seed)
+    first = differences(session, model.state)
+    if not first:
+        return acknowledged, []
+    model.apply(acknowledged, seed)
+    if not differences(session, model.state):
+        return acknowledged + 1, []
+    return acknowledged, first
+
+
+def make_changes(path: Path, start: int, seed: int, pipe: int) -> None:
+    with Session.open(path) as session:
+        number = start
+        while True:
+            apply(session, number, seed)
+            number += 1
+            os.write(pipe, number.to_bytes(4, "little"))
+
+
+def last_acknowledged(pipe: int, start: int) -> int:
+    content = b""
+    while part := os.read(pipe, 65536):
+        content += part
+    return int.from_bytes(content[-4:], "little") if content else start
+
+
+def killed(path: Path, start: int, seed: int, rng: random.Random) -> int:
+    """Have a child make changes from ``start`` on and kill it; the last it acknowledged."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        try:
+            make_changes(path, start, seed, writing)
+        finally:
+            os._exit(1)
+    os.close(writing)
+    time.sleep(rng.uniform(0.002, 0.04))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    acknowledged = last_acknowledged(reading, start)
+    os.close(reading)
+    return acknowledged
+
+
+def full(path: Path, start: int, seed: int, rng: random.Random) -> int:
+    """Have a child make changes until no file may grow any more; the last it acknowledged."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        limit = path.stat().st_size + rng.randrange(60_000)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        try:
+            make_changes(path, start, seed, writing)
+        except InputError as error:
+            os._exit(0 if error.field == "disk" else 3)
+        finally:
+            os._exit(4)
+    os.close(writing)
+    acknowledged = last_acknowledged(reading, start)
+    _, status = os.waitpid(child, 0)
+    os.close(reading)
+    if os.waitstatus_to_exitcode(status):
+        raise SystemExit(f"the child ended with {os.waitstatus_to_exitcode(status)}, not told why")
+    return acknowledged
+
+
+def main(arguments: list[str]) -> None:
+    how, folder, times, changes, seed = arguments[0], Path(arguments[1]), *map(int, arguments[2:])
+    path = folder / "crash.labsession"
+    rng = random.Random(seed)
+    with Session.create(path) as session, session._database.transaction() as connection:
+        connection.executemany(
+            "INSERT INTO frame (number) VALUES (?)", [(frame,) for frame in range(FRAMES)]
+        )
+    interrupt = killed if how == "kill" else full
+    done, rounds, unacknowledged = 0, 0, 0
+    while rounds < times or done < changes:
+        acknowledged = interrupt(path, done, seed, rng)
+        done, wrong = check(path, acknowledged, seed)
+        if wrong:
+            raise SystemExit(f"round {rounds}, after change {acknowledged}: {wrong}")
+        unacknowledged += done - acknowledged
+        rounds += 1
+    print(json.dumps({"rounds": rounds, "changes": done, "unacknowledged": unacknowledged}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

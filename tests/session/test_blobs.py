@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from labapp.core.boundary import Boundary
+from labapp.core.dots import Dots
+from labapp.core.interpolation import CloughTocherSurface, ThinPlateSurface
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.session.blobs import HEAD, MAGIC, Damaged, fingerprint, pack, unpack
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.lists(inner).map(tuple) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+def same(one: object, other: object) -> bool:
+    """Equal to the bit, NaN included."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        assert isinstance(other, np.ndarray)
+        return (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
+    if isinstance(one, float):
+        return repr(one) == repr(other)
+    if isinstance(one, dict):
+        assert isinstance(other, dict)
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        assert isinstance(other, list | tuple)
+        return len(one) == len(other) and all(map(same, one, other))
+    if dataclasses.is_dataclass(one):
+        names = [field.name for field in dataclasses.fields(one)]
+        return all(same(getattr(one, name), getattr(other, name)) for name in names)
+    return one == other
+
+
+@given(plain)
+def test_plain_values_come_back(value: object):
+    assert same(unpack(pack(value)), value)
+
+
+@given(hnp.arrays(hnp.scalar_dtypes(), hnp.array_shapes(min_dims=0, min_side=0)))
+def test_arrays_come_back_bit_for_bit_and_read_only(array: np.ndarray):
+    found = unpack(pack(array))
+    assert same(found, array)
+    assert not found.flags.writeable
+
+
+@given(st.binary())
+def test_bytes_come_back(content: bytes):
+    assert unpack(pack([content, content])) == [content, content]
+
+
+def test_a_rig_comes_back():
+    rig = Rig(
+        Laser(31.14, 31.48),
+        DotPattern(absent=frozenset({(10, 10), (3, 4)})),
+        Electrode(5.0),
+        ImagingPlane.vertical(50.0, 45.0, 3.0),
+    )
+    assert same(unpack(pack(rig)), rig)
+    assert unpack(pack(Settings(scheme="ers"))) == Settings(scheme="ers")
+
+
+@pytest.mark.parametrize("kind", [CloughTocherSurface, ThinPlateSurface])
+def test_surfaces_come_back(kind: type):
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-3, 3, (60, 2)), rng.uniform(0, 0.3, 60)])
+    surface = kind(points)
+    x, y = rng.uniform(-4, 4, (2, 50))
+    found = unpack(pack(surface))
+    np.testing.assert_array_equal(found.height(x, y), surface.height(x, y))
+
+
+def test_a_spline_surface_comes_back():
+    rng = np.random.default_rng(6)
+    basis = SplineBasis.over(np.array([-3.0, -4.0]), np.array([3.0, 4.0]), 0.7)
+    surface = SplineSurface(basis, rng.normal(size=np.prod(basis.shape)))
+    assert same(unpack(pack(surface)), surface)
+
+
+def test_a_measurement_without_a_surface_comes_back(unmeasured: Measurement):
+    assert same(unpack(pack(unmeasured)), unmeasured)
+
+
+def test_equal_values_have_one_fingerprint_and_others_another():
+    dots = Dots(*np.arange(7.0).reshape(7, 1))
+    assert fingerprint(dots) == fingerprint(unpack(pack(dots)))
+    assert fingerprint(dots) != fingerprint(dataclasses.replace(dots, peak=dots.peak + 1e-9))
+
+
+def test_what_an_earlier_version_did_not_know_gets_its_default():
+    """A class's field that is not in the blob: as if an earlier labapp had written it."""
+    tree = b'{"Settings":{"scheme":"ers"}}'
+    body = zlib.compress(len(tree).to_bytes(4, "little") + tree)
+    assert unpack(HEAD.pack(MAGIC, zlib.crc32(body)) + body) == Settings(scheme="ers")
+
+
+def test_what_only_a_later_version_knows_is_refused():
+    for tree in (b'{"Settings":{"colour":"red"}}', b'{"NewThing":{}}', b'{"list":1}', b"[1]"):
+        body = zlib.compress(len(tree).to_bytes(4, "little") + tree)
+        with pytest.raises(Damaged):
+            unpack(HEAD.pack(MAGIC, zlib.crc32(body)) + body)
+
+
+def test_every_changed_byte_is_noticed():
+    blob = pack(Boundary(np.zeros(2), np.zeros(4), np.zeros((4, 3))))
+    for place in range(len(blob)):
+        changed = bytearray(blob)
+        changed[place] ^= 0x10
+        with pytest.raises(Damaged):
+            unpack(bytes(changed))
+    for length in range(len(blob)):
+        with pytest.raises(Damaged):
+            unpack(blob[:length])
+
+
+def test_other_classes_are_refused():
+    with pytest.raises(TypeError, match="Path"):
+        pack(Path("a"))
+    with pytest.raises(TypeError, match="objects"):
+        pack(np.array([{}]))

@@ -1,0 +1,255 @@
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from labapp.errors import InputError
+from labapp.session import database as module
+from labapp.session.database import Database, SessionInUse
+from labapp.session.schema import APPLICATION_ID, TABLES, VERSION
+
+DATA = Path(__file__).parent / "data"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A new session file with one document in it."""
+    path = tmp_path / "a.labsession"
+    database = Database.create(path)
+    write(database, "one")
+    database.close()
+    return path
+
+
+def write(database: Database, kind: str) -> None:
+    with database.transaction() as connection:
+        connection.execute(
+            "INSERT INTO document (kind, sha256, content) VALUES (?, '', x'00')", (kind,)
+        )
+
+
+def kinds(database: Database) -> list[str]:
+    return [kind for (kind,) in database.rows("SELECT kind FROM document ORDER BY kind")]
+
+
+def test_the_file_says_what_it_is(path: Path):
+    connection = sqlite3.connect(path)
+    assert connection.execute("PRAGMA application_id").fetchone() == (APPLICATION_ID,)
+    assert connection.execute("PRAGMA user_version").fetchone() == (VERSION,)
+    connection.close()
+
+
+def test_a_closed_session_is_one_file(path: Path):
+    visible = [entry.name for entry in path.parent.iterdir() if not entry.name.startswith(".")]
+    assert visible == [path.name]
+
+
+def test_making_one_over_a_file_is_refused(path: Path):
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="is there already"):
+        Database.create(path)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["a.txt", "nowhere/a.labsession"])
+def test_making_one_where_it_cannot_be_is_refused(tmp_path: Path, name: str):
+    with pytest.raises(InputError, match=r"expected (a name|a folder)"):
+        Database.create(tmp_path / name)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("content", "value"),
+    [
+        (b"", "0 bytes"),
+        (b"SQLite format 3\x00", "not a session"),
+        (b"hello" * 100, "not a session"),
+        (b"SQLite format 3\x00" + bytes(200), "a database of another program"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, content: bytes, value: str):
+    path = tmp_path / "a.labsession"
+    path.write_bytes(content)
+    for read_only in (False, True):
+        with pytest.raises(InputError, match=value):
+            Database.open(path, read_only)
+    assert path.read_bytes() == content
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="No such file"):
+        Database.open(tmp_path / "a.labsession")
+    with pytest.raises(InputError, match="folder"):
+        Database.open(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_tables_of_another_make_are_refused(path: Path):
+    connection = sqlite3.connect(path)
+    connection.execute("DROP TABLE detail")
+    connection.close()
+    with pytest.raises(InputError, match="not those of a session"):
+        Database.open(path)
+
+
+def test_a_newer_version_is_refused_and_left_alone(path: Path):
+    connection = sqlite3.connect(path)
+    connection.execute(f"PRAGMA user_version = {VERSION + 1}")
+    connection.close()
+    before = path.read_bytes()
+    for read_only in (False, True):
+        with pytest.raises(InputError, match=r"of a newer labapp.*install the newer"):
+            Database.open(path, read_only)
+    assert path.read_bytes() == before
+
+
+# --- one writer, many readers -----------------------------------------------------------------
+
+
+def test_a_second_writer_is_told_and_may_read(path: Path):
+    first = Database.open(path)
+    with pytest.raises(SessionInUse, match=r"another program.*read-only"):
+        Database.open(path)
+    reader = Database.open(path, read_only=True)
+    write(first, "two")
+    assert kinds(reader) == ["one", "two"]
+    with pytest.raises(InputError, match="read-only"):
+        write(reader, "three")
+    reader.close()
+    first.close()
+    Database.open(path).close()
+
+
+def test_another_process_that_died_does_not_keep_the_session(path: Path):
+    script = (
+        "import os, sys; from labapp.session.database import Database; "
+        "d = Database.open(sys.argv[1]); print('open', flush=True); os.kill(os.getpid(), 9)"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", script, path], capture_output=True, text=True, check=False
+    )
+    assert answer.stdout == "open\n"
+    Database.open(path).close()
+
+
+def test_a_place_where_no_lock_can_be_made_is_told(path: Path):
+    lock = path.with_name(f".{path.name}.lock")
+    lock.unlink(missing_ok=True)
+    lock.mkdir()
+    with pytest.raises(InputError, match=r"folder that can be written; .* read-only"):
+        Database.open(path)
+    Database.open(path, read_only=True).close()
+
+
+# --- changes are whole ------------------------------------------------------------------------
+
+
+def test_a_change_that_fails_leaves_nothing(path: Path):
+    database = Database.open(path)
+
+    def fail() -> None:
+        with database.transaction():
+            write(database, "two")  # within it, and so part of it
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert kinds(database) == ["one"]
+    write(database, "three")
+    database.close()
+    assert kinds(Database.open(path, read_only=True)) == ["one", "three"]
+
+
+def cut_off(path: Path) -> Path:
+    """A copy of the session as it is in the middle of a change: half of it in the file."""
+    database = Database.open(path)
+    with database.transaction() as connection:
+        connection.execute("PRAGMA cache_size = 1")
+        connection.execute("PRAGMA cache_spill = 1")
+        for number in range(40):
+            connection.execute(
+                "INSERT INTO document (kind, frame, sha256, content) VALUES ('x', ?, '', ?)",
+                (number, os.urandom(8000)),
+            )
+        folder = path.parent / "copy"
+        folder.mkdir()
+        for entry in path.parent.glob(f"{path.name}*"):
+            shutil.copyfile(entry, folder / entry.name)
+    database.close()
+    copy = folder / path.name
+    assert copy.with_name(f"{copy.name}-journal").stat().st_size > 0
+    assert copy.stat().st_size > 50_000
+    return copy
+
+
+def test_a_change_that_was_cut_off_is_taken_back(path: Path):
+    database = Database.open(cut_off(path))
+    assert kinds(database) == ["one"]
+    assert database.problems() == []
+    database.close()
+
+
+def test_reading_one_with_a_change_cut_off_leaves_the_file_alone(path: Path):
+    copy = cut_off(path)
+    before = {entry: entry.read_bytes() for entry in copy.parent.iterdir()}
+    database = Database.open(copy, read_only=True)
+    assert kinds(database) == ["one"]
+    database.close()
+    assert {entry: entry.read_bytes() for entry in copy.parent.iterdir()} == before
+
+
+# --- versions ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def next_version(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The session is there; then comes a labapp whose sessions have one more table."""
+    added = "CREATE TABLE signal (time_s REAL PRIMARY KEY, current_a REAL)"
+    monkeypatch.setattr(module, "VERSION", VERSION + 1)
+    monkeypatch.setattr(module, "TABLES", (*TABLES, added))
+    monkeypatch.setitem(
+        module.MIGRATIONS, VERSION, (added, "UPDATE document SET kind = upper(kind)")
+    )
+
+
+@pytest.mark.usefixtures("next_version")
+def test_an_older_version_is_copied_and_brought_up_to_date(path: Path):
+    before = path.read_bytes()
+    database = Database.open(path)
+    assert kinds(database) == ["ONE"]
+    database.close()
+    kept = path.with_name(f"a.version-{VERSION}.labsession")
+    assert kept.read_bytes() == before
+    assert kinds(Database.open(path)) == ["ONE"]  # and only once
+
+
+@pytest.mark.usefixtures("next_version")
+def test_an_older_version_is_read_without_a_change(path: Path):
+    before = path.read_bytes()
+    database = Database.open(path, read_only=True)
+    assert kinds(database) == ["ONE"]
+    database.close()
+    assert path.read_bytes() == before
+    assert [entry for entry in path.parent.iterdir() if "version" in entry.name] == []
+
+
+@pytest.mark.usefixtures("next_version")
+def test_a_migration_that_fails_leaves_the_file_as_it_was(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    steps = (*module.MIGRATIONS[VERSION], "INSERT INTO nowhere VALUES (1)")
+    monkeypatch.setitem(module.MIGRATIONS, VERSION, steps)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="nowhere"):
+        Database.open(path)
+    assert path.read_bytes() == before
+
+
+def test_every_earlier_version_has_a_step():
+    assert set(module.MIGRATIONS) == set(range(1, VERSION))

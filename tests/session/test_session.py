@@ -1,0 +1,356 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import labapp
+from labapp.core.correction import Correction
+from labapp.core.pipeline import Settings
+from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
+from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
+from labapp.session.record import Record
+from labapp.session.session import Session
+from labapp.session.setup import read_setup
+from tests.session.test_blobs import same
+
+SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
+
+
+@pytest.fixture(scope="module")
+def measured_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording of four frames, two of them measured in a session beside it."""
+    folder = tmp_path_factory.mktemp("session")
+    shutil.copy(SAMPLE / "recording.avi", folder)
+    with Session.create(folder / "run.labsession", Record(operator="A. Weld")) as session:
+        session.set_setup((SAMPLE / "setup.toml").read_text("utf-8"))
+        session.import_recording(folder / "recording.avi", "0:8:2")
+        statuses = [measurement.status for _, measurement in session.measure([0, 2])]
+    assert statuses == ["ok", "ok"]
+    return folder
+
+
+@pytest.fixture
+def folder(measured_once: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(measured_once, tmp_path / "run"))
+
+
+@pytest.fixture
+def session(folder: Path) -> Iterator[Session]:
+    with Session.open(folder / "run.labsession") as session:
+        yield session
+
+
+def pretend(session: Session, frame: int, **changes: object) -> None:
+    """Keep another measurement of a frame, without measuring."""
+    result = session.result(frame)
+    assert result is not None
+    session._results.put(
+        frame,
+        replace(result.measurement, **changes),  # type: ignore[arg-type]
+        session._basis(),  # type: ignore[arg-type]
+        session._documents.fingerprint("correction", frame),
+    )
+
+
+def test_the_package_offers_it():
+    assert labapp.Session is Session
+
+
+def test_a_session_holds_everything(session: Session):
+    assert session.record == Record(operator="A. Weld")
+    assert same(session.setup.rig, read_setup(SAMPLE / "setup.toml").rig)
+    assert session.frames.tolist() == [0, 2, 4, 6]
+    assert session.stale_frames().tolist() == [4, 6]
+    recording = session.recording
+    assert recording is not None
+    assert recording.path == "recording.avi"
+    assert (recording.frames, recording.rows, recording.columns) == (30, 640, 480)
+    assert recording.frame_exact
+    assert "FFV1" in recording.description
+    assert session.problems() == []
+
+
+def test_results_say_what_they_come_from(session: Session):
+    result = session.result(2)
+    assert result is not None
+    assert (result.frame, result.scheme, result.version) == (2, "fit", labapp.__version__)
+    assert result.setup == session.setup_text
+    assert result.settings == Settings()
+    assert result.stale == ()
+    assert result.measurement.measures is not None
+    overview = session.overview()
+    assert overview.status == ("ok", "ok", "", "")
+    assert overview.measures["height_mm"][1] == result.measurement.measures.height_mm
+    np.testing.assert_allclose(overview.time_s, [0, 2 / 60, 4 / 60, 6 / 60])
+    assert session.result(4) is None
+
+
+def test_what_is_kept_is_what_was_measured(session: Session):
+    ((_, measured),) = session.measure([4])
+    kept = session.result(4)
+    assert kept is not None
+    assert measured.reconstruction is not None
+    without = replace(measured, reconstruction=replace(measured.reconstruction, variants=()))
+    assert same(kept.measurement, without)
+
+
+def test_frames_are_those_of_the_recording(session: Session):
+    video = cv2.VideoCapture(str(SAMPLE / "recording.avi"))
+    frames = [video.read()[1][..., 0] for _ in range(7)]
+    for number in (6, 0, 4):
+        np.testing.assert_array_equal(session.frame(number).image, frames[number])
+    with pytest.raises(InputError, match=r"frame: 1; expected one of the session's 4 frames"):
+        session.frame(1)
+
+
+# --- what no longer stands --------------------------------------------------------------------
+
+
+def test_a_changed_calibration_makes_results_stale_and_undo_lets_them_stand(session: Session):
+    session.update_setup({"laser": {"distance_mm": 30.0}}, "laser moved")
+    assert session.stale_frames().tolist() == [0, 2, 4, 6]
+    result = session.result(0)
+    assert result is not None
+    assert result.stale == (SETUP_CHANGED,)
+    undone = session.undo()
+    assert undone is not None
+    assert undone.label == "laser moved"
+    assert session.stale_frames().tolist() == [4, 6]
+    session.redo()
+    assert session.stale_frames().tolist() == [0, 2, 4, 6]
+
+
+def test_a_comment_in_the_setup_makes_nothing_stale(session: Session):
+    session.set_setup(session.setup_text + "\n# checked on Monday\n")
+    assert session.stale_frames().tolist() == [4, 6]
+
+
+def test_an_incomplete_setup_makes_everything_stale(session: Session):
+    session.update_setup({"laser": {"distance_mm": None}})
+    assert session.overview().stale.tolist() == [True, True, False, False]
+    with pytest.raises(InputError, match=r"laser.distance_mm"):
+        next(session.measure())
+
+
+def test_a_correction_makes_its_frame_stale(session: Session):
+    result = session.result(2)
+    assert result is not None
+    correction = Correction.of(result.measurement.dots, result.measurement.lattice)
+    session.correct({2: correction})
+    assert same(session.correction(2), correction)
+    overview = session.overview()
+    assert overview.corrected.tolist() == [False, True, False, False]
+    assert overview.stale.tolist() == [False, True, False, False]
+    result = session.result(2)
+    assert result is not None
+    assert result.stale == (CORRECTION_CHANGED,)
+    ((number, measurement),) = session.measure([2])
+    assert (number, measurement.status) == (2, "ok")
+    assert session.overview().stale.tolist() == [False, False, False, False]
+    session.undo()  # the correction: what was measured with it no longer stands
+    assert session.overview().stale.tolist() == [False, True, False, False]
+
+
+def test_a_correction_of_a_frame_that_is_not_there_is_refused(session: Session):
+    with pytest.raises(InputError, match="frame"):
+        session.correct({3: None})
+
+
+def test_each_scheme_keeps_its_own_results(session: Session):
+    session.set_settings(Settings(scheme="ers"))
+    assert session.stale_frames().tolist() == [0, 2, 4, 6]
+    one = session.result(0, "fit")
+    assert one is not None
+    basis = session._basis()
+    assert basis is not None
+    session._results.put(0, replace(one.measurement, scheme="ers"), basis, None)
+    assert session.overview().status == ("ok", "", "", "")
+    assert session.overview("fit").stale.tolist() == [False] * 4
+    assert session._results.schemes(0) == ("ers", "fit")
+    one = session.result(0, "fit")
+    assert one is not None
+    assert one.stale == ()
+
+
+def test_changed_settings_make_results_stale(session: Session):
+    settings = Settings()
+    session.set_settings(replace(settings, fit=replace(settings.fit, knot_mm=0.8)))
+    result = session.result(0)
+    assert result is not None
+    assert result.stale == (SETTINGS_CHANGED,)
+
+
+def test_a_result_without_a_surface_is_kept_too(session: Session):
+    pretend(
+        session,
+        0,
+        status="no-dots",
+        reason="dark",
+        match=None,
+        lattice=None,
+        dots=None,
+        reconstruction=None,
+        measures=None,
+    )
+    assert session.overview().status[0] == "no-dots"
+    assert np.isnan(session.overview().measures["height_mm"][0])
+    assert session.problems() == []
+
+
+# --- where the recording is -------------------------------------------------------------------
+
+
+def test_the_folder_may_be_moved(folder: Path):
+    moved = folder.rename(folder.with_name("elsewhere"))
+    with Session.open(moved / "run.labsession") as session:
+        assert session.missing_recording is None
+        assert session.frame(6).image.shape == (640, 480)
+        assert session.problems() == []
+
+
+def test_a_recording_beside_the_session_is_found(folder: Path):
+    (folder / "videos").mkdir()
+    with Session.create(folder / "other.labsession") as session:
+        video = shutil.copy(folder / "recording.avi", folder / "videos")
+        session.import_recording(video, ":2")
+    shutil.rmtree(folder / "videos")
+    with Session.open(folder / "other.labsession") as session:
+        assert session.frame(1).index == 1
+
+
+def test_a_recording_that_is_gone_is_asked_for_and_what_was_measured_shows(folder: Path):
+    (folder / "recording.avi").rename(folder / "moved.avi")
+    with Session.open(folder / "run.labsession") as session:
+        assert session.missing_recording == folder / "recording.avi"
+        result = session.result(0)
+        assert result is not None
+        assert result.measurement.measures is not None
+        for attempt in (lambda: session.frame(0), lambda: next(session.measure())):
+            with pytest.raises(InputError, match="is not there"):
+                attempt()
+        assert session.overview().status == ("ok", "ok", "", "")
+        session.relink(folder / "moved.avi")
+        assert session.missing_recording is None
+        assert session.frame(0).image.any()
+    with Session.open(folder / "run.labsession") as session:
+        assert session.frame(0).image.any()
+
+
+def test_another_recording_in_its_place_is_noticed(folder: Path):
+    content = bytearray((folder / "recording.avi").read_bytes())
+    (folder / "recording.avi").write_bytes(content[:-200_000])
+    with Session.open(folder / "run.labsession") as session:
+        assert any("not what was imported" in problem for problem in session.problems())
+        with pytest.raises(InputError, match="another recording"):
+            session.relink(folder / "recording.avi")
+
+
+def test_frames_that_changed_are_noticed(folder: Path):
+    rng = np.random.default_rng(4)
+    frames = rng.integers(0, 255, (3, 20, 30), np.uint8)
+    np.save(folder / "stack.npy", frames)
+    with Session.create(folder / "other.labsession") as session:
+        session.import_recording(folder / "stack.npy")
+        frames[1, 5, 5] ^= 1
+        np.save(folder / "stack.npy", frames)
+        session.frame(0)
+        with pytest.raises(InputError, match="frame 1: is not the one that was imported"):
+            session.frame(1)
+        assert len(session.problems()) == 1
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_embedded_frames_need_no_recording(tmp_path: Path, dtype: type):
+    frames = (np.random.default_rng(3).integers(0, 250, (4, 20, 30)) * 1.0).astype(dtype)
+    np.save(tmp_path / "stack.npy", frames)
+    with Session.create(tmp_path / "a.labsession") as session:
+        session.import_recording(tmp_path / "stack.npy", "1:", embed=True, frame_rate_hz=500)
+    (tmp_path / "stack.npy").unlink()
+    with Session.open(tmp_path / "a.labsession", read_only=True) as session:
+        assert session.missing_recording is None
+        for number in (3, 1, 2):
+            frame = session.frame(number)
+            assert frame.image.dtype == dtype
+            np.testing.assert_array_equal(frame.image, frames[number])
+            assert frame.time_s == pytest.approx(number / 500)
+        assert session.problems() == []
+
+
+def test_another_recording_is_refused_once_frames_are_measured(session: Session, folder: Path):
+    np.save(folder / "stack.npy", np.zeros((3, 20, 30), np.uint8))
+    with pytest.raises(InputError, match="new session"):
+        session.import_recording(folder / "stack.npy")
+    with pytest.raises(InputError, match="frame 0 is measured"):
+        session.import_recording(folder / "recording.avi", "2:4")
+    session.import_recording(folder / "recording.avi", ":5")
+    assert session.frames.tolist() == [0, 1, 2, 3, 4]
+    assert session.overview().status == ("ok", "", "ok", "", "")
+
+
+def test_an_import_that_is_stopped_leaves_the_session_as_it_was(session: Session, folder: Path):
+    def stop(done: int, _: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        session.import_recording(folder / "recording.avi", progress=stop)
+    assert session.frames.tolist() == [0, 2, 4, 6]
+
+
+# --- calibrations -----------------------------------------------------------------------------
+
+
+def test_a_laser_calibration_goes_into_the_rig_and_back(session: Session):
+    found = session.calibrate_laser([13.676], [18.561], [7.874])
+    assert session.setup.rig.laser == found.laser
+    readings = session.laser_calibration
+    assert readings is not None
+    assert (readings.l2_mm, readings.found) == ((18.561,), found)
+    session.undo()
+    assert session.laser_calibration is None
+    assert session.setup.rig.laser.distance_mm == pytest.approx(31.48)
+
+
+def test_a_plane_calibration_keeps_its_picture(session: Session):
+    found = session.calibrate_plane(SAMPLE / "calibration.png", 6.35)
+    kept = session.plane_calibration
+    assert kept is not None
+    assert (kept.unit_mm, kept.found) == (6.35, found)
+    picture = cv2.imread(str(SAMPLE / "calibration.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(session.picture(kept.picture_sha256), picture)
+    assert same(session.setup.calibration, found.image_calibration)
+    session.undo()
+    assert session.plane_calibration is None
+    with pytest.raises(InputError, match="calibration picture: missing"):
+        session.picture("0" * 64)
+
+
+def test_a_picture_without_a_target_changes_nothing(session: Session, tmp_path: Path):
+    cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((200, 200), np.uint8))
+    with pytest.raises(CannotMeasure):
+        session.calibrate_plane(tmp_path / "dark.png", 6.35)
+    assert [change.label for change in session.history] == ["experiment record", "setup"]
+    assert session.plane_calibration is None
+
+
+# --- damage -----------------------------------------------------------------------------------
+
+
+def test_damage_is_told_and_the_rest_still_shows(session: Session):
+    with session._database.transaction() as connection:
+        connection.execute("UPDATE detail SET content = substr(content, 1, 900) WHERE result = 1")
+        connection.execute("UPDATE result SET height_mm = height_mm + 0.01 WHERE id = 2")
+    with pytest.raises(InputError, match="result of frame 0"):
+        session.result(0)
+    assert session.result(2) is not None
+    problems = session.problems()
+    assert len(problems) == 2
+    assert "result of frame 0 (fit) is damaged" in problems[0]
+    assert "result of frame 2 (fit) is not what" in problems[1]
