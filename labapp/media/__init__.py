@@ -1,4 +1,4 @@
-"""Frames from images, folders, stacks and videos: `open_source` opens any of them."""
+"""Frames from images, folders, stacks, videos and high-speed recordings: `open_source`."""
 
 from __future__ import annotations
 
@@ -9,15 +9,32 @@ import cv2
 
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage
-from labapp.media.images import IMAGE_SUFFIXES, open_folder, open_image
+from labapp.media.cine import CINE_MAGIC, CineSource
+from labapp.media.images import IMAGE_SUFFIXES, ImageSequence, files_in, images_in
+from labapp.media.numpy_stack import NPY_MAGIC, ZIP_MAGIC, NumpyStack
+from labapp.media.photron import PHOTRON_SUFFIXES, PhotronSource
 from labapp.media.quiet import quiet_opencv
+from labapp.media.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.media.video import VideoSource
 
 __all__ = ["Frame", "FrameSource", "GreyImage", "open_source"]
 
+VIDEO_SUFFIXES = frozenset(
+    ".avi .mkv .mp4 .m4v .mov .mpg .mpeg .ts .wmv .asf .webm .ogv .flv .mxf .dv .gif".split()
+)
+RECORDING_SUFFIXES = VIDEO_SUFFIXES | {".cine", ".npy", ".npz"} | PHOTRON_SUFFIXES
 
-def open_source(path: str | os.PathLike[str]) -> FrameSource:
-    """Open an image, a folder of images, a TIFF stack or a video.
+
+def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> FrameSource:
+    """Open a recording: what it is, its content tells before its name does.
+
+    Parameters
+    ----------
+    path
+        An image, a folder of images or with one recording in it, a TIFF stack, a video, a Phantom
+        .cine, a Photron .mraw or its header, a NumPy .npy or .npz.
+    index
+        The `FrameSource.index` of an earlier opening; it saves reading a video through again.
 
     Raises
     ------
@@ -27,17 +44,72 @@ def open_source(path: str | os.PathLike[str]) -> FrameSource:
     quiet_opencv()
     path = Path(path)
     try:
-        size = path.stat().st_size
         if path.is_dir():
-            return open_folder(path)
-        with path.open("rb"):
-            pass
+            return _open_folder(path, index)
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(12)
     except OSError as error:
-        raise InputError(
-            path, "source", error.strerror, "an image, a folder of images or a video"
-        ) from error
+        expected = "an image, a folder of images or a video"
+        raise InputError(path, "source", error.strerror, expected) from error
     if size == 0:
         raise InputError(path, "size", "0 bytes", "an image or a video with something in it")
-    if path.suffix.lower() in IMAGE_SUFFIXES or cv2.haveImageReader(str(path)):
-        return open_image(path)
-    return VideoSource(path)
+    return _by_content(path, head, index) or _by_name(path, index)
+
+
+def _by_content(path: Path, head: bytes, index: bytes | None) -> FrameSource | None:
+    """Open what begins with bytes that only one format begins with; None for all else."""
+    if head[:4] in TIFF_MAGICS:
+        return TiffStack(path)
+    if head[:4] == CINE_MAGIC:
+        return CineSource(path)
+    if head[:6] == NPY_MAGIC:
+        return NumpyStack(path, archive=False)
+    if head[:4] == ZIP_MAGIC:
+        return NumpyStack(path, archive=True)
+    if head[:4] == b"GIF8" or (head[:4] == b"RIFF" and head[8:] != b"WEBP"):
+        return VideoSource(path, index)
+    return None
+
+
+def _by_name(path: Path, index: bytes | None) -> FrameSource:
+    suffix = path.suffix.lower()
+    if suffix in PHOTRON_SUFFIXES:
+        return PhotronSource(path)
+    if suffix == ".cine":
+        return CineSource(path)
+    if suffix in (".npy", ".npz"):
+        return NumpyStack(path, archive=suffix == ".npz")
+    if suffix in TIFF_SUFFIXES:
+        return TiffStack(path)
+    if suffix in IMAGE_SUFFIXES or cv2.haveImageReader(str(path)):
+        return ImageSequence(path, [path])
+    return VideoSource(path, index)
+
+
+def _open_folder(path: Path, index: bytes | None) -> FrameSource:
+    """Open the images in a folder, or the one recording in it."""
+    images = images_in(path)
+    if len(images) == 1:
+        return open_source(images[0], index)
+    if images:
+        return ImageSequence(path, images)
+    recordings = [entry for entry in files_in(path) if entry.suffix.lower() in RECORDING_SUFFIXES]
+    headers = {entry.stem for entry in recordings if entry.suffix.lower() in (".cih", ".cihx")}
+    # A Photron recording is two files; its header stands for both.
+    recordings = [
+        entry
+        for entry in recordings
+        if entry.suffix.lower() != ".mraw" or entry.stem not in headers
+    ]
+    if len(recordings) == 1:
+        return open_source(recordings[0], index)
+    if recordings:
+        names = ", ".join(entry.name for entry in recordings)
+        raise InputError(path, "folder", names, "one recording in it, or name the one to open")
+    raise InputError(
+        path,
+        "folder",
+        "no image or recording in it",
+        "a folder of images (PNG, TIFF, BMP, JPEG, PGM) or with one video in it",
+    )

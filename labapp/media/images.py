@@ -1,46 +1,34 @@
-"""Frames from image files: one picture, a folder of them, or a TIFF stack."""
+"""Frames from image files: one picture, or a folder of them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from labapp.errors import InputError
-from labapp.media.base import Frame, FrameSource, GreyImage, check_index, to_grey
+from labapp.media.base import GreyImage, to_grey
+from labapp.media.stored import StoredFrames, finite
+from labapp.media.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 
 IMAGE_SUFFIXES = frozenset(
-    ".png .tif .tiff .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()
-)
+    ".png .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()
+) | set(TIFF_SUFFIXES)
 AN_IMAGE = "a whole image: PNG, TIFF, BMP, JPEG, PGM"
 
 
-@dataclass(frozen=True)
-class Page:
-    """One picture in one file; ``number`` is None for a file that is not a stack."""
-
-    path: Path
-    number: int | None = None
-
-    def __str__(self) -> str:
-        return str(self.path) if self.number is None else f"{self.path}, page {self.number}"
-
-
-class ImageSequence(FrameSource):
+class ImageSequence(StoredFrames):
     """Pictures of one shape, read one at a time.
 
     Parameters
     ----------
-    pages
-        The pictures in order, at least one.
-    name
-        What to call them.
+    path
+        The file or folder, for its name.
+    pictures
+        The files in order, at least one.
 
     Raises
     ------
@@ -48,105 +36,85 @@ class ImageSequence(FrameSource):
         If not one of them can be read.
     """
 
-    frame_rate_hz = None
-    warnings: tuple[str, ...] = ()
+    def __init__(self, path: Path, pictures: Sequence[Path]) -> None:
+        self._pictures = tuple(pictures)
+        image = self._first_whole()
+        kinds = sorted({picture.suffix.lstrip(".").upper() for picture in self._pictures} - {""})
+        kind = " and ".join(kinds) or "image"
+        super().__init__(
+            path,
+            kind if len(self._pictures) == 1 else f"{len(self._pictures)} pictures, {kind}",
+            len(self._pictures),
+            (image.shape[0], image.shape[1]),
+            8 * image.dtype.itemsize,
+        )
 
-    def __init__(self, pages: Sequence[Page], name: str) -> None:
-        self.name = name
-        self._pages = tuple(pages)
-        self.shape = self._first_shape()
-
-    def _first_shape(self) -> tuple[int, int]:
+    def _first_whole(self) -> GreyImage:
         refused: list[InputError] = []
-        for page in self._pages:
+        for picture in self._pictures:
             try:
-                rows, columns = read_image(page).shape
+                return read_image(picture)
             except InputError as error:
                 refused.append(error)
-            else:
-                return rows, columns
         raise refused[0]
 
-    def __len__(self) -> int:
-        return len(self._pages)
-
-    def frame(self, index: int) -> Frame:
-        """Read picture ``index``; see `FrameSource.frame`."""
-        check_index(self, index)
-        page = self._pages[index]
-        image = read_image(page)
+    def _grey(self, index: int) -> GreyImage:
+        picture = self._pictures[index]
+        image = read_image(picture)
         if image.shape != self.shape:
             rows, columns = self.shape
             raise InputError(
-                page.path,
+                picture,
                 "size",
                 f"{image.shape[1]}×{image.shape[0]} px",
                 f"{columns}×{rows} px like the pictures before it",
             )
-        return Frame(index, None, image)
+        return image
 
 
-def open_folder(path: Path) -> ImageSequence:
-    """Open every image in a folder, in natural order (``2.png`` before ``10.png``)."""
+def images_in(path: Path) -> list[Path]:
+    """The image files in a folder, in natural order (``2.png`` before ``10.png``)."""
+    return [entry for entry in files_in(path) if entry.suffix.lower() in IMAGE_SUFFIXES]
+
+
+def files_in(path: Path) -> list[Path]:
+    """What is in a folder, in natural order, without hidden files."""
     try:
-        names = sorted(
-            (
-                entry
-                for entry in path.iterdir()
-                if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".")
-            ),
-            key=lambda entry: natural_key(entry.name),
-        )
+        entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
         raise InputError(path, "folder", error.strerror, "a folder that may be read") from error
-    if not names:
-        raise InputError(
-            path,
-            "folder",
-            "no image in it",
-            "a folder of images (PNG, TIFF, BMP, JPEG, PGM), or name a video file",
-        )
-    return ImageSequence([Page(entry) for entry in names], path.name or str(path))
+    return sorted(entries, key=lambda entry: natural_key(entry.name))
 
 
-def open_image(path: Path) -> ImageSequence:
-    """Open an image file; each page of a TIFF stack is a frame."""
-    count = cv2.imcount(str(path)) if path.suffix.lower() in {".tif", ".tiff"} else 1
-    pages = [Page(path, number) for number in range(count)] if count > 1 else [Page(path)]
-    return ImageSequence(pages, path.name)
-
-
-def read_image(page: Page) -> GreyImage:
-    """Grey levels of one picture, shape (rows, columns).
+def read_image(path: Path) -> GreyImage:
+    """Grey levels of one picture in a file, shape (rows, columns).
 
     Raises
     ------
     InputError
-        If it cannot be opened, is not a whole image, or holds NaN or infinity.
+        If it cannot be opened, is not a whole image, holds several, or NaN or infinity.
     """
-    image = _decode(page)
-    if image is None or image.size == 0:
-        raise InputError(page.path, "content", "cannot be decoded", AN_IMAGE)
-    grey = to_grey(image)
-    if grey.dtype == np.float32 and not np.isfinite(grey).all():
-        raise InputError(page.path, "grey levels", "NaN or infinity", "finite grey levels")
-    return grey
-
-
-def _decode(page: Page) -> npt.NDArray[Any] | None:
+    # Read here rather than by OpenCV: it says why a file cannot be opened.
     try:
-        if page.number is not None:
-            _, images = cv2.imreadmulti(str(page.path), page.number, 1, flags=cv2.IMREAD_UNCHANGED)
-            return images[0] if images else None
-        # Read here rather than by OpenCV: it says why a file cannot be opened.
-        content = np.fromfile(page.path, np.uint8)
-        if not content.size:
-            raise InputError(page.path, "size", "0 bytes", AN_IMAGE)
-        return cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        content = np.fromfile(path, np.uint8)
     except OSError as error:
-        raise InputError(page.path, "file", error.strerror, "a file that may be read") from error
+        raise InputError(path, "file", error.strerror, "a file that may be read") from error
+    if not content.size:
+        raise InputError(path, "size", "0 bytes", AN_IMAGE)
+    if content[:4].tobytes() in TIFF_MAGICS:
+        with TiffStack(path) as stack:
+            if len(stack) > 1:
+                raise InputError(
+                    path, "pages", len(stack), "one picture a file, or open the stack itself"
+                )
+            return stack.frame(0).image
+    try:
+        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     except cv2.error:
-        return None
+        image = None
+    if image is None or image.size == 0:
+        raise InputError(path, "content", "cannot be decoded", AN_IMAGE)
+    return finite(path, to_grey(image))
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

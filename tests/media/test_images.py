@@ -11,6 +11,8 @@ from labapp.errors import InputError
 from labapp.media import open_source
 from labapp.media.base import to_grey
 from labapp.media.images import natural_key
+from tests.media.cine_writer import write_cine
+from tests.media.conftest import WriteVideo
 
 GREY = (np.indices((20, 30)).sum(axis=0) * 5).astype(np.uint8)
 
@@ -129,6 +131,59 @@ def test_there_is_no_frame_beyond_the_last(tmp_path: Path) -> None:
                 source.frame(index)
 
 
+def test_content_tells_what_a_file_is_before_its_name(tmp_path: Path) -> None:
+    saved = tmp_path / "stack.npy"
+    np.save(saved, GREY[np.newaxis])
+    tiff = save(tmp_path / "frame.tif", GREY)
+    cine = write_cine(tmp_path / "run.cine", [GREY])
+    for path, kind in [(saved, "NumPy"), (tiff, "TIFF"), (cine, "Phantom")]:
+        for name in ("renamed.avi", "renamed.png", "renamed"):
+            with open_source(path.rename(tmp_path / name)) as source:
+                assert source.description.startswith(kind)
+                np.testing.assert_array_equal(source.frame(0).image, GREY)
+            (tmp_path / name).rename(path)
+
+
+def test_a_webp_is_an_image_though_it_begins_like_an_avi(tmp_path: Path) -> None:
+    path = tmp_path / "frame.webp"
+    assert cv2.imwrite(str(path), GREY, [cv2.IMWRITE_WEBP_QUALITY, 101])
+    with open_source(path) as source:
+        np.testing.assert_array_equal(source.frame(0).image, GREY)
+
+
+def test_the_one_recording_in_a_folder_is_opened(
+    tmp_path: Path, pictures: list[np.ndarray], write_video: WriteVideo
+) -> None:
+    (tmp_path / "notes.txt").write_text("not a recording")
+    video = write_video(tmp_path / "run.avi", pictures, "FFV1")
+    with open_source(tmp_path) as source:
+        assert source.name == "run.avi"
+        np.testing.assert_array_equal(source.frame(3).image, pictures[3])
+    cine = write_cine(tmp_path / "run.cine", pictures[:2])
+    with pytest.raises(InputError, match=r"run\.avi, run\.cine; expected one recording in it"):
+        open_source(tmp_path)
+    video.unlink()
+    with open_source(tmp_path) as source:
+        assert source.name == cine.name
+    # Images go before recordings: a folder of them often holds the video they came from.
+    save(tmp_path / "1.png", GREY)
+    save(tmp_path / "2.png", GREY)
+    with open_source(tmp_path) as source:
+        assert len(source) == 2
+        assert source.description == "2 pictures, PNG, 30×20 px, 8 bit grey"
+
+
+@pytest.mark.parametrize("suffix", ["cine", "cihx", "cih", "mraw", "npy", "npz", "tif", "avi"])
+def test_an_unknown_content_is_named_by_what_the_name_promises(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"run.{suffix}"
+    path.write_text("not a recording\n" * 20)
+    with pytest.raises(InputError) as caught:
+        open_source(path)
+    assert os.fspath(path) in str(caught.value)
+    promised = {"cine": "Phantom", "tif": "TIFF", "avi": "video", "npy": "NumPy", "npz": ".npz"}
+    assert promised.get(suffix, "beside it") in caught.value.expected
+
+
 @pytest.mark.parametrize("suffix", ["png", "tiff", "bmp", "jpg", "pgm"])
 def test_half_an_image_is_refused(
     tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
@@ -149,7 +204,7 @@ def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
     text = tmp_path / "text.png"
     text.write_text("not an image\n" * 50)
     for path, said in [
-        (empty, "no image in it; expected a folder of images"),
+        (empty, "no image or recording in it; expected a folder of images"),
         (nothing, "0 bytes; expected an image or a video"),
         (text, "cannot be decoded; expected a whole image"),
         (tmp_path / "missing.png", "No such file or directory; expected an image, a folder"),

@@ -1,0 +1,169 @@
+"""Frames that each lie at a known place in a file: what the readers of such recordings share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.media.base import Frame, FrameSource, GreyImage, check_index
+
+
+class StoredFrames(FrameSource):
+    """Frames read one at a time by `_grey`, in any order, with no place kept in the file.
+
+    Parameters
+    ----------
+    path
+        The file or folder.
+    kind
+        What it is, as the description begins: "Phantom cine".
+    count
+        Number of frames, at least 1.
+    shape
+        (rows, columns).
+    bit_depth
+        Significant bits of a grey level.
+    colour
+        Whether it was recorded in colour.
+    frame_rate_hz
+        Frames a second; None where the recording does not say.
+    time_s
+        Time of every frame since the first, shape (count,), s; None: from the frame rate.
+    """
+
+    warnings: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        path: Path,
+        kind: str,
+        count: int,
+        shape: tuple[int, int],
+        bit_depth: int,
+        *,
+        colour: bool = False,
+        frame_rate_hz: float | None = None,
+        time_s: FloatArray | None = None,
+    ) -> None:
+        self.name = path.name or str(path)
+        self.shape = shape
+        self.bit_depth = bit_depth
+        self.frame_rate_hz = frame_rate_hz
+        rate = "" if frame_rate_hz is None else f", {frame_rate_hz:g} frames/s"
+        self.description = (
+            f"{kind}, {shape[1]}×{shape[0]} px, {bit_depth} bit "
+            f"{'colour' if colour else 'grey'}{rate}"
+        )
+        self._path = path
+        self._count = count
+        self._time_s = time_s
+
+    def __len__(self) -> int:
+        return self._count
+
+    def frame(self, index: int) -> Frame:
+        """Read frame ``index``; see `FrameSource.frame`."""
+        check_index(self, index)
+        return Frame(index, self._time(index), self._grey(index))
+
+    def _time(self, index: int) -> float | None:
+        if self._time_s is not None:
+            return float(self._time_s[index])
+        return None if self.frame_rate_hz is None else index / self.frame_rate_hz
+
+    def _grey(self, index: int) -> GreyImage:
+        """Grey levels of frame ``index``, shape `shape`."""
+        raise NotImplementedError
+
+
+def ends_early(name: str, claimed: int, whole: int) -> tuple[str, ...]:
+    """The sentence for a recording whose header promises more frames than are whole, if it does."""
+    if whole >= claimed:
+        return ()
+    return (f"{name} ends early: its header says {claimed} frames, {whole} of them whole",)
+
+
+def plausible_rate(value: float) -> float | None:
+    """``value`` as frames a second; None where it cannot be one."""
+    return float(value) if np.isfinite(value) and 0 < value < 1e12 else None
+
+
+def increasing(time_s: FloatArray) -> bool:
+    """Whether times are finite and each is later than the one before."""
+    return bool(np.isfinite(time_s).all() and (np.diff(time_s) > 0).all())
+
+
+def finite(path: Path, image: GreyImage) -> GreyImage:
+    """Give ``image`` back; refuse it where a level is NaN or infinite."""
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
+        raise InputError(path, "grey levels", "NaN or infinity", "finite grey levels")
+    return image
+
+
+def file_size(path: Path) -> int:
+    """Bytes in a file."""
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def read_bytes(path: Path, offset: int, size: int) -> bytes:
+    """Read ``size`` bytes at ``offset``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened or has not that many.
+    """
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            content = file.read(size)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    if len(content) != size:
+        raise InputError(
+            path, "size", f"{offset + len(content)} bytes", f"at least {offset + size} bytes"
+        )
+    return content
+
+
+def unpack_bits(packed: bytes, bits: int) -> npt.NDArray[np.uint16]:
+    """Unpack levels of ``bits`` bits stored one after the other, the highest bit first.
+
+    Parameters
+    ----------
+    packed
+        n levels in n·bits/8 bytes; bits too few for one more level are left out.
+    bits
+        1 … 16.
+
+    Returns
+    -------
+    Shape (n,).
+    """
+    content = np.frombuffer(packed, np.uint8)
+    if bits == 12:  # By far the most frequent: three bytes hold two levels.
+        triples = content[: len(content) // 3 * 3].reshape(-1, 3).astype(np.uint16)
+        pairs: npt.NDArray[np.uint16] = np.empty((len(triples), 2), np.uint16)
+        pairs[:, 0] = triples[:, 0] << 4 | triples[:, 1] >> 4
+        pairs[:, 1] = (triples[:, 1] & 15) << 8 | triples[:, 2]
+        last = content[len(triples) * 3 :].astype(np.uint16)
+        odd = [last[0] << 4 | last[1] >> 4] if len(last) == 2 else []
+        return np.append(pairs.ravel(), np.array(odd, np.uint16))
+    count = len(content) * 8 // bits
+    levels: npt.NDArray[Any] = np.zeros(count, np.uint16)
+    each = np.unpackbits(content, count=count * bits).reshape(count, bits)
+    for column in each.T:
+        levels = levels << 1 | column
+    return levels
+
+
+def _unreadable(path: Path, error: OSError) -> InputError:
+    return InputError(path, "file", error.strerror, "a file that may be read")

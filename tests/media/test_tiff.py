@@ -1,0 +1,286 @@
+from __future__ import annotations
+
+import struct
+import subprocess
+from pathlib import Path
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import tifffile
+
+from labapp.errors import InputError
+from labapp.media import open_source
+from tests.media.cine_writer import pack
+from tests.media.mutate import survives_damage
+
+RNG = np.random.default_rng(14)
+GREY_8 = RNG.integers(0, 256, (5, 12, 17), np.uint8)
+GREY_16 = RNG.integers(0, 65536, (5, 12, 17), np.uint16)
+COLOUR = RNG.integers(0, 256, (3, 12, 17, 3), np.uint8)
+
+
+def same_frames(path: Path, stack: np.ndarray) -> None:
+    """Hold every frame against the stack, in order and out of it."""
+    with open_source(path) as source:
+        assert len(source) == len(stack)
+        assert source.shape == stack.shape[1:]
+        assert source.warnings == ()
+        order = [*range(len(stack)), *reversed(range(len(stack)))]
+        for k in order:
+            frame = source.frame(k)
+            assert frame.image.dtype == stack.dtype
+            np.testing.assert_array_equal(frame.image, stack[k])
+        with pytest.raises(IndexError):
+            source.frame(len(stack))
+        again = source.reopen()
+        source.close()
+        with again:
+            np.testing.assert_array_equal(again.frame(0).image, stack[0])
+
+
+@pytest.mark.parametrize("stack", [GREY_8, GREY_16], ids=["8 bit", "16 bit"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"byteorder": ">"},
+        {"bigtiff": True},
+        {"bigtiff": True, "byteorder": ">"},
+        {"imagej": True},
+        {"ome": True},
+        {"metadata": None},
+        {"contiguous": False, "rowsperstrip": 5},
+        {"tile": (16, 16)},
+        {"compression": "zlib"},
+        {"compression": "zlib", "predictor": True, "byteorder": ">"},
+        {"compression": "lzma"},
+    ],
+    ids=str,
+)
+def test_stacks_of_tifffile(tmp_path: Path, stack: np.ndarray, how: dict[str, object]) -> None:
+    path = tmp_path / "run.tif"
+    tifffile.imwrite(path, stack, photometric="minisblack", **how)
+    same_frames(path, stack)
+    with open_source(path) as source:
+        bits = 8 * stack.itemsize
+        assert source.bit_depth == bits
+        assert source.description == f"TIFF stack of 5 pages, 17×12 px, {bits} bit grey"
+        assert source.frame_rate_hz is None
+        assert source.frame(1).time_s is None
+
+
+def test_pages_written_one_by_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for page in GREY_16:
+            writer.write(page, photometric="minisblack", contiguous=False)
+    same_frames(path, GREY_16)
+
+
+def test_a_stack_without_pages(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    tifffile.imwrite(path, GREY_16, imagej=True, truncate=True, metadata={"finterval": 0.002})
+    same_frames(path, GREY_16)
+    with open_source(path) as source:
+        assert source.frame_rate_hz == pytest.approx(500)
+        assert source.frame(3).time_s == pytest.approx(0.006)
+    path.write_bytes(path.read_bytes()[: -12 * 17 * 2 - 1])
+    with open_source(path) as source:
+        assert source.warnings == ("run.tif ends early: its header says 5 frames, 3 of them whole",)
+        np.testing.assert_array_equal([frame.image for frame in source], GREY_16[:3])
+
+
+@pytest.mark.parametrize("code", [1, 5, 8, 32773, 32946])
+def test_stacks_of_opencv(tmp_path: Path, code: int) -> None:
+    path = tmp_path / "run.tif"
+    assert cv2.imwritemulti(str(path), list(GREY_16), [cv2.IMWRITE_TIFF_COMPRESSION, code])
+    same_frames(path, GREY_16)
+
+
+def test_jpeg_in_tiff(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    smooth = np.indices((32, 32)).sum(axis=0).astype(np.uint8) * 4
+    assert cv2.imwrite(str(path), smooth, [cv2.IMWRITE_TIFF_COMPRESSION, 7])
+    with open_source(path) as source:
+        np.testing.assert_allclose(source.frame(0).image, smooth, atol=8)
+
+
+@pytest.mark.parametrize("algorithm", ["raw", "packbits", "lzw", "deflate"])
+@pytest.mark.parametrize("pixels", ["gray", "gray16le"])
+def test_pictures_of_ffmpeg(tmp_path: Path, algorithm: str, pixels: str) -> None:
+    stack = GREY_8 if pixels == "gray" else GREY_16
+    how = f"-v error -f rawvideo -pix_fmt {pixels} -s 17x12 -i - -compression_algo {algorithm}"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *how.split(), tmp_path / "run%d.tif"]
+    subprocess.run(command, input=stack.tobytes(), check=True)
+    same_frames(tmp_path, stack)
+    same_frames(tmp_path / "run3.tif", stack[2:3])
+
+
+def test_a_series_of_numbered_pictures(tmp_path: Path) -> None:
+    # What i-SPEED software exports: one 12 bit picture in 16 bit a file.
+    stack = GREY_16 >> 4
+    for k, page in enumerate(stack):
+        tifffile.imwrite(tmp_path / f"run_{k + 8}.tif", page, photometric="minisblack")
+    same_frames(tmp_path, stack)
+    with open_source(tmp_path) as source:
+        assert source.description == "5 pictures, TIF, 17×12 px, 16 bit grey"
+
+
+def test_a_folder_of_stacks_is_refused_and_of_one_opened(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", GREY_8, photometric="minisblack")
+    same_frames(tmp_path, GREY_8)
+    tifffile.imwrite(tmp_path / "b.tif", GREY_8, photometric="minisblack")
+    with pytest.raises(InputError, match=r"a\.tif: pages: 5; expected one picture a file"):
+        open_source(tmp_path)
+
+
+@pytest.mark.parametrize("planes", ["contig", "separate"])
+@pytest.mark.parametrize("scale", [1, 257], ids=["8 bit", "16 bit"])
+def test_colour_becomes_luminance(tmp_path: Path, planes: str, scale: int) -> None:
+    path = tmp_path / "run.tif"
+    kind = np.uint8 if scale == 1 else np.uint16
+    stack = COLOUR.astype(kind) * kind(scale)
+    stored = np.moveaxis(stack, 3, 1) if planes == "separate" else stack
+    tifffile.imwrite(path, stored, photometric="rgb", planarconfig=planes)
+    with open_source(path) as source:
+        assert "colour" in source.description
+        for frame in source:
+            expected = stack[frame.index] @ [0.299, 0.587, 0.114]
+            np.testing.assert_allclose(frame.image, expected, atol=0.6 * scale)
+
+
+def test_white_may_be_zero(tmp_path: Path) -> None:
+    for stack, white in ((GREY_8, 255), (GREY_16, 65535)):
+        path = tmp_path / "run.tif"
+        tifffile.imwrite(path, stack, photometric="miniswhite")
+        same_frames(path, white - stack)
+
+
+def test_alpha_is_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    image = np.dstack([GREY_8[0], GREY_8[1]])
+    tifffile.imwrite(path, image, photometric="minisblack", extrasamples=["unassalpha"])
+    same_frames(path, GREY_8[:1])
+
+
+def test_floats_and_wide_integers_become_float32(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    for kind in (np.float32, np.float64, np.int16, np.uint32):
+        tifffile.imwrite(path, GREY_16.astype(kind), photometric="minisblack")
+        same_frames(path, GREY_16.astype(kind).astype(np.float32))
+
+
+def one_page(rows: int, columns: int, bits: int, content: bytes, **other: int) -> bytes:
+    """A TIFF made by hand: one page, one strip, before its directory."""
+    tags = {256: columns, 257: rows, 258: bits, 259: 1, 262: 1, 273: 8, 277: 1, 278: rows}
+    tags |= {279: len(content)} | {int(tag[1:]): value for tag, value in other.items()}
+    content += b"\0" * (len(content) % 2)
+    directory = struct.pack("<H", len(tags))
+    for tag, value in sorted(tags.items()):
+        directory += struct.pack("<2H2I", tag, 4, 1, value)
+    return struct.pack("<2sHI", b"II", 42, 8 + len(content)) + content + directory + bytes(4)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+def test_packed_levels(tmp_path: Path, bits: int) -> None:
+    path = tmp_path / "run.tif"
+    levels = GREY_16[0] >> (16 - bits)
+    rows = b"".join(pack(row, bits) for row in levels)
+    path.write_bytes(one_page(12, 17, bits, rows))
+    same_frames(path, levels[np.newaxis])
+    with open_source(path) as source:
+        assert source.bit_depth == bits
+
+
+def test_one_bit_is_black_or_white(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    levels = GREY_8[:1] // 128
+    rows = b"".join(pack(row, 1) for row in levels[0])
+    path.write_bytes(one_page(12, 17, 1, rows))
+    same_frames(path, levels * 255)
+    path.write_bytes(one_page(12, 17, 1, rows, t262=0))
+    same_frames(path, (1 - levels) * 255)
+
+
+def test_a_palette_is_looked_up(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    ramp = np.tile(np.arange(256, dtype=np.uint16)[::-1] * 257, (3, 1))
+    tifffile.imwrite(path, GREY_8[0], photometric="palette", colormap=ramp)
+    with open_source(path) as source:
+        np.testing.assert_allclose(source.frame(0).image, 255 - GREY_8[0], atol=1)
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"t259": 50000}, r"page 0 cannot be decoded \(compression ZSTD\)"),
+        ({"t256": 60000}, "8 bits|bytes for"),
+        ({"t273": 10**6}, "bytes; expected a whole image: TIFF"),
+        ({"t277": 5}, "samples a pixel: 5|bytes for"),
+    ],
+)
+def test_what_cannot_be_is_named(tmp_path: Path, other: dict[str, int], said: str) -> None:
+    path = tmp_path / "run.tif"
+    path.write_bytes(one_page(12, 17, 8, GREY_8[0].tobytes(), **other))
+    with pytest.raises(InputError, match=said):
+        open_source(path)
+
+
+def test_the_times_of_ome(tmp_path: Path) -> None:
+    path = tmp_path / "run.ome.tif"
+    about = {"axes": "TYX", "TimeIncrement": 4, "TimeIncrementUnit": "ms"}
+    tifffile.imwrite(path, GREY_8, ome=True, photometric="minisblack", metadata=about)
+    with open_source(path) as source:
+        assert source.frame_rate_hz == pytest.approx(250)
+        assert source.frame(2).time_s == pytest.approx(0.008)
+    times = [7.0, 7.5, 8.0, 9.0, 9.5]
+    about = {"axes": "TYX", "Plane": {"DeltaT": times, "DeltaTUnit": ["s"] * 5}}
+    tifffile.imwrite(path, GREY_8, ome=True, photometric="minisblack", metadata=about)
+    with open_source(path) as source:
+        assert [frame.time_s for frame in source] == [0, 0.5, 1, 2, 2.5]
+        assert source.frame_rate_hz == 2
+
+
+def test_a_page_of_another_size_is_refused_alone(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for page in (GREY_8[0], GREY_8[1][:5], GREY_8[2]):
+            writer.write(page, photometric="minisblack", metadata=None)
+    with open_source(path) as source:
+        np.testing.assert_array_equal(source.frame(2).image, GREY_8[2])
+        with pytest.raises(InputError, match="page 1, size: 17×5 px; expected 17×12 px"):
+            source.frame(1)
+
+
+def test_a_chain_of_pages_cut_off_gives_those_that_are_whole(tmp_path: Path) -> None:
+    path = tmp_path / "run.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for page in GREY_8:
+            writer.write(page, photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path) as tiff:
+        places = [page.offset for page in tiff.pages]
+    content = path.read_bytes()
+    path.write_bytes(content[: places[3] + 20])
+    with open_source(path) as source:
+        np.testing.assert_array_equal([frame.image for frame in source], GREY_8[:3])
+        assert source.warnings == ("run.tif ends early: 3 of its pages are whole",)
+
+
+def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
+    for seed, (name, how) in enumerate(
+        [
+            ("plain", {}),
+            ("pages", {"metadata": None, "rowsperstrip": 4}),
+            ("big", {"bigtiff": True, "byteorder": ">"}),
+            ("packed", {"compression": "zlib"}),
+            ("imagej", {"imagej": True, "truncate": True}),
+        ]
+    ):
+        path = tmp_path / f"{name}.tif"
+        tifffile.imwrite(path, GREY_8, photometric="minisblack", **how)
+        survives_damage(path, 100, 600, seed)
+    path = tmp_path / "lzw.tif"
+    assert cv2.imwritemulti(str(path), list(GREY_8), [cv2.IMWRITE_TIFF_COMPRESSION, 5])
+    survives_damage(path, 100, 600, 9)
