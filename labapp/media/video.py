@@ -1,43 +1,103 @@
-"""Frames from video files, decoded by FFmpeg through OpenCV."""
+"""Frames from video files, decoded by FFmpeg through PyAV."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import itertools
 import math
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Self
 
-import cv2
+import av
 import numpy as np
+from av.container import InputContainer
+from av.error import ExitError, FFmpegError
+from av.packet import Packet
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
 
-from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.media.base import Frame, FrameSource, GreyImage, check_index, to_grey
-
-FAR_FRAMES = 60
-"""A jump forward of more than this is made by seeking, a shorter one by decoding on."""
-
-DAMAGED_FRAMES = 50
-"""More frames than this that cannot be decoded, one after the other, are the end."""
-
-GREY_FORMATS = frozenset(
-    int.from_bytes(code, "little") for code in (b"Y800", b"GREY", b"Y8  ", b"Y1\x00\x10")
+from labapp.media.base import Frame, FrameSource, check_index
+from labapp.media.ffv1 import slices_whole
+from labapp.media.luminance import bit_depth_of, grey_of
+from labapp.media.packets import (
+    BoolArray,
+    IntArray,
+    Packets,
+    PacketTable,
+    Timing,
+    number_by_order,
+    number_by_stamp,
 )
-"""Pixel formats (8 and 16 bit) that OpenCV hands over as they are with CONVERT_RGB = 0."""
+
+NEAR_PACKETS = 8
+"""The next key frame is reached by decoding when it is no further than this, else by seeking."""
+
+DAMAGED_READS = 50
+"""More failures than this to read a packet, one after the other, are the end."""
+
+MOST_PIXELS = 2**26
+"""A frame of more pixels (8192×8192) is taken for a damaged header: 1 GB at 16 byte a pixel."""
+
+READ_S = 8.0
+"""No one step of opening or reading takes longer, s: a damaged table can send FFmpeg astray."""
+
+CONTAINERS = {
+    "avi": "AVI",
+    "matroska": "MKV",
+    "mov": "MP4",
+    "mpegts": "MPEG-TS",
+    "mpeg": "MPEG",
+    "asf": "WMV",
+    "gif": "GIF",
+    "nut": "NUT",
+    "ogg": "Ogg",
+    "flv": "FLV",
+    "mxf": "MXF",
+    "dv": "DV",
+    "apng": "APNG",
+    "ivf": "IVF",
+    "yuv4mpegpipe": "Y4M",
+}
+"""What is opened, by FFmpeg's names. No playlists, which name other files, and no text."""
+
+CODECS = {
+    "mjpeg": "MJPG",
+    "h264": "H.264",
+    "hevc": "H.265",
+    "mpeg4": "MPEG-4",
+    "rawvideo": "raw frames",
+}
 
 A_VIDEO = "a video that FFmpeg can decode: AVI, MKV or MP4 with FFV1, MJPG, H.264 or raw frames"
 
+SEEK_WARNING = (
+    "{name} does not allow to seek exactly, so every frame is decoded from the start: right, but "
+    "slow; re-encode it as FFV1 or MJPG to move through it quickly"
+)
+
 
 class VideoSource(FrameSource):
-    """A video whose frames are known by their time stamps.
+    """A video of which every packet is known, so that any frame is found exactly.
 
-    The number of frames in an AVI, whose rate is constant, is believed when a seek to the last
-    finds a frame with the last one's time and nothing after it; everything else is counted by
-    decoding. Where a seek has gone is told by the stamp of the frame found there. Stamps that do
-    not grow (H.264 in AVI) tell nothing: then a jump back decodes from the start.
+    The file is read through once without decoding: where each packet is, which are key frames,
+    and which frame, in the order they are shown, comes of each. A packet is given its place in
+    that table as its time stamp before it is decoded; the frame that comes out carries it, so a
+    frame is known for certain wherever reading began. Only where the container keeps neither the
+    order frames are shown in nor which are key frames (H.264 in AVI; an AVI cut before its index)
+    is everything decoded once to learn them.
+
+    A frame that cannot be decoded whole is refused, and so are those that build on it.
 
     Parameters
     ----------
     path
         The file.
+    index
+        What an earlier source gave as its `index`, to open the file without reading it through.
 
     Raises
     ------
@@ -45,151 +105,359 @@ class VideoSource(FrameSource):
         If there is not one whole frame in it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.name = path.name
+    _shown: tuple[int, VideoFrame] | None
+    """The frame read last."""
+    _ahead: tuple[int, VideoFrame] | None
+    """A frame that was decoded while looking for one that cannot be."""
+    _next: int
+    """Frames from this one on may still come out of the decoder."""
+    _fed: int
+    """The packet read last."""
+
+    def __init__(self, path: Path, index: bytes | None = None) -> None:
         self._path = path
-        self._capture = _open(path)
+        self._fingerprint = _fingerprint(path)
+        self.name = path.name
+        self._container, self._stream = _open(path)
         try:
-            self._reliable = False
-            self._next = 0
-            rate = self._capture.get(cv2.CAP_PROP_FPS)
-            self.frame_rate_hz: float | None = rate if math.isfinite(rate) and rate > 0 else None
-            claimed = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-            self._stamp_ms = self._stamps(claimed)
-            if not len(self._stamp_ms):
-                raise InputError(path, "frames", "not one that is whole", A_VIDEO)
-            self._reliable = bool((np.diff(self._stamp_ms) > 0).all())
-            self.warnings = self._ends_early(claimed)
-            self._time_s = self._times()
-            self._rewind()
-            self._grab()
-            rows, columns = self._retrieve(0).shape
-            self.shape = (rows, columns)
+            table = None if index is None else PacketTable.from_bytes(index, self._fingerprint)
+            if table is None:
+                table, index = self._read_through(), None
+            self._use(table, index or table.to_bytes(self._fingerprint))
         except BaseException:
             self.close()
             raise
 
+    def _use(self, table: PacketTable, index: bytes) -> None:
+        self.index = index
+        self.shape = table.shape
+        self.frame_rate_hz = table.frame_rate_hz
+        self.bit_depth = table.bit_depth
+        self.description = table.description
+        self.warnings = table.warnings
+        if not table.seekable:
+            self.warnings += (SEEK_WARNING.format(name=self.name),)
+        self._table = table
+        self._ordinal = {place: k for k, place in enumerate(table.place.tolist())}
+        self._keys = np.flatnonzero(table.key)
+        self._stand(self._listed_packets())
+
     def __len__(self) -> int:
-        return len(self._stamp_ms)
+        return len(self._table.time_s)
 
     def close(self) -> None:
         """Let go of the file. Closing twice does no harm."""
-        self._capture.release()
+        self._container.close()
+
+    def reopen(self) -> Self:
+        """Open the same video once more; see `FrameSource.reopen`."""
+        return type(self)(self._path, self.index)
+
+    @property
+    def seekable(self) -> bool:
+        """Whether frames are got to by seeking; if not, by decoding from the start."""
+        return self._table.seekable
+
+    def decode_from_start(self) -> None:
+        """From now on get to no frame by seeking; kept in `index`, said in `warnings`."""
+        self._open()
+        table = self._table.without_seeking()
+        self._use(table, table.to_bytes(self._fingerprint))
 
     def frame(self, index: int) -> Frame:
         """Read frame ``index``; see `FrameSource.frame`. Reading in order never seeks."""
         check_index(self, index)
-        if not self._next - 1 <= index <= self._next + FAR_FRAMES:
-            self._jump(index)
+        if self._shown is None or self._shown[0] != index:
+            self._shown = self._find(index)
+        if self._shown is None:
+            raise InputError(self._path, f"frame {index}", "cannot be decoded", "a whole frame")
+        image = grey_of(self._shown[1])
+        if image.shape != self.shape:
+            rows, columns = self.shape
+            raise InputError(
+                self._path,
+                f"frame {index}, size",
+                f"{image.shape[1]}×{image.shape[0]} px",
+                f"{columns}×{rows} px like the frames before it",
+            )
+        time_s = float(self._table.time_s[index])
+        return Frame(index, None if math.isnan(time_s) else time_s, image)
+
+    def _find(self, index: int) -> tuple[int, VideoFrame] | None:
+        """Frame ``index`` with its number; None when decoding passes it by."""
+        before = np.flatnonzero(self._table.number[self._keys] <= index)
+        key = int(self._keys[before[-1]]) if len(before) else 0
+        far = self._table.seekable and key > self._fed + NEAR_PACKETS
+        if index < self._next or far:
+            self._seek(key)
+        found = self._decode_to(index)
+        if found is None and self._table.seekable:
+            # Reading may have stuck at damage before it; or what follows a key frame may build on
+            # what is before it (H.264's open groups). So get there the other way.
+            if self._from_start:
+                self._seek(key)
+            else:
+                self._restart()
+            found = self._decode_to(index)
+        return found
+
+    def _decode_to(self, index: int) -> tuple[int, VideoFrame] | None:
+        found = None
         while self._next <= index:
-            if not self._grab():
-                self._rewind()
-                break
-        if self._next != index + 1:
-            raise self._unreadable(index)
-        time_s = None if self._time_s is None else float(self._time_s[index])
-        return Frame(index, time_s, self._retrieve(index))
+            found = self._ahead or next(self._decoded, None)
+            if found is None or found[0] > index:
+                self._ahead = found
+                return None
+            self._ahead = None
+            self._next = found[0] + 1
+        return found
 
-    def _rewind(self) -> None:
-        self._capture.release()
-        self._capture = _open(self._path)
+    def _restart(self) -> None:
+        """Open the file again and go on before its first frame."""
+        self._open()
+        self._stand(self._listed_packets())
+
+    def _open(self) -> None:
+        self._container.close()
+        self._container, self._stream = _open(self._path)
+
+    def _stand(
+        self, packets: Iterator[tuple[int, Packet[VideoStream]]], *, from_start: bool = True
+    ) -> None:
+        """Go on with ``packets``, with nothing left of what was decoded before."""
+        self._decoded = self._decode(packets)
+        self._from_start = from_start
+        self._shown = None
+        self._ahead = None
         self._next = 0
+        self._fed = -1
 
-    def _grab(self) -> bool:
-        """Decode the next frame that can be; False at the end.
+    def _seek(self, key: int) -> None:
+        """Get to packet ``key`` or one before it; which is known by the packet that is there."""
+        if self._fed < 0:
+            # A palette comes with the first packet only.
+            next(self._decoded, None)
+        for stamp in self._table.seek_stamps(key):
+            with contextlib.suppress(FFmpegError):
+                self._container.seek(stamp, stream=self._stream)
+                packets = self._listed_packets()
+                first = next(packets, None)
+                if first is not None and first[0] <= key:
+                    self._stand(itertools.chain([first], packets), from_start=first[0] == 0)
+                    return
+        self._restart()
 
-        With reliable stamps a frame that cannot be decoded is passed over without those after it
-        taking its number.
+    def _listed_packets(self) -> Iterator[tuple[int, Packet[VideoStream]]]:
+        """Packets from here on, each with its place in the table."""
+        for packet in _packets(self._container, self._stream):
+            ordinal = self._ordinal.get(getattr(packet, self._table.placed_by))
+            if ordinal is not None:
+                yield ordinal, packet
+
+    def _decode(
+        self, packets: Iterator[tuple[int, Packet[VideoStream]]]
+    ) -> Iterator[tuple[int, VideoFrame]]:
+        """Frames with their numbers, as they come out of the decoder.
+
+        After a packet that is missing or damaged nothing is decoded before the next key frame:
+        decoders would go on with what they have, and only some would say so.
         """
-        if not any(self._capture.grab() for _ in range(DAMAGED_FRAMES)):
-            return False
-        if self._reliable:
-            half = np.diff(self._stamp_ms).min(initial=np.inf) / 2
-            self._next = int(np.searchsorted(self._stamp_ms, self._now() + half))
-        else:
-            self._next += 1
-        return True
+        sound, begun = False, 0
+        for ordinal, packet in packets:
+            sound = sound and ordinal == self._fed + 1
+            self._fed = ordinal
+            if not sound and self._table.key[ordinal]:
+                sound, begun = True, ordinal
+            if sound:
+                whole = not self._table.slice_crc or slices_whole(bytes(packet))
+                frames = _decode_as(self._stream, packet, ordinal) if whole else None
+                sound = frames is not None
+                yield from self._numbered(frames or [], begun)
+        yield from self._numbered(_decode_as(self._stream, None, 0) or [], begun)
 
-    def _jump(self, index: int) -> None:
-        """Get to ``index`` or before it; where a seek goes is known by the stamp found there."""
-        if self._reliable:
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
-            if self._grab() and self._next <= index + 1:
-                return
-        self._rewind()
+    def _numbered(self, frames: list[VideoFrame], begun: int) -> Iterator[tuple[int, VideoFrame]]:
+        for frame in frames:
+            ordinal = -1 if frame.pts is None else frame.pts
+            number = int(self._table.number[ordinal]) if ordinal >= 0 else -1
+            # What is shown before the key frame it follows builds on what was not decoded.
+            stray = ordinal > begun and number < self._table.number[begun]
+            if number >= self._next and not stray and not frame.is_corrupt:
+                yield number, frame
 
-    def _now(self) -> float:
-        """Time stamp of the frame grabbed last, ms."""
-        return float(self._capture.get(cv2.CAP_PROP_POS_MSEC))
-
-    def _retrieve(self, index: int) -> GreyImage:
-        retrieved, image = self._capture.retrieve()
-        if not retrieved:
-            raise self._unreadable(index)
-        return to_grey(image)
-
-    def _unreadable(self, index: int) -> InputError:
-        return InputError(self._path, f"frame {index}", "cannot be decoded", "a whole frame")
-
-    def _stamps(self, claimed: int) -> FloatArray:
-        """Time stamp of every frame, shape (n,), ms."""
-        if _is_avi(self._path):
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, claimed - 1)
-            if self._capture.grab():
-                last = np.array([self._now()])
-                if self._fits(last, claimed) and not self._capture.grab():
-                    return self._regular(claimed)
-        self._rewind()
-        counted = []
-        while self._grab():
-            counted.append(self._now())
-        stamps = np.array(counted)
-        # With the last frame in its place, those missing are holes: the others keep their numbers.
-        return self._regular(claimed) if self._fits(stamps, claimed) else stamps
-
-    def _fits(self, stamp_ms: FloatArray, claimed: int) -> bool:
-        """Whether frames stand at multiples of the interval, the last at ``claimed`` − 1."""
-        if self.frame_rate_hz is None or not len(stamp_ms):
-            return False
-        place = stamp_ms / 1000 * self.frame_rate_hz
-        on_grid = np.abs(place - place.round()).max() < 0.25
-        return bool(on_grid and round(place[-1]) == claimed - 1)
-
-    def _regular(self, count: int) -> FloatArray:
-        assert self.frame_rate_hz is not None
-        return np.arange(count, dtype=np.float64) * (1000 / self.frame_rate_hz)
-
-    def _ends_early(self, claimed: int) -> tuple[str, ...]:
-        # Fewer frames over the whole time are a varying rate, not an early end.
-        last = self._stamp_ms[-1] / 1000 * (self.frame_rate_hz or 0) if self._reliable else 0
-        if max(len(self), round(last) + 1) >= claimed:
-            return ()
-        return (
-            f"{self.name} ends early: its header says {claimed} frames, {len(self)} of them whole",
+    def _read_through(self) -> PacketTable:
+        """Everything there is to know about the file, by reading all of it once."""
+        entries = list(self._stream.index_entries)
+        is_avi = self._container.format.name == "avi"
+        codec = self._stream.codec_context.codec
+        timing = Timing(
+            float(self._stream.time_base or 0),
+            self._rate(),
+            self._claimed(),
+            stamped=not (is_avi and codec.reorder),
+            from_0=is_avi,
+        )
+        size = self._fingerprint[0]
+        packets = Packets.read(_packets(self._container, self._stream), size)
+        indexed = is_avi and len(entries) >= len(packets)
+        if indexed:
+            packets = packets.completed(entries, size)
+        if not len(packets):
+            raise InputError(self._path, "frames", "not one that is whole", A_VIDEO)
+        number = number_by_order(packets)
+        if codec.reorder and timing.stamped and packets.stamps_differ():
+            number = number_by_stamp(packets)
+        elif codec.reorder:
+            timing = dataclasses.replace(timing, stamped=False)
+            key, number = self._decode_through(packets)
+            packets = packets.with_keys(key & packets.key if indexed or not is_avi else key)
+        elif is_avi and not indexed and not codec.intra_only:
+            key, _ = self._decode_through(packets)
+            packets = packets.with_keys(key)
+        if not (number >= 0).any():
+            raise InputError(self._path, "frames", "not one that is whole", A_VIDEO)
+        table = PacketTable.build(packets, number, timing, self.name)
+        self._open()
+        first, packet = self._first_frame()
+        rows, columns = grey_of(first).shape
+        self._open()
+        return dataclasses.replace(
+            table,
+            shape=(rows, columns),
+            bit_depth=bit_depth_of(first),
+            description=self._describe(first),
+            slice_crc=codec.name == "ffv1" and slices_whole(bytes(packet)),
+            # MPEG program streams have stamps for some packets only; the others' are guessed.
+            seekable=self._container.format.name != "mpeg",
         )
 
-    def _times(self) -> FloatArray | None:
-        """Time of every frame since the first, shape (n,), s."""
-        elapsed: FloatArray = (self._stamp_ms - self._stamp_ms[0]) / 1000
-        if self.frame_rate_hz is None:
-            return elapsed if self._reliable else None
-        regular: FloatArray = self._regular(len(self)) / 1000
-        # Containers round stamps (Matroska: to 1 ms); a frame later than that was later.
-        if self._reliable and (np.abs(elapsed - regular) * self.frame_rate_hz >= 0.5).any():
-            return elapsed
-        return regular
+    def _decode_through(self, packets: Packets) -> tuple[BoolArray, IntArray]:
+        """Key frames, and the frame of each packet in the order shown, by decoding everything."""
+        self._open()
+        key = np.zeros(len(packets), bool)
+        number = np.full(len(packets), -1, np.int64)
+        ordinals = {place: k for k, place in enumerate(packets.place.tolist())}
+        shown = 0
+        for packet in itertools.chain(_packets(self._container, self._stream), [None]):
+            ordinal = 0 if packet is None else ordinals.get(getattr(packet, packets.placed_by))
+            if ordinal is None:
+                continue
+            for frame in _decode_as(self._stream, packet, ordinal) or []:
+                if frame.pts is not None and number[frame.pts] < 0:
+                    key[frame.pts] = frame.key_frame
+                    number[frame.pts] = shown
+                    shown += 1
+        return key, number
+
+    def _first_frame(self) -> tuple[VideoFrame, Packet[VideoStream]]:
+        """The first frame that is whole, and the packet after which it came out."""
+        last = None
+        for packet in itertools.chain(_packets(self._container, self._stream), [None]):
+            last = packet or last
+            for frame in _decode_as(self._stream, packet, 0) or []:
+                if last is not None and not frame.is_corrupt:
+                    return frame, last
+        raise InputError(self._path, "frames", "not one that is whole", A_VIDEO)
+
+    def _rate(self) -> float | None:
+        rate = float(self._stream.average_rate or 0)
+        return rate if math.isfinite(rate) and rate > 0 else None
+
+    def _claimed(self) -> int:
+        """Number of frames the header speaks of; 0 where it does not."""
+        if self._stream.frames:
+            return self._stream.frames
+        whole_file = self._container.format.name.startswith("matroska")
+        if whole_file and len(self._container.streams) == 1 and self._container.duration:
+            return round(self._container.duration / av.time_base * (self._rate() or 0))
+        return 0
+
+    def _describe(self, frame: VideoFrame) -> str:
+        container = self._container.format.name.split(",")[0]
+        codec = self._stream.codec_context.name
+        rows, columns = grey_of(frame).shape
+        colour = "grey" if frame.format.name.startswith("gray") else "colour"
+        rate = self._rate()
+        return ", ".join(
+            [
+                CONTAINERS.get(container, container.upper()),
+                CODECS.get(codec, codec.upper()),
+                f"{columns}×{rows} px",
+                f"{bit_depth_of(frame)} bit {colour}",
+                *([] if rate is None else [f"{rate:.6g} frames/s"]),
+            ]
+        )
 
 
-def _is_avi(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(4) == b"RIFF"
+def _fingerprint(path: Path) -> tuple[int, int]:
+    """Size, byte, and checksum of both ends of a file: whether it is still the same."""
+    part = 1 << 16
+    try:
+        with path.open("rb") as file:
+            ends = file.read(part)
+            size = file.seek(0, 2)
+            file.seek(max(0, size - part))
+            ends += file.read(part)
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "a file that may be read") from error
+    return size, zlib.crc32(ends)
 
 
-def _open(path: Path) -> cv2.VideoCapture:
-    # FFmpeg only: other back ends take names with digits for numbered pictures.
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    if not capture.isOpened():
-        raise InputError(path, "content", "not a video, or its index is missing", A_VIDEO)
-    if int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) in GREY_FORMATS:
-        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
-    return capture
+def _open(path: Path) -> tuple[InputContainer, VideoStream]:
+    try:
+        container = av.open(
+            f"file:{path}",
+            options={
+                "fflags": "discardcorrupt",
+                "protocol_whitelist": "file",
+                "format_whitelist": ",".join((*CONTAINERS, "webm", "mp4")),
+            },
+            timeout=(READ_S, READ_S),
+        )
+    except (FFmpegError, ValueError) as error:
+        raise InputError(
+            path, "content", "not a video, or its index is missing", A_VIDEO
+        ) from error
+    try:
+        stream = container.streams.best("video")
+        if not isinstance(stream, VideoStream) or stream.codec_context is None:
+            raise InputError(path, "content", "no pictures", A_VIDEO)
+        context = stream.codec_context
+        if context.width * context.height > MOST_PIXELS:
+            size = f"{context.width}×{context.height} px"
+            raise InputError(path, "frame size", size, f"at most {MOST_PIXELS} px in a frame")
+        # Frame threads would hold back each frame that is asked for until more are read.
+        context.thread_type = "SLICE"
+        context.options = {"max_pixels": str(MOST_PIXELS), "err_detect": "explode"}
+    except BaseException:
+        container.close()
+        raise
+    return container, stream
+
+
+def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
+    """Whole packets in the file's order; those that cannot be read are passed over."""
+    failures = 0
+    while failures < DAMAGED_READS:
+        try:
+            for packet in container.demux(stream):
+                if packet.size:
+                    failures = 0
+                    yield packet
+        except ExitError:
+            return
+        except FFmpegError:
+            failures += 1
+        else:
+            return
+
+
+def _decode_as(
+    stream: VideoStream, packet: Packet[VideoStream] | None, stamp: int
+) -> list[VideoFrame] | None:
+    """Frames that come out when ``packet`` goes in as ``stamp``; None when it is damaged."""
+    if packet is not None:
+        packet.pts = packet.dts = stamp
+    try:
+        return stream.codec_context.decode(packet)
+    except FFmpegError:
+        return None

@@ -1,15 +1,19 @@
 from __future__ import annotations
 
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 Pictures = list[npt.NDArray[np.uint8]]
 WriteVideo = Callable[[Path, Pictures, str], Path]
+Encode = Callable[..., Path]
 
 
 @pytest.fixture
@@ -41,3 +45,28 @@ def _write_video(path: Path, pictures: Pictures, codec: str) -> Path:
 def write_video() -> WriteVideo:
     """Write pictures as a video of 60 frames a second: (path, pictures, codec) -> path."""
     return _write_video
+
+
+def _encode(
+    path: Path, pictures: Sequence[npt.NDArray[Any]], *options: str, levels: str = "gray"
+) -> Path:
+    rows, columns = pictures[0].shape
+    subprocess.run(
+        [
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "rawvideo"),
+            *("-pix_fmt", levels, "-s", f"{columns}x{rows}", "-r", "60", "-i", "-"),
+            *(*options, str(path)),
+        ],
+        input=b"".join(picture.tobytes() for picture in pictures),
+        check=True,
+    )
+    return path
+
+
+@pytest.fixture(scope="session")
+def encode() -> Encode:
+    """Have ffmpeg write grey pictures at 60 frames a second: (path, pictures, *options) -> path.
+
+    ``levels`` is ffmpeg's name for how they are stored: gray, gray10le, … gray16le.
+    """
+    return _encode

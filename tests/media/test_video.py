@@ -1,26 +1,370 @@
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
+import av
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from labapp.errors import InputError
 from labapp.media import open_source
+from labapp.media.packets import Packets
 from labapp.media.video import VideoSource
 
-Pictures = list[npt.NDArray[np.uint8]]
+Pictures = list[npt.NDArray[Any]]
 WriteVideo = Callable[[Path, Pictures, str], Path]
+Encode = Callable[..., Path]
 
 H264 = Path(__file__).parent / "data" / "h264.mp4"
 VARYING = Path(__file__).parent / "data" / "varying_rate.mkv"
 GREY_16 = Path(__file__).parent / "data" / "grey16.mkv"
+
+COUNT = 40
+
+FFV1 = "-c:v ffv1"
+FFV1_CRC = "-c:v ffv1 -level 3 -slices 4 -slicecrc 1 -g 6"
+MJPG = "-c:v mjpeg -q:v 2 -pix_fmt yuvj420p"
+X264 = "-c:v libx264 -pix_fmt yuv420p -qp 8 -bf 3 -b_strategy 0 -g 15"
+MPEG4 = "-c:v mpeg4 -q:v 2 -pix_fmt yuv420p"
+
+EXACT = [
+    ("a.avi", 8, FFV1, "AVI, FFV1, 64×48 px, 8 bit grey, 60 frames/s"),
+    ("a.mkv", 8, FFV1, "MKV, FFV1, 64×48 px, 8 bit grey, 60 frames/s"),
+    ("a.mp4", 8, FFV1 + " -strict -2", "MP4, FFV1, 64×48 px, 8 bit grey, 60 frames/s"),
+    ("a.mkv", 10, FFV1 + "", "MKV, FFV1, 64×48 px, 10 bit grey, 60 frames/s"),
+    ("a.avi", 12, FFV1 + "", "AVI, FFV1, 64×48 px, 12 bit grey, 60 frames/s"),
+    ("a.avi", 16, FFV1, "AVI, FFV1, 64×48 px, 16 bit grey, 60 frames/s"),
+    ("a.mkv", 8, FFV1 + " -pix_fmt bgr0", "MKV, FFV1, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mkv", 16, FFV1 + " -pix_fmt gbrp16le", "MKV, FFV1, 64×48 px, 16 bit colour, 60 frames/s"),
+    ("a.avi", 8, "-c:v rawvideo", "AVI, raw frames, 64×48 px, 8 bit grey, 60 frames/s"),
+    ("a.mkv", 8, "-c:v rawvideo", "MKV, raw frames, 64×48 px, 8 bit grey, 60 frames/s"),
+    ("a.mov", 8, "-c:v rawvideo", "MP4, raw frames, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.nut", 16, "-c:v rawvideo", "NUT, raw frames, 64×48 px, 16 bit grey, 60 frames/s"),
+    ("a.avi", 8, "-c:v png", "AVI, PNG, 64×48 px, 8 bit grey, 60 frames/s"),
+    ("a.avi", 16, "-c:v png -pix_fmt gray16be", "AVI, PNG, 64×48 px, 16 bit grey, 60 frames/s"),
+]
+NEARLY = [
+    ("a.avi", MJPG, "AVI, MJPG, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mkv", MJPG, "MKV, MJPG, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mp4", MJPG, "MP4, MJPG, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mkv", FFV1 + " -pix_fmt yuv420p", "MKV, FFV1, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mp4", X264, "MP4, H.264, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mkv", X264, "MKV, H.264, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.avi", X264, "AVI, H.264, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mkv", X264 + " -flags -cgop -x264-params open-gop=1:scenecut=0", None),
+    ("a.mp4", X264 + " -color_range pc -vf scale=out_range=pc", None),
+    ("a.ts", X264, "MPEG-TS, H.264, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.avi", MPEG4, "AVI, MPEG-4, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.avi", MPEG4 + " -bf 2", "AVI, MPEG-4, 64×48 px, 8 bit colour, 60 frames/s"),
+    ("a.mp4", MPEG4 + " -bf 2", "MP4, MPEG-4, 64×48 px, 8 bit colour, 60 frames/s"),
+    (
+        "a.mpg",
+        "-c:v mpeg2video -q:v 2 -bf 2",
+        "MPEG, MPEG2VIDEO, 64×48 px, 8 bit colour, 60 frames/s",
+    ),
+]
+
+
+def pictures_of(bits: int) -> Pictures:
+    """Noise: no two frames alike, every level used."""
+    rng = np.random.default_rng(bits)
+    top = 2**bits
+    levels = [rng.integers(0, top, (48, 64), np.uint16) for _ in range(COUNT)]
+    return [x.astype(np.uint8) if bits == 8 else x for x in levels]
+
+
+def numbered() -> Pictures:
+    """Frame k shows k in six blocks, black for 0, white for 1, over a noisy ramp."""
+    frames = []
+    rng = np.random.default_rng(0)
+    for k in range(COUNT):
+        ramp = np.linspace(20, 235, 64) + rng.integers(-20, 20, (48, 64))
+        picture = ramp.astype(np.uint8)
+        for bit in range(6):
+            picture[8:24, 8 * bit : 8 * bit + 8] = 255 * (k >> bit & 1)
+        frames.append(picture)
+    return frames
+
+
+def number_in(image: npt.NDArray[Any]) -> int:
+    full = np.iinfo(image.dtype).max if image.dtype == np.uint8 else 1023
+    return sum(
+        int(image[10:22, 8 * bit + 2 : 8 * bit + 6].mean() > full / 2) << bit for bit in range(6)
+    )
+
+
+def orders() -> list[int]:
+    rng = np.random.default_rng(3)
+    return [*range(COUNT - 1, -1, -3), *rng.integers(0, COUNT, 20).tolist(), 7, 8, 9, 20, 19, 19]
+
+
+@pytest.mark.parametrize(("name", "bits", "options", "description"), EXACT)
+def test_ffmpegs_lossless_recordings_come_back_exactly(
+    tmp_path: Path, encode: Encode, name: str, bits: int, options: str, description: str
+) -> None:
+    pictures = pictures_of(bits)
+    levels = "gray" if bits == 8 else f"gray{bits}le"
+    path = encode(tmp_path / name, pictures, *options.split(), levels=levels)
+    with VideoSource(path) as source:
+        assert source.description == description
+        assert source.bit_depth == bits
+        assert source.warnings == ()
+        for frame, picture in zip(source, pictures, strict=True):
+            assert frame.image.dtype == picture.dtype
+            np.testing.assert_array_equal(frame.image, picture)
+            assert frame.time_s == pytest.approx(frame.index / 60)
+    with VideoSource(path, source.index) as again:
+        for index in orders():
+            np.testing.assert_array_equal(again.frame(index).image, pictures[index])
+
+
+@pytest.mark.parametrize(("name", "options", "description"), NEARLY)
+def test_ffmpegs_lossy_recordings_come_back_in_order(
+    tmp_path: Path, encode: Encode, name: str, options: str, description: str | None
+) -> None:
+    pictures = numbered()
+    path = encode(tmp_path / name, pictures, *options.split())
+    with VideoSource(path) as source:
+        assert description in (source.description, None)
+        assert len(source) == COUNT
+        frames = list(source)
+    for frame, picture in zip(frames, pictures, strict=True):
+        assert number_in(frame.image) == frame.index
+        assert np.abs(frame.image.astype(float) - picture).mean() < 3
+        assert frame.time_s == pytest.approx(frame.index / 60)
+    with VideoSource(path, source.index) as again:
+        for index in orders():
+            np.testing.assert_array_equal(again.frame(index).image, frames[index].image)
+
+
+def test_limited_luminance_fills_the_range_of_its_bits(tmp_path: Path, encode: Encode) -> None:
+    """Rounding to 219 and back costs a level."""
+    ramp = [np.tile(np.arange(256, dtype=np.uint8), (48, 1))]
+    eight = encode(tmp_path / "8.mkv", ramp, *(FFV1 + " -pix_fmt yuv422p").split())
+    with VideoSource(eight) as source:
+        assert np.abs(source.frame(0).image.astype(int) - ramp[0]).max() == 1
+    ten = encode(tmp_path / "10.mkv", ramp, *(FFV1 + " -pix_fmt yuv420p10le").split())
+    with VideoSource(ten) as source:
+        assert (source.bit_depth, source.frame(0).image.dtype) == (10, np.uint16)
+        assert np.abs(source.frame(0).image / 1023 - ramp[0] / 255).max() < 0.005
+
+
+def test_pictures_are_turned_as_the_recording_says(tmp_path: Path, encode: Encode) -> None:
+    pictures = numbered()[:3]
+    flat = encode(tmp_path / "flat.mp4", pictures, *X264.split())
+    turned = tmp_path / "turned.mp4"
+    subprocess.run(
+        [
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-display_rotation", "90"),
+            *("-i", str(flat), "-c", "copy", str(turned)),
+        ],
+        check=True,
+    )
+    with VideoSource(flat) as source, VideoSource(turned) as other:
+        assert other.shape == (64, 48)
+        np.testing.assert_array_equal(other.frame(1).image, np.rot90(source.frame(1).image))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("v.mkv", X264), ("v.mp4", X264), ("v.mkv", FFV1), ("v.mp4", MJPG)]
+)
+def test_a_pause_in_a_recording_is_kept(
+    tmp_path: Path, encode: Encode, name: str, options: str
+) -> None:
+    """The camera stops for five intervals after frame 5, then runs at half its rate."""
+    place = [k if k <= 5 else 2 * k + 5 for k in range(COUNT)]
+    stamps = "setpts='if(lte(N,5),N,2*N+5)/60/TB'"
+    path = encode(tmp_path / name, numbered(), *options.split(), "-vf", stamps, "-fps_mode", "vfr")
+    with VideoSource(path) as source:
+        assert source.warnings == ()
+        frames = list(source)
+    assert [number_in(frame.image) for frame in frames] == list(range(COUNT))
+    # Matroska keeps whole milliseconds.
+    assert [frame.time_s for frame in frames] == pytest.approx([k / 60 for k in place], abs=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("v.avi", X264),
+        ("v.mkv", X264),
+        ("v.mp4", X264 + " -movflags +faststart"),
+        ("v.avi", FFV1_CRC),
+        ("v.mkv", FFV1_CRC),
+        ("v.avi", MPEG4),
+        ("v.mov", "-c:v rawvideo -movflags +faststart"),
+    ],
+)
+@pytest.mark.parametrize("kept", [0.5, 0.8, 0.99])
+def test_what_is_left_of_a_cut_recording_is_read(
+    tmp_path: Path, encode: Encode, name: str, options: str, kept: float
+) -> None:
+    path = encode(tmp_path / name, numbered(), *options.split())
+    with VideoSource(path) as source:
+        whole = [frame.image for frame in source]
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * kept)])
+    with VideoSource(path) as source:
+        assert 0 < len(source) <= COUNT
+        got = read_all(source)
+        # H.264 stores a frame before those it is shown after: the last ones left have gaps.
+        for index in range(len(got) - (4 if options.startswith(X264) else 0)):
+            np.testing.assert_array_equal(got[index], whole[index])
+        for index in (len(got) - 1, 0, len(got) // 2):
+            np.testing.assert_array_equal(source.frame(index).image, got[index])
+
+
+def read_all(source: VideoSource) -> list[npt.NDArray[Any] | None]:
+    images: list[npt.NDArray[Any] | None] = []
+    for index in range(len(source)):
+        try:
+            images.append(source.frame(index).image)
+        except InputError:
+            images.append(None)
+    return images
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("v.avi", FFV1_CRC), ("v.mkv", FFV1_CRC), ("v.avi", "-c:v png"), ("v.mkv", "-c:v png")],
+)
+def test_garbage_in_the_middle_costs_frames_but_changes_none(
+    tmp_path: Path, encode: Encode, name: str, options: str
+) -> None:
+    """These codecs carry checksums: a frame comes back as it was or not at all."""
+    pictures = pictures_of(8)
+    path = encode(tmp_path / name, pictures, *options.split())
+    content = path.read_bytes()
+    rng = np.random.default_rng(4)
+    lost = []
+    for _ in range(8):
+        at = int(rng.integers(len(content) // 5, len(content) * 4 // 5))
+        path.write_bytes(content[:at] + rng.bytes(300) + content[at + 300 :])
+        with VideoSource(path) as source:
+            assert len(source) == COUNT
+            images = read_all(source)
+            for index in orders():
+                if images[index] is not None:
+                    np.testing.assert_array_equal(source.frame(index).image, images[index])
+        for image, picture in zip(images, pictures, strict=True):
+            if image is not None:
+                np.testing.assert_array_equal(image, picture)
+        lost.append(sum(image is None for image in images))
+    assert 0 < max(lost) <= 8
+
+
+def test_frames_after_a_damaged_group_of_pictures_are_whole(tmp_path: Path, encode: Encode) -> None:
+    path = encode(tmp_path / "v.mp4", numbered(), *X264.split())
+    with VideoSource(path) as source:
+        whole = [frame.image for frame in source]
+    content = bytearray(path.read_bytes())
+    with av.open(path) as container:
+        places = [packet.pos for packet in container.demux(video=0)]
+    packet_15 = [place for place in places if place is not None][15]
+    content[packet_15 + 4 : packet_15 + 64] = bytes(60)
+    path.write_bytes(content)
+    with VideoSource(path) as source:
+        images = read_all(source)
+    assert images[15] is None
+    for index in (*range(10), *range(30, COUNT)):
+        np.testing.assert_array_equal(images[index], whole[index])
+
+
+@pytest.mark.parametrize(("name", "options"), [("v.avi", X264), ("v.mkv", FFV1), ("v.mp4", MJPG)])
+def test_with_its_index_a_recording_is_not_read_through_again(
+    tmp_path: Path, encode: Encode, name: str, options: str
+) -> None:
+    path = encode(tmp_path / name, numbered(), *options.split())
+    with VideoSource(path) as source:
+        index = source.index
+        about = (source.shape, source.frame_rate_hz, source.bit_depth, source.description)
+        whole = [frame.image for frame in source]
+    with mock.patch.object(Packets, "read") as read, VideoSource(path, index) as source:
+        assert about == (source.shape, source.frame_rate_hz, source.bit_depth, source.description)
+        assert (len(source), source.index) == (COUNT, index)
+        np.testing.assert_array_equal(source.frame(33).image, whole[33])
+        with source.reopen() as other:
+            np.testing.assert_array_equal(other.frame(12).image, whole[12])
+    read.assert_not_called()
+
+
+def test_an_index_that_does_not_fit_is_ignored(tmp_path: Path, encode: Encode) -> None:
+    path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
+    with VideoSource(path) as source:
+        index = source.index
+    assert index is not None
+    damaged = bytearray(index)
+    damaged[len(index) // 2] ^= 1
+    other = encode(tmp_path / "w.avi", numbered()[:20], *FFV1.split())
+    for file, given, count in [
+        (path, bytes(damaged), COUNT),
+        (path, index[:50], COUNT),
+        (path, b"", COUNT),
+        (other, index, 20),
+    ]:
+        with VideoSource(file, given) as source:
+            assert len(source) == count
+            assert number_in(source.frame(count - 1).image) == count - 1
+
+
+def test_a_frame_too_large_to_be_true_is_refused(tmp_path: Path, encode: Encode) -> None:
+    path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
+    content = bytearray(path.read_bytes())
+    for start in (content.index(b"avih") + 40, content.index(b"strf") + 12):
+        content[start : start + 8] = (12000).to_bytes(4, "little") * 2
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="frame size: 12000×12000 px; expected at most"):
+        VideoSource(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("v.avi", X264), ("v.mkv", FFV1), ("v.mp4", X264), ("v.avi", MJPG)]
+)
+def test_whatever_the_bytes_a_recording_is_read_or_refused(
+    tmp_path: Path, encode: Encode, name: str, options: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing but InputError, and no file is changed."""
+    path = encode(tmp_path / name, numbered(), *options.split())
+    content = path.read_bytes()
+    rng = np.random.default_rng(7)
+    opened = 0
+    for _ in range(25):
+        mutated = bytearray(content)
+        # Headers are hit as often as all the rest.
+        for span in (600, len(content)):
+            for at in rng.integers(0, span, 3):
+                mutated[at] = rng.integers(256)
+        path.write_bytes(mutated)
+        with contextlib.suppress(InputError), VideoSource(path) as source:
+            opened += 1
+            for index in (0, len(source) - 1, len(source) // 2):
+                with contextlib.suppress(InputError):
+                    assert source.frame(index).image.shape == source.shape
+        assert path.read_bytes() == mutated
+    assert opened > 0
+    assert capfd.readouterr() == ("", "")
+
+
+def test_lists_of_files_and_texts_are_no_videos(tmp_path: Path, encode: Encode) -> None:
+    encode(tmp_path / "v.mkv", numbered(), *FFV1.split())
+    playlist = tmp_path / "list.avi"
+    playlist.write_text("ffconcat version 1.0\nfile v.mkv\n")
+    text = tmp_path / "notes.txt"
+    text.write_text("current 125 A\n" * 200)
+    for path in (playlist, text):
+        with pytest.raises(InputError, match="not a video"):
+            VideoSource(path)
+
 
 LOSSLESS = [("ffv1.avi", "FFV1"), ("ffv1.mkv", "FFV1"), ("raw.avi", "Y800"), ("png.avi", "MPNG")]
 LOSSY = [("mjpg.avi", "MJPG"), ("mpeg4.mp4", "mp4v")]
@@ -97,7 +441,7 @@ def test_reading_in_order_neither_seeks_nor_opens_again(
     tmp_path: Path, pictures: Pictures, write_video: WriteVideo
 ) -> None:
     with VideoSource(write_video(tmp_path / "v.avi", pictures, "FFV1")) as source:
-        with mock.patch.object(VideoSource, "_jump") as jump:
+        with mock.patch.object(VideoSource, "_seek") as jump:
             images = [source.frame(index).image for index in (0, 1, 2, 2, 3, 7, 15)]
         jump.assert_not_called()
     np.testing.assert_array_equal(images[-1], pictures[15])

@@ -1,0 +1,289 @@
+"""What reading a video through tells of its packets, and how it is kept for the next opening."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+from av.index import IndexEntry
+from av.packet import Packet
+
+from labapp.core.values import FloatArray, freeze
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+MAGIC = b"labapp video index 1\n"
+
+UNKNOWN = np.iinfo(np.int64).min
+"""Stamp of a packet that has none."""
+
+
+@dataclass(frozen=True)
+class Packets:
+    """Packets of a video in the order of the file, n of them.
+
+    Parameters
+    ----------
+    placed_by
+        What tells one packet from another: its place in the file ("pos") or its stamp.
+    place
+        That, shape (n,).
+    pts, dts
+        When it is to be shown and decoded, shape (n,), ticks; `UNKNOWN` where it does not say.
+    key
+        Whether decoding can begin with it, shape (n,).
+    shown
+        Whether a frame comes of it, shape (n,): edited MP4s hold some that are not shown.
+    """
+
+    placed_by: str
+    place: IntArray
+    pts: IntArray
+    dts: IntArray
+    key: BoolArray
+    shown: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    @classmethod
+    def read(cls, packets: Iterable[Packet[Any]], file_byte: int) -> Self:
+        """List packets; no more of them than the file has bytes for."""
+        rows = []
+        byte = 0
+        for packet in packets:
+            byte += packet.size
+            if byte > file_byte:
+                break
+            rows.append(
+                [
+                    *(UNKNOWN if x is None else x for x in (packet.pos, packet.pts, packet.dts)),
+                    packet.is_keyframe,
+                    not packet.is_discard,
+                ]
+            )
+        pos, pts, dts, key, shown = np.array(rows, np.int64).reshape(-1, 5).T
+        placed_by, place = next(
+            ((name, stamp) for name, stamp in (("pos", pos), ("pts", pts)) if _differ(stamp)),
+            ("dts", dts),
+        )
+        return cls(placed_by, place, pts, dts, key > 0, shown > 0)
+
+    def completed(self, entries: Iterable[IndexEntry], file_byte: int) -> Self:
+        """These as the index at the end of an AVI has them; itself where it has others.
+
+        Reading counts packets and may stop at a damaged one; the index knows them all.
+        """
+        # The index says where a chunk is, a packet where what is in it is.
+        rows = [
+            (entry.pos + 8, entry.timestamp, entry.is_keyframe)
+            for entry in entries
+            if entry.size and entry.pos + 8 + entry.size <= file_byte
+        ]
+        place, stamp, key = np.array(rows, np.int64).reshape(-1, 3).T
+        if self.placed_by != "pos" or not np.isin(self.place, place).all() or not _differ(place):
+            return self
+        return type(self)("pos", place, stamp, stamp, key > 0, np.ones(len(place), bool))
+
+    def with_keys(self, key: BoolArray) -> Self:
+        """The same with other key frames."""
+        return dataclasses.replace(self, key=key)
+
+    def stamps_differ(self) -> bool:
+        """Whether every packet has a stamp that is its own."""
+        return _differ(self.pts)
+
+
+def _differ(values: IntArray) -> bool:
+    return len(np.unique(values)) == len(values) and not (values == UNKNOWN).any()
+
+
+def number_by_order(packets: Packets) -> IntArray:
+    """Frame number of each packet, shape (n,), for codecs that keep frames in order; −1: none."""
+    return np.where(packets.shown, np.cumsum(packets.shown) - 1, -1)
+
+
+def number_by_stamp(packets: Packets) -> IntArray:
+    """Frame number of each packet, shape (n,), in the order of their stamps; −1: none."""
+    number = np.full(len(packets), -1, np.int64)
+    order = np.argsort(packets.pts)
+    order = order[packets.shown[order]]
+    number[order] = np.arange(len(order))
+    return number
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What a video's header says of time.
+
+    Parameters
+    ----------
+    tick_s
+        Unit of the stamps, s.
+    rate_hz
+        Frames a second on average; None where it does not say.
+    claimed
+        Number of frames; 0 where it does not say.
+    stamped
+        Whether stamps tell when frames are shown.
+    from_0
+        Whether the stamp of the first frame would be 0, else it is the first there is.
+    """
+
+    tick_s: float
+    rate_hz: float | None
+    claimed: int
+    stamped: bool
+    from_0: bool
+
+
+@dataclass(frozen=True)
+class PacketTable:
+    """What there is to know to find any frame of a video.
+
+    Parameters
+    ----------
+    placed_by, place, key
+        As in `Packets`.
+    seek
+        Stamps to seek to for each key frame, shape (keys, 2), ticks.
+    number
+        The frame that comes of each packet, shape (n,); −1: none.
+    time_s
+        Time of each frame since the first, shape (frames,), s; NaN where there is no time base.
+    frame_rate_hz, shape, bit_depth, description, warnings
+        As of a `FrameSource`.
+    seekable
+        Whether frames may be got to by seeking.
+    slice_crc
+        Whether packets carry checksums, as FFV1's may.
+    """
+
+    placed_by: str
+    place: IntArray
+    key: BoolArray
+    seek: IntArray
+    number: IntArray
+    time_s: FloatArray
+    frame_rate_hz: float | None
+    shape: tuple[int, int] = (0, 0)
+    bit_depth: int = 8
+    description: str = ""
+    warnings: tuple[str, ...] = ()
+    seekable: bool = True
+    slice_crc: bool = False
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @classmethod
+    def build(cls, packets: Packets, number: IntArray, timing: Timing, name: str) -> Self:
+        """Give every packet its frame and every frame its time.
+
+        ``number`` is the frame of each packet, shape (n,), were no packet missing.
+        """
+        shown = number >= 0
+        stamp_s = np.full(int(number.max(initial=-1)) + 1, np.nan)
+        if timing.stamped and not (packets.pts[shown] == UNKNOWN).any():
+            stamp_s[number[shown]] = packets.pts[shown] * timing.tick_s
+        elapsed_s = stamp_s - (0 if timing.from_0 else stamp_s[0])
+        if not (np.diff(elapsed_s) >= 0).all():
+            elapsed_s[:] = np.nan
+        place = _places(elapsed_s, timing)
+        number = np.where(shown, place[number], -1)
+        time_s = _times(elapsed_s, place, timing)
+        # Fewer frames over the whole time are a varying rate, not an early end.
+        last = np.nan_to_num(elapsed_s[-1] * (timing.rate_hz or 0), nan=-1.0)
+        early = max(len(time_s), round(last) + 1) < timing.claimed
+        key = packets.key & (number >= 0)
+        return cls(
+            packets.placed_by,
+            packets.place,
+            key,
+            np.stack([packets.pts[key], packets.dts[key]], axis=1),
+            number,
+            time_s,
+            timing.rate_hz,
+            warnings=(
+                f"{name} ends early: its header says {timing.claimed} frames, "
+                f"{len(elapsed_s)} of them whole",
+            )
+            * early,
+        )
+
+    def seek_stamps(self, packet: int) -> list[int]:
+        """Stamps to seek to for a key packet, the likeliest first; none to be read from 0."""
+        if not self.seekable or packet == 0:
+            return []
+        stamps = self.seek[np.count_nonzero(self.key[:packet])].tolist()
+        return [stamp for stamp in dict.fromkeys(stamps) if stamp != UNKNOWN]
+
+    def without_seeking(self) -> Self:
+        """The same, with every frame got to from the start."""
+        return dataclasses.replace(self, seekable=False)
+
+    def to_bytes(self, fingerprint: tuple[int, int]) -> bytes:
+        """All of it as bytes, for the file of this fingerprint."""
+        buffer = io.BytesIO()
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        arrays = {k: v for k, v in values.items() if isinstance(v, np.ndarray)}
+        others = {k: v for k, v in values.items() if k not in arrays}
+        np.savez(buffer, allow_pickle=False, **arrays)
+        others["fingerprint"] = fingerprint
+        text = json.dumps(others).encode()
+        body = zlib.compress(len(text).to_bytes(4, "big") + text + buffer.getvalue(), 1)
+        return MAGIC + zlib.crc32(body).to_bytes(4, "big") + body
+
+    @classmethod
+    def from_bytes(cls, content: bytes, fingerprint: tuple[int, int]) -> Self | None:
+        """What `to_bytes` gave; None if it is damaged or made for another file."""
+        head = len(MAGIC)
+        body = content[head + 4 :]
+        if content[:head] != MAGIC or content[head : head + 4] != zlib.crc32(body).to_bytes(
+            4, "big"
+        ):
+            return None
+        content = zlib.decompress(body)
+        end = 4 + int.from_bytes(content[:4], "big")
+        others = json.loads(content[4:end])
+        if tuple(others.pop("fingerprint")) != fingerprint:
+            return None
+        others["shape"] = tuple(others["shape"])
+        others["warnings"] = tuple(others["warnings"])
+        with np.load(io.BytesIO(content[end:]), allow_pickle=False) as arrays:
+            return cls(**others, **{name: arrays[name] for name in arrays.files})
+
+
+def _places(elapsed_s: FloatArray, timing: Timing) -> IntArray:
+    """Number of each frame, shape (n,), with those that are missing counted where stamps tell.
+
+    They do where all stand at multiples of the interval and the last in its place.
+    """
+    plain = np.arange(len(elapsed_s))
+    missing = len(plain) < timing.claimed <= 2 * len(plain)
+    if not missing or timing.rate_hz is None or np.isnan(elapsed_s).any():
+        return plain
+    place = elapsed_s * timing.rate_hz
+    number = np.rint(place).astype(np.int64)
+    on_grid = np.abs(place - number).max() < 0.25 and (np.diff(number) > 0).all()
+    return number if on_grid and number[-1] == timing.claimed - 1 else plain
+
+
+def _times(elapsed_s: FloatArray, place: IntArray, timing: Timing) -> FloatArray:
+    """Time of each frame since the first, shape (frames,), s."""
+    if timing.rate_hz is None:
+        since_first: FloatArray = elapsed_s - elapsed_s[0]
+        return since_first
+    regular: FloatArray = np.arange(place[-1] + 1) / timing.rate_hz
+    # Containers round stamps to ticks (Matroska: 1 ms); what is further off was at another time.
+    if (np.abs(elapsed_s - regular[place]) > 1.5 * timing.tick_s).any():
+        regular[place] = elapsed_s
+    return regular

@@ -1,0 +1,124 @@
+"""Read a recording through once at import, and check that any frame can be asked for."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.values import freeze
+from labapp.errors import InputError
+from labapp.media.base import FrameSource, GreyImage
+from labapp.media.video import VideoSource
+
+CHECKED_FRAMES = 24
+"""Frames drawn to be read again out of order."""
+
+NAMED_FRAMES = 10
+"""No more frames than this are listed in a warning."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What reading a recording through has shown.
+
+    Parameters
+    ----------
+    checksum
+        `frame_checksum` of each frame, shape (n,), uint32; 0 where a frame cannot be read.
+    readable
+        Whether a frame can be read, shape (n,).
+    frame_exact
+        Whether the frames read again out of order were the same.
+    checked
+        How many were; 0 for a video that is decoded from its start in any case.
+    warnings
+        What the user should know beyond the source's own warnings, one sentence each.
+    """
+
+    checksum: npt.NDArray[np.uint32]
+    readable: npt.NDArray[np.bool_]
+    frame_exact: bool
+    checked: int
+    warnings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def frame_checksum(image: GreyImage) -> int:
+    """CRC-32 of a frame's grey levels, row by row, the low byte first."""
+    little = np.ascontiguousarray(image, image.dtype.newbyteorder("<"))
+    return zlib.crc32(little.tobytes())
+
+
+def survey(source: FrameSource, progress: Callable[[int, int], None] | None = None) -> Survey:
+    """Read every frame in order, then some out of order from the source opened anew.
+
+    A video that gives other frames then is made to decode from its start from now on
+    (`VideoSource.decode_from_start`).
+
+    Parameters
+    ----------
+    source
+        What is to be read.
+    progress
+        Called with the frames done and all there are to do; may raise to end the survey.
+    """
+    order = _order(source)
+    total = len(source) + len(order)
+    checksum = np.zeros(len(source), np.uint32)
+    readable = np.zeros(len(source), bool)
+    for index in range(len(source)):
+        found = _checksum(source, index)
+        readable[index] = found is not None
+        checksum[index] = found or 0
+        if progress is not None:
+            progress(index + 1, total)
+    exact = True
+    with source.reopen() as again:
+        for count, index in enumerate(order, 1):
+            exact &= _checksum(again, index) == (int(checksum[index]) if readable[index] else None)
+            if progress is not None:
+                progress(len(source) + count, total)
+    return Survey(
+        checksum, readable, exact, len(order), (*_unread(readable), *_inexact(source, exact))
+    )
+
+
+def _checksum(source: FrameSource, index: int) -> int | None:
+    try:
+        return frame_checksum(source.frame(index).image)
+    except InputError:
+        return None
+
+
+def _order(source: FrameSource) -> list[int]:
+    """Frames to read again: last, first, jumps both ways, then steps backwards."""
+    if isinstance(source, VideoSource) and not source.seekable:
+        return []
+    count = len(source)
+    drawn = np.random.default_rng(count).permutation(count)[:CHECKED_FRAMES].tolist()
+    last = max(0, count - 1)
+    return [last, 0, *drawn, *sorted({max(0, k - 1) for k in drawn[:4]}, reverse=True)]
+
+
+def _unread(readable: npt.NDArray[np.bool_]) -> tuple[str, ...]:
+    numbers = np.flatnonzero(~readable).tolist()
+    if not numbers:
+        return ()
+    named = ", ".join(map(str, numbers[:NAMED_FRAMES])) + " …" * (len(numbers) > NAMED_FRAMES)
+    return (f"{len(numbers)} of {len(readable)} frames cannot be read: {named}",)
+
+
+def _inexact(source: FrameSource, exact: bool) -> tuple[str, ...]:
+    if exact:
+        return ()
+    if not isinstance(source, VideoSource):
+        return (f"{source.name} gave other frames when they were read again; has it changed?",)
+    before = source.warnings
+    source.decode_from_start()
+    return tuple(sentence for sentence in source.warnings if sentence not in before)
