@@ -7,6 +7,11 @@ import shutil
 from pathlib import Path
 
 
+def as_bytes(text: str) -> bytes:
+    r"""UTF-8; a file name that is no text keeps its odd bytes as ``\udcXX``, as in JSON."""
+    return text.encode("utf-8", "backslashreplace")
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file beside its place and rename it, so that no reader sees half of it.
 

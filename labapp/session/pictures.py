@@ -11,7 +11,8 @@ import multiprocessing
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -134,10 +135,25 @@ def write_trend_picture(
     write_whole(path, content.getvalue())
 
 
-def write_surface_picture(path: Path, reconstruction: Reconstruction) -> None:
+def drawing_process() -> ProcessPoolExecutor:
+    """A process to draw in: VTK ends the one it runs in where there is no OpenGL."""
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, context, initializer=_without_display)
+
+
+def write_surface_picture(
+    path: Path, reconstruction: Reconstruction, process: Executor | None = None
+) -> None:
     """Write a PNG of the surface in 3-D, coloured by height, with the reflection points.
 
-    VTK ends the process it runs in where there is no OpenGL, so it runs in one of its own.
+    Parameters
+    ----------
+    path
+        Where to.
+    reconstruction
+        What to draw.
+    process
+        A `drawing_process` to draw several pictures in; None starts one for this.
 
     Raises
     ------
@@ -147,8 +163,8 @@ def write_surface_picture(path: Path, reconstruction: Reconstruction) -> None:
         Where nothing can be drawn.
     """
     vertices, triangles = surface_mesh(reconstruction, 0.1)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, initializer=_without_display) as process:
+    with ExitStack() as stack:
+        process = process or stack.enter_context(drawing_process())
         drawing = process.submit(draw_surface, vertices, triangles, reconstruction.points_mm)
         _, content = cv2.imencode(".png", drawing.result())
     write_whole(path, content.tobytes())

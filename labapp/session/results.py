@@ -7,7 +7,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -15,22 +15,52 @@ from typing import Self
 import labapp
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
+from labapp.core.reconstruction import Reconstruction
 from labapp.errors import InputError
-from labapp.session.files import write_whole
-from labapp.session.tables import (
-    TABLES,
-    boundary_rows,
-    dots_rows,
-    measures_row,
-    points_rows,
-    surface_csv,
-    surface_stl,
-)
+from labapp.session.files import as_bytes, write_whole
+from labapp.session.meshes import FORMATS, SPACING_MM, solid, surface
+from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables, surface_csv
 
 RUN_FILE = "run.json"
 OURS = re.compile(r"(measures|dots|points|boundary|surface_\d{6,})\.csv|surface_\d{6,}\.stl")
-SPACING_MM = 0.1
-"""Distance between the nodes of the surface files, mm."""
+SURFACES = ("csv", "stl")
+"""What a run writes of each surface."""
+
+
+def surface_files(
+    frame: int,
+    reconstruction: Reconstruction | None,
+    formats: Collection[str],
+    spacing_mm: float,
+    *,
+    as_solid: bool = False,
+) -> dict[str, bytes]:
+    """The files of a frame's surface, by name; none without a surface.
+
+    Parameters
+    ----------
+    frame
+        Its number.
+    reconstruction
+        What it gave.
+    formats
+        Some of ``csv`` and those of `FORMATS`.
+    spacing_mm
+        Distance of the nodes, mm.
+    as_solid
+        Whether to add the mesh as a watertight body in each of the `FORMATS` chosen.
+    """
+    if reconstruction is None:
+        return {}
+    files = {}
+    if "csv" in formats:
+        files[f"surface_{frame:06d}.csv"] = surface_csv(reconstruction, spacing_mm)
+    chosen = [FORMATS[name] for name in FORMATS if name in formats]
+    for stem, make in (("surface", surface), ("solid", solid))[: 1 + as_solid]:
+        mesh = make(reconstruction, spacing_mm) if chosen else None
+        if mesh is not None:
+            files |= {f"{stem}_{frame:06d}{end}": write(mesh) for end, write in chosen}
+    return files
 
 
 class ResultsWriter:
@@ -75,7 +105,7 @@ class ResultsWriter:
             "program": "labapp",
             "version": labapp.__version__,
             "state": "running",
-            "started": _now(),
+            "started": now(),
             "ended": None,
             "frames_done": 0,
             **provenance,
@@ -85,9 +115,9 @@ class ResultsWriter:
             folder.mkdir(parents=True, exist_ok=True)
             _clear(folder)
             self._write_run()
-            for name, columns in TABLES.items():
-                self._files[name] = io.FileIO(folder / name, "a")
-                _append(self._files[name], ",".join(columns) + "\n")
+            for name in TABLES:
+                self._files[name] = io.FileIO(folder / f"{name}.csv", "a")
+                _append(self._files[name], csv_header(name))
         except OSError as error:
             self._close_files()
             raise self._unwritable(error) from error
@@ -101,27 +131,24 @@ class ResultsWriter:
             If it cannot be written (disk full, folder gone); the frames before are whole.
         """
         before = {file: os.fstat(file.fileno()).st_size for file in self._files.values()}
-        surface_files: dict[Path, bytes] = {}
-        reconstruction = measurement.reconstruction
-        if self._surfaces and reconstruction is not None:
-            stem = self.folder / f"surface_{frame:06d}"
-            surface_files[stem.with_suffix(".csv")] = surface_csv(reconstruction, SPACING_MM)
-            surface_files[stem.with_suffix(".stl")] = surface_stl(reconstruction, SPACING_MM)
-        rows = {
-            "dots.csv": dots_rows(frame, measurement, self._calibration),
-            "points.csv": points_rows(frame, reconstruction),
-            "boundary.csv": boundary_rows(frame, reconstruction),
-            "measures.csv": measures_row(frame, time_s, measurement),
+        formats = SURFACES if self._surfaces else ()
+        surfaces = {
+            self.folder / name: content
+            for name, content in surface_files(
+                frame, measurement.reconstruction, formats, SPACING_MM
+            ).items()
         }
+        tables = frame_tables(frame, time_s, measurement, self._calibration)
+        rows = {name: csv_rows(name, table) for name, table in tables.items()}
         try:
-            for path, content in surface_files.items():
+            for path, content in surfaces.items():
                 write_whole(path, content)
             for name, text in rows.items():
                 _append(self._files[name], text)
         except BaseException as error:
             for file, size in before.items():
                 file.truncate(size)
-            for path in surface_files:
+            for path in surfaces:
                 path.unlink(missing_ok=True)
             if isinstance(error, OSError):
                 raise self._unwritable(error) from error
@@ -141,7 +168,7 @@ class ResultsWriter:
         state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         self._run |= {
             "state": state if error else "finished",
-            "ended": _now(),
+            "ended": now(),
             "frames_done": self.frames,
         }
         try:
@@ -153,7 +180,7 @@ class ResultsWriter:
 
     def _write_run(self) -> None:
         text = json.dumps(self._run, indent=2, ensure_ascii=False) + "\n"
-        write_whole(self.folder / RUN_FILE, text.encode())
+        write_whole(self.folder / RUN_FILE, as_bytes(text))
 
     def _close_files(self) -> None:
         for file in self._files.values():
@@ -187,17 +214,18 @@ def _clear(folder: Path) -> None:
 def _is_run(path: Path) -> bool:
     try:
         run = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(run, dict) and run.get("program") == "labapp"
 
 
 def _append(file: io.FileIO, text: str) -> None:
     """Write all of it: a disk that fills takes a part first, and fails at the next try."""
-    content = text.encode()
+    content = as_bytes(text)
     while content:
         content = content[file.write(content) :]
 
 
-def _now() -> str:
+def now() -> str:
+    """The time, ISO 8601, with the time zone."""
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

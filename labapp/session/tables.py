@@ -1,4 +1,8 @@
-"""A measurement as the rows and surface files that leave the program; mm, px, degrees, s."""
+"""A measurement as tables: their columns, units and values, and the CSV text of both.
+
+The values are the exact ones; only CSV rounds them. A value that is unknown is NaN, and an empty
+cell in CSV.
+"""
 
 from __future__ import annotations
 
@@ -6,121 +10,216 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from labapp.core.coordinates import ImageCalibration
-from labapp.core.measures import Measures, surface_grid, surface_mesh
+from labapp.core.measures import surface_grid
 from labapp.core.pipeline import Measurement
 from labapp.core.reconstruction import Reconstruction
 
-SIZES = (
-    "are_mm mre_mm width_mm length_mm height_mm depth_mm area_mm2 volume_mm3 "
-    "center_x_mm center_y_mm peak_x_mm peak_y_mm"
-).split()
-MORE_SIZES = (
-    "width_sigma_mm length_sigma_mm height_sigma_mm depth_sigma_mm area_sigma_mm2 "
-    "volume_sigma_mm3 are_inner_mm mre_inner_mm"
-).split()
-TABLES = {
-    "dots.csv": (
-        "frame u_px v_px plane_x_mm plane_z_mm reflected_row reflected_column "
-        "ray_row ray_column blocked source"
-    ).split(),
-    "points.csv": "frame ray_row ray_column x_mm y_mm z_mm residual_mm sigma_mm".split(),
-    "boundary.csv": "frame theta_deg x_mm y_mm z_mm".split(),
-    "measures.csv": [
-        *"frame time_s status scheme correspondence dots rows".split(),
-        *SIZES,
-        *MORE_SIZES,
-        "reason",
-    ],
+PX_DIGITS, MM_DIGITS = 4, 6
+
+UNITS = ("mm", "mm2", "mm3", "px", "deg", "s")
+NO_UNIT = "1"
+
+Table = dict[str, npt.NDArray[Any]]
+"""Column name → values, shape (rows,): int64 where always known, float64, or text (object)."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a column holds.
+
+    Parameters
+    ----------
+    name
+        Its name, which ends in the unit.
+    description
+        What it holds, in a few words.
+    digits
+        Decimals in CSV; 0 for whole numbers, None for text.
+    """
+
+    name: str
+    description: str
+    digits: int | None = MM_DIGITS
+
+    @property
+    def unit(self) -> str:
+        """``mm``, ``px`` …; ``1`` for plain numbers and text."""
+        end = self.name.rpartition("_")[2]
+        return end if end in UNITS else NO_UNIT
+
+
+FRAME = Column("frame", "number of the frame in its recording, from 0", 0)
+
+TABLES: dict[str, tuple[Column, ...]] = {
+    "dots": (
+        FRAME,
+        Column("u_px", "place in the frame, to the right", PX_DIGITS),
+        Column("v_px", "place in the frame, down", PX_DIGITS),
+        Column("plane_x_mm", "place on the imaging plane, X′"),
+        Column("plane_z_mm", "place on the imaging plane, Z′"),
+        Column("reflected_row", "reflected row, from the bottom up, from 1", 0),
+        Column("reflected_column", "reflected column, from left to right, from 1", 0),
+        Column("ray_row", "row i of the ray that made the dot, from 1", 0),
+        Column("ray_column", "column j of the ray that made the dot, from 1", 0),
+        Column("blocked", "1 if the torch hides dots of its row, otherwise 0", 0),
+        Column("source", "auto as it was found, manual if placed or changed by hand", None),
+    ),
+    "points": (
+        FRAME,
+        Column("ray_row", "row i of the ray, from 1", 0),
+        Column("ray_column", "column j of the ray, from 1", 0),
+        Column("x_mm", "X of the reflection point"),
+        Column("y_mm", "Y of the reflection point, along the welding direction"),
+        Column("z_mm", "height of the reflection point above the work piece"),
+        Column("residual_mm", "distance of computed and captured dot on the imaging plane"),
+        Column("sigma_mm", "standard uncertainty of the height"),
+    ),
+    "boundary": (
+        FRAME,
+        Column("theta_deg", "polar angle about the centre, from +X, counter-clockwise", PX_DIGITS),
+        Column("x_mm", "X of the boundary point"),
+        Column("y_mm", "Y of the boundary point"),
+        Column("z_mm", "height of the boundary point above the work piece"),
+    ),
+    "measures": (
+        FRAME,
+        Column("time_s", "time since the recording's first frame"),
+        Column("status", "ok, or one word for why there is no surface", None),
+        Column("scheme", "reconstruction scheme", None),
+        Column("correspondence", "orientation of columns and rows", None),
+        Column("dots", "dots found", 0),
+        Column("rows", "reflected rows found", 0),
+        Column("are_mm", "average reflection error"),
+        Column("mre_mm", "maximum reflection error"),
+        Column("width_mm", "extent of the boundary along X"),
+        Column("length_mm", "extent of the boundary along Y"),
+        Column("height_mm", "largest z"),
+        Column("depth_mm", "smallest z"),
+        Column("area_mm2", "area within the boundary, seen from above"),
+        Column("volume_mm3", "integral of z over the area, negative for a concave pool"),
+        Column("center_x_mm", "X of the pool's centre"),
+        Column("center_y_mm", "Y of the pool's centre"),
+        Column("peak_x_mm", "X where the surface is farthest from the work piece"),
+        Column("peak_y_mm", "Y where the surface is farthest from the work piece"),
+        Column("width_sigma_mm", "standard uncertainty of the width"),
+        Column("length_sigma_mm", "standard uncertainty of the length"),
+        Column("height_sigma_mm", "standard uncertainty of the height"),
+        Column("depth_sigma_mm", "standard uncertainty of the depth"),
+        Column("area_sigma_mm2", "standard uncertainty of the area"),
+        Column("volume_sigma_mm3", "standard uncertainty of the volume"),
+        Column("are_inner_mm", "average reflection error of inside points"),
+        Column("mre_inner_mm", "maximum reflection error of inside points"),
+        Column("reason", "why there is no surface, in a sentence", None),
+    ),
 }
 """The tables and their columns, in the order in which a frame is written to them."""
 
-PX_DIGITS, MM_DIGITS = 4, 6
-
-STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+SIZES = [column.name for column in TABLES["measures"][7:-1]]
 
 
-def measures_row(frame: int, time_s: float | None, measurement: Measurement) -> str:
-    """The frame's row of `measures.csv`; every frame has one."""
+def frame_tables(
+    frame: int, time_s: float | None, measurement: Measurement, calibration: ImageCalibration
+) -> dict[str, Table]:
+    """All that a frame has to say, table by table, with the columns of `TABLES`.
+
+    Parameters
+    ----------
+    frame, time_s
+        Its number, and its time where it has one.
+    measurement
+        What it gave. `measures` gets a row in any case, the others none for what there is not.
+    calibration
+        Pixel ↔ imaging plane, for the dots' places on the plane.
+    """
+    reconstruction = measurement.reconstruction
+    columns = {
+        "dots": _dots(measurement, calibration),
+        "points": [] if reconstruction is None else _points(reconstruction),
+        "boundary": [] if reconstruction is None else _boundary(reconstruction),
+        "measures": _measures(time_s, measurement),
+    }
+    tables = {}
+    for name, values in columns.items():
+        rows = len(values[0]) if values else 0
+        filled = values or [np.empty(0)] * (len(TABLES[name]) - 1)
+        names = [column.name for column in TABLES[name]]
+        tables[name] = dict(zip(names, [np.full(rows, frame), *filled], strict=True))
+    return tables
+
+
+def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArray[Any]]:
     lattice, match = measurement.lattice, measurement.match
-    rows = None if lattice is None else len(np.unique(lattice.row[lattice.row > 0]))
-    return as_csv(
-        [
-            [
-                frame,
-                number(time_s),
-                measurement.status,
-                measurement.scheme,
-                "" if match is None else match.orientation,
-                0 if measurement.dots is None else len(measurement.dots),
-                "" if rows is None else rows,
-                *(_size(measurement.measures, name) for name in [*SIZES, *MORE_SIZES]),
-                measurement.reason,
-            ]
-        ]
-    )
+    row: list[object] = [
+        math.nan if time_s is None else time_s,
+        measurement.status,
+        measurement.scheme,
+        "" if match is None else match.orientation,
+        0 if measurement.dots is None else len(measurement.dots),
+        math.nan if lattice is None else float(len(np.unique(lattice.row[lattice.row > 0]))),
+        *(getattr(measurement.measures, name, math.nan) for name in SIZES),
+        measurement.reason,
+    ]
+    return [np.array([cell], object if isinstance(cell, str) else None) for cell in row]
 
 
-def _size(measures: Measures | None, name: str) -> str:
-    return "" if measures is None else number(getattr(measures, name))
-
-
-def dots_rows(frame: int, measurement: Measurement, calibration: ImageCalibration) -> str:
-    """The frame's rows of `dots.csv`: every dot found, cells empty for what it has not."""
+def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:
+    """Every dot found; NaN for the row, column or ray that it has not."""
     dots, lattice, match = measurement.dots, measurement.lattice, measurement.match
-    if dots is None or not len(dots):
-        return ""
-    rays = {} if match is None else dict(zip(match.dot.tolist(), match.ray.tolist(), strict=True))
+    if dots is None:
+        return []
+    ray = np.full((len(dots), 2), np.nan)
+    if match is not None:
+        ray[match.dot] = match.ray
+    site = np.full((len(dots), 2), np.nan)
+    blocked = np.full(len(dots), np.nan)
+    if lattice is not None:
+        number = np.column_stack([lattice.row, lattice.column])
+        site = np.where(number > 0, number, np.nan)
+        hidden = np.isin(lattice.row, list(lattice.blocked_rows))
+        blocked = np.where(lattice.row > 0, hidden, np.nan)
+    source = np.full(len(dots), "auto", object)
+    if measurement.correction is not None:
+        source[measurement.correction.manual] = "manual"
     plane = calibration.to_plane(dots.image_px)
-    rows = []
-    for k, ((u, v), (x, z)) in enumerate(zip(dots.image_px, plane, strict=True)):
-        row, column = (0, 0) if lattice is None else (lattice.row[k], lattice.column[k])
-        blocked = "" if lattice is None or not row else int(row in lattice.blocked_rows)
-        rows.append(
-            [
-                frame,
-                number(u, PX_DIGITS),
-                number(v, PX_DIGITS),
-                number(x),
-                number(z),
-                row or "",
-                column or "",
-                *rays.get(k, ("", "")),
-                blocked,
-                "auto",
-            ]
-        )
-    return as_csv(rows)
+    return [*dots.image_px.T, *plane.T, *site.T, *ray.T, blocked, source]
 
 
-def points_rows(frame: int, reconstruction: Reconstruction | None) -> str:
-    """The frame's rows of `points.csv`: reflection points and how far their dots are off."""
-    if reconstruction is None:
-        return ""
-    return as_csv(
-        [frame, i, j, *map(number, point), number(residual), number(sigma)]
-        for (i, j), point, residual, sigma in zip(
-            reconstruction.ray,
-            reconstruction.points_mm,
-            np.linalg.norm(reconstruction.residual_mm, axis=-1),
-            reconstruction.sigma_mm,
-            strict=True,
-        )
-    )
+def _points(reconstruction: Reconstruction) -> list[npt.NDArray[Any]]:
+    """Reflection points, and how far their dots are off."""
+    residual = np.linalg.norm(reconstruction.residual_mm, axis=-1)
+    return [
+        *reconstruction.ray.T,
+        *reconstruction.points_mm.T,
+        residual,
+        reconstruction.sigma_mm,
+    ]
 
 
-def boundary_rows(frame: int, reconstruction: Reconstruction | None) -> str:
-    """The frame's rows of `boundary.csv`."""
-    if reconstruction is None:
-        return ""
-    boundary = reconstruction.boundary
-    return as_csv(
-        [frame, number(theta, PX_DIGITS), *map(number, point)]
-        for theta, point in zip(boundary.theta_deg, boundary.points_mm, strict=True)
-    )
+def _boundary(reconstruction: Reconstruction) -> list[npt.NDArray[Any]]:
+    return [reconstruction.boundary.theta_deg, *reconstruction.boundary.points_mm.T]
+
+
+def csv_header(name: str) -> str:
+    """The first line of a table's CSV file."""
+    return as_csv([[column.name for column in TABLES[name]]])
+
+
+def csv_rows(name: str, table: Table) -> str:
+    """A table's rows as CSV text, rounded to the digits of `TABLES`."""
+    cells = [
+        table[column.name].tolist()
+        if column.digits is None
+        else [number(value, column.digits) for value in table[column.name].tolist()]
+        for column in TABLES[name]
+    ]
+    return as_csv(zip(*cells, strict=True))
 
 
 def surface_csv(reconstruction: Reconstruction, spacing_mm: float) -> bytes:
@@ -130,21 +229,6 @@ def surface_csv(reconstruction: Reconstruction, spacing_mm: float) -> bytes:
     text = io.StringIO()
     np.savetxt(text, nodes, f"%.{MM_DIGITS}f", ",", header="x_mm,y_mm,z_mm", comments="")
     return text.getvalue().encode()
-
-
-def surface_stl(reconstruction: Reconstruction, spacing_mm: float) -> bytes:
-    """The surface within the boundary as a binary STL, mm, normals up."""
-    vertices, triangles = surface_mesh(reconstruction, spacing_mm)
-    corners = vertices[triangles]
-    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(normal, axis=1, keepdims=True)
-    whole = area[:, 0] > 0
-    mesh = np.zeros(int(whole.sum()), STL_TRIANGLE)
-    mesh["normal"] = normal[whole] / area[whole]
-    mesh["corner"] = corners[whole]
-    title = b"labapp pool surface, mm".ljust(80)
-    return b"".join([title, len(mesh).to_bytes(4, "little"), mesh.tobytes()])
 
 
 def number(value: float | None, digits: int = MM_DIGITS) -> str:

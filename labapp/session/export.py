@@ -1,0 +1,446 @@
+"""Chosen results of many frames in one folder that is whole or not there, with a manifest.
+
+The folder is made beside its place, as ``.NAME.part``, and renamed when all of it is there. An
+export that was there before is replaced then and not earlier, and only if it still is as it was
+written: somebody's own files are never deleted.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Executor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import labapp
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement
+from labapp.core.reconstruction import Reconstruction
+from labapp.errors import InputError
+from labapp.media import GreyImage
+from labapp.session.files import as_bytes
+from labapp.session.hdf5 import Hdf5Writer
+from labapp.session.meshes import FORMATS, SMALLEST_SPACING_MM, SPACING_MM
+from labapp.session.pictures import (
+    drawing_process,
+    write_frame_picture,
+    write_surface_picture,
+    write_trend_picture,
+)
+from labapp.session.results import SURFACES, now, surface_files
+from labapp.session.summary import Summary
+from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables
+
+MANIFEST = "manifest.json"
+HDF5_FILE = "results.h5"
+TREND_FILE = "trends.png"
+TREND = ("width", "length", "height")
+PICTURES = ("frames", "surfaces", "trends")
+
+UNITS = (
+    "lengths in mm, angles in degrees, times in s, places in a frame in px; see the column names"
+)
+
+LARGEST_MANIFEST = 1 << 28
+
+AN_EXPORT = "a folder that labapp exported"
+ROOM = "a folder that can be written, with room on its disk; what was there is as it was"
+OWN_FOLDER = "a new or empty folder, or an earlier export that was not changed (it is replaced)"
+
+
+@dataclass(frozen=True)
+class ExportChoice:
+    """What of the results is to be exported.
+
+    Parameters
+    ----------
+    tables
+        Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``.
+    surfaces
+        How to write each surface: some of ``csv``, ``stl``, ``stl-ascii``, ``ply``, ``vtp``.
+    solid
+        Whether to add each surface as a watertight body, in the mesh formats of `surfaces`.
+    hdf5
+        Whether to write everything into one HDF5 file.
+    pictures
+        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D) and ``trends``.
+    spacing_mm
+        Distance of the surfaces' nodes, mm.
+
+    Raises
+    ------
+    InputError
+        If there is no such choice.
+    """
+
+    tables: frozenset[str] = frozenset(TABLES)
+    surfaces: frozenset[str] = frozenset(SURFACES)
+    solid: bool = False
+    hdf5: bool = False
+    pictures: frozenset[str] = frozenset()
+    spacing_mm: float = SPACING_MM
+
+    def __post_init__(self) -> None:
+        allowed: dict[str, Collection[str]] = {
+            "tables": TABLES,
+            "surfaces": ("csv", *FORMATS),
+            "pictures": PICTURES,
+        }
+        for field, words in allowed.items():
+            if unknown := sorted(getattr(self, field) - frozenset(words)):
+                raise InputError("export", field, unknown[0], f"some of {', '.join(words)}")
+        if self.solid and not self.surfaces & FORMATS.keys():
+            raise InputError("export", "solid", "no mesh format", f"one of {', '.join(FORMATS)}")
+        if not SMALLEST_SPACING_MM <= self.spacing_mm <= 1:
+            raise InputError(
+                "export", "spacing_mm", self.spacing_mm, f"from {SMALLEST_SPACING_MM} to 1 mm"
+            )
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """A file of an export, as its manifest lists it.
+
+    Parameters
+    ----------
+    name
+        Its name in the folder.
+    size
+        In bytes.
+    sha256
+        Of its content, in hex.
+    rows
+        Of a CSV file, without its header; None of any other.
+    """
+
+    name: str
+    size: int
+    sha256: str
+    rows: int | None
+
+
+def export(
+    folder: str | os.PathLike[str],
+    measured: Iterable[tuple[int, float | None, Measurement]],
+    calibration: ImageCalibration,
+    provenance: Mapping[str, object],
+    choice: ExportChoice,
+    *,
+    image_of: Callable[[int], GreyImage] | None = None,
+    extras: Mapping[str, bytes] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[ExportedFile, ...]:
+    """Write results into a folder: all of them, or nothing and what was there stays.
+
+    Parameters
+    ----------
+    folder
+        Where to: a new or an empty folder, or an earlier export, which is replaced.
+    measured
+        (frame, time in s, measurement) of each frame; taken one at a time.
+    calibration
+        Pixel ↔ imaging plane, for the dots' places on the plane.
+    provenance
+        What the manifest and the HDF5 file are to say of source, setup and settings; plain values.
+    choice
+        What to write.
+    image_of
+        Reads a frame's grey levels; needed for pictures of frames.
+    extras
+        Further files, name → content: a report.
+    progress
+        Called with the number of frames done; may raise to stop.
+
+    Returns
+    -------
+    tuple[ExportedFile, ...]
+        The files written, by name; the manifest, which lists them, is not among them.
+
+    Raises
+    ------
+    InputError
+        If the folder is somebody's own, or cannot be written, or a picture cannot be drawn.
+    """
+    target = Path(folder).resolve()
+    if not target.name:
+        raise InputError(target, "folder", "is the root of the disk", OWN_FOLDER)
+    if "frames" in choice.pictures and image_of is None:
+        raise InputError(target, "pictures", "frames", "a recording that can be read")
+    with _told(target, ROOM), _beside(target) as part:
+        files = _Files(part)
+        for name, content in (extras or {}).items():
+            files.add(name, content)
+        frames = _write_results(
+            files, measured, calibration, provenance, choice, image_of, progress
+        )
+        return files.finish({"frames": frames, "units": UNITS, "provenance": provenance})
+
+
+def verify_export(folder: str | os.PathLike[str]) -> list[str]:
+    """What in a folder differs from its manifest, a sentence each; empty if nothing does.
+
+    Raises
+    ------
+    InputError
+        If the folder has no manifest that can be read.
+    """
+    folder = Path(folder)
+    listed = {file.name: file for file in _manifest(folder)}
+    with _told(folder, AN_EXPORT):
+        there = {path.name: path for path in folder.iterdir() if path.name != MANIFEST}
+        problems = [f"{name} is not in the manifest" for name in sorted(there.keys() - listed)]
+        for name, file in sorted(listed.items()):
+            if name not in there:
+                problems.append(f"{name} is missing")
+            elif there[name].is_symlink() or not there[name].is_file():
+                problems.append(f"{name} is not a file")
+            elif there[name].stat().st_size != file.size:
+                size = there[name].stat().st_size
+                problems.append(f"{name} has {size} bytes instead of {file.size}")
+            elif _sha256(there[name]) != file.sha256:
+                problems.append(f"{name} was changed")
+    return problems
+
+
+class _Files:
+    """The folder in the making."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._rows: dict[str, int] = {}
+
+    def add(self, name: str, content: bytes) -> None:
+        """Write a file."""
+        self.new(name).write_bytes(content)
+        if name.endswith(".csv"):
+            self._rows[name] = content.count(b"\n") - 1
+
+    def new(self, name: str) -> Path:
+        """Where a file goes that is not there yet."""
+        path = self.folder / name
+        if path.name != name or name.startswith("."):
+            raise InputError(self.folder, "name", name, "a plain file name")
+        if path.exists():
+            raise InputError(self.folder, "name", name, "each file only once")
+        return path
+
+    def extend(self, name: str, text: str, rows: int) -> None:
+        """Add rows to a CSV file."""
+        with (self.folder / name).open("ab") as file:
+            file.write(as_bytes(text))
+        self._rows[name] += rows
+
+    def finish(self, about: Mapping[str, object]) -> tuple[ExportedFile, ...]:
+        """Write the manifest; returns what it lists: every file, by name, on the disk for good."""
+        written = tuple(
+            ExportedFile(path.name, path.stat().st_size, _synced(path), self._rows.get(path.name))
+            for path in sorted(self.folder.iterdir())
+        )
+        manifest = {**_made(), **about, "files": [asdict(file) for file in written]}
+        text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
+        self.add(MANIFEST, as_bytes(text))
+        _synced(self.folder / MANIFEST)
+        return written
+
+
+def _write_results(
+    files: _Files,
+    measured: Iterable[tuple[int, float | None, Measurement]],
+    calibration: ImageCalibration,
+    provenance: Mapping[str, object],
+    choice: ExportChoice,
+    image_of: Callable[[int], GreyImage] | None,
+    progress: Callable[[int], None] | None,
+) -> int:
+    """Everything that is chosen, frame by frame; returns how many frames."""
+    summary = Summary()
+    for name in choice.tables:
+        files.add(f"{name}.csv", csv_header(name).encode())
+    with ExitStack() as stack:
+        hdf5 = process = None
+        if choice.hdf5:
+            about = _root_attributes(provenance)
+            writer = Hdf5Writer(files.new(HDF5_FILE), about, choice.spacing_mm)
+            hdf5 = stack.enter_context(writer)
+        if "surfaces" in choice.pictures:
+            process = stack.enter_context(drawing_process())
+        for frame, time_s, measurement in measured:
+            reconstruction = measurement.reconstruction
+            tables = frame_tables(frame, time_s, measurement, calibration)
+            for name in choice.tables:
+                rows = csv_rows(name, tables[name])
+                files.extend(f"{name}.csv", rows, len(tables[name]["frame"]))
+            surfaces = surface_files(
+                frame, reconstruction, choice.surfaces, choice.spacing_mm, as_solid=choice.solid
+            )
+            for name, content in surfaces.items():
+                files.add(name, content)
+            if hdf5 is not None:
+                hdf5.write(frame, tables, reconstruction)
+            if image_of is not None and _has_picture(measurement, choice):
+                path = files.new(f"frame_{frame:06d}.png")
+                write_frame_picture(path, image_of(frame), measurement)
+            if process is not None and reconstruction is not None:
+                _draw_surface(files.new(f"surface_{frame:06d}.png"), reconstruction, process)
+            summary.add(frame, time_s, measurement)
+            if progress is not None:
+                progress(len(summary.frames))
+    if "trends" in choice.pictures and summary.example is not None:
+        _draw_trend(files.new(TREND_FILE), summary)
+    return len(summary.frames)
+
+
+def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
+    return "frames" in choice.pictures and measurement.status != "unreadable"
+
+
+def _made() -> dict[str, object]:
+    return {"program": "labapp", "version": labapp.__version__, "created": now()}
+
+
+def _root_attributes(provenance: Mapping[str, object]) -> dict[str, object]:
+    """Attributes of the HDF5 file; the setup as the TOML text it is."""
+    about = {**_made(), **provenance}
+    setup = about.get("setup")
+    if isinstance(setup, Mapping) and "toml" in setup:
+        about["setup"] = setup["toml"]
+    return about
+
+
+def _draw_surface(path: Path, reconstruction: Reconstruction, process: Executor) -> None:
+    try:
+        write_surface_picture(path, reconstruction, process)
+    except ImportError as error:
+        wanted = f"{error.name}, which is not installed (pip install 'labapp[gui]')"
+        raise InputError("export", "pictures", "surfaces", wanted) from error
+    except BrokenProcessPool as error:
+        wanted = "a system on which OpenGL can be used; it cannot be used here"
+        raise InputError("export", "pictures", "surfaces", wanted) from error
+
+
+def _draw_trend(path: Path, summary: Summary) -> None:
+    timed = all(time_s is not None for _, time_s, _ in summary.frames)
+    axis = [time_s if timed else frame for frame, time_s, _ in summary.frames]
+    series = {name: summary.series(f"{name}_mm") for name in TREND}
+    write_trend_picture(path, axis, "time (s)" if timed else "frame", series)
+
+
+@contextmanager
+def _beside(target: Path) -> Iterator[Path]:
+    """A folder beside the target, which takes its place when all went well."""
+    part = target.with_name(f".{target.name}.part")
+    old = target.with_name(f".{target.name}.old")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part.mkdir(exist_ok=True)
+    with _alone(target, part) as handle:
+        try:
+            if old.exists() and not target.exists():  # ended between the two steps of `_swap`
+                old.rename(target)
+            _check_replaceable(target)
+            for path in part.iterdir():
+                path.unlink()
+            yield part
+            os.fsync(handle)
+            _check_replaceable(target)
+            _swap(part, target, old)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+@contextmanager
+def _alone(target: Path, part: Path) -> Iterator[int]:
+    """Keep a second export to the same place out; yields a handle of the folder."""
+    handle = os.open(part, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                target, "export", "is being written by another program", "to wait for it"
+            ) from error
+        except OSError:
+            pass  # some network drives have no locks
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def _swap(part: Path, target: Path, old: Path) -> None:
+    """Put the folder in its place; what was there is back if that fails, and gone if not."""
+    try:
+        if target.exists():
+            if old.exists():
+                shutil.rmtree(old)
+            target.rename(old)
+        part.rename(target)
+    except BaseException:
+        if old.exists() and not target.exists():
+            old.rename(target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _check_replaceable(target: Path) -> None:
+    """Refuse to replace a folder that holds anything but an export as it was written."""
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise InputError(target, "folder", "is a file", OWN_FOLDER)
+    names = sorted(path.name for path in target.iterdir())
+    if not names:
+        return
+    if MANIFEST not in names:
+        raise InputError(target, "folder", f"holds {names[0]} and no {MANIFEST}", OWN_FOLDER)
+    lost = [problem for problem in verify_export(target) if not problem.endswith("is missing")]
+    if lost:
+        raise InputError(target, "folder", f"{lost[0]}: it may be yours", OWN_FOLDER)
+
+
+def _manifest(folder: Path) -> tuple[ExportedFile, ...]:
+    """The files that a folder's manifest lists."""
+    path = folder / MANIFEST
+    try:
+        if not path.is_file() or path.stat().st_size > LARGEST_MANIFEST:
+            raise InputError(folder, MANIFEST, "is not there", AN_EXPORT)
+        content = json.loads(path.read_bytes())
+        if content["program"] != "labapp":
+            raise ValueError
+        entries = content["files"]
+        for entry in entries:
+            if [type(entry[key]) for key in ("name", "size", "sha256")] != [str, int, str]:
+                raise ValueError
+        return tuple(ExportedFile(**entry) for entry in entries)
+    except OSError as error:
+        raise InputError(folder, MANIFEST, error.strerror, AN_EXPORT) from error
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise InputError(folder, MANIFEST, "is not one of labapp", AN_EXPORT) from error
+
+
+def _synced(path: Path) -> str:
+    """SHA-256 of a file that is on the disk for good."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+    return _sha256(path)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def _told(folder: Path, expected: str) -> Iterator[None]:
+    """Turn errors of the file system into what a user can act on."""
+    try:
+        yield
+    except OSError as error:
+        what = error.strerror or str(error)
+        name = f" ({Path(error.filename).name})" if error.filename else ""
+        raise InputError(folder, "export", f"{what}{name}", expected) from error

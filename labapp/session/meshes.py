@@ -1,0 +1,231 @@
+"""The pool surface as triangles, and the files that other programs open them from.
+
+Lengths are in mm. Triangles are counter-clockwise seen from outside, those of the pool surface
+from above: its normals point up. The same reconstruction gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.measures import surface_mesh
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.values import FloatArray, IntArray, freeze
+
+SPACING_MM = 0.1
+"""Distance between the rings of a mesh, and between the nodes of a surface as CSV, mm."""
+
+SMALLEST_SPACING_MM = 0.05
+"""STL's 32-bit numbers cannot tell apart the vertices of smaller rings."""
+
+BLOCK_MM = 1.0
+"""How far the bottom of a block lies below the lowest point of the pool, mm."""
+
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+PLY_VERTEX = np.dtype([("place", "<f8", 3), ("height", "<f8")])
+PLY_FACE = np.dtype([("count", "u1"), ("corner", "<i4", 3)])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles; n vertices, k triangles.
+
+    Parameters
+    ----------
+    vertices_mm
+        UCS, shape (n, 3), mm.
+    triangles
+        Indices of their corners, shape (k, 3).
+    """
+
+    vertices_mm: FloatArray
+    triangles: IntArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def surface(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
+    """The pool surface, open below; it ends at the boundary.
+
+    Triangles where the surface is not known are left out.
+
+    Parameters
+    ----------
+    reconstruction
+        What to mesh.
+    spacing_mm
+        Largest distance between rings of vertices, mm.
+    """
+    vertices, triangles = surface_mesh(reconstruction, spacing_mm)
+    triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
+    used, corner = np.unique(triangles, return_inverse=True)
+    return Mesh(vertices[used], corner.reshape(triangles.shape))
+
+
+def solid(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
+    """The pool surface as the top of a watertight body.
+
+    A pool that lies above its boundary everywhere is closed by the polygon of its boundary: the
+    body is what stands above it, with the pool's volume. Any other (concave, dented) is the top of
+    a block with vertical walls along the boundary and a flat bottom, `BLOCK_MM` below the lowest
+    point. Where the surface is not known it is made straight between where it is.
+
+    Parameters
+    ----------
+    reconstruction
+        What to mesh.
+    spacing_mm
+        Largest distance between rings of vertices, mm.
+    """
+    vertices, top = surface_mesh(reconstruction, spacing_mm)
+    count = len(reconstruction.boundary.points_mm)
+    base = _base_height(vertices[0, :2], vertices[-count:])
+    vertices = _filled(vertices, count)
+    rings = len(vertices) // count
+    # The polygon below is a fan about the centre: its height under each vertex, ring by ring.
+    fraction = np.arange(1, rings)[:, None] / rings
+    below = base + fraction * (vertices[-count:, 2] - base)
+    convex = vertices[0, 2] > base and (vertices[1:-count, 2] > below.ravel()).all()
+
+    centre, rim = len(vertices), np.arange(len(vertices) - count, len(vertices))
+    if convex:
+        floor, walls = rim, []
+        bottom = np.append(vertices[0, :2], base)[None]
+    else:
+        level = vertices[:, 2].min() - BLOCK_MM
+        floor, walls = centre + 1 + np.arange(count), _walls(rim, centre + 1)
+        outline = np.column_stack([vertices[rim, :2], np.full(count, level)])
+        bottom = np.vstack([np.append(vertices[0, :2], level), outline])
+    fan = np.column_stack([np.full(count, centre), np.roll(floor, -1), floor])
+    return Mesh(np.vstack([vertices, bottom]), np.vstack([top, *walls, fan]))
+
+
+def _base_height(center_mm: FloatArray, rim_mm: FloatArray) -> float:
+    """Height at the centre of the plane that comes nearest to the boundary, shape (m, 3), mm."""
+    terms = np.column_stack([np.ones(len(rim_mm)), rim_mm[:, :2] - center_mm])
+    return float(np.linalg.lstsq(terms, rim_mm[:, 2], rcond=None)[0][0])
+
+
+def _filled(vertices: FloatArray, count: int) -> FloatArray:
+    """The same vertices, heights that are not known interpolated from the centre outwards."""
+    if np.isfinite(vertices).all():
+        return vertices
+    filled = vertices.copy()
+    spokes = filled[1:, 2].reshape(-1, count)  # a view: a ring in each row, the boundary last
+    if not np.isfinite(filled[0, 2]):
+        innermost = np.isfinite(spokes).argmax(axis=0)
+        filled[0, 2] = spokes[innermost, np.arange(count)].mean()
+    for spoke in spokes.T:
+        height = np.append(filled[0, 2], spoke)
+        known = np.flatnonzero(np.isfinite(height))
+        spoke[:] = np.interp(np.arange(1, len(height)), known, height[known])
+    return filled
+
+
+def _walls(rim: IntArray, below: int) -> list[IntArray]:
+    """Triangles from the boundary's vertices down to as many others, the first at ``below``."""
+    after, foot = np.roll(rim, -1), below + np.arange(len(rim))
+    foot_after = np.roll(foot, -1)
+    return [np.column_stack([rim, foot, foot_after]), np.column_stack([rim, foot_after, after])]
+
+
+def stl(mesh: Mesh) -> bytes:
+    """Binary STL; triangles without an area are left out."""
+    normal, corners = _facets(mesh)
+    facets = np.zeros(len(corners), STL_TRIANGLE)
+    facets["normal"], facets["corner"] = normal, corners
+    title = b"labapp pool surface, mm".ljust(80)
+    return b"".join([title, len(facets).to_bytes(4, "little"), facets.tobytes()])
+
+
+def stl_ascii(mesh: Mesh) -> bytes:
+    """ASCII STL, with the digits that tell 32-bit numbers apart."""
+    facet = (
+        "facet normal {:.8e} {:.8e} {:.8e}\nouter loop\n"
+        + "vertex {:.8e} {:.8e} {:.8e}\n" * 3
+        + "endloop\nendfacet\n"
+    )
+    normal, corners = _facets(mesh)
+    numbers = np.column_stack([normal, corners.reshape(-1, 9)]).astype(np.float32).tolist()
+    facets = "".join(facet.format(*each) for each in numbers)
+    return f"solid labapp_pool_surface_mm\n{facets}endsolid labapp_pool_surface_mm\n".encode()
+
+
+def _facets(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
+    """Unit normals, shape (k, 3), and corners, shape (k, 3, 3), of triangles with an area."""
+    corners = mesh.vertices_mm[mesh.triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1, keepdims=True)
+    whole = area[:, 0] > 0
+    return normal[whole] / area[whole], corners[whole]
+
+
+def ply(mesh: Mesh) -> bytes:
+    """Binary PLY, 64-bit, with the scalar ``height_mm`` at each vertex to colour it by."""
+    header = "\n".join(
+        [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment labapp pool surface, mm",
+            f"element vertex {len(mesh.vertices_mm)}",
+            *(f"property double {name}" for name in ("x", "y", "z", "height_mm")),
+            f"element face {len(mesh.triangles)}",
+            "property list uchar int vertex_indices",
+            "end_header\n",
+        ]
+    )
+    vertices = np.zeros(len(mesh.vertices_mm), PLY_VERTEX)
+    vertices["place"], vertices["height"] = mesh.vertices_mm, mesh.vertices_mm[:, 2]
+    faces = np.zeros(len(mesh.triangles), PLY_FACE)
+    faces["count"], faces["corner"] = 3, mesh.triangles
+    return b"".join([header.encode(), vertices.tobytes(), faces.tobytes()])
+
+
+def vtp(mesh: Mesh) -> bytes:
+    """VTK XML PolyData, 64-bit, with the point array ``height_mm``; ``units`` in the field data."""
+    count = len(mesh.triangles)
+    units = " ".join(str(code) for code in b"mm\0")  # VTK keeps text as the codes of its letters
+    points = _vtk_array("Points", mesh.vertices_mm, "<f8", components=3)
+    height = _vtk_array("height_mm", mesh.vertices_mm[:, 2], "<f8")
+    corners = _vtk_array("connectivity", mesh.triangles, "<i8")
+    ends = _vtk_array("offsets", 3 * np.arange(1, count + 1), "<i8")
+    return f"""<?xml version="1.0"?>
+<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
+<PolyData>
+<FieldData>
+<Array type="String" Name="units" NumberOfTuples="1" format="ascii">{units}</Array>
+</FieldData>
+<Piece NumberOfPoints="{len(mesh.vertices_mm)}" NumberOfPolys="{count}">
+<PointData Scalars="height_mm">{height}</PointData>
+<Points>{points}</Points>
+<Polys>{corners}{ends}</Polys>
+</Piece>
+</PolyData>
+</VTKFile>
+""".encode()
+
+
+def _vtk_array(name: str, values: npt.NDArray[Any], kind: str, components: int = 1) -> str:
+    content = np.ascontiguousarray(values, kind).tobytes()
+    text = base64.b64encode(len(content).to_bytes(8, "little") + content).decode()
+    vtk_type = {"<f8": "Float64", "<i8": "Int64"}[kind]
+    return (
+        f'<DataArray type="{vtk_type}" Name="{name}" NumberOfComponents="{components}" '
+        f'format="binary">{text}</DataArray>'
+    )
+
+
+FORMATS: dict[str, tuple[str, Callable[[Mesh], bytes]]] = {
+    "stl": (".stl", stl),
+    "stl-ascii": ("_ascii.stl", stl_ascii),
+    "ply": (".ply", ply),
+    "vtp": (".vtp", vtp),
+}
+"""Format → how its files' names end, and what writes it."""
