@@ -445,7 +445,8 @@ def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[
                     yield packet
         except ExitError:
             return
-        except FFmpegError:
+        except (FFmpegError, IndexError):
+            # PyAV has no place for a stream that damage makes appear amid the file.
             failures += 1
         else:
             return

@@ -75,11 +75,14 @@ def measure(path: Path, bar_ms: float | None) -> None:
     with VideoSource(path, index) as source:
         drawn = np.random.default_rng(1).integers(0, len(source), SCRUBBED).tolist()
         played = milliseconds(lambda: [source.frame(k) for k in range(SCRUBBED)]) / SCRUBBED
+        before = time.process_time()
         each = [milliseconds(lambda k=k: source.frame(k)) for k in drawn]
+        busy = 1000 * (time.process_time() - before) / SCRUBBED
     scrubbed = float(np.median(each))
     bar = "" if bar_ms is None else f" (at most {bar_ms:g}: {'ok' if scrubbed <= bar_ms else 'NO'})"
     print(
         f"{path.name}: scrubbing {scrubbed:.1f} ms a frame{bar}, 95 % {np.quantile(each, 0.95):.1f}"
+        f", of the processor {busy:.1f}"
         f"; in order {played:.1f} ms; ratio {scrubbed / played:.1f}; "
         f"opening {first_ms:.0f} ms, with index {again_ms:.0f} ms, {len(index or b'')} bytes"
     )
