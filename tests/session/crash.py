@@ -29,6 +29,8 @@ from labapp.session.record import Record
 from labapp.session.session import Session
 
 FRAMES = 40
+MOST_CHANGES = 1000
+"""In one round: more than there is time for, or room."""
 PLAIN = {"notes": "", "setup": "", "scheme": "fit", "corrections": {}}
 
 
@@ -163,18 +165,17 @@ def differences_from(session: Session, acknowledged: int, seed: int) -> tuple[in
 
 def make_changes(path: Path, start: int, seed: int, pipe: int) -> None:
     with Session.open(path) as session:
-        number = start
-        while True:
+        for number in range(start, start + MOST_CHANGES):
             apply(session, number, seed)
-            number += 1
-            os.write(pipe, number.to_bytes(4, "little"))
+            os.write(pipe, (number + 1).to_bytes(4, "little"))
 
 
-def last_acknowledged(pipe: int, start: int) -> int:
-    content = b""
-    while part := os.read(pipe, 65536):
-        content += part
-    return int.from_bytes(content[-4:], "little") if content else start
+def last_acknowledged(pipe: int, before: int, most: int = MOST_CHANGES) -> int:
+    """The last change acknowledged, once there are ``most`` or the child is gone."""
+    last = before
+    while last < before + most and (part := os.read(pipe, 4)):
+        last = int.from_bytes(part, "little")
+    return last
 
 
 def killed(path: Path, start: int, seed: int, rng: random.Random) -> int:
@@ -188,21 +189,23 @@ def killed(path: Path, start: int, seed: int, rng: random.Random) -> int:
         finally:
             os._exit(1)
     os.close(writing)
-    time.sleep(rng.uniform(0.002, 0.04))
+    # After some changes, and then at any moment of the next: or of opening the session.
+    acknowledged = last_acknowledged(reading, start, rng.randrange(10))
+    time.sleep(rng.uniform(0, 0.01))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    acknowledged = last_acknowledged(reading, start)
+    acknowledged = last_acknowledged(reading, acknowledged)
     os.close(reading)
     return acknowledged
 
 
 def full(path: Path, start: int, seed: int, rng: random.Random) -> int:
     """Have a child make changes until no file may grow any more; the last it acknowledged."""
+    limit = path.stat().st_size + rng.randrange(400_000)
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         os.close(reading)
-        limit = path.stat().st_size + rng.randrange(60_000)
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
         try:
             make_changes(path, start, seed, writing)
