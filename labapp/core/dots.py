@@ -6,7 +6,7 @@ text's two chains are in `threshold_dots`; `detection` chooses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -110,6 +110,58 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
     keep = bright >= settings.contrast * _typical(bright)
     keep[keep] = _first_of_each(u[keep], v[keep], size)
     return _describe(image, band, noise, u[keep], v[keep], size, settings.speckle_px)
+
+
+FAINT = 3.0
+"""A peak that is pointed at stands this many noise σ above the background: half of what one that
+nobody points at must."""
+
+
+def dot_at(
+    frame: Image, u_px: float, v_px: float, others: Dots, settings: BandPassSettings
+) -> Dots:
+    """Describe the one dot that is pointed at: the nearest peak there, or else the place itself.
+
+    Parameters
+    ----------
+    frame
+        Grey image, shape (height, width), any real type.
+    u_px, v_px
+        Place in the frame, px.
+    others
+        The dots there are; their peaks are not taken again and their light is kept out.
+    settings
+        See `BandPassSettings`.
+
+    Returns
+    -------
+    Dots
+        One dot, with centroid and uncertainty as `band_pass_dots` gives them. Where no peak of
+        its own is within two dots' sizes it is at (u_px, v_px), uncertain by a dot's size.
+    """
+    image = np.asarray(frame, np.float32)
+    size = settings.size_px or float(np.median(others.size_px) if len(others) else 0.0)
+    size = size or _estimate_size(image)
+    band = _band_pass(image, size)
+    noise = _local_noise(image, size)
+    v, u = _local_maxima(band, FAINT * _band_noise(band, noise, size), size)
+    away = np.hypot(u - u_px, v - v_px)
+    taken = np.full(len(u), np.inf)
+    if len(others) and len(u):
+        taken = np.asarray(cKDTree(others.image_px).query(np.stack([u, v], axis=1))[0])
+    away[taken < max(1.5, size)] = np.inf
+    if not (away <= 2.0 * size).any():
+        at = round(v_px), round(u_px)
+        peak = max(float(band[at]), 0.0) / _PEAK_GAIN
+        snr = peak / max(float(noise[at]), 1e-3 * peak, 1e-9)
+        unsure = max(size, 1.0)
+        return Dots(*(np.array([x]) for x in (u_px, v_px, unsure, unsure, size, peak, snr)))
+    k = int(np.argmin(away))
+    limit = np.array(image.shape[::-1]) - 1
+    known = np.clip(np.rint(others.image_px), 0, limit).astype(np.int64)
+    u, v = np.append(known[:, 0], u[k]), np.append(known[:, 1], v[k])
+    every = _describe(image, band, noise, u, v, size, settings.speckle_px)
+    return Dots(*(getattr(every, column.name)[-1:] for column in fields(every)))
 
 
 # Sizes of dot that are looked for: from the sharpest a camera gives to a dozen pixels across.

@@ -175,7 +175,7 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int,
     Where the surface lets dots run into each other there is nothing to be told of either.
     """
     lit = labels != UNLABELLED
-    among = predict(scene, pool, _amid(lit) & ~scene.absent)
+    among = predict(scene, pool, _amid(lit) & ~scene.absent & ~scene.hidden)
     merged = among.spacing_mm < scene.resolution_mm
     rays = scene.rays[among.at[:, 0], among.at[:, 1]]
     hidden = blocked(among.points_mm, rays, scene.rig, pool)
@@ -208,7 +208,7 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     merged = around.spacing_mm < scene.resolution_mm
     seen = scene.in_view(around.plane_mm) & ~hidden & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
-    witness[_amid(lit) | scene.absent] = 0
+    witness[_amid(lit) | scene.absent | scene.hidden] = 0
     witness[lit] = 1
     # A dot that no ray was given may be the dot of a ray that seems dark.
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])

@@ -97,7 +97,7 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
     if len(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
     grid = _from_one(grid)
-    holes = _holes(grid, points, tree)
+    holes = find_holes(grid, dots)
     certain = [site for site, sides in holes if sides == 4]
     return lattice_of_sites(
         grid,
@@ -399,8 +399,15 @@ def lattice_of_sites(
     return Lattice(row, column, reference, candidates, _blocked_rows(grid))
 
 
-def _holes(grid: dict[Site, int], points: FloatArray, tree: cKDTree) -> list[tuple[Site, int]]:
-    """Empty sites with lit neighbours left and right and on how many sides in all (3 or 4)."""
+def find_holes(grid: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
+    """Empty sites with lit neighbours left and right and on how many sides in all (3 or 4).
+
+    ``grid`` is the dot at each site (k, t). The holes with most such sides come first.
+    """
+    if not grid:
+        return []
+    points = dots.image_px
+    tree = cKDTree(points)
     holes = []
     for k, t in {(k + dk, t + dt) for k, t in grid for dk, dt in _NEXT} - grid.keys():
         lit = [(k + dk, t + dt) in grid for dk, dt in _NEXT]

@@ -7,7 +7,15 @@ from typing import Literal
 
 from labapp.core import ers, fit, irs, measures
 from labapp.core.coordinates import ImageCalibration
-from labapp.core.correspondence import Match, MatchSettings, indexed_lattice, match_rays
+from labapp.core.correction import Correction
+from labapp.core.correspondence import (
+    Match,
+    MatchSettings,
+    confirmed_lattice,
+    indexed_lattice,
+    match_corrected,
+    match_rays,
+)
 from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
 from labapp.core.dots import Dots, Image
 from labapp.core.lattice import Lattice
@@ -58,6 +66,8 @@ class Measurement:
         Which scheme was asked for.
     dots, lattice, match, reconstruction, measures
         The steps' results; None from the step on that could not be done.
+    correction
+        What the operator put right; None if dots and rows are as they were found.
     """
 
     status: str
@@ -68,10 +78,15 @@ class Measurement:
     match: Match | None = None
     reconstruction: Reconstruction | None = None
     measures: measures.Measures | None = None
+    correction: Correction | None = None
 
 
 def measure(
-    image: Image, rig: Rig, calibration: ImageCalibration, settings: Settings
+    image: Image,
+    rig: Rig,
+    calibration: ImageCalibration,
+    settings: Settings,
+    correction: Correction | None = None,
 ) -> Measurement:
     """Measure the pool that a frame shows. Never raises for a bad frame: the status says why.
 
@@ -83,25 +98,50 @@ def measure(
         The bench, and how the camera sees the imaging plane.
     settings
         See `Settings`.
+    correction
+        The frame's dots and rows as the operator left them; they are measured in place of what
+        would be found, and of the image only the shape counts.
     """
-    result = Measurement("ok", "", settings.scheme)
+    result = Measurement("ok", "", settings.scheme, correction=correction)
     height, width = image.shape
+    chosen = replace(settings.match, correspondence=settings.correspondence)
+    bench = (rig, calibration, (height, width), chosen)
     try:
-        dots = find_dots(image, settings.dots)
-        result = replace(result, dots=dots)
-        lattice, doubt = _lattice(dots, (height, width), settings.lattice)
-        result = replace(result, lattice=lattice)
-        chosen = replace(settings.match, correspondence=settings.correspondence)
-        try:
-            match = match_rays(dots, lattice, rig, calibration, (height, width), chosen)
-        except CannotMeasure as answer:
-            raise (doubt if doubt and answer.status == "no-match" else answer) from None
-        result = replace(result, match=match, lattice=indexed_lattice(match, rig, len(dots)))
+        if correction is None:
+            dots = find_dots(image, settings.dots)
+            result = replace(result, dots=dots)
+            lattice, doubt = _lattice(dots, (height, width), settings.lattice)
+            result = replace(result, lattice=lattice)
+            try:
+                match = match_rays(dots, lattice, *bench)
+            except CannotMeasure as answer:
+                raise (doubt if doubt and answer.status == "no-match" else answer) from None
+            lattice = indexed_lattice(match, rig, len(dots))
+        else:
+            dots, given = correction.dots, correction.lattice
+            result = replace(result, dots=dots, lattice=given)
+            match = match_corrected(dots, given, *bench)
+            lattice = confirmed_lattice(match, rig, given)
+        result = replace(result, match=match, lattice=lattice)
         reconstruction = reconstruct(match, rig, settings)
         size = measures.measure(reconstruction, match, rig)
         return replace(result, reconstruction=reconstruction, measures=size)
     except CannotMeasure as answer:
         return replace(result, status=answer.status, reason=answer.reason)
+
+
+def start_correction(measurement: Measurement) -> Correction:
+    """Return the correction that a frame was measured with, or one of what was found in it.
+
+    A reference is taken over only where the frame was matched: a hole that stands out among the
+    rows is no more than a candidate until the rays agree.
+    """
+    if measurement.correction is not None:
+        return measurement.correction
+    lattice = measurement.lattice
+    if lattice is not None and measurement.match is None:
+        lattice = replace(lattice, reference=None)
+    return Correction.of(measurement.dots, lattice)
 
 
 def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:

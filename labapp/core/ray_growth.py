@@ -76,6 +76,8 @@ class Scene:
         The bench, and how the camera sees the plane.
     frame_shape
         Height and width of the frame, px.
+    hidden_rows
+        Rows i of the pattern whose missing dots the operator says are hidden.
 
     Attributes
     ----------
@@ -91,6 +93,7 @@ class Scene:
     rig: Rig
     calibration: ImageCalibration
     frame_shape: tuple[int, int]
+    hidden_rows: frozenset[int] = frozenset()
     rays: FloatArray = field(init=False)
     landing_mm: FloatArray = field(init=False)
     spacing_mm: FloatArray = field(init=False)
@@ -126,6 +129,13 @@ class Scene:
         mask = np.zeros(self.rays.shape[:2], bool)
         for i, j in self.rig.pattern.absent_rays:
             mask[i - 1, j - 1] = True
+        return mask
+
+    @property
+    def hidden(self) -> BoolArray:
+        """Rays of `hidden_rows`, shape (rows, columns)."""
+        mask = np.zeros(self.rays.shape[:2], bool)
+        mask[[i - 1 for i in self.hidden_rows if 1 <= i <= len(mask)]] = True
         return mask
 
     def fit(self, labels: IntArray, witness: IntArray, settings: FitSettings) -> FittedPool:

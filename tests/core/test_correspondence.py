@@ -8,9 +8,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from labapp.core.correspondence import Match, MatchSettings, indexed_lattice, match_rays
+from labapp.core.correction import (
+    Correction,
+    assign,
+    block_row,
+    clear_rows,
+    delete_dots,
+    set_reference,
+    shift_row,
+)
+from labapp.core.correspondence import (
+    Match,
+    MatchSettings,
+    confirmed_lattice,
+    indexed_lattice,
+    match_corrected,
+    match_rays,
+)
 from labapp.core.dots import Dots
-from labapp.core.lattice import GrowSettings, grow_lattice
+from labapp.core.lattice import GrowSettings, Lattice, Site, grow_lattice
 from labapp.core.orientation import ORIENTATIONS, Orientation, ways
 from labapp.core.rig import DotPattern, Laser, Rig
 from labapp.core.values import BoolArray, CannotMeasure
@@ -244,6 +260,189 @@ def test_a_forced_correspondence_that_is_right_changes_nothing(
     match, _ = matched(seen.dots, settings=MatchSettings(correspondence=forced))
     assert match is not None
     assert match.orientation == forced
+    np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
+    assert len(match.dot) >= 0.95 * len(seen.ray)
+
+
+def corrected(correction: Correction, settings: MatchSettings | None = None) -> Match:
+    return match_corrected(
+        correction.dots,
+        correction.lattice,
+        BENCH_RIG,
+        BENCH_VIEW,
+        FRAME_SHAPE,
+        settings or MatchSettings(),
+    )
+
+
+def by_hand(seen: SeenDots, orientation: Orientation = "S/S") -> tuple[Correction, Site]:
+    """Every dot in its row and column as an operator would give them, and the reference's site."""
+    real = seen.ray[:, 0] > 0
+    number = seen.ray * ways(orientation)
+    step = 1 - number[real].min(axis=0)
+    site = np.where(real[:, None], number + step, 0)
+    k, t = (np.array([10, 10]) * ways(orientation) + step).tolist()
+    return Correction.of(seen.dots, Lattice(site[:, 0], site[:, 1])), (k, t)
+
+
+def grown(seen: SeenDots) -> tuple[Correction, Site]:
+    """The rows that a search finds (S/S), and the reference's site in them."""
+    found = replace(grow_lattice(seen.dots, GrowSettings()), reference=None)
+    site = np.stack([found.row, found.column], axis=-1)
+    offset = (site - seen.ray)[(found.row > 0) & (seen.ray[:, 0] > 0)]
+    k, t = (np.median(offset, axis=0) + 10).astype(int).tolist()
+    return Correction.of(seen.dots, found), (k, t)
+
+
+def without(seen: SeenDots, *rays: tuple[int, int]) -> SeenDots:
+    keep = np.array([tuple(ray) not in rays for ray in seen.ray.tolist()])
+    return SeenDots(as_dots(seen.dots.image_px[keep]), seen.ray[keep])
+
+
+FLAT = spherical_cap(4.04, 0.06)
+NARROW = spherical_cap(4.7, 0.211)
+BEHIND_THE_TORCH = [(i, j) for i in (10, 11, 12) for j in (9, 10, 11)]
+
+
+@pytest.mark.parametrize(
+    ("pool", "hidden", "refusal"),
+    [
+        (FLAT, [(9, 10)], "ambiguous-rows"),
+        (spherical_cap(5.5, 0.27), BEHIND_THE_TORCH, "no-match"),
+    ],
+)
+def test_a_reference_that_cannot_be_told_is_set_by_hand(
+    pool: Pool, hidden: list[tuple[int, int]], refusal: str
+) -> None:
+    seen = without(exact(pool), *hidden)
+    assert matched(seen.dots) == (None, refusal)
+    correction, reference = grown(seen)
+    match = corrected(set_reference(correction, reference))
+    np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
+    assert len(match.dot) == len(seen.ray)
+    assert match.orientation == "S/S"
+    assert match.margin > 5
+
+
+def test_a_dot_that_hides_the_reference_is_deleted_by_hand() -> None:
+    seen = exact(NARROW, with_reference=True)
+    assert matched(seen.dots) == (None, "no-reference")
+    correction, reference = grown(seen)
+    with pytest.raises(CannotMeasure, match="where the matrix has no rays"):
+        corrected(set_reference(correction, reference))
+    false = np.flatnonzero(seen.ray[:, 0] == 0)
+    match = corrected(delete_dots(correction, false))  # the hole it leaves is the reference
+    np.testing.assert_array_equal(match.ray, np.delete(seen.ray, false, axis=0)[match.dot])
+    assert len(match.dot) == len(seen.ray) - 1
+
+
+@pytest.mark.parametrize(("pool", "orientation"), [(CONVEX, "S/S"), (CONCAVE, "I/I")])
+def test_rows_given_by_hand_are_binding_and_keep_their_numbers(
+    pool: Pool, orientation: Orientation
+) -> None:
+    seen = without(exact(pool), *BEHIND_THE_TORCH)
+    correction, reference = by_hand(seen, orientation)
+    # Numbers need not begin at 1.
+    lattice = correction.lattice
+    raised = replace(lattice, row=lattice.row + 2, blocked_rows=frozenset({5}))
+    correction = set_reference(
+        replace(correction, lattice=raised), (reference[0] + 2, reference[1])
+    )
+    match = corrected(correction)
+    assert match.orientation == orientation
+    assert sorted(match.dot.tolist()) == list(range(len(seen.ray)))
+    np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
+    after = confirmed_lattice(match, BENCH_RIG, correction.lattice)
+    np.testing.assert_array_equal(after.row, correction.lattice.row)
+    np.testing.assert_array_equal(after.column, correction.lattice.column)
+    assert after.reference == correction.lattice.reference
+    assert after.blocked_rows == {5}
+
+
+def test_dots_left_in_doubt_get_rays_that_no_given_number_contradicts() -> None:
+    seen = see(CONVEX, np.random.default_rng(3), sigma_px=0.1, false=2)
+    correction, reference = by_hand(seen)
+    doubt = np.arange(0, len(seen.ray) - 2, 3)
+    correction = set_reference(clear_rows(correction, doubt), reference)
+    match = corrected(correction)
+    np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
+    assert len(match.dot) == len(seen.ray) - 2
+    # A row that the surface does not agree to leaves the dot without a ray.
+    one = int(doubt[4])
+    true = int(by_hand(seen)[0].lattice.row[one])
+    assert one in corrected(assign(correction, [one], row=true)).dot
+    assert one not in corrected(assign(correction, [one], row=true + 1)).dot
+
+
+def test_rows_without_a_reference_are_matched_as_a_block() -> None:
+    seen = exact(CONVEX)
+    correction, reference = by_hand(seen)
+    match = corrected(correction)
+    np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
+    assert len(match.dot) == len(seen.ray)
+    assert confirmed_lattice(match, BENCH_RIG, correction.lattice).reference == reference
+
+
+def test_without_any_rows_the_optics_decide() -> None:
+    seen = exact(CONVEX)
+    match = corrected(Correction.of(seen.dots, None))
+    np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
+    assert len(match.dot) == len(seen.ray)
+
+
+@pytest.mark.parametrize("pool", [CONVEX, CONCAVE])
+@pytest.mark.parametrize("columns", [1, -1])
+def test_a_row_that_was_shifted_by_mistake_is_refused_and_named(pool: Pool, columns: int) -> None:
+    seen = exact(pool)
+    correction, reference = by_hand(seen, "S/S" if pool is CONVEX else "I/I")
+    good = set_reference(correction, reference)
+    right = corrected(good).trials[0].residual_mm
+    for row in (2, reference[0] - 1, reference[0] + 1):
+        with pytest.raises(CannotMeasure, match=f"does not fit: .* most in row {row}") as refusal:
+            corrected(shift_row(good, row, columns))
+        assert refusal.value.status == "no-match"
+    # A single dot that is one off is put up with, and shows.
+    edge = int(np.argmax(good.lattice.column))
+    column = int(good.lattice.column[edge]) + 1
+    assert corrected(assign(good, [edge], column=column)).trials[0].residual_mm > 1.3 * right
+
+
+def test_blocked_rows_do_not_testify() -> None:
+    # The torch hides what its rig does not say: the boundary must not be drawn within.
+    behind = {(i, j) for i in (6, 7) for j in range(12, 20)}
+    seen = without(exact(CONVEX), *behind)
+    correction, reference = by_hand(seen)
+    correction = set_reference(correction, reference)
+    silent = behind - set(map(tuple, exact(CONVEX).ray.tolist()))
+    misled = corrected(correction).witness
+    assert any(misled[i - 1, j - 1] < 0 for i, j in behind - silent)
+    for i in (6, 7):
+        correction = block_row(correction, reference[0] + i - 10)
+    match = corrected(correction)
+    rows = match.witness[5:7]
+    assert set(np.unique(rows)) == {0, 1}
+    np.testing.assert_array_equal(
+        np.delete(match.witness, (5, 6), 0) > 0, np.delete(misled, (5, 6), 0) > 0
+    )
+
+
+def test_too_few_rows_or_an_orientation_that_is_wrong_have_no_answer() -> None:
+    seen = exact(CONVEX)
+    correction, reference = by_hand(seen)
+    good = set_reference(correction, reference)
+    with pytest.raises(CannotMeasure, match="too-few-dots: 5 dots have a row"):
+        corrected(clear_rows(good, np.arange(5, len(seen.ray))))
+    with pytest.raises(CannotMeasure, match="no-match: the correction"):
+        corrected(good, MatchSettings(correspondence="I/I"))
+    with pytest.raises(CannotMeasure, match="too-few-dots"):
+        corrected(Correction.of(None, None))
+
+
+def test_a_few_rows_round_the_reference_are_enough() -> None:
+    seen = exact(CONVEX)
+    correction, reference = by_hand(seen)
+    far = np.flatnonzero(np.abs(seen.ray - 10).max(axis=-1) > 1)
+    match = corrected(set_reference(clear_rows(correction, far), reference))
     np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
     assert len(match.dot) >= 0.95 * len(seen.ray)
 

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from labapp.core.correction import Correction, add_dot, assign, delete_dots, set_reference
 from labapp.core.detection import DotSettings
+from labapp.core.dots import Dots
+from labapp.core.lattice import GrowSettings, Lattice, grow_lattice
 from labapp.core.measures import measure as size_of
-from labapp.core.pipeline import Measurement, Settings, measure, reconstruct
+from labapp.core.pipeline import (
+    Measurement,
+    Settings,
+    measure,
+    reconstruct,
+    start_correction,
+)
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.media import open_source
 from labapp.session.setup import read_setup
+from labapp.simulation.pools import spherical_cap
+from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, as_dots, see
 
 SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
 FRAMES = (0, 7, 14, 21, 28)
@@ -157,6 +168,102 @@ def test_the_scheme_is_the_one_that_is_asked_for(
     assert ours.match.trials == other.match.trials
     again = reconstruct(other.match, SETUP.rig, Settings())
     assert size_of(again, other.match, SETUP.rig) == ours.measures
+
+
+def test_a_correction_that_changes_nothing_changes_no_figure(
+    images: dict[int, npt.NDArray[np.generic]], measurements: dict[int, Measurement]
+) -> None:
+    found = measurements[FRAMES[2]]
+    assert found.lattice is not None
+    correction = start_correction(found)
+    assert correction.lattice.reference == found.lattice.reference
+    dark = np.zeros_like(images[FRAMES[2]])  # of the image only the shape counts
+    again = measure(dark, SETUP.rig, SETUP.calibration, Settings(), correction)
+    assert again.measures == found.measures
+    assert again.correction is correction
+    assert start_correction(again) is correction
+    assert again.lattice is not None
+    np.testing.assert_array_equal(again.lattice.row, found.lattice.row)
+    assert again.match is not None
+    assert found.match is not None
+    np.testing.assert_array_equal(again.match.witness, found.match.witness)
+
+
+def test_a_false_dot_is_deleted_and_a_missing_one_added_by_hand(
+    images: dict[int, npt.NDArray[np.generic]], measurements: dict[int, Measurement]
+) -> None:
+    index = FRAMES[0]
+    found = measurements[index]
+    assert found.match is not None
+    assert found.dots is not None
+    start = start_correction(found)
+    # A dot in the middle, of all rays, is missed by the detector and a false one seen instead.
+    one = int(found.match.dot[len(found.match.dot) // 2])
+    ray = found.match.ray[len(found.match.dot) // 2].tolist()
+    (true,) = (
+        (row["u_px"], row["v_px"])
+        for row in table("dots_truth.csv")
+        if [row["frame"], row["ray_row"], row["ray_column"]] == [index, *ray]
+    )
+    worse = add_dot(delete_dots(start, [one]), images[index], true[0] + 30.0, true[1] + 17.0)
+    site = int(start.lattice.row[one]), int(start.lattice.column[one])
+    better = add_dot(
+        delete_dots(worse, [len(worse.dots) - 1]), images[index], true[0] + 2.0, true[1] - 2.0
+    )
+    last = len(better.dots) - 1
+    assert np.linalg.norm(better.dots.image_px[last] - true) < 0.3
+    better = assign(better, [last], *site)
+    assert np.flatnonzero(better.manual).tolist() == [last]
+    result = measure(images[index], SETUP.rig, SETUP.calibration, Settings(), better)
+    assert result.status == "ok"
+    assert result.match is not None
+    assert len(result.match.dot) == len(found.match.dot)
+    assert result.match.ray[result.match.dot == last].tolist() == [ray]
+    assert result.measures is not None
+    assert found.measures is not None
+    assert result.measures.height_mm == pytest.approx(found.measures.height_mm, rel=0.002)
+
+
+def test_a_frame_that_was_refused_is_measured_with_its_reference_set() -> None:
+    # The torch hides what is round the reference.
+    pool = spherical_cap(5.5, 0.27)
+    seen = see(pool, np.random.default_rng(2), sigma_px=0.1)
+    hidden = (np.abs(seen.ray - [11, 10]) <= 1).all(axis=-1)
+    dots = Dots(*(getattr(seen.dots, field.name)[~hidden] for field in fields(Dots)))
+    ray = seen.ray[~hidden]
+    lattice = grow_lattice(dots, GrowSettings())
+    offset = (np.stack([lattice.row, lattice.column], axis=-1) - ray)[lattice.row > 0]
+    assert (offset == offset[0]).all()
+    k, t = (offset[0] + 10).tolist()
+    result = measure(
+        np.zeros(FRAME_SHAPE),
+        BENCH_RIG,
+        BENCH_VIEW,
+        Settings(),
+        set_reference(Correction.of(dots, replace(lattice, reference=None)), (k, t)),
+    )
+    assert (result.status, result.reason) == ("ok", "")
+    assert result.match is not None
+    np.testing.assert_array_equal(result.match.ray, ray[result.match.dot])
+    assert result.measures is not None
+    assert result.measures.height_mm == pytest.approx(0.27, rel=0.03)
+    assert result.measures.width_mm == pytest.approx(5.5, rel=0.02)
+
+
+def test_a_hole_that_no_ray_confirmed_is_no_reference() -> None:
+    dots = as_dots(np.mgrid[:4, :4].reshape(2, -1).T * 20.0)
+    lattice = Lattice(np.arange(16) // 4 + 1, np.arange(16) % 4 + 1, (9, 9), ((9, 9),))
+    refused = Measurement("no-match", "…", "fit", dots, lattice)
+    assert start_correction(refused).lattice.reference is None
+    assert len(start_correction(Measurement("no-dots", "…", "fit")).dots) == 0
+
+
+def test_a_correction_without_dots_has_a_status() -> None:
+    result = measure(
+        np.zeros((640, 480)), SETUP.rig, SETUP.calibration, Settings(), Correction.of(None, None)
+    )
+    assert result.status == "too-few-dots"
+    assert result.lattice is not None
 
 
 def test_a_frame_is_left_as_it_was(images: dict[int, npt.NDArray[np.generic]]) -> None:
