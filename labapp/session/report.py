@@ -1,0 +1,276 @@
+"""The report of a session as PDF: set-up, calibrations, results, error budget, corrections."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import scipy
+
+import labapp
+from labapp.errors import InputError
+from labapp.session import report_data as data
+from labapp.session import report_figures as figures
+from labapp.session.error_budget import laser_in_use, plane_in_use
+from labapp.session.report_data import Told, number, with_unit
+from labapp.session.report_layout import Story
+from labapp.session.report_results import (
+    tell_budget,
+    tell_corrections,
+    tell_example,
+    tell_results,
+)
+from labapp.session.session import Session
+
+POOL_MM = (7.0, 0.3)
+"""Length and height of the pool in the side view where none is expected or measured."""
+
+
+def report_pdf(
+    session: Session,
+    scheme: str | None = None,
+    frames: Sequence[int] | None = None,
+    now: datetime.datetime | None = None,
+) -> bytes:
+    """Report on a session: A4 pages, PDF. It tells of what there is, however little.
+
+    Parameters
+    ----------
+    session
+        The session.
+    scheme
+        Whose results; None: of the one that the settings choose.
+    frames
+        Which frames; None: all of the session's.
+    now
+        The report's date; None: this moment. The same session, libraries and date give the same
+        bytes.
+
+    Raises
+    ------
+    InputError
+        If a frame is asked for that the session does not have, or what it notes is damaged.
+    """
+    now = now or datetime.datetime.now().astimezone()
+    told = Told.of(session, scheme, frames)
+    title = session.record.title or session.path.stem
+    story = Story()
+    _experiment(story, told, title)
+    _set_up(story, told)
+    _laser(story, told)
+    _plane(story, told)
+    tell_results(story, told)
+    tell_example(story, told)
+    tell_budget(story, told)
+    tell_corrections(story, told)
+    name = session.path.name
+    header = name if title == session.path.stem else f"{title}  ·  {name}"
+    made = f"labapp {labapp.__version__}, {now:%Y-%m-%d %H:%M}"
+    return story.pdf(header, made, title)
+
+
+def _experiment(story: Story, told: Told, title: str) -> None:
+    session, record = told.session, told.session.record
+    story.title(title)
+    story.text(
+        "Three-dimensional surface of a weld pool, measured from a reflected laser dot matrix."
+    )
+    story.heading("1  Experiment")
+    size = (record.expected_width_mm, record.expected_length_mm, record.expected_height_mm)
+    expected = " × ".join("?" if part is None else f"{part:.6g}" for part in size)
+    before = len(story.flowables)
+    story.listing(
+        [
+            ("operator", record.operator),
+            ("material", record.material),
+            ("thickness", with_unit(record.thickness_mm, "mm")),
+            ("current", with_unit(record.current_a, "A")),
+            ("voltage", with_unit(record.voltage_v, "V")),
+            ("travel speed", with_unit(record.travel_speed_mm_s, "mm/s")),
+            ("shielding gas", record.gas),
+            ("gas flow", with_unit(record.gas_flow_l_min, "l/min")),
+            (
+                "expected pool",
+                "" if size == (None, None, None) else f"{expected} mm (width × length × height)",
+            ),
+            ("notes", record.notes),
+        ]
+    )
+    if len(story.flowables) == before:
+        story.text("Nothing was noted about the experiment.")
+    if record.safety:
+        story.part("Safety list")
+        story.listing([(time.replace("T", " "), item) for item, time in record.safety])
+    else:
+        story.text("No item of the safety list was ticked.")
+    story.part("Recording")
+    _recording(story, session)
+    story.part("Measured by")
+    versions = sorted({line.version for line in told.lines if line.version})
+    story.listing(
+        [
+            ("session file", session.path.name),
+            ("scheme", told.scheme),
+            ("measured with", ", ".join(f"labapp {v}" for v in versions) or "nothing measured yet"),
+            (
+                "reported with",
+                f"labapp {labapp.__version__}, Python {platform.python_version()}, "
+                f"NumPy {np.__version__}, SciPy {scipy.__version__}, OpenCV {cv2.__version__}",
+            ),
+        ]
+    )
+    changed = data.settings_cells(session.settings)
+    if len(changed) > 1:
+        story.table("Settings that differ from the defaults.", changed, "lll", (0.5, 0.25, 0.25))
+    else:
+        story.text("All settings are the defaults.")
+
+
+def _recording(story: Story, session: Session) -> None:
+    recording = session.recording
+    if recording is None:
+        story.text("No recording was imported.")
+        return
+    start, stop, step = recording.selected
+    used = f"{len(session.frames)} of {recording.frames}: {start} to {stop - 1}"
+    rate = recording.frame_rate_hz
+    source = "given at import" if recording.rate_is_given else "the recording's own"
+    exact = "yes, checked at import" if recording.frame_exact else "no"
+    story.listing(
+        [
+            ("file", recording.path),
+            ("content", recording.description),
+            ("size", f"{recording.size} bytes"),
+            ("SHA-256", recording.sha256),
+            ("frames used", used + (f", in steps of {step}" if step > 1 else "")),
+            ("frame rate", "unknown" if rate is None else f"{rate:.6g} frames/s ({source})"),
+            ("frame-exact", exact),
+            ("kept in the session", "yes, lossless" if recording.embedded else "no"),
+            ("imported", recording.imported.replace("T", " ")),
+            *(("warning", warning) for warning in recording.warnings),
+        ]
+    )
+    if (missing := session.missing_recording) is not None:
+        story.text(
+            f"The recording is not where it was ({missing.name}): what was measured "
+            "stands, its frames cannot be shown."
+        )
+
+
+def _set_up(story: Story, told: Told) -> None:
+    story.heading("2  Set-up")
+    if told.setup is None:
+        story.text("The set-up is not complete:")
+        rows = [[problem.field, str(problem.value), problem.expected] for problem in told.problems]
+        story.table(
+            "What is missing or wrong in the set-up.",
+            [["key", "found", "expected"], *rows],
+            "lll",
+            (0.35, 0.15, 0.5),
+        )
+        return
+    story.table(
+        "The rig. UCS: origin on the work piece under the electrode's tip, Y along the welding "
+        "direction, Z up.",
+        data.rig_cells(told.setup),
+        "llr",
+        (0.22, 0.48, 0.3),
+    )
+    story.figure(
+        "The rig from the side, to scale: the central ray and the outer ones of its column, "
+        "reflected as from a flat work piece. The width of the torch is not to scale.",
+        figures.side_view(told.setup.rig, _pool_size(told)),
+    )
+
+
+def _pool_size(told: Told) -> tuple[float, float]:
+    """Length and height for the side view: as measured, else as expected."""
+    record = told.session.record
+    length, height = data.values(told.lines, "length_mm"), data.values(told.lines, "height_mm")
+    depth = data.values(told.lines, "depth_mm")
+    if len(length):
+        peak = height.mean() if abs(height.mean()) >= abs(depth.mean()) else depth.mean()
+        return float(length.mean()), float(peak)
+    return record.expected_length_mm or POOL_MM[0], record.expected_height_mm or POOL_MM[1]
+
+
+def _laser(story: Story, told: Told) -> None:
+    story.heading("3  Calibrations")
+    story.part("Laser (Appendix I)")
+    readings = told.session.laser_calibration
+    if readings is None:
+        story.text("Not calibrated in this session: values were given.")
+        return
+    found = readings.found
+    rows = []
+    for name, lengths in (
+        ("l₁, towards the laser", readings.l1_mm),
+        ("l₂, away from it", readings.l2_mm),
+        ("l₃, across", readings.l3_mm),
+    ):
+        spread = float(np.std(lengths, ddof=1)) if len(lengths) > 1 else None
+        shown = ", ".join(f"{length:.6g}" for length in lengths)
+        rows.append([name, shown, number(float(np.mean(lengths)), 3), number(spread, 3)])
+    story.table(
+        f"Half lengths of the cross as read, mm; fan angle {readings.fan_angle_deg:.6g}°. Spread: "
+        "standard deviation of the readings.",
+        [["length", "readings", "mean", "spread"], *rows],
+        "llrr",
+        (0.25, 0.45, 0.15, 0.15),
+    )
+    story.listing(
+        [
+            ("projection angle", f"{found.angle_deg:.3f} ± {found.angle_sigma_deg:.3f} °"),
+            ("distance", f"{found.distance_mm:.3f} ± {found.distance_sigma_mm:.3f} mm"),
+            ("height", f"{found.height_mm:.3f} ± {found.height_sigma_mm:.3f} mm"),
+            ("horizontal", f"{found.horizontal_mm:.3f} ± {found.horizontal_sigma_mm:.3f} mm"),
+            ("l₁ that follows", f"{found.expected_l1_mm:.3f} mm"),
+            *(("warning", warning) for warning in found.warnings),
+        ]
+    )
+    if told.setup is not None and not laser_in_use(found, told.setup.rig):
+        story.text("The rig's laser was changed after this calibration: other values are in use.")
+
+
+def _plane(story: Story, told: Told) -> None:
+    story.part("Imaging plane (§5.1)")
+    plane = told.session.plane_calibration
+    if plane is None:
+        story.text("Not calibrated in this session: values were given.")
+        return
+    found = plane.found
+    points = (found.origin_px, found.x_axis_px, found.z_axis_px)
+    places = ("0, 0", f"{found.x_axis_mm:.6g}, 0", f"0, {found.z_axis_mm:.6g}")
+    rows = [
+        [name, where, number(u, 2), number(v, 2), number(sigma, 2)]
+        for name, where, (u, v), sigma in zip(
+            ("O′", "middle of the bar on O′X′", "middle of the bar on O′Z′"),
+            places,
+            points,
+            found.sigma_px,
+            strict=True,
+        )
+    ]
+    along_x, along_z = found.px_per_mm
+    story.table(
+        f"What was found in the calibration picture; a unit of the axes is {plane.unit_mm:.6g} mm. "
+        f"Scale {along_x:.4f} px/mm along O′X′, {along_z:.4f} px/mm along O′Z′; "
+        f"{found.angle_deg:.3f}° between them.",
+        [["point", "X′, Z′ (mm)", "u (px)", "v (px)", "± (px)"], *rows],
+        "llrrr",
+        (0.36, 0.22, 0.14, 0.14, 0.14),
+    )
+    if told.setup is not None and not plane_in_use(found, told.setup.calibration):
+        story.text("The image calibration was changed after this one: other values are in use.")
+    try:
+        picture = told.session.picture(plane.picture_sha256)
+    except InputError as error:
+        story.text(f"The calibration picture cannot be shown: it is {error.value}.")
+        return
+    story.figure(
+        "The calibration picture with O′ and both axes as found.",
+        figures.target_picture(picture, found),
+    )

@@ -1,0 +1,411 @@
+"""What a report tells, as plain values and tables of text, before it is laid out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from labapp.core.measures import Measures
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.rig import ImagingPlane
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.session.error_budget import SIZES, Contribution, together
+from labapp.session.measured import scheme_name
+from labapp.session.report_layout import Cells
+from labapp.session.session import Session
+from labapp.session.setup import Setup
+
+DOUBTFUL_MARGIN = 5.0
+"""A frame is doubtful where another correspondence comes within this factor of the residual."""
+
+ALL_FRAMES, SOME_FRAMES = 60, 20
+"""So many frames are listed one by one; of more, so many of the first and of the last."""
+
+NUMBER = re.compile(r"\d+(?:\.\d+)?")
+
+UNKNOWN = "–"
+
+STATISTICS = {
+    "width_mm": ("width (mm)", 4),
+    "length_mm": ("length (mm)", 4),
+    "height_mm": ("height (mm)", 4),
+    "depth_mm": ("depth (mm)", 4),
+    "area_mm2": ("area (mm²)", 3),
+    "volume_mm3": ("volume (mm³)", 4),
+    "are_mm": ("ARE (mm)", 4),
+    "mre_mm": ("MRE (mm)", 4),
+}
+
+
+@dataclass(frozen=True)
+class FrameLine:
+    """One frame, as a report tells of it.
+
+    Parameters
+    ----------
+    frame, time_s
+        Its number, and its time where it has one, else NaN.
+    status, reason
+        As in `Measurement`; empty where it was not measured.
+    stale
+        Why its result no longer stands, a clause each.
+    corrected
+        Whether it was measured from dots and rows corrected by hand.
+    doubtful
+        Whether another correspondence explains its dots nearly as well.
+    dots
+        Dots found.
+    orientation
+        Its correspondence.
+    version
+        The labapp that measured it.
+    measures
+        Its sizes; None without a surface.
+    """
+
+    frame: int
+    time_s: float
+    status: str = ""
+    reason: str = ""
+    stale: tuple[str, ...] = ()
+    corrected: bool = False
+    doubtful: bool = False
+    dots: int | None = None
+    orientation: str = ""
+    version: str = ""
+    measures: Measures | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether its sizes are in the means."""
+        return self.measures is not None and not self.stale
+
+    @property
+    def state(self) -> str:
+        """How it is marked in the trends, in words."""
+        if self.stale:
+            return "stale"
+        if self.measures is None:
+            return self.status or "not measured"
+        if self.doubtful:
+            return "doubtful"
+        return "corrected by hand" if self.corrected else "measured"
+
+    def size(self, name: str) -> float:
+        """One of its measures; NaN without a surface."""
+        return float(getattr(self.measures, name, math.nan))
+
+
+@dataclass(frozen=True)
+class Told:
+    """A session, and what of it is reported.
+
+    Parameters
+    ----------
+    session
+        The session.
+    scheme
+        Whose results.
+    lines
+        The frames.
+    setup
+        The setup as it is now; None if it is not complete.
+    problems
+        What is missing or wrong in it.
+    """
+
+    session: Session
+    scheme: str
+    lines: list[FrameLine]
+    setup: Setup | None
+    problems: tuple[InputError, ...]
+
+    @classmethod
+    def of(cls, session: Session, scheme: str | None, frames: Sequence[int] | None) -> Told:
+        """Gather it."""
+        scheme = scheme or scheme_name(session.settings)
+        setup: Setup | None = None
+        problems: tuple[InputError, ...] = ()
+        try:
+            setup = session.setup
+        except InputError as error:
+            problems = error.problems
+        return cls(session, scheme, frame_lines(session, scheme, frames), setup, problems)
+
+
+def frame_lines(session: Session, scheme: str, frames: Sequence[int] | None) -> list[FrameLine]:
+    """Tell of each frame what its result says; a damaged result is a status of its own.
+
+    Raises
+    ------
+    InputError
+        If a frame is asked for that the session does not have.
+    """
+    seen = session.overview(scheme)
+    times = dict(zip(seen.frame.tolist(), seen.time_s.tolist(), strict=True))
+    numbers = list(times) if frames is None else sorted({int(frame) for frame in frames})
+    for number in numbers:
+        if number not in times:
+            raise InputError(session.path, "frame", number, "frames of the session")
+    status = dict(zip(seen.frame.tolist(), seen.status, strict=True))
+    return [
+        _frame_line(session, scheme, number, times[number])
+        if status[number]
+        else FrameLine(number, times[number])
+        for number in numbers
+    ]
+
+
+def _frame_line(session: Session, scheme: str, number: int, time_s: float) -> FrameLine:
+    try:
+        result = session.result(number, scheme)
+    except InputError as error:
+        return FrameLine(number, time_s, "damaged", f"what was kept is damaged: {error.value}")
+    if result is None:
+        return FrameLine(number, time_s)
+    found = result.measurement
+    return FrameLine(
+        frame=number,
+        time_s=time_s,
+        status=found.status,
+        reason=found.reason,
+        stale=result.stale,
+        corrected=found.correction is not None,
+        doubtful=is_doubtful(found),
+        dots=None if found.dots is None else len(found.dots),
+        orientation="" if found.match is None else found.match.orientation,
+        version=result.version,
+        measures=found.measures,
+    )
+
+
+def is_doubtful(measurement: Measurement) -> bool:
+    """Whether another correspondence explains the dots nearly as well."""
+    return measurement.match is not None and measurement.match.margin < DOUBTFUL_MARGIN
+
+
+def representative(lines: Iterable[FrameLine]) -> FrameLine | None:
+    """The frame that stands for all: its height is nearest to their median; None if none counts.
+
+    Of a concave pool it is the depth: whichever is farther from the work piece.
+    """
+    counted = [line for line in lines if line.counts]
+    if not counted:
+        return None
+    peak = np.array([[line.size("height_mm"), line.size("depth_mm")] for line in counted])
+    peak = peak[:, int(np.abs(peak).sum(axis=0).argmax())]
+    return counted[int(np.abs(peak - np.median(peak)).argmin())]
+
+
+def values(lines: Iterable[FrameLine], name: str) -> FloatArray:
+    """One of the measures of the frames that count, NaN left out, shape (n,)."""
+    found = np.array([line.size(name) for line in lines if line.counts])
+    return np.asarray(found[np.isfinite(found)], np.float64)
+
+
+def number(value: float | None, digits: int) -> str:
+    """A number with so many decimals, no sign on what rounds to nothing; a dash if unknown."""
+    return UNKNOWN if value is None or not math.isfinite(value) else f"{value:z.{digits}f}"
+
+
+def with_unit(value: float | None, unit: str) -> str:
+    """A number that was typed, with its unit; empty if none was."""
+    return "" if value is None else f"{value:.6g} {unit}"
+
+
+def frames_text(numbers: Sequence[int], most: int = 12) -> str:
+    """Frame numbers in short: ``0–4, 7, 9–11``."""
+    runs: list[list[int]] = []
+    for k in sorted(numbers):
+        if runs and k == runs[-1][1] + 1:
+            runs[-1][1] = k
+        else:
+            runs.append([k, k])
+    shown = [f"{a}" if a == b else f"{a}–{b}" for a, b in runs]
+    more = f" and {len(shown) - most} more" if len(shown) > most else ""
+    return ", ".join(shown[:most]) + more
+
+
+def status_cells(lines: Sequence[FrameLine]) -> Cells:
+    """How many frames came to what, and which: those that count first."""
+    groups: dict[tuple[str, str], list[FrameLine]] = {}
+    for line in lines:
+        status, why = _outcome(line)
+        # The same sentence with other numbers in it is the same reason; the first is shown.
+        groups.setdefault((status, NUMBER.sub("#", why)), []).append(line)
+    ranked = sorted(groups.items(), key=lambda item: (item[0][0] != "in the mean", item[0]))
+    rows = [
+        [*_outcome(found[0]), str(len(found)), frames_text([line.frame for line in found])]
+        for _, found in ranked
+    ]
+    return [["outcome", "why", "frames", "which"], *rows]
+
+
+def _outcome(line: FrameLine) -> tuple[str, str]:
+    if line.stale:
+        return "stale, left out", "; ".join(line.stale)
+    if not line.status:
+        return "not measured", ""
+    if line.measures is not None:
+        return "in the mean", ""
+    return line.status, line.reason
+
+
+def statistics_cells(lines: Sequence[FrameLine]) -> Cells:
+    """Mean, standard deviation (root of the variances of Eq. 7-2 … 7-4), extremes, range, ±."""
+    rows = []
+    for name, (label, digits) in STATISTICS.items():
+        found = values(lines, name)
+        if not len(found):
+            continue
+        figures = [found.mean(), found.std(), found.min(), found.max(), np.ptp(found)]
+        sigma = values(lines, sigma_name(name))
+        figures.append(np.median(sigma) if len(sigma) else math.nan)
+        rows.append([label, str(len(found)), *(number(float(f), digits) for f in figures)])
+    head = ["quantity", "frames", "mean", "std. dev.", "least", "largest", "range", "±"]
+    return [head, *rows]
+
+
+def sigma_name(name: str) -> str:
+    """Name of a measure's standard uncertainty."""
+    size, _, unit = name.rpartition("_")
+    return f"{size}_sigma_{unit}"
+
+
+def frame_cells(lines: Sequence[FrameLine]) -> Cells:
+    """All frames, one a row; of many the first and the last."""
+    head = ["frame", "time (s)", "dots", *("width", "length", "height", "volume", "ARE"), "state"]
+    told = list(lines)
+    if len(told) > ALL_FRAMES:
+        told = [*told[:SOME_FRAMES], *told[-SOME_FRAMES:]]
+    rows = [
+        [
+            str(line.frame),
+            number(line.time_s, 4),
+            UNKNOWN if line.dots is None else str(line.dots),
+            *(number(line.size(f"{name}_mm"), 4) for name in ("width", "length", "height")),
+            number(line.size("volume_mm3"), 4),
+            number(line.size("are_mm"), 4),
+            line.state,
+        ]
+        for line in told
+    ]
+    if len(told) < len(lines):
+        left_out = [["…", *[""] * (len(head) - 2), f"{len(lines) - len(told)} frames"]]
+        rows = rows[:SOME_FRAMES] + left_out + rows[SOME_FRAMES:]
+    return [head, *rows]
+
+
+def budget_cells(lines: Sequence[FrameLine], contributions: Sequence[Contribution]) -> Cells:
+    """The measurement's own ±, what each calibration's ± adds, and their root sum of squares."""
+    digits = [STATISTICS[name][1] for name in SIZES]
+    own = [values(lines, sigma_name(name)) for name in SIZES]
+    noise = np.array([np.median(sigma) if len(sigma) else math.nan for sigma in own])
+    rows = [["dots and fit (median)", "", *_row(noise, digits)]]
+    rows += [
+        [
+            f"{one.name}{'*' if one.nominal else ''}",
+            f"{one.sigma:.2g} {one.unit}",
+            *_row(one.change, digits),
+        ]
+        for one in contributions
+    ]
+    total = together(noise, *(one.change for one in contributions))
+    rows.append(["root of the sum of squares", "", *_row(total, digits)])
+    return [["source", "±", *(STATISTICS[name][0] for name in SIZES)], *rows]
+
+
+def _row(figures: FloatArray, digits: Sequence[int]) -> list[str]:
+    return [number(float(f), d) for f, d in zip(figures, digits, strict=True)]
+
+
+def settings_cells(settings: Settings) -> Cells:
+    """Settings that differ from the defaults."""
+    default = dict(_flat(Settings()))
+    rows = [
+        [name, str(value), str(default[name])]
+        for name, value in _flat(settings)
+        if value != default[name]
+    ]
+    return [["setting", "value", "default"], *rows]
+
+
+def _flat(settings: Any, prefix: str = "") -> Iterable[tuple[str, object]]:
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _flat(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name, value
+
+
+def rig_cells(setup: Setup) -> Cells:
+    """The rig and the image calibration, with units."""
+    rig, plane = setup.rig, setup.rig.imaging_plane
+    absent = ", ".join(f"({i}, {j})" for i, j in sorted(rig.pattern.absent_rays)[:8])
+    x, y, z = plane.origin_mm
+    along_x, along_z, angle = _image_scale(setup)
+    origin = setup.calibration.to_image(np.zeros(2))
+    return [
+        ["part", "quantity", "value"],
+        ["laser", "projection angle α", f"{rig.laser.projection_angle_deg:.6g} °"],
+        ["", "distance to the origin", f"{rig.laser.distance_mm:.6g} mm"],
+        ["dot pattern", "rows × columns", f"{rig.pattern.rows} × {rig.pattern.columns}"],
+        ["", "inter-beam angle β", f"{rig.pattern.inter_beam_angle_deg:.6g} °"],
+        ["", "absent rays (i, j)", absent + (" …" if len(rig.pattern.absent_rays) > 8 else "")],
+        ["electrode", "height of the tip", f"{rig.electrode.height_mm:.6g} mm"],
+        ["imaging plane", "distance D: O′ at Y = −D", f"{-y:.6g} mm"],
+        ["", "s: O′ at X = −s", f"{-x:.6g} mm"],
+        ["", "h: O′ at Z = h", f"{z:.6g} mm"],
+        ["", "width × height", f"{plane.width_mm:.6g} × {plane.height_mm:.6g} mm"],
+        *_tilt_rows(plane),
+        ["image calibration", "O′ in the picture (u, v)", f"{origin[0]:.2f}, {origin[1]:.2f} px"],
+        ["", "scale along O′X′", f"{along_x:.4f} px/mm"],
+        ["", "scale along O′Z′", f"{along_z:.4f} px/mm"],
+        ["", "angle between the axes", f"{angle:.3f} °"],
+    ]
+
+
+def _tilt_rows(plane: ImagingPlane) -> Cells:
+    yaw = np.arctan2(plane.x_axis[1], plane.x_axis[0])
+    level = plane.z_axis[0] * np.sin(yaw) - plane.z_axis[1] * np.cos(yaw)
+    pitch = np.arctan2(level, plane.z_axis[2])
+    if abs(yaw) + abs(pitch) < 1e-9:
+        return [["", "pose", "vertical, square to Y"]]
+    return [["", "pitch, yaw", f"{np.degrees(pitch):.4g} °, {np.degrees(yaw):.4g} °"]]
+
+
+def _image_scale(setup: Setup) -> tuple[float, float, float]:
+    """Scale along O′X′ and O′Z′ at O′, px/mm, and the angle between them, degrees."""
+    step = 1e-3
+    seen = setup.calibration.to_image(step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    x_arm, z_arm = (seen[1:] - seen[0]) / step
+    turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
+    return float(np.hypot(*x_arm)), float(np.hypot(*z_arm)), float(np.degrees(turn) % 360)
+
+
+def corrections_cells(session: Session, frames: Sequence[int]) -> Cells:
+    """Frames with a correction: dots, how many by hand, blocked rows."""
+    rows = []
+    seen = session.overview()
+    corrected = set(seen.frame[seen.corrected].tolist())
+    for frame in frames:
+        correction = session.correction(frame) if frame in corrected else None
+        if correction is not None:
+            blocked = sorted(correction.lattice.blocked_rows)
+            rows.append(
+                [
+                    str(frame),
+                    str(len(correction.dots)),
+                    str(int(correction.manual.sum())),
+                    f"blocked rows {', '.join(map(str, blocked))}" if blocked else "",
+                ]
+            )
+    return [["frame", "dots", "of them by hand", ""], *rows]

@@ -1,0 +1,342 @@
+"""Figures of the report, as PNG: black on white, lengths in mm."""
+
+from __future__ import annotations
+
+import colorsys
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from labapp.core.measures import surface_mesh
+from labapp.core.optics import meet_level, meet_plane, ray_directions, reflect
+from labapp.core.pipeline import Measurement
+from labapp.core.plane_calibration import PlaneCalibration
+from labapp.core.rig import Rig
+from labapp.core.values import FloatArray
+from labapp.media import GreyImage
+from labapp.session.report_layout import DPI
+
+INCHES = 6.7
+"""Width of a page's text."""
+
+STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 7.5,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": "0.3",
+    "lines.linewidth": 0.8,
+    "savefig.facecolor": "white",
+}
+
+STATES = {
+    "measured": {"marker": "o", "color": "#1b4f8a", "markerfacecolor": "#1b4f8a"},
+    "corrected by hand": {"marker": "s", "color": "#1b7a3d", "markerfacecolor": "#1b7a3d"},
+    "doubtful": {"marker": "o", "color": "#c05a00", "markerfacecolor": "white"},
+    "stale": {"marker": "x", "color": "0.6", "markerfacecolor": "0.6"},
+}
+"""How frames are drawn over time: told apart by shape as well as colour."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """A size over the frames; n of them.
+
+    Parameters
+    ----------
+    label
+        Its name and unit.
+    values, sigma
+        Shape (n,); NaN where there is none.
+    """
+
+    label: str
+    values: FloatArray
+    sigma: FloatArray
+
+
+def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
+    """The rig from the side, to scale: laser, torch, pool, plane, central ray and the fan.
+
+    Parameters
+    ----------
+    rig
+        The rig.
+    pool_mm
+        Length and height of the pool.
+    """
+    laser, plane = rig.laser.position_mm, rig.imaging_plane
+    top = plane.origin_mm + plane.height_mm * plane.z_axis
+    middle = (rig.pattern.columns - 1) // 2
+    fan = ray_directions(rig.laser, rig.pattern)[[0, (rig.pattern.rows - 1) // 2, -1], middle]
+    low, high = min(plane.origin_mm[1], top[1]) - 8, laser[1] + 12
+    floor, roof = -9.0, max(top[2], laser[2], 3 * rig.electrode.height_mm) + 7
+    with rc_context(STYLE):
+        figure = _figure(INCHES, min(INCHES * (roof - floor) / (high - low) + 0.45, 4.5))
+        view = figure.subplots()
+        view.axhspan(floor, 0, color="0.9", lw=0)
+        view.axhline(0, color="0.3", lw=0.8)
+        for k, direction in enumerate(fan):
+            _draw_ray(view, rig, direction, central=k == 1)
+        _draw_torch(view, rig.electrode.height_mm, roof)
+        across = np.linspace(-0.5, 0.5, 60)
+        pool = np.column_stack([pool_mm[0] * across, pool_mm[1] * (1 - 4 * across**2)])
+        view.add_patch(Polygon(pool, closed=True, fc="#c05a00", ec="#c05a00", lw=1.2, zorder=3))
+        view.plot([plane.origin_mm[1], top[1]], [plane.origin_mm[2], top[2]], "k", lw=2)
+        view.plot(laser[1], laser[2], "ks", ms=5)
+        _label_rig(view, rig, top)
+        view.set(xlim=(low, high), ylim=(floor, roof), aspect="equal")
+        view.set(xlabel="Y, welding direction (mm)", ylabel="Z (mm)")
+        return _png(figure)
+
+
+def _draw_ray(view: Any, rig: Rig, direction: FloatArray, *, central: bool) -> None:
+    """A ray down to the work piece, and from there, as from a flat mirror, to the plane."""
+    laser = rig.laser.position_mm
+    foot = meet_level(laser, direction)
+    after = reflect(direction, np.array([0.0, 0.0, 1.0]))
+    end = rig.imaging_plane.to_universal(meet_plane(foot, after, rig.imaging_plane))
+    path = np.array([laser, foot, end])
+    look = {"color": "#b01030", "lw": 1.1} if central else {"color": "#d98a9a", "lw": 0.6}
+    view.plot(path[:, 1], path[:, 2], **look, zorder=2)
+
+
+def _draw_torch(view: Any, tip_mm: float, roof_mm: float) -> None:
+    """The electrode, a taper and a rod; sizes across it are not those of a torch."""
+    rod = [(0, tip_mm), (1.2, tip_mm + 4), (1.2, roof_mm), (-1.2, roof_mm), (-1.2, tip_mm + 4)]
+    view.add_patch(Polygon(np.array(rod), closed=True, fc="0.75", ec="0.3", lw=0.6, zorder=1))
+
+
+def _label_rig(view: Any, rig: Rig, top: FloatArray) -> None:
+    laser, plane = rig.laser.position_mm, rig.imaging_plane
+    angle, origin = rig.laser.projection_angle_deg, plane.origin_mm
+    view.annotate("laser", laser[1:], (6, 4), textcoords="offset points")
+    view.annotate("imaging plane", top[1:], (5, -3), textcoords="offset points", va="top")
+    view.annotate("O′", origin[1:], (-4, 0), textcoords="offset points", ha="right")
+    torch = (1.2, max(rig.electrode.height_mm + 5, 0.55 * top[2]))
+    view.annotate("torch", torch, (5, 0), textcoords="offset points")
+    view.annotate("pool", (0, 0), (0, -11), textcoords="offset points", ha="center")
+    reach = 0.42 * rig.laser.distance_mm
+    arc = np.radians(np.linspace(0, angle, 40))
+    view.plot(reach * np.cos(arc), reach * np.sin(arc), "k", lw=0.6)
+    half = np.radians(angle / 2)
+    at = (reach * np.cos(half), reach * np.sin(half))
+    view.annotate(f"α = {angle:.4g}°", at, (5, -3), textcoords="offset points")
+    along = laser[1:] * 0.72
+    view.annotate(
+        f"{rig.laser.distance_mm:.4g} mm", along, (-3, 5), textcoords="offset points", ha="right"
+    )
+    arrow = {"arrowstyle": "<->", "lw": 0.6, "color": "0.3"}
+    view.annotate("", (0, -6), (origin[1], -6), arrowprops=arrow)
+    view.annotate(f"{-origin[1]:.4g} mm", (origin[1] / 2, -5.6), ha="center", va="bottom")
+
+
+def target_picture(image: GreyImage, found: PlaneCalibration) -> bytes:
+    """The calibration picture with O′ and both axes drawn over it."""
+    origin, *ends = (np.array(p) for p in (found.origin_px, found.x_axis_px, found.z_axis_px))
+    tips = [origin + 1.25 * (end - origin) for end in ends]
+    corners = np.array([origin, *tips])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = 0.2 * np.ptp(corners, axis=0).max()
+    box = np.clip([low - margin, high + margin], -0.5, np.array(image.shape[::-1]) - 0.5)
+    wide, tall = box[1] - box[0]
+    with rc_context(STYLE):
+        figure = _figure(INCHES * 0.85, float(np.clip(INCHES * 0.8 * tall / wide, 1.5, 4.5)))
+        view = figure.subplots()
+        view.imshow(image, cmap="gray", interpolation="antialiased")
+        for name, end, tip, colour in zip(
+            ("X′", "Z′"), ends, tips, ("#ff5a36", "#45a5ff"), strict=True
+        ):
+            arrow = {"arrowstyle": "->", "color": colour, "lw": 1.2, "shrinkA": 0, "shrinkB": 0}
+            view.annotate("", tip, origin, arrowprops=arrow)
+            view.plot(*end, "x", color=colour, ms=8, mew=1.6)
+            at = tip + 0.08 * (end - origin)
+            view.text(*at, name, color=colour, ha="center", va="center", fontsize=9)
+        view.plot(*origin, "o", color="#50e070", ms=11, mfc="none", mew=1.4)
+        view.annotate(
+            "O′",
+            origin,
+            (-9, -9),
+            textcoords="offset points",
+            color="#50e070",
+            ha="right",
+            va="top",
+        )
+        view.set(xlim=box[:, 0], ylim=box[::-1, 1], xlabel="u (px)", ylabel="v (px)")
+        return _png(figure)
+
+
+def trends(axis: FloatArray, label: str, series: list[Series], states: list[str]) -> bytes:
+    """Sizes over time, one plot each, with ± one σ; every frame marked by its state.
+
+    Parameters
+    ----------
+    axis, label
+        Time or number of each frame, shape (n,), and what it is.
+    series
+        The sizes.
+    states
+        Which of `STATES` each frame has; what is in none is not drawn.
+    """
+    with rc_context(STYLE):
+        figure = _figure(INCHES, 1.2 * len(series) + 0.4)
+        plots = figure.subplots(len(series), sharex=True, squeeze=False)[:, 0]
+        for plot, one in zip(plots, series, strict=True):
+            _draw_trend(plot, axis, one, states)
+        plots[-1].set_xlabel(label)
+        handles, names = plots[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside upper right", ncols=len(names), frameon=False)
+        return _png(figure)
+
+
+def _draw_trend(plot: Any, axis: FloatArray, series: Series, states: list[str]) -> None:
+    kept = np.array([state in STATES and state != "stale" for state in states], bool)
+    line = np.where(kept, series.values, np.nan)
+    plot.plot(axis, line, "-", color="0.75", lw=0.7, zorder=1)
+    mean = np.nanmean(line) if np.isfinite(line).any() else np.nan
+    plot.axhline(mean, color="0.4", lw=0.6, ls=":", zorder=1)
+    for state, look in STATES.items():
+        chosen = np.array([s == state for s in states], bool)
+        if not chosen.any():
+            continue
+        plot.errorbar(
+            axis[chosen],
+            series.values[chosen],
+            np.nan_to_num(series.sigma[chosen]),
+            ls="none",
+            ms=3.2,
+            elinewidth=0.7,
+            label=state,
+            **look,
+        )
+    plot.set_ylabel(series.label)
+    plot.grid(alpha=0.25, lw=0.4)
+
+
+def dots_picture(image: GreyImage | None, measurement: Measurement) -> bytes:
+    """A frame, as a negative, with its dots ringed, a colour a row of rays.
+
+    Parameters
+    ----------
+    image
+        The frame; None where it cannot be read: the dots alone.
+    measurement
+        What was found in it; there are dots.
+    """
+    dots, match = measurement.dots, measurement.match
+    assert dots is not None
+    u, v = dots.image_px.T
+    box = (u.min() - 45, u.max() + 25, v.max() + 18, v.min() - 22)
+    tall = INCHES * (box[2] - box[3]) / (box[1] - box[0])
+    with rc_context(STYLE):
+        figure = _figure(INCHES, float(np.clip(tall + 0.3, 1.5, 5.0)))
+        view = figure.subplots()
+        if image is not None:
+            low, high = np.percentile(image, [1, 99.8])
+            view.imshow(image, cmap="gray_r", vmin=low, vmax=max(high, low + 1e-9))
+        rays = {} if match is None else dict(zip(match.dot, match.ray, strict=True))
+        first: dict[int, tuple[float, float]] = {}
+        for k, (x, y) in enumerate(dots.image_px):
+            ray = rays.get(k)
+            colour = "0.6" if ray is None else _row_colour(int(ray[0]))
+            view.plot(x, y, "o", ms=6.5, mfc="none", mec=colour, mew=0.8)
+            if ray is None:
+                continue
+            at = {"textcoords": "offset points", "color": colour, "fontsize": 4.5}
+            view.annotate(str(ray[1]), (x, y), (0, 4.2), ha="center", **at)
+            first[int(ray[0])] = min(first.get(int(ray[0]), (x, y)), (x, y))
+        for row, place in first.items():
+            at = {"textcoords": "offset points", "color": _row_colour(row), "fontsize": 5.5}
+            view.annotate(f"row {row}", place, (-6, 0), ha="right", va="center", **at)
+        view.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="u (px)", ylabel="v (px)")
+        return _png(figure)
+
+
+def height_map(measurement: Measurement) -> bytes:
+    """The surface from above: height, boundary, reflection points, centre and peak."""
+    found, size = measurement.reconstruction, measurement.measures
+    assert found is not None
+    assert size is not None
+    vertices, triangles = surface_mesh(found, 0.1)
+    # A surface that interpolates need not reach the boundary everywhere.
+    triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
+    x, y, z = np.nan_to_num(vertices).T
+    outline = np.vstack([found.boundary.points_mm, found.boundary.points_mm[:1]])
+    with rc_context(STYLE):
+        wide = INCHES * 0.55
+        ratio = np.ptp(outline[:, 1]) / np.ptp(outline[:, 0])
+        figure = _figure(wide, float(np.clip((wide - 1.1) * ratio + 0.5, 2.0, 3.3)))
+        view = figure.subplots()
+        flat = np.ptp(z) < 1e-6
+        levels = [z.min() - 1e-3, z.max() + 1e-3] if flat else 14
+        heights = view.tricontourf(x, y, triangles, z, levels=levels, cmap="viridis")
+        view.plot(outline[:, 0], outline[:, 1], "k", lw=1)
+        points = found.points_mm
+        view.plot(points[:, 0], points[:, 1], "o", ms=2.2, mfc="white", mec="k", mew=0.3)
+        view.plot(size.center_x_mm, size.center_y_mm, "k+", ms=8, mew=1.1)
+        view.plot(size.peak_x_mm, size.peak_y_mm, "^", color="#d02020", ms=5)
+        view.set(aspect="equal", xlabel="X (mm)", ylabel="Y, welding direction (mm)")
+        figure.colorbar(heights, ax=view, label="height (mm)", shrink=0.85)
+        return _png(figure)
+
+
+def dots_compared(measurement: Measurement) -> bytes:
+    """Captured and computed reflected dots over each other, on the imaging plane."""
+    found, match = measurement.reconstruction, measurement.match
+    assert found is not None
+    assert match is not None
+    captured = dict(zip(map(tuple, match.ray.tolist()), match.plane_mm, strict=True))
+    rays = [tuple(ray) for ray in found.ray.tolist()]
+    known = np.array([ray in captured for ray in rays], bool)
+    seen = np.array([captured[ray] for ray in rays if ray in captured]).reshape(-1, 2)
+    computed = seen + found.residual_mm[known]
+    with rc_context(STYLE):
+        tall = 1.0 if not len(seen) else np.ptp(seen[:, 1]) / max(np.ptp(seen[:, 0]), 1e-9)
+        figure = _figure(INCHES * 0.8, float(np.clip(INCHES * 0.8 * tall + 0.6, 1.6, 5.0)))
+        view = figure.subplots()
+        view.plot(*seen.T, "o", ms=5, mfc="none", mec="k", mew=0.7, label="captured")
+        view.plot(*computed.T, "x", ms=4, color="#c01030", mew=0.8, label="computed")
+        view.set(aspect="equal", xlabel="X′ (mm)", ylabel="Z′ (mm)")
+        figure.legend(loc="outside upper right", ncols=2, frameon=False)
+        return _png(figure)
+
+
+def positions(axis: FloatArray, label: str, places: Mapping[str, FloatArray]) -> bytes:
+    """The pool's centre and peak over time, X above Y (Fig. 7-15)."""
+    with rc_context(STYLE):
+        figure = _figure(INCHES, 2.3)
+        plots = figure.subplots(2, sharex=True)
+        for (name, place), look in zip(places.items(), ("k+-", "r^-"), strict=True):
+            for plot, values in zip(plots, place.T, strict=True):
+                plot.plot(axis, values, look, ms=4, lw=0.5, mew=0.8, label=name)
+        for plot, name in zip(plots, "XY", strict=True):
+            plot.set_ylabel(f"{name} (mm)")
+            plot.grid(alpha=0.25, lw=0.4)
+        plots[-1].set_xlabel(label)
+        handles, names = plots[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside upper right", ncols=2, frameon=False)
+        return _png(figure)
+
+
+def _row_colour(row: int) -> tuple[float, float, float]:
+    """A colour that is dark enough on white and differs most between neighbouring rows."""
+    return colorsys.hsv_to_rgb(row * 0.381966 % 1, 0.9, 0.65)
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    content = io.BytesIO()
+    # Without the name of the program that drew it: the same figure is the same bytes.
+    figure.savefig(content, format="png", dpi=DPI, metadata={"Software": None})
+    return content.getvalue()

@@ -1,0 +1,229 @@
+"""The report's results: sizes and trends, one frame in pictures, error budget, corrections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from labapp.core.pipeline import Measurement
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.session import report_data as data
+from labapp.session import report_figures as figures
+from labapp.session.error_budget import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX, calibration_budget
+from labapp.session.report_data import FrameLine, Told
+from labapp.session.report_layout import Story
+from labapp.session.setup import parse_setup
+
+LATEST_CHANGES = 40
+"""So many of the newest changes are listed."""
+
+NOT_COVERED = (
+    "Not in it: that the pool is taken for a mirror and the imaging plane for a perfectly "
+    "diffuse, flat one; a wrong correspondence (a row or a column more or less); the tilt of the "
+    "plane; the length of the calibration target's unit; distortion by the lens; the pool's motion "
+    "during the exposure. Quantities are moved one by one, as if independent, to first order."
+)
+
+
+def tell_results(story: Story, told: Told) -> None:
+    """What the frames came to: counts, means, trends, every frame."""
+    story.heading("4  Results")
+    lines = told.lines
+    if not lines:
+        story.text("There are no frames: nothing was measured.")
+        return
+    counted = [line for line in lines if line.counts]
+    story.text(
+        f"{len(lines)} frames, scheme {told.scheme}: {len(counted)} with a surface that stands. "
+        "Stale results, made from calibrations, settings or corrections that were changed since, "
+        "are in no mean."
+    )
+    story.table("What the frames came to.", data.status_cells(lines), "llrl", (0.2, 0.4, 0.1, 0.3))
+    if counted:
+        story.table(
+            f"Sizes over the {len(counted)} frames that count. Standard deviation: root of the "
+            "variance of Eq. 7-2 … 7-4 (divided by the number of frames). ±: standard uncertainty "
+            "of a single frame, their median; – where the scheme gives none.",
+            data.statistics_cells(lines),
+            "lrrrrrrr",
+            (0.19, 0.09, *[0.12] * 6),
+        )
+        _trends(story, lines)
+    elif any(line.status for line in lines):
+        story.text("No frame has a surface that stands, so there is no mean.")
+    else:
+        story.text("Nothing was measured yet.")
+        return
+    more = len(lines) > data.ALL_FRAMES
+    story.table(
+        "Frame by frame, mm and mm³"
+        + ("; all frames are in measures.csv of an export." if more else "."),
+        data.frame_cells(lines),
+        "rrrrrrrrl",
+        (0.08, 0.1, 0.07, 0.11, 0.11, 0.11, 0.11, 0.11, 0.2),
+    )
+
+
+def _trends(story: Story, lines: list[FrameLine]) -> None:
+    if sum(line.measures is not None for line in lines) < 2:
+        return
+    times = np.array([line.time_s for line in lines])
+    timed = bool(np.isfinite(times).all())
+    axis = times if timed else np.array([float(line.frame) for line in lines])
+    label = "time (s)" if timed else "frame"
+    concave = abs(data.values(lines, "depth_mm").mean()) > abs(
+        data.values(lines, "height_mm").mean()
+    )
+    peak = "depth_mm" if concave else "height_mm"
+    series = [
+        figures.Series(
+            data.STATISTICS[name][0], _each(lines, name), _each(lines, data.sigma_name(name))
+        )
+        for name in ("width_mm", "length_mm", peak, "volume_mm3", "are_mm")
+    ]
+    states = [line.state for line in lines]
+    story.figure(
+        "Sizes over time with ± one σ of each frame; dotted: mean. Doubtful: another "
+        f"correspondence comes within a factor of {data.DOUBTFUL_MARGIN:g} of the residual; stale: "
+        "made from what was changed since, in no mean.",
+        figures.trends(axis, label, series, states),
+    )
+    kept = np.array([[line.counts] for line in lines])
+    places = {
+        name: np.where(
+            kept,
+            np.column_stack([_each(lines, f"{key}_x_mm"), _each(lines, f"{key}_y_mm")]),
+            np.nan,
+        )
+        for name, key in (
+            ("centre of the pool", "center"),
+            ("farthest from the work piece", "peak"),
+        )
+    }
+    story.figure(
+        "Position of the pool's centre and of its highest (concave: lowest) point.",
+        figures.positions(axis, label, places),
+    )
+
+
+def _each(lines: Sequence[FrameLine], name: str) -> FloatArray:
+    return np.array([line.size(name) for line in lines])
+
+
+def tell_example(story: Story, told: Told) -> None:
+    """One frame in pictures: that of the middling height; else the first with dots."""
+    line = data.representative(told.lines) or next((x for x in told.lines if x.dots), None)
+    if line is None:
+        return
+    result = told.session.result(line.frame, told.scheme)
+    assert result is not None
+    found = result.measurement
+    if line.counts:
+        story.part(f"Frame {line.frame}: its height (concave: depth) is nearest to the median")
+    else:
+        why = "; ".join(line.stale) or line.status
+        story.part(f"Frame {line.frame}: the first with dots, not in the mean ({why})")
+    _dots(story, told, line.frame, found)
+    if found.reconstruction is not None and found.measures is not None:
+        story.figure(
+            f"Frame {line.frame}: height over the work piece. Black: boundary; white: reflection "
+            "points; cross: centre; triangle: where it is farthest from the work piece. "
+            "The electrode is over X = Y = 0.",
+            figures.height_map(found),
+        )
+        story.figure(
+            f"Frame {line.frame}: captured reflected dots and those computed from the surface, "
+            f"on the imaging plane; ARE {found.measures.are_mm:.4f} mm, "
+            f"MRE {found.measures.mre_mm:.4f} mm.",
+            figures.dots_compared(found),
+        )
+
+
+def _dots(story: Story, told: Told, frame: int, found: Measurement) -> None:
+    missing = ""
+    try:
+        image = told.session.frame(frame).image
+    except InputError:
+        image, missing = None, " The frame itself cannot be read."
+    story.figure(
+        f"Frame {frame}, as a negative, with its {0 if found.dots is None else len(found.dots)} "
+        "dots. Left: row i of the ray; above a dot: its column j; grey ring: no ray." + missing,
+        figures.dots_picture(image, found),
+    )
+
+
+def tell_budget(story: Story, told: Told) -> None:
+    """What each uncertainty does to the sizes of the frame that stands for all."""
+    story.heading("5  Error budget")
+    line = data.representative(told.lines)
+    if line is None:
+        story.text("No frame has a surface that stands, so there is none.")
+        return
+    session = told.session
+    result = session.result(line.frame, told.scheme)
+    assert result is not None
+    laser, plane = session.laser_calibration, session.plane_calibration
+    contributions = calibration_budget(
+        result.measurement,
+        parse_setup(result.setup, session.path),
+        result.settings,
+        None if laser is None else laser.found,
+        None if plane is None else plane.found,
+    )
+    story.table(
+        f"What each ± (one σ) changes in the sizes. Calibration: frame {line.frame}, measured "
+        "anew with the quantity moved by its ±, the correspondence kept. *: no ± is known; a "
+        f"nominal {NOMINAL_MM:g} mm, {NOMINAL_DEG:g}° or {NOMINAL_PX:g} px is taken.",
+        data.budget_cells(told.lines, contributions),
+        "lrrrrrrr",
+        (0.31, 0.1, *[0.0983] * 6),
+    )
+    if not len(data.values(told.lines, "height_sigma_mm")):
+        story.text(f"The scheme {told.scheme} gives no ± of its own: the total is without it.")
+    if any(np.isnan(one.change).any() for one in contributions):
+        story.text("–: the surface could not be made with the quantity moved; not in the total.")
+    story.text(
+        "It covers the noise of the dots' centres, the level of the work piece as far as the "
+        "scheme tells it, and where laser, imaging plane and picture stand to each other. "
+        + NOT_COVERED
+    )
+
+
+def tell_corrections(story: Story, told: Told) -> None:
+    """What was corrected by hand, and what was changed in the session."""
+    story.heading("6  Corrections by hand, and history")
+    cells = data.corrections_cells(told.session, [line.frame for line in told.lines])
+    if len(cells) > 1:
+        story.table(
+            "Frames whose dots and rows were corrected by hand.",
+            cells,
+            "rrrl",
+            (0.1, 0.1, 0.2, 0.6),
+        )
+    else:
+        story.text("No dots or rows were corrected by hand.")
+    history = told.session.history
+    if not history:
+        story.text("No change is in the history.")
+        return
+    earlier = len(history) - LATEST_CHANGES
+    story.table(
+        "Changes of the record, the set-up, the settings, calibrations and corrections"
+        + (f"; the newest {LATEST_CHANGES} of {len(history)}." if earlier > 0 else "."),
+        [
+            ["no.", "made", "change", ""],
+            *(
+                [
+                    str(change.number),
+                    change.made.replace("T", " "),
+                    change.label,
+                    "undone" if change.undone else "",
+                ]
+                for change in history[-LATEST_CHANGES:]
+            ),
+        ],
+        "rlll",
+        (0.08, 0.3, 0.5, 0.12),
+    )

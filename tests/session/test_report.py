@@ -1,0 +1,397 @@
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import labapp
+from labapp.core import correction, ers
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.correspondence import Trial
+from labapp.core.laser_calibration import calibrate_laser
+from labapp.core.measures import measure
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.plane_calibration import PlaneCalibration
+from labapp.core.rig import Laser
+from labapp.errors import InputError
+from labapp.session import report_data as data
+from labapp.session import report_figures, report_layout
+from labapp.session.error_budget import SIZES, Contribution, calibration_budget, together
+from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
+from labapp.session.record import Record
+from labapp.session.report import report_pdf
+from labapp.session.report_data import FrameLine, Told
+from labapp.session.report_layout import Story, plain
+from labapp.session.report_results import tell_corrections, tell_example, tell_results
+from labapp.session.session import Session
+from labapp.session.setup import Setup, parse_setup
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.pools import spherical_cap
+from tests.scenes import FRAME_SHAPE, as_dots
+
+SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
+SETUP = (SAMPLE / "setup.toml").read_text("utf-8")
+ERS = Settings(scheme="ers")
+NOW = datetime.datetime(2026, 11, 21, 4, 0)
+
+
+@pytest.fixture(autouse=True)
+def coarse_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most of a report's time goes into pixels."""
+    for module in (report_figures, report_layout):
+        monkeypatch.setattr(module, "DPI", 40)
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    return parse_setup(SETUP, "setup.toml")
+
+
+@pytest.fixture(scope="module")
+def seen(setup: Setup) -> Measurement:
+    """A cap of 6 mm, 0.3 mm high, measured by ERS from exact dots."""
+    match = exact_match(trace(spherical_cap(6.0, 0.3), setup.rig), setup.rig)
+    found = ers.reconstruct(match, setup.rig, ers.ErsSettings())
+    return Measurement(
+        status="ok",
+        reason="",
+        scheme="ers",
+        dots=as_dots(setup.calibration.to_image(match.plane_mm)),
+        match=match,
+        reconstruction=found,
+        measures=measure(found, match, setup.rig),
+    )
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Iterator[Session]:
+    """A session of six frames, nothing measured."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    rng = np.random.default_rng(1)
+    for k in range(6):
+        image = rng.integers(0, 255, FRAME_SHAPE, np.uint8)
+        assert cv2.imwrite(str(folder / f"{k}.png"), image)
+    with Session.create(tmp_path / "run.labsession") as session:
+        session.set_setup(SETUP)
+        session.set_settings(ERS)
+        session.import_recording(folder, frame_rate_hz=50.0)
+        yield session
+
+
+@pytest.fixture
+def keep(session: Session, seen: Measurement) -> Callable[..., None]:
+    """Keep a measurement of a frame as if it had been made now."""
+
+    def put(frame: int, width_mm: float | None = None, **changes: object) -> None:
+        found = replace(seen, **changes)
+        if width_mm is not None:
+            assert found.measures is not None
+            found = replace(found, measures=replace(found.measures, width_mm=width_mm))
+        basis = session._basis()
+        assert basis is not None
+        session._results.put(
+            frame, found, basis, session._documents.fingerprint("correction", frame)
+        )
+
+    return put
+
+
+NOTHING = {"match": None, "reconstruction": None, "measures": None}
+
+
+def pages(pdf: bytes) -> int:
+    assert pdf.startswith(b"%PDF-")
+    assert pdf.rstrip().endswith(b"%%EOF")
+    return len(re.findall(rb"/Type\s*/Page\b", pdf))
+
+
+def lines_of(session: Session) -> list[FrameLine]:
+    return data.frame_lines(session, "ers", None)
+
+
+# --- what counts ------------------------------------------------------------------------------
+
+
+def test_statistics_are_those_of_eq_7_2_and_leave_out_what_is_stale(
+    session: Session, keep: Callable[..., None]
+):
+    session.update_setup({"laser": {"distance_mm": 31.0}})
+    keep(0, 99.0)
+    session.undo()
+    for frame, width in ((1, 6.0), (2, 7.0), (3, 9.5)):
+        keep(frame, width)
+    keep(4, status="no-match", reason="9 dots are left over", **NOTHING)
+    rows = {row[0]: row[1:] for row in data.statistics_cells(lines_of(session))}
+    widths = np.array([6.0, 7.0, 9.5])
+    assert rows["width (mm)"] == [
+        "3",
+        "7.5000",
+        f"{np.sqrt(np.sum((widths - 7.5) ** 2) / 3):.4f}",
+        "6.0000",
+        "9.5000",
+        "3.5000",
+        data.UNKNOWN,
+    ]
+    assert rows["ARE (mm)"][0] == "3"
+    cells = data.status_cells(lines_of(session))[1:]
+    assert cells == [
+        ["in the mean", "", "3", "1–3"],
+        ["no-match", "9 dots are left over", "1", "4"],
+        ["not measured", "", "1", "5"],
+        ["stale, left out", SETUP_CHANGED, "1", "0"],
+    ]
+
+
+def test_reasons_that_differ_in_numbers_are_one(session: Session, keep: Callable[..., None]):
+    for frame in (0, 1, 3):
+        keep(frame, status="no-match", reason=f"{frame + 7} dots, ±0.{frame} px", **NOTHING)
+    assert data.status_cells(lines_of(session))[1] == ["no-match", "7 dots, ±0.0 px", "3", "0–1, 3"]
+
+
+def test_a_correction_makes_stale_and_is_listed(
+    session: Session, seen: Measurement, keep: Callable[..., None]
+):
+    keep(2)
+    moved = correction.move_dots(correction.Correction.of(seen.dots, None), [0, 4], 0.5, 0.0)
+    session.correct({2: correction.block_row(moved, 3)})
+    line = lines_of(session)[2]
+    assert (line.stale, line.state, line.counts) == ((CORRECTION_CHANGED,), "stale", False)
+    story = Story()
+    tell_corrections(story, Told.of(session, None, None))
+    count = str(len(moved.dots))
+    assert story.tables[0][1:] == [["2", count, "2", "blocked rows 3"]]
+    assert [row[2] for row in story.tables[1]][1:] == ["setup", "settings", "correction"]
+    keep(2, correction=session.correction(2))
+    assert lines_of(session)[2].state == "corrected by hand"
+
+
+def test_a_frame_whose_correspondence_has_a_rival_is_doubtful(
+    session: Session, seen: Measurement, keep: Callable[..., None]
+):
+    assert seen.match is not None
+    for frame, rival in ((0, 0.049), (1, 0.051)):
+        trials = (Trial("S/S", 0.01), Trial("I/I", rival))
+        keep(frame, match=replace(seen.match, orientation="S/S", trials=trials))
+    assert [line.state for line in lines_of(session)[:3]] == [
+        "doubtful",
+        "measured",
+        "not measured",
+    ]
+
+
+def test_of_many_frames_the_first_and_the_last_are_listed():
+    lines = [FrameLine(k, k / 50) for k in range(100)]
+    cells = data.frame_cells(lines)
+    assert [row[0] for row in cells[1:]] == [*map(str, range(20)), "…", *map(str, range(80, 100))]
+    assert cells[21][-1] == "60 frames"
+    assert len(data.frame_cells(lines[:60])) == 61
+
+
+def test_the_frame_that_stands_for_all_has_the_median_peak(seen: Measurement):
+    assert seen.measures is not None
+
+    def line(frame: int, **sizes: float) -> FrameLine:
+        assert seen.measures is not None
+        return FrameLine(frame, 0.0, "ok", measures=replace(seen.measures, **sizes))
+
+    convex = [line(k, height_mm=h) for k, h in enumerate((0.2, 0.5, 0.31, 0.3))]
+    assert data.representative([*convex, FrameLine(9, 0.0, "no-dots")]) is convex[2]
+    concave = [line(k, height_mm=0.0, depth_mm=d) for k, d in enumerate((-0.4, -0.2, -0.3))]
+    assert data.representative(concave) is concave[2]
+    assert data.representative([replace(convex[0], stale=("x",))]) is None
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [([], ""), ([3], "3"), ([0, 1, 2, 5, 7, 8], "0–2, 5, 7–8"), ([2, 1], "1–2")],
+)
+def test_frames_are_named_in_short(numbers: list[int], text: str):
+    assert data.frames_text(numbers) == text
+
+
+def test_settings_that_differ_are_told_with_their_defaults():
+    assert data.settings_cells(Settings())[1:] == []
+    assert data.settings_cells(ERS)[1:] == [["scheme", "ers", "fit"]]
+
+
+def test_the_rig_is_told_with_units(setup: Setup):
+    cells = {row[1]: row[2] for row in data.rig_cells(setup)}
+    assert cells["projection angle α"] == "31.14 °"
+    assert cells["s: O′ at X = −s"] == "45 mm"
+    assert cells["pose"] == "vertical, square to Y"
+    arm = np.hypot(242.01 - 44.0, 587.93 - 590.0)
+    assert cells["scale along O′X′"] == f"{arm / 34.925:.4f} px/mm"
+    tilted = SETUP.replace("\ns_mm", "\npitch_deg = 4.0\nyaw_deg = -3.0\ns_mm")
+    cells = {row[1]: row[2] for row in data.rig_cells(parse_setup(tilted, "setup.toml"))}
+    assert cells["pitch, yaw"] == "4 °, -3 °"
+
+
+# --- error budget -----------------------------------------------------------------------------
+
+
+def test_the_budget_is_what_measuring_with_other_values_gives(seen: Measurement, setup: Setup):
+    found = calibration_budget(seen, setup, ERS, None, None)
+    assert [one.name.split(",")[0] for one in found] == [
+        *["laser"] * 2,
+        *["imaging plane"] * 3,
+        *["image calibration"] * 3,
+    ]
+    assert all(one.nominal for one in found)
+    moved = replace(setup.rig, laser=replace(setup.rig.laser, distance_mm=31.58))
+    assert seen.match is not None
+    assert seen.measures is not None
+    size = measure(ers.reconstruct(seen.match, moved, ERS.ers), seen.match, moved)
+    change = [abs(getattr(size, name) - getattr(seen.measures, name)) for name in SIZES]
+    np.testing.assert_allclose(found[1].change, change, atol=1e-12)
+    assert found[1].change[0] > 0.005
+
+
+def test_a_moved_point_of_the_picture_is_another_image_calibration(seen: Measurement, setup: Setup):
+    points = ((44.0, 590.0), (242.01, 587.93), 34.925, (43.06, 499.99), 15.875)
+    plane = PlaneCalibration(*points, sigma_px=(0.2, 0.1, 0.3), threshold=50.0)
+    found = calibration_budget(seen, setup, ERS, None, plane)[5]
+    assert seen.match is not None
+    assert seen.measures is not None
+    image = setup.calibration.to_image(seen.match.plane_mm)
+    heights = []
+    for origin in ((44.2, 590.0), (44.0, 590.2)):
+        other = ImageCalibration.from_three_points(origin, *points[1:])
+        match = replace(seen.match, plane_mm=other.to_plane(image))
+        size = measure(ers.reconstruct(match, setup.rig, ERS.ers), match, setup.rig)
+        heights.append(size.height_mm - seen.measures.height_mm)
+    assert (found.name, found.sigma, found.nominal) == ("image calibration, O′", 0.2, False)
+    np.testing.assert_allclose(found.change[2], np.hypot(*heights), rtol=1e-6)
+    assert found.change[2] > 1e-4
+
+
+def test_a_calibration_tells_its_own_uncertainty_while_it_is_in_use(
+    seen: Measurement, setup: Setup
+):
+    laser = calibrate_laser([4.6, 4.7, 4.65], [6.2, 6.3, 6.2], [2.75, 2.76, 2.75])
+    other = calibration_budget(seen, setup, ERS, laser, None)
+    assert other[0].nominal
+    used = replace(setup, rig=replace(setup.rig, laser=Laser(laser.angle_deg, laser.distance_mm)))
+    found = calibration_budget(seen, used, ERS, laser, None)
+    assert [one.nominal for one in found[:3]] == [False, False, True]
+    assert (found[0].sigma, found[1].sigma) == (laser.angle_sigma_deg, laser.distance_sigma_mm)
+
+
+def test_the_total_is_the_root_of_the_sum_of_squares(seen: Measurement):
+    assert seen.measures is not None
+    line = FrameLine(0, 0.0, "ok", measures=replace(seen.measures, width_sigma_mm=0.03))
+    changes = np.array([0.04, 0.1, np.nan, 0.0, 0.0, 0.0])
+    parts = [
+        Contribution("a", 0.1, "mm", True, changes),
+        Contribution("b", 0.1, "mm", False, np.zeros(6)),
+    ]
+    cells = data.budget_cells([line], parts)
+    assert [row[0] for row in cells[2:4]] == ["a*", "b"]
+    assert cells[-1][2:5] == ["0.0500", "0.1000", "0.0000"]
+    np.testing.assert_allclose(together(changes, changes)[:2], np.sqrt(2) * changes[:2])
+
+
+# --- the pages --------------------------------------------------------------------------------
+
+
+def test_a_report_is_pdf_and_the_same_bytes_for_the_same_session(
+    session: Session, keep: Callable[..., None], tmp_path: Path
+):
+    for frame in range(4):
+        keep(frame, 6.0 + 0.1 * frame)
+    once = report_pdf(session, now=NOW)
+    assert pages(once) >= 5
+    assert report_pdf(session, now=NOW) == once
+
+
+def test_figures_and_tables_are_counted(session: Session, keep: Callable[..., None]):
+    keep(0)
+    keep(1)
+    story = Story()
+    told = Told.of(session, None, None)
+    tell_results(story, told)
+    tell_example(story, told)
+    numbered = [caption.split(".")[0] for caption in story.captions]
+    assert numbered == [
+        *("Table 1", "Table 2", "Figure 1", "Figure 2", "Table 3"),
+        *("Figure 3", "Figure 4", "Figure 5"),
+    ]
+
+
+def test_a_session_of_nothing_still_gives_a_report(tmp_path: Path):
+    with Session.create(tmp_path / "new.labsession") as session:
+        assert pages(report_pdf(session, now=NOW)) >= 1
+        session.update_setup({"laser": {"distance_mm": -3.0}})
+        assert pages(report_pdf(session, now=NOW)) >= 1
+
+
+def test_frames_without_a_surface_and_a_recording_that_is_gone_are_told(
+    session: Session, keep: Callable[..., None], tmp_path: Path
+):
+    for frame in range(3):
+        keep(frame, status="no-match", reason="<b> & 3 dots", **NOTHING)
+    (tmp_path / "frames").rename(tmp_path / "elsewhere")
+    story = Story()
+    told = Told.of(session, None, None)
+    tell_results(story, told)
+    tell_example(story, told)
+    assert story.tables[0][1] == ["no-match", "<b> & 3 dots", "3", "0–2"]
+    assert story.captions[-1].endswith("The frame itself cannot be read.")
+    assert pages(report_pdf(session, now=NOW)) >= 2
+
+
+def test_frames_can_be_chosen_and_must_be_there(session: Session, keep: Callable[..., None]):
+    keep(1)
+    assert [line.frame for line in data.frame_lines(session, "ers", [4, 1, 1])] == [1, 4]
+    assert lines_of(session)[1].status == "ok"
+    assert data.frame_lines(session, "fit", [1])[0].status == ""
+    with pytest.raises(InputError, match=r"frame: 6; expected frames of the session"):
+        report_pdf(session, frames=[6], now=NOW)
+
+
+def test_a_damaged_result_is_a_status_of_its_own(session: Session, keep: Callable[..., None]):
+    keep(0)
+    with session._database.transaction() as connection:
+        connection.execute("UPDATE detail SET content = x'00'")
+    assert lines_of(session)[0].status == "damaged"
+    assert pages(report_pdf(session, now=NOW)) >= 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<b>not bold</b> & <unclosed",
+        "Ω σ Ольга ąęł",
+        "long" * 400,
+        "word " * 4000,
+        "tab\tnew\nline\r\n\x00\x1b\ud800￾",
+        "焊接熔池 한국어 テスト 😀",
+        "]]> &amp; &#0; <para>",
+        "",
+    ],
+)
+def test_whatever_was_typed_comes_out(text: str, tmp_path: Path):
+    story = Story()
+    story.title(text or "untitled")
+    story.text(text)
+    story.listing([("notes", text), (text, "x")])
+    story.table(text, [["a", "b"], [text, text]], "lr", (0.5, 0.5))
+    assert pages(story.pdf(text, "footer", text.encode("utf-8", "replace").decode())) >= 1
+
+
+def test_markup_is_text_and_lines_stay_lines():
+    assert plain("a < b & c\n<i>") == "a &lt; b &amp; c<br/>&lt;i&gt;"
+
+
+def test_a_record_is_reported_by_its_title(tmp_path: Path):
+    record = Record(title="Bead on plate", operator="A. Weld", safety=(("goggles", "2026"),))
+    with Session.create(tmp_path / "x.labsession", record) as session:
+        once = report_pdf(session, now=NOW)
+        assert b"Bead on plate" in once
+        assert report_pdf(session, now=NOW + datetime.timedelta(days=1)) != once
