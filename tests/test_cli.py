@@ -11,7 +11,6 @@ import sys
 import textwrap
 import time
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -23,40 +22,17 @@ from labapp.core.pipeline import Measurement, Settings
 from labapp.errors import InputError
 from labapp.session import log, results, run
 from labapp.session.run import select_frames
+from tests.conftest import Run
 
 SAMPLE = Path(__file__).parents[1] / "sample_sessions" / "gtaw"
 SETUP = SAMPLE / "setup.toml"
-Run = Callable[..., tuple[int, str, str]]
+
+pytestmark = pytest.mark.usefixtures("state")
 
 
 def table(path: Path) -> list[dict[str, str]]:
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
-
-
-@pytest.fixture(autouse=True)
-def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep the log out of the home folder; start each test without its handler."""
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    logger = log.start_log()
-    for handler in list(logger.handlers):
-        handler.close()
-        logger.removeHandler(handler)
-    return tmp_path / "state"
-
-
-@pytest.fixture
-def labapp(capfd: pytest.CaptureFixture[str]) -> Run:
-    """Run the command line: (arguments) -> (exit code, stdout, stderr)."""
-
-    def start(*arguments: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            cli.main([str(argument) for argument in arguments])
-        out, err = capfd.readouterr()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, out, err
-
-    return start
 
 
 def answer(status: str = "no-dots") -> Measurement:
@@ -540,7 +516,7 @@ def test_help_tells_units(labapp: Run, command: str) -> None:
 
 
 def test_every_status_is_explained() -> None:
-    root = Path(cli.__file__).parent
+    root = Path(cli.__file__).parents[1]
     raised = {
         status
         for path in root.rglob("*.py")

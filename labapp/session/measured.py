@@ -228,6 +228,14 @@ class Results:
         )
         return tuple(scheme for (scheme,) in rows)
 
+    def counts(self) -> dict[tuple[str, str], int]:
+        """How many results there are: (scheme, version of labapp) → count."""
+        rows = self._database.rows(
+            "SELECT scheme, version, count(*) FROM result JOIN inputs ON inputs.id = result.inputs "
+            "GROUP BY scheme, version ORDER BY scheme, version"
+        )
+        return {(scheme, version): count for scheme, version, count in rows}
+
     def overview(self, scheme: str, basis: Basis | None, corrections: dict[int, str]) -> Overview:
         """All frames at a glance; see `get` for the parameters."""
         outdated = self._outdated(basis)

@@ -16,18 +16,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import labapp
+from labapp.cli import session
+from labapp.cli.shared import (
+    BAD_INPUT,
+    FAULT,
+    FRAMES_HELP,
+    FRAMES_METAVAR,
+    INTERRUPTED,
+    NOTHING,
+    failure,
+    note,
+    progress_bar,
+)
 from labapp.errors import InputError
 from labapp.session.log import log_file, start_log
 
 if TYPE_CHECKING:
-    from labapp.core.pipeline import Measurement, Settings
+    from labapp.core.pipeline import Settings
     from labapp.session.summary import Summary
-
-INTERRUPTED, FAULT, BAD_INPUT, NO_SURFACE = 130, 3, 2, 1
 
 IMPATIENT_S = 2.0
 """Ctrl-C again within this time does nothing: the first is being obeyed."""
@@ -41,11 +49,12 @@ app = typer.Typer(
     help="Measure the 3-D surface of a molten weld pool from a reflected laser dot matrix. "
     "Lengths are in mm, angles in degrees, places in an image in px (u right, v down, the "
     "centre of the first pixel is 0, 0), times in s.",
-    epilog="Exit codes: 0 done; 1 done, but nothing could be measured; 2 bad input or output; "
-    "3 a fault in labapp; 130 stopped by Ctrl-C.",
+    epilog="Exit codes: 0 done; 1 done, but nothing could be measured, or a session is not whole; "
+    "2 bad input or output; 3 a fault in labapp; 130 stopped by Ctrl-C.",
 )
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate the laser or the imaging plane.")
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(session.app, name="session")
 
 SetupToChange = Annotated[
     Path | None,
@@ -151,10 +160,7 @@ def reconstruct(
     ] = "auto",
     frames: Annotated[
         str,
-        typer.Option(
-            metavar="A:B:STEP",
-            help="Frames A to before B, counted from 0, every STEP-th; parts may be left out.",
-        ),
+        typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP),
     ] = ":",
     surfaces: Annotated[
         Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
@@ -173,7 +179,7 @@ def reconstruct(
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     summary = _run(source, setup, out, settings, frames, surfaces == "all")
     if not summary.statuses["ok"]:
-        raise typer.Exit(NO_SURFACE)
+        raise typer.Exit(NOTHING)
 
 
 def _run(
@@ -193,9 +199,9 @@ def _run(
 
     setup = read_setup(setup_path)
     summary = Summary()
-    with open_source(source_path) as source, _progress() as progress:
+    with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:
-            _note(progress.console, f"warning: {warning}")
+            note(progress.console, f"warning: {warning}")
         selected = select_frames(frames, len(source))
         task = progress.add_task(source.name, total=len(selected))
         origin = provenance(source, source_path, setup_path, setup, settings, selected)
@@ -208,35 +214,14 @@ def _run(
                     summary.add(frame, time_s, measurement)
                     progress.advance(task)
                     if measurement.status != "ok":
-                        _note(progress.console, _failure(frame, measurement))
+                        note(progress.console, failure(frame, measurement))
         except KeyboardInterrupt:
             done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
-            _note(progress.console, done)
+            note(progress.console, done)
             raise typer.Exit(INTERRUPTED) from None
     typer.echo(summary.text())
     typer.echo(f"Results are in {out.absolute()}")
     return summary
-
-
-def _failure(frame: int, measurement: Measurement) -> str:
-    return f"frame {frame}: {measurement.status}: {measurement.reason}"
-
-
-def _progress() -> Progress:
-    """A progress bar on stderr; nothing where stderr is not a terminal."""
-    console = Console(stderr=True)
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    )
-
-
-def _note(console: Console, text: str) -> None:
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -265,7 +250,7 @@ def detect(
     placed = 0 if lattice is None else int((lattice.row > 0).sum())
     typer.echo(f"{len(dots)} dots, {placed} with a row and a column, in {out.absolute()}")
     if not len(dots):
-        raise typer.Exit(NO_SURFACE)
+        raise typer.Exit(NOTHING)
 
 
 @calibrate.command("laser")
@@ -331,7 +316,7 @@ def calibrate_plane(
         found = core.calibrate_plane(picture, core.PlaneCalibrationSettings(unit_mm=unit_mm))
     except CannotMeasure as answer:
         typer.echo(f"{image}: {answer}", err=True)
-        raise typer.Exit(NO_SURFACE) from answer
+        raise typer.Exit(NOTHING) from answer
     points = {
         "origin_px": found.origin_px,
         "x_axis_px": found.x_axis_px,
@@ -380,4 +365,4 @@ def demo(
     for name, done in draw_pictures(recording, summary, out):
         typer.echo(f"  {name}" if done is None else f"  no {name}: {done}")
     if not summary.statuses["ok"]:
-        raise typer.Exit(NO_SURFACE)
+        raise typer.Exit(NOTHING)

@@ -1,0 +1,317 @@
+"""`labapp session correct`: dots and rows of a frame put right, and carried on from frame to frame.
+
+Each option is an edit of `labapp.core.correction`; they are applied in the order they are given in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from itertools import repeat
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from labapp.cli.shared import frames_text, measure_frames, several, told_effect
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.core.correction import Correction
+    from labapp.core.measures import Measures
+    from labapp.core.pipeline import Measurement
+    from labapp.session.session import Session
+
+NEAR_PX = 5.0
+"""A dot is meant by a place within this distance of it."""
+
+LABEL_LENGTH = 120
+
+FORMS = {
+    "dots": "TABLE.csv",
+    "delete": "U,V",
+    "add": "U,V",
+    "move": "U,V:DU,DV",
+    "place": "U,V:ROW,COLUMN",
+    "clear": "U,V",
+    "shift_row": "ROW:COLUMNS",
+    "split_row": "ROW:COLUMN",
+    "merge_rows": "ROW:INTO",
+    "block_row": "ROW",
+    "unblock_row": "ROW",
+    "reference": "ROW,COLUMN",
+    "automatic": "",
+}
+"""Every edit, and what it is given. U, V, DU and DV are px, the others are whole numbers."""
+
+
+class InOrder(TyperCommand):
+    """A command that keeps in which order its options were given: `context.meta["order"]`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line, once more than usual."""
+        _, _, order = self.make_parser(ctx).parse_args(args=list(args))
+        ctx.meta["order"] = [parameter.name for parameter in order]
+        return super().parse_args(ctx, args)
+
+
+def _edit(name: str, text: str) -> Any:
+    return typer.Option(f"--{name.replace('_', '-')}", metavar=FORMS[name], help=text)
+
+
+Dots = Annotated[
+    list[str] | None,
+    _edit("dots", "Dots, rows and columns are those of a table, as in dots.csv (px)."),
+]
+Delete = Annotated[list[str] | None, _edit("delete", "Take out the dot at U,V (px).")]
+Add = Annotated[list[str] | None, _edit("add", "Add the dot that is at U,V (px).")]
+Move = Annotated[list[str] | None, _edit("move", "Move the dot at U,V by DU,DV (px).")]
+Place = Annotated[list[str] | None, _edit("place", "Give the dot at U,V (px) a row and a column.")]
+Clear = Annotated[list[str] | None, _edit("clear", "The dot at U,V (px) has no row, no column.")]
+ShiftRow = Annotated[
+    list[str] | None, _edit("shift_row", "Shift a row by columns, to the right if positive.")
+]
+SplitRow = Annotated[
+    list[str] | None, _edit("split_row", "From COLUMN on, the row is one of its own, above it.")
+]
+MergeRows = Annotated[list[str] | None, _edit("merge_rows", "Dots of ROW go into row INTO.")]
+BlockRow = Annotated[list[str] | None, _edit("block_row", "The torch hides dots of this row.")]
+UnblockRow = Annotated[list[str] | None, _edit("unblock_row", "It hides none of this row.")]
+Reference = Annotated[
+    list[str] | None, _edit("reference", "Where the reference is, the absent centre dot.")
+]
+Automatic = Annotated[
+    bool, typer.Option("--automatic", help="Back to what was found; edits after it start there.")
+]
+
+
+def correct(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")],
+    *,
+    frame: Annotated[int, typer.Option(min=0, help="Which frame, its number in the recording.")],
+    dots: Dots = None,
+    delete: Delete = None,
+    add: Add = None,
+    move: Move = None,
+    place: Place = None,
+    clear: Clear = None,
+    shift_row: ShiftRow = None,
+    split_row: SplitRow = None,
+    merge_rows: MergeRows = None,
+    block_row: BlockRow = None,
+    unblock_row: UnblockRow = None,
+    reference: Reference = None,
+    automatic: Automatic = False,
+    carry_on: Annotated[
+        bool, typer.Option("--carry-on", help="Correct the following frames too, while it fits.")
+    ] = False,
+    measure: Annotated[bool, typer.Option(help="Measure the corrected frames.")] = True,
+) -> None:
+    """Put the dots and rows of a frame right, by edits applied in the order given.
+
+    Rows are counted from the bottom up, columns from left to right, both from 1.
+
+    A dot is named by its place in the frame: the nearest one within 5 px.
+
+    All edits together are one step: labapp session undo takes it back.
+    """
+    from labapp.session.session import Session
+
+    edits = _edits_in_order(context)
+    if not edits and not carry_on:
+        raise InputError("correct", "edits", "none", f"some of --{', --'.join(FORMS)}")
+    with Session.open(file) as session:
+        own = session.frames.tolist()
+        if frame not in own:
+            raise InputError("--frame", "frame", frame, f"what the session has: {frames_text(own)}")
+        kept = _edited(session, frame, edits)
+        corrections: dict[int, Correction | None] = {frame: kept}
+        if carry_on:
+            if kept is None:
+                wanted = "edits that leave a correction to be carried on"
+                raise InputError("--carry-on", "edits", "--automatic", wanted)
+            corrections |= _carried_on(session, frame, kept)
+        frames = list(corrections)
+        before = session.result(frame)
+        with nullcontext() if measure else told_effect(session):
+            session.correct(corrections, _label(frames, edits))
+            typer.echo(f"Corrected: {frames_text(frames)} (labapp session undo takes it back)")
+        if measure:
+            _measure(session, frames, None if before is None else before.measurement)
+
+
+def _edits_in_order(context: typer.Context) -> list[tuple[str, str]]:
+    """(name, value) of every edit, in the order they were given in."""
+    given: dict[str, Iterator[str]] = {
+        name: iter(values) if isinstance(values, list | tuple) else repeat("")
+        for name, values in context.params.items()
+        if name in FORMS and values
+    }
+    return [(name, next(given[name])) for name in context.meta["order"] if name in given]
+
+
+def _label(frames: list[int], edits: list[tuple[str, str]]) -> str:
+    """Name a change for the history."""
+    told = ", ".join(f"{name.replace('_', '-')} {value}".rstrip() for name, value in edits)
+    label = f"{frames_text(frames)}: {told or 'carried on'}"
+    return label if len(label) <= LABEL_LENGTH else f"{label[: LABEL_LENGTH - 1]}…"
+
+
+def _edited(session: Session, frame: int, edits: list[tuple[str, str]]) -> Correction | None:
+    """The frame's correction after the edits; None if they go back to automatic."""
+    again = [place for place, (name, _) in enumerate(edits) if name == "automatic"]
+    if again:
+        edits = edits[again[-1] + 1 :]
+        if not edits:
+            return None
+    correction = _start(session, frame, automatic=bool(again))
+    for name, value in edits:
+        try:
+            correction = _apply(session, frame, correction, name, value)
+        except ValueError as error:
+            option = f"--{name.replace('_', '-')}"
+            wanted = f"an edit that fits frame {frame}: {error}"
+            raise InputError(option, FORMS[name], value, wanted) from error
+    return correction
+
+
+def _start(session: Session, frame: int, *, automatic: bool) -> Correction:
+    """What the edits start from: the frame's correction, or what is found in it."""
+    from labapp.core.pipeline import measure, start_correction
+
+    corrected = session.correction(frame)
+    if corrected is not None and not automatic:
+        return corrected
+    result = session.result(frame)
+    if corrected is None and result is not None and not result.stale:
+        return start_correction(result.measurement)
+    image, setup = session.frame(frame).image, session.setup
+    return start_correction(measure(image, setup.rig, setup.calibration, session.settings))
+
+
+def _apply(
+    session: Session, frame: int, correction: Correction, name: str, value: str
+) -> Correction:
+    """Apply one edit; ValueError if it does not fit."""
+    from labapp.core import correction as core
+    from labapp.session.corrections_csv import read_correction
+
+    if name == "dots":
+        recording = session.recording
+        assert recording is not None
+        shape = recording.rows, recording.columns
+        return read_correction(value, frame, shape, correction)
+    numbers = _numbers(name, value)
+    if name == "add":
+        image, settings = session.frame(frame).image, session.settings.dots.band_pass
+        u, v = numbers
+        return core.add_dot(correction, image, u, v, settings)
+    if name in ("delete", "move", "place", "clear"):
+        of_dot: dict[str, Callable[..., Correction]] = {
+            "delete": core.delete_dots,
+            "move": core.move_dots,
+            "place": core.assign,
+            "clear": core.clear_rows,
+        }
+        u, v, *others = numbers
+        return of_dot[name](correction, [_dot_at(correction, u, v)], *others)
+    if name == "reference":
+        return core.set_reference(correction, (numbers[0], numbers[1]))
+    if name in ("block_row", "unblock_row"):
+        return core.block_row(correction, numbers[0], blocked=name == "block_row")
+    of_row: dict[str, Callable[..., Correction]] = {
+        "shift_row": core.shift_row,
+        "split_row": core.split_row,
+        "merge_rows": core.merge_rows,
+    }
+    return of_row[name](correction, *numbers)
+
+
+def _numbers(name: str, text: str) -> list[Any]:
+    """The numbers of an edit, of the form that `FORMS` gives it."""
+    form = FORMS[name]
+    if [c for c in text if c in ",:"] != [c for c in form if c in ",:"]:
+        raise ValueError(f"it is of the form {form}")
+    numbers: list[Any] = []
+    for what, part in zip(*(t.replace(":", ",").split(",") for t in (form, text)), strict=True):
+        in_px = what in ("U", "V", "DU", "DV")
+        try:
+            number = float(part) if in_px else int(part)
+        except ValueError:
+            wanted = "a number (px)" if in_px else "a whole number"
+            raise ValueError(f"{what} is {wanted}") from None
+        if not math.isfinite(number):
+            raise ValueError(f"{what} is a number (px)")
+        numbers.append(number)
+    return numbers
+
+
+def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
+    """The dot that a place means."""
+    import numpy as np
+
+    from labapp.core.correction import named
+
+    dots = correction.dots
+    if not len(dots):
+        raise ValueError("the frame has no dots; --add adds one")
+    away = np.hypot(dots.u_px - u_px, dots.v_px - v_px)
+    nearest = int(np.argmin(away))
+    if away[nearest] > NEAR_PX:
+        far = f"the nearest is {named(dots, nearest)}, {away[nearest]:.1f} px away"
+        raise ValueError(f"no dot is within {NEAR_PX:g} px; {far}")
+    return nearest
+
+
+def _carried_on(session: Session, frame: int, correction: Correction) -> dict[int, Correction]:
+    """Corrections of the frames after it, as far as it fits; says up to where."""
+    from labapp.core.detection import find_dots
+    from labapp.core.tracking import carry_on
+    from labapp.core.values import CannotMeasure
+
+    carried: dict[int, Correction] = {}
+    settings = session.settings.dots
+    stopped = "the last frame"
+    last: Correction | None = correction
+    for number in session.frames[session.frames > frame].tolist():
+        assert last is not None
+        try:
+            last = carry_on(last, find_dots(session.frame(number).image, settings))
+            why = "it no longer fits"
+        except (CannotMeasure, InputError) as answer:
+            last, why = None, str(answer)
+        if last is None:
+            stopped = f"before frame {number}: {why}"
+            break
+        carried[number] = last
+    replaced = [number for number in carried if session.correction(number) is not None]
+    if replaced:
+        typer.echo(f"It replaces earlier corrections of {frames_text(replaced)}")
+    typer.echo(f"Carried on over {several(len(carried), 'frame')}, up to {stopped}")
+    return carried
+
+
+def _measure(session: Session, frames: list[int], before: Measurement | None) -> None:
+    """Measure the corrected frames, and compare the first with what it gave before."""
+    summary = measure_frames(session, frames)
+    after = session.result(frames[0])
+    assert after is not None
+    known = "not measured" if before is None else before.status
+    typer.echo(f"frame {frames[0]}: {known} → {after.measurement.status}")
+    typer.echo(_compared(None if before is None else before.measures, after.measurement.measures))
+    if len(frames) > 1:
+        typer.echo(summary.text())
+
+
+def _compared(before: Measures | None, after: Measures | None) -> str:
+    from labapp.session.summary import TOLD
+
+    lines = []
+    for label, name in TOLD.items():
+        values = [getattr(measures, name, math.nan) for measures in (before, after)]
+        told = [f"{value:z8.4f}" if math.isfinite(value) else f"{'–':>8}" for value in values]
+        lines.append(f"  {label:7}{told[0]} → {told[1]} mm")
+    return "\n".join(lines)

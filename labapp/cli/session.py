@@ -1,0 +1,350 @@
+"""`labapp session …`: an experiment in one file, by the calls that a script makes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from labapp.cli.correct import InOrder, correct
+from labapp.cli.info import info
+from labapp.cli.shared import (
+    FRAMES_HELP,
+    FRAMES_METAVAR,
+    NOTHING,
+    choose_frames,
+    finite,
+    measure_frames,
+    progress_bar,
+    several,
+    told_effect,
+)
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.core.pipeline import Settings
+    from labapp.session.frames import Progress
+    from labapp.session.session import Session
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Keep an experiment in one file: set-up, recording, corrections, results.",
+)
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")]
+Frames = Annotated[str | None, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)]
+Quantity = Annotated[float | None, typer.Option(min=0, callback=finite)]
+
+
+@app.command()
+def new(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="The new session; its name ends in .labsession.")
+    ],
+    setup: Annotated[
+        Path | None, typer.Option(help="Setup file (TOML; mm, degrees, px) to take over.")
+    ] = None,
+    *,
+    title: str = "",
+    operator: str = "",
+    material: str = "",
+    thickness_mm: Quantity = None,
+    current_a: Quantity = None,
+    voltage_v: Quantity = None,
+    travel_speed_mm_s: Quantity = None,
+    gas: str = "",
+    notes: str = "",
+) -> None:
+    """Make a session, with the set-up and the experiment record as far as they are known."""
+    from labapp.session.record import Record
+    from labapp.session.session import Session
+    from labapp.session.setup import read_setup
+
+    text = None if setup is None else read_setup(setup).text
+    record = Record(
+        title=title,
+        operator=operator,
+        material=material,
+        thickness_mm=thickness_mm,
+        current_a=current_a,
+        voltage_v=voltage_v,
+        travel_speed_mm_s=travel_speed_mm_s,
+        gas=gas,
+        notes=notes,
+    )
+    with Session.create(file, None if record == Record() else record) as session:
+        if text is not None:
+            session.set_setup(text)
+        typer.echo(f"{session.path} is made")
+    if text is None:
+        typer.echo(f"It has no set-up yet:\n  labapp session setup {file} SETUP.toml")
+    typer.echo(f"Import a recording:\n  labapp session import {file} RECORDING")
+
+
+@app.command("setup")
+def set_setup(
+    file: File,
+    setup: Annotated[Path, typer.Argument(help="Setup file (TOML; mm, degrees, px).")],
+) -> None:
+    """Replace the set-up: rig and image calibration. It can be undone."""
+    from labapp.session.session import Session
+    from labapp.session.setup import read_setup
+
+    text = read_setup(setup).text
+    with Session.open(file) as session, told_effect(session):
+        same = session.setup_text == text
+        session.set_setup(text)
+        typer.echo("The set-up is the same as before" if same else f"The set-up is that of {setup}")
+
+
+@app.command("import")
+def import_recording(
+    file: File,
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="A video, an image, a folder of images, a TIFF or NumPy stack, a Phantom .cine, "
+            "a Photron .mraw or its header."
+        ),
+    ],
+    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
+    frame_rate: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            callback=finite,
+            help="Frames a second (Hz), where the recording does not say so or is wrong.",
+        ),
+    ] = None,
+    embed: Annotated[
+        bool, typer.Option("--embed", help="Keep the frames in the session itself, lossless.")
+    ] = False,
+) -> None:
+    """Take in a recording: read it through, check it, and say what was read."""
+    from labapp.session.session import Session
+
+    with Session.open(file) as session:
+        with _counted(f"reading {recording.name}") as progress:
+            found = session.import_recording(
+                recording, frames, frame_rate_hz=frame_rate, embed=embed, progress=progress
+            )
+        for warning in found.warnings:
+            typer.echo(f"warning: {warning}", err=True)
+        used = several(len(session.frames), "frame")
+        start, stop, step = found.selected
+        if found.frame_rate_hz is None:
+            time_base = "none: give --frame-rate, or the frames have no times"
+        else:
+            whose = "as given" if found.rate_is_given else "the recording's own"
+            time_base = f"{found.frame_rate_hz:g} frames/s, {whose}"
+        exact = "frame-exact" if found.frame_exact else INEXACT
+        typer.echo(f"{recording.name}: {found.description}")
+        typer.echo(
+            f"frames     {found.frames} in it, {used} in the session ({start}:{stop}:{step})"
+        )
+        typer.echo(f"time base  {time_base}")
+        typer.echo(f"at random  {exact}")
+        typer.echo(f"kept       {'in the session itself' if embed else f'as {found.path}'}")
+
+
+INEXACT = (
+    "not frame-exact: frames that come out wrong are refused; encode it anew, "
+    "as FFV1 or MJPG in AVI"
+)
+
+
+@app.command()
+def relink(
+    file: File, recording: Annotated[Path, typer.Argument(help="Where the recording is now.")]
+) -> None:
+    """Say where the recording is now. Only the one that was imported is taken."""
+    from labapp.session.session import Session
+
+    with Session.open(file) as session:
+        session.relink(recording)
+    typer.echo(f"{session.path} finds its recording at {recording}")
+
+
+@app.command()
+def measure(
+    file: File,
+    frames: Frames = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="All frames, also those whose measures stand.")
+    ] = False,
+    scheme: Annotated[
+        Literal["fit", "ers", "irs"] | None,
+        typer.Option(help="From now on: least-squares fit, ERS (ch. 7), IRS (ch. 6)."),
+    ] = None,
+    algorithm: Annotated[
+        Literal["opa", "epa-r", "epa-c", "epa-rc"] | None,
+        typer.Option(help="From now on: algorithm of IRS; the other schemes have none."),
+    ] = None,
+    correspondence: Annotated[
+        Literal["auto", "S/S", "S/I", "I/I"] | None,
+        typer.Option(help="From now on: order of columns/rows of dots to that of rays."),
+    ] = None,
+) -> None:
+    """Measure frames: those that are not measured yet or whose measures no longer stand.
+
+    Scheme, algorithm and correspondence are kept as settings of the session; that can be undone.
+
+    Ctrl-C stops after whole frames: what was finished is kept.
+    """
+    from labapp.session.session import Session
+
+    if everything and frames is not None:
+        raise InputError("--all", "frames", f"and --frames {frames}", "one of the two")
+    with Session.open(file) as session:
+        _ = session.setup  # what is missing in it is told before anything is changed
+        chosen = choose_frames(session, frames or ":")
+        options = {"scheme": scheme, "algorithm": algorithm, "correspondence": correspondence}
+        _set(session, {name: value for name, value in options.items() if value is not None})
+        if frames is None and not everything:
+            chosen = session.stale_frames().tolist()
+        if not chosen:
+            typer.echo("Nothing to measure: the measures of all frames stand (--all: once more)")
+            return
+        summary = measure_frames(session, chosen)
+    typer.echo(summary.text())
+    if not summary.statuses["ok"]:
+        raise typer.Exit(NOTHING)
+
+
+def _set(session: Session, options: dict[str, str]) -> None:
+    """Make options the session's settings, in one step of its history."""
+    settings: Settings = replace(session.settings, **options)  # type: ignore[arg-type]
+    if "algorithm" in options and settings.scheme != "irs":
+        wanted = "--scheme irs, which alone has it"
+        raise InputError("--algorithm", "algorithm", settings.algorithm, wanted)
+    if settings != session.settings:
+        told = ", ".join(f"{name} {value}" for name, value in options.items())
+        session.set_settings(settings, told)
+        typer.echo(f"Settings: {told} (labapp session undo takes it back)")
+
+
+app.command(cls=InOrder)(correct)
+
+
+@app.command()
+def undo(file: File) -> None:
+    """Take back the last change of set-up, calibration, settings, dots or rows."""
+    _step(file, "undo")
+
+
+@app.command()
+def redo(file: File) -> None:
+    """Make the change again that was taken back last."""
+    _step(file, "redo")
+
+
+@app.command()
+def export(
+    file: File,
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder for the results: new, empty, or an earlier export, replaced."),
+    ],
+    *,
+    frames: Frames = None,
+    scheme: Annotated[
+        Literal["fit", "ers", "irs-opa", "irs-epa-r", "irs-epa-c", "irs-epa-rc"] | None,
+        typer.Option(help="Whose results; without it, those of the session's settings."),
+    ] = None,
+    tables: Annotated[
+        bool, typer.Option(help="Measures, dots, points and boundaries as CSV (mm, px).")
+    ] = True,
+    surfaces: Annotated[
+        str, typer.Option(help="Some of csv,stl,stl-ascii,ply,vtp, or none (mm).")
+    ] = "csv,stl",
+    solid: Annotated[
+        bool, typer.Option("--solid", help="Each surface as a watertight body, too.")
+    ] = False,
+    hdf5: Annotated[bool, typer.Option("--hdf5", help="Everything in one HDF5 file.")] = False,
+    pictures: Annotated[
+        str, typer.Option(help="Some of frames,surfaces,trends, or none.")
+    ] = "none",
+    report: Annotated[bool, typer.Option("--report", help="A PDF report.")] = False,
+) -> None:
+    """Write results into a folder, which is whole or not there, with a manifest.
+
+    Results that no longer stand are refused: measure again first.
+    """
+    from labapp.session.export import ExportChoice
+    from labapp.session.session import Session
+    from labapp.session.tables import TABLES
+
+    choice = ExportChoice(
+        tables=frozenset(TABLES if tables else ()),
+        surfaces=_words(surfaces),
+        solid=solid,
+        hdf5=hdf5,
+        pictures=_words(pictures),
+    )
+    with Session.open(file, read_only=True) as session, progress_bar() as progress:
+        chosen = None if frames is None else choose_frames(session, frames)
+        task = progress.add_task(out.name, total=len(session.frames if chosen is None else chosen))
+        files = session.export(
+            out,
+            choice,
+            frames=chosen,
+            scheme=scheme,
+            report=report,
+            progress=lambda done: progress.update(task, completed=done),
+        )
+    typer.echo(f"{several(len(files), 'file')} and the manifest are in {out.absolute()}")
+
+
+def _words(text: str) -> frozenset[str]:
+    """Split ``a,b,c``; ``none`` stands for nothing."""
+    return frozenset() if text == "none" else frozenset(map(str.strip, text.split(",")))
+
+
+def _step(file: Path, way: Literal["undo", "redo"]) -> None:
+    from labapp.session.session import Session
+
+    with Session.open(file) as session, told_effect(session):
+        change = session.undo() if way == "undo" else session.redo()
+        done = "Undone" if way == "undo" else "Done again"
+        told = f"{done}: {change.label} (of {change.made})" if change else f"Nothing to {way}"
+        typer.echo(told)
+
+
+app.command()(info)
+
+
+@app.command()
+def verify(
+    file: File,
+    recording: Annotated[
+        bool, typer.Option(help="Read through the recording, or the frames kept, as well.")
+    ] = True,
+) -> None:
+    """Check the whole session: a problem a line, and exit code 1 if there is any."""
+    from labapp.session.session import Session
+
+    with Session.open(file, read_only=True) as session:
+        with _counted("checking") as progress:
+            problems = session.problems(progress, recording)
+        for problem in problems:
+            typer.echo(problem)
+        if problems:
+            raise typer.Exit(NOTHING)
+        results = sum(session.measured_by.values())
+        parts = ((len(session.frames), "frame"), (results, "result"))
+        told = [
+            several(count, thing) for count, thing in (*parts, (len(session.history), "change"))
+        ]
+        typer.echo(f"whole: {', '.join(told)}")
+
+
+@contextmanager
+def _counted(what: str) -> Iterator[Progress]:
+    """Show how far something is; yields what is to be called with done and total."""
+    with progress_bar() as progress:
+        task = progress.add_task(what, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -1,0 +1,149 @@
+"""What commands share: exit codes, the progress bar, what they tell of frames and results."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.core.pipeline import Measurement
+    from labapp.session.session import Session
+    from labapp.session.summary import Summary
+
+INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 130, 3, 2, 1
+"""Exit codes; 0 is done. `NOTHING`: done, but nothing was measured, or a session is not whole."""
+
+RUNS_SHOWN = 6
+
+FRAMES_METAVAR = "A:B:STEP"
+FRAMES_HELP = "Frames A to before B, counted from 0, every STEP-th; parts may be left out."
+
+
+def progress_bar() -> Progress:
+    """A progress bar on stderr; nothing where stderr is not a terminal."""
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+def note(console: Console, text: str) -> None:
+    """Tell something on stderr, above the progress bar."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def failure(frame: int, measurement: Measurement) -> str:
+    """Say of a frame that it gave nothing, and why."""
+    return f"frame {frame}: {measurement.status}: {measurement.reason}"
+
+
+def several(count: int, thing: str) -> str:
+    """A number of things: "1 frame", "2 frames"."""
+    return f"{count} {thing}{'s' * (count != 1)}"
+
+
+def frames_text(frames: Iterable[int]) -> str:
+    """Frames in short: "frames 0 to 3, 7"; "no frame"."""
+    runs: list[list[int]] = []
+    ordered = sorted(frames)
+    for frame in ordered:
+        if runs and frame == runs[-1][-1] + 1:
+            runs[-1] = [runs[-1][0], frame]
+        else:
+            runs.append([frame])
+    if not runs:
+        return "no frame"
+    told = [" to ".join(map(str, run)) for run in runs]
+    shown = ", ".join([*told[:RUNS_SHOWN], *(["…"] if len(told) > RUNS_SHOWN else [])])
+    return f"frame{'s' * (len(ordered) > 1)} {shown}"
+
+
+def finite(value: float | None) -> float | None:
+    """Refuse nan and inf as the value of an option."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a number")
+    return value
+
+
+def choose_frames(session: Session, text: str) -> list[int]:
+    """Choose frames of a session by ``A:B:STEP``, numbers in its recording.
+
+    Raises
+    ------
+    InputError
+        If it is not of that form, or the session has none of these.
+    """
+    from labapp.session.run import select_frames
+
+    recording = session.recording
+    if recording is None:
+        raise InputError(session.path, "recording", "none", "one: labapp session import")
+    asked, own = select_frames(text, recording.frames), session.frames.tolist()
+    chosen = [frame for frame in own if frame in asked]
+    if not chosen:
+        some = f"some of what the session has: {frames_text(own)}"
+        raise InputError("--frames", "frames", text, some)
+    return chosen
+
+
+def measure_frames(session: Session, frames: Sequence[int]) -> Summary:
+    """Measure frames of a session, showing progress and failures on stderr.
+
+    Ctrl-C ends the program; what was finished is kept.
+    """
+    from labapp.session.summary import Summary
+
+    summary = Summary()
+    with progress_bar() as progress:
+        task = progress.add_task(session.path.name, total=len(frames))
+        try:
+            for frame, measurement in session.measure(frames):
+                summary.add(frame, None, measurement)
+                progress.advance(task)
+                if measurement.status != "ok":
+                    note(progress.console, failure(frame, measurement))
+        except KeyboardInterrupt:
+            done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
+            note(progress.console, f"{done}; the others: labapp session measure {session.path}")
+            raise typer.Exit(INTERRUPTED) from None
+    return summary
+
+
+@contextmanager
+def told_effect(session: Session) -> Iterator[None]:
+    """Tell what a change does to results: which no longer stand, which stand again."""
+    before = _stale(session)
+    yield
+    after = _stale(session)
+    if fallen := after - before:
+        typer.echo(f"No longer standing: {_results(fallen)}; to measure again:")
+        typer.echo(f"  labapp session measure {session.path}")
+    if risen := before - after:
+        typer.echo(f"Standing again: {_results(risen)}")
+
+
+def _stale(session: Session) -> set[tuple[int, str]]:
+    """(frame, scheme) of every result that no longer stands."""
+    stale: set[tuple[int, str]] = set()
+    for scheme in {scheme for scheme, _ in session.measured_by}:
+        seen = session.overview(scheme)
+        stale.update((int(frame), scheme) for frame in seen.frame[seen.stale])
+    return stale
+
+
+def _results(results: Collection[tuple[int, str]]) -> str:
+    frames = {frame for frame, _ in results}
+    return f"{several(len(results), 'result')} ({frames_text(frames)})"

@@ -1,0 +1,822 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import labapp as package
+from labapp.core import pipeline
+from labapp.core.correction import Correction
+from labapp.core.detection import find_dots, find_lattice
+from labapp.core.measures import Measures
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.values import CannotMeasure
+from labapp.session import run
+from labapp.session.session import Session
+from tests.conftest import Run
+
+SAMPLE = Path(package.__file__).parents[1] / "sample_sessions" / "gtaw"
+SETUP = SAMPLE / "setup.toml"
+
+DARK = 5
+"""The frame of the recording with nothing in it."""
+
+
+def picture(shift_px: float) -> np.ndarray:
+    """Seven by seven dots 20 px apart without the one in the middle, shifted to the right."""
+    v, u = np.mgrid[:160, :200]
+    image = np.full(u.shape, 10.0)
+    for row in range(7):
+        for column in range(7):
+            if (row, column) != (3, 3):
+                away = (u - 30 - shift_px - 20 * column) ** 2 + (v - 20 - 20 * row) ** 2
+                image += 150 * np.exp(-away / 8)
+    return image.astype(np.uint8)
+
+
+def measure(
+    image: np.ndarray,
+    rig: object,
+    calibration: object,
+    settings: Settings,
+    correction: Correction | None = None,
+) -> Measurement:
+    """Find real dots and a surface of the height that row 2 has columns, or is blocked."""
+    try:
+        dots = find_dots(image, settings.dots)
+        lattice = find_lattice(dots, (image.shape[0], image.shape[1]), settings.lattice)
+    except CannotMeasure as answer:
+        return Measurement(answer.status, answer.reason, settings.scheme)
+    if correction is not None:
+        dots, lattice = correction.dots, correction.lattice
+    found = Measurement("ok", "", settings.scheme, dots, lattice, correction=correction)
+    if settings.scheme == "ers":
+        return replace(found, status="no-match", reason="for the test")
+    sizes = dict.fromkeys(Measures.__dataclass_fields__, 1.0)
+    height = float(len(dots) + 100 * len(lattice.blocked_rows))
+    return replace(found, measures=Measures(**{**sizes, "height_mm": height}))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "measure", measure)
+    monkeypatch.setattr(pipeline, "measure", measure)
+
+
+@pytest.fixture(scope="module")
+def imported_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording of six frames, the last of them dark, and a session of it."""
+    folder = tmp_path_factory.mktemp("cli_session")
+    frames = [picture(1.5 * k) for k in range(DARK)]
+    np.save(folder / "stack.npy", np.stack([*frames, np.full((160, 200), 10, np.uint8)]))
+    with Session.create(folder / "run.labsession") as session:
+        session.set_setup(SETUP.read_text("utf-8"))
+        session.import_recording(folder / "stack.npy", frame_rate_hz=100)
+    return folder
+
+
+@pytest.fixture
+def file(imported_once: Path, tmp_path: Path) -> Path:
+    """A session in which nothing was measured."""
+    folder = Path(shutil.copytree(imported_once, tmp_path / "run"))
+    return folder / "run.labsession"
+
+
+@pytest.fixture(scope="module")
+def measured_once(imported_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("measured") / "run"
+    shutil.copytree(imported_once, folder)
+    with (
+        pytest.MonkeyPatch.context() as patched,
+        Session.open(folder / "run.labsession") as session,
+    ):
+        patched.setattr(run, "measure", measure)
+        statuses = [measurement.status for _, measurement in session.measure()]
+    assert statuses == ["ok"] * DARK + ["no-dots"]
+    return folder
+
+
+@pytest.fixture
+def measured(measured_once: Path, tmp_path: Path) -> Path:
+    """A session in which all six frames were measured."""
+    return Path(shutil.copytree(measured_once, tmp_path / "measured")) / "run.labsession"
+
+
+def opened(file: Path) -> Session:
+    return Session.open(file, read_only=True)
+
+
+# --- new, setup, import, relink ---------------------------------------------------------------
+
+
+def test_a_new_session_keeps_setup_and_record(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "a.labsession"
+    noted = "--title T --operator O --material M --thickness-mm 2 --current-a 120 --gas Ar".split()
+    more = "--voltage-v 11.5 --travel-speed-mm-s 3 --notes N".split()
+    code, said, complained = labapp("session", "new", file, "--setup", SETUP, *noted, *more)
+    assert (code, complained) == (0, "")
+    assert said.startswith(f"{file} is made\n")
+    with opened(file) as session:
+        record = session.record
+        assert (record.title, record.operator, record.material, record.gas) == ("T", "O", "M", "Ar")
+        assert (record.thickness_mm, record.current_a, record.voltage_v) == (2, 120, 11.5)
+        assert (record.travel_speed_mm_s, record.notes) == (3, "N")
+        assert session.setup_text == SETUP.read_text("utf-8")
+
+
+def test_a_session_without_a_setup_says_how_to_go_on(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "a.labsession"
+    code, said, _ = labapp("session", "new", file)
+    assert code == 0
+    assert f"labapp session setup {file} SETUP.toml" in said
+    with opened(file) as session:
+        assert session.history == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("run.txt", [], "run.txt: name: run.txt; expected a name that ends in .labsession"),
+        ("there.labsession", [], "file: is there already; expected a new name, or open it"),
+        ("a.labsession", ["--setup", "none.toml"], "none.toml: file: No such file"),
+        ("a.labsession", ["--thickness-mm", "nan"], "--thickness-mm"),
+        ("a.labsession", ["--thickness-mm", "-1"], "--thickness-mm"),
+        ("a.labsession", ["--current-a", "x"], "--current-a"),
+    ],
+)
+def test_a_session_that_cannot_be_made_is_not(
+    labapp: Run, tmp_path: Path, name: str, options: list[str], said: str
+) -> None:
+    there = tmp_path / "there.labsession"
+    there.write_bytes(b"mine")
+    code, _, complained = labapp("session", "new", tmp_path / name, *options)
+    assert code == 2
+    assert said in complained
+    assert there.read_bytes() == b"mine"
+    assert not (tmp_path / "a.labsession").exists()
+
+
+def test_a_changed_setup_says_what_no_longer_stands(
+    labapp: Run, measured: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(SETUP.read_text().replace("distance_mm = 31.48", "distance_mm = 31.9"))
+    code, said, _ = labapp("session", "setup", measured, other)
+    assert code == 0
+    assert "No longer standing: 6 results (frames 0 to 5)" in said
+    assert f"labapp session measure {measured}" in said
+    code, said, _ = labapp("session", "undo", measured)
+    assert said.startswith("Undone: setup (of ")
+    assert "Standing again: 6 results (frames 0 to 5)" in said
+    _, said, _ = labapp("session", "setup", measured, SETUP)
+    assert said == "The set-up is the same as before\n"
+
+
+def test_a_wrong_setup_changes_nothing(labapp: Run, file: Path, tmp_path: Path) -> None:
+    (tmp_path / "wrong.toml").write_text(SETUP.read_text().replace("= 31.48", "= -31.48"))
+    code, _, complained = labapp("session", "setup", file, tmp_path / "wrong.toml")
+    assert code == 2
+    assert "laser.distance_mm: -31.48; expected a number above 0" in complained
+    with opened(file) as session:
+        assert session.setup_text == SETUP.read_text("utf-8")
+
+
+def test_import_says_what_was_read(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "a.labsession"
+    shutil.copy(SAMPLE / "recording.avi", tmp_path)
+    labapp("session", "new", file)
+    code, said, complained = labapp(
+        "session", "import", file, tmp_path / "recording.avi", "--frames", "0:10:3"
+    )
+    assert (code, complained) == (0, "")
+    lines = said.splitlines()
+    assert re.fullmatch(r"recording.avi: AVI, FFV1, 480×640 px, 8 bit grey.*", lines[0])
+    assert lines[1:] == [
+        "frames     30 in it, 4 frames in the session (0:10:3)",
+        "time base  60 frames/s, the recording's own",
+        "at random  frame-exact",
+        "kept       as recording.avi",
+    ]
+    with opened(file) as session:
+        assert session.frames.tolist() == [0, 3, 6, 9]
+
+
+def test_import_takes_a_rate_and_keeps_frames(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "a.labsession"
+    np.save(tmp_path / "s.npy", np.zeros((3, 8, 9), np.uint8))
+    labapp("session", "new", file)
+    _, said, _ = labapp("session", "import", file, tmp_path / "s.npy")
+    assert "time base  none: give --frame-rate, or the frames have no times" in said
+    options = ("--frame-rate", 500, "--embed")
+    code, said, _ = labapp("session", "import", file, tmp_path / "s.npy", *options)
+    assert code == 0
+    assert "time base  500 frames/s, as given" in said
+    assert "kept       in the session itself" in said
+    (tmp_path / "s.npy").unlink()
+    with opened(file) as session:
+        assert session.frame(2).time_s == pytest.approx(2 / 500)
+
+
+def test_warnings_of_a_recording_are_told(labapp: Run, tmp_path: Path) -> None:
+    content = (SAMPLE / "recording.avi").read_bytes()
+    (tmp_path / "v.avi").write_bytes(content[: len(content) // 2])
+    labapp("session", "new", tmp_path / "a.labsession")
+    code, _, complained = labapp("session", "import", tmp_path / "a.labsession", tmp_path / "v.avi")
+    assert code == 0
+    assert complained.startswith("warning: v.avi ends early")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["none.avi"], "none.avi: source: No such file or directory"),
+        (["stack.npy", "--frames", "9:"], "--frames: frames: 9:; expected some of the frames 0"),
+        (["stack.npy", "--frame-rate", "nan"], "--frame-rate"),
+        (["stack.npy", "--frame-rate", "0"], "frame rate: 0.0; expected frames a second above 0"),
+    ],
+)
+def test_an_import_that_fails_changes_nothing(
+    labapp: Run, file: Path, options: list[str], said: str
+) -> None:
+    before = file.read_bytes()
+    code, _, complained = labapp("session", "import", file, file.parent / options[0], *options[1:])
+    assert code == 2
+    assert said in complained
+    assert file.read_bytes() == before
+
+
+def test_a_recording_that_was_moved_is_found_again(labapp: Run, measured: Path) -> None:
+    moved = (measured.parent / "stack.npy").rename(measured.parent / "moved.npy")
+    code, _, complained = labapp("session", "measure", measured, "--all")
+    assert code == 2
+    assert "stack.npy: recording: is not there" in complained
+    _, said, _ = labapp("session", "info", measured)
+    assert "stack.npy is missing; labapp session relink says where it is now" in said
+    code, _, complained = labapp("session", "relink", measured, SAMPLE / "recording.avi")
+    assert code == 2
+    assert "content: another recording" in complained
+    code, said, _ = labapp("session", "relink", measured, moved)
+    assert (code, said) == (0, f"{measured} finds its recording at {moved}\n")
+    assert labapp("session", "measure", measured, "--all")[0] == 0
+
+
+# --- measure ----------------------------------------------------------------------------------
+
+
+def test_measure_takes_what_is_missing_or_stale(labapp: Run, file: Path) -> None:
+    code, said, _ = labapp("session", "measure", file, "--frames", "1:4:2")
+    assert code == 0
+    assert said.startswith("2 frames, 2 with a surface\n")
+    _, said, _ = labapp("session", "measure", file)
+    assert said.startswith("4 frames, 3 with a surface (1 no-dots)")
+    code, said, _ = labapp("session", "measure", file)
+    assert code == 0
+    assert said.startswith("Nothing to measure")
+    _, said, _ = labapp("session", "measure", file, "--all")
+    assert said.startswith("6 frames, 5 with a surface (1 no-dots)")
+
+
+def test_a_scheme_is_a_setting_that_can_be_undone(labapp: Run, measured: Path) -> None:
+    options = ("--scheme", "irs", "--algorithm", "epa-c", "--correspondence", "I/I")
+    code, said, _ = labapp("session", "measure", measured, "--frames", 2, *options)
+    assert code == 0
+    assert said.startswith("Settings: scheme irs, algorithm epa-c, correspondence I/I (labapp")
+    with opened(measured) as session:
+        assert session.settings == Settings("irs", "epa-c", "I/I")
+        assert session.measured_by == {
+            ("fit", package.__version__): 6,
+            ("irs-epa-c", package.__version__): 1,
+        }
+    _, said, _ = labapp("session", "undo", measured)
+    assert said.startswith("Undone: scheme irs, algorithm epa-c, correspondence I/I")
+    with opened(measured) as session:
+        assert session.settings == Settings()
+        assert not session.overview().stale.any()
+
+
+def test_a_run_without_a_surface_ends_with_1(labapp: Run, file: Path) -> None:
+    code, said, complained = labapp(
+        "session", "measure", file, "--frames", "0:2", "--scheme", "ers"
+    )
+    assert code == 1
+    assert complained.splitlines() == [f"frame {k}: no-match: for the test" for k in range(2)]
+    assert said.endswith("2 frames, 0 with a surface (2 no-match)\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--frames 7", "--frames: frames: 7; expected some of the frames 0 to 5"),
+        ("--frames x", "--frames: frames: x; expected A:B:STEP"),
+        ("--frames 1 --all", "--all: frames: and --frames 1; expected one of the two"),
+        ("--algorithm epa-r", "--algorithm: algorithm: epa-r; expected --scheme irs"),
+        ("--scheme best", "--scheme"),
+    ],
+)
+def test_what_cannot_be_measured_changes_nothing(
+    labapp: Run, file: Path, options: str, said: str
+) -> None:
+    before = file.read_bytes()
+    code, _, complained = labapp("session", "measure", file, *options.split())
+    assert code == 2
+    assert said in complained
+    assert file.read_bytes() == before
+
+
+def test_frames_are_those_that_were_imported(labapp: Run, file: Path) -> None:
+    labapp("session", "import", file, file.parent / "stack.npy", "--frames", "::2")
+    code, said, _ = labapp("session", "measure", file, "--frames", "1:3")
+    assert code == 0
+    assert said.startswith("1 frame, 1 with a surface")
+    code, _, complained = labapp("session", "measure", file, "--frames", "3")
+    assert code == 2
+    assert "expected some of what the session has: frames 0, 2, 4" in complained
+
+
+def test_what_a_session_lacks_is_told(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "a.labsession"
+    labapp("session", "new", file)
+    code, _, complained = labapp("session", "measure", file, "--scheme", "ers")
+    assert code == 2
+    assert f"{file}: laser: missing; expected a table [laser]" in complained
+    labapp("session", "setup", file, SETUP)
+    code, _, complained = labapp("session", "measure", file, "--scheme", "ers")
+    assert code == 2
+    assert "recording: none; expected one: labapp session import" in complained
+    with opened(file) as session:
+        assert session.settings == Settings()
+
+
+def test_ctrl_c_keeps_what_was_finished(
+    labapp: Run, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[object] = []
+
+    def pressed(*given: object) -> Measurement:
+        seen.append(given)
+        if len(seen) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+        return measure(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(run, "measure", pressed)
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code, said, complained = labapp("session", "measure", file)
+    finally:
+        signal.signal(signal.SIGINT, former)
+    assert (code, said) == (130, "")
+    assert complained == (
+        f"stopped: 2 of 6 frames are done and kept; the others: labapp session measure {file}\n"
+    )
+    with opened(file) as session:
+        assert session.stale_frames().tolist() == [2, 3, 4, 5]
+        assert session.problems() == []
+
+
+# --- correct ----------------------------------------------------------------------------------
+
+
+def test_edits_are_applied_in_the_order_given(labapp: Run, measured: Path) -> None:
+    correct = ("session", "correct", measured, "--frame", 1)
+    code, _, complained = labapp(*correct, "--merge-rows", "1:2", "--shift-row", "1:7")
+    assert code == 2
+    assert "--merge-rows: ROW:INTO: 1:2; expected an edit that fits frame 1: row 1" in complained
+    order = "--shift-row 1:7 --merge-rows 1:2 --shift-row 1:-1"
+    code, said, complained = labapp(*correct, *order.split())
+    assert (code, complained) == (0, "")
+    assert said.splitlines()[0] == "Corrected: frame 1 (labapp session undo takes it back)"
+    with opened(measured) as session:
+        correction = session.correction(1)
+        assert correction is not None
+        assert correction.lattice.row.tolist().count(1) == 14
+        (change,) = session.history[1:]
+        assert change.label == "frame 1: shift-row 1:7, merge-rows 1:2, shift-row 1:-1"
+
+
+def test_every_edit_reaches_the_frame(labapp: Run, measured: Path) -> None:
+    # The dot of row 1 (the lowest), column 1, is at (30, 140) px in frame 0.
+    edits = (
+        "--delete 31,141 --add 30.2,139.7 --place 30,140:1,1 --move 50,140:0.5,-0.25 "
+        "--clear 70,140 --split-row 7:4 --block-row 2 --block-row 3 --unblock-row 3 "
+        "--reference 4,4"
+    )
+    code, said, complained = labapp("session", "correct", measured, "--frame", 0, *edits.split())
+    assert (code, complained) == (0, "")
+    with opened(measured) as session:
+        correction = session.correction(0)
+    assert correction is not None
+    lattice, dots = correction.lattice, correction.dots
+    assert (len(dots), lattice.reference, lattice.blocked_rows) == (48, (4, 4), frozenset({2}))
+    assert (lattice.row[-1], lattice.column[-1]) == (1, 1)
+    np.testing.assert_allclose(dots.image_px[-1], [30, 140], atol=0.2)
+    moved = int(np.argmin(np.hypot(dots.u_px - 50.5, dots.v_px - 139.75)))
+    np.testing.assert_allclose(dots.image_px[moved], [50.5, 139.75], atol=0.2)
+    assert lattice.row[int(np.argmin(np.hypot(dots.u_px - 70, dots.v_px - 140)))] == 0
+    assert (lattice.row == 8).sum() == 4
+    assert said.splitlines()[1:] == [
+        "frame 0: ok → ok",
+        "  width    1.0000 →   1.0000 mm",
+        "  length   1.0000 →   1.0000 mm",
+        "  height  48.0000 → 148.0000 mm",
+        "  depth    1.0000 →   1.0000 mm",
+        "  ARE      1.0000 →   1.0000 mm",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ("--delete 40,130", "the nearest is dot"),
+        ("--delete 40", "--delete: U,V: 40; expected an edit that fits frame 0: it is of the form"),
+        ("--delete x,1", "U is a number (px)"),
+        ("--delete nan,1", "U is a number (px)"),
+        ("--move 30,140:1", "it is of the form U,V:DU,DV"),
+        ("--place 30,140:1.5,1", "ROW is a whole number"),
+        ("--place 30,140:1,2", "row 1, column 2 is the place of dot"),
+        ("--add 500,1", "(500, 1) px is not in the frame"),
+        ("--add 30,140", "is there already"),
+        ("--shift-row 40:1", "row 40 has no dots"),
+        ("--merge-rows 1:1", "cannot be merged with itself"),
+        ("--unblock-row 1", "row 1 is not marked as blocked"),
+        ("--reference 1", "it is of the form ROW,COLUMN"),
+        ("--dots none.csv", "none.csv: file: No such file"),
+        ("", "correct: edits: none; expected some of --dots, --delete"),
+        ("--automatic --carry-on", "--carry-on: edits: --automatic"),
+    ],
+)
+def test_an_edit_that_does_not_fit_changes_nothing(
+    labapp: Run, measured: Path, edit: str, said: str
+) -> None:
+    before = measured.read_bytes()
+    # What would fit, before it, is not done either.
+    fits = [] if "automatic" in edit or not edit else ["--block-row", "2"]
+    code, told, complained = labapp(
+        "session", "correct", measured, "--frame", 0, *fits, *edit.split()
+    )
+    assert (code, told) == (2, "")
+    assert said in complained
+    assert measured.read_bytes() == before
+
+
+def test_a_frame_that_is_not_there_cannot_be_corrected(labapp: Run, measured: Path) -> None:
+    code, _, complained = labapp("session", "correct", measured, "--frame", 6, "--block-row", 1)
+    assert code == 2
+    assert "--frame: frame: 6; expected what the session has: frames 0 to 5" in complained
+
+
+def test_a_correction_goes_back_to_automatic(labapp: Run, measured: Path) -> None:
+    correct = ("session", "correct", measured, "--frame", 0)
+    labapp(*correct, "--delete", "30,140", "--block-row", 2)
+    # Edits after it start from what is found, those before it are void.
+    labapp(*correct, "--block-row", 7, "--automatic", "--block-row", 3)
+    with opened(measured) as session:
+        correction = session.correction(0)
+        assert correction is not None
+        assert (len(correction.dots), correction.lattice.blocked_rows) == (48, frozenset({3}))
+    code, said, _ = labapp(*correct, "--automatic", "--no-measure")
+    assert code == 0
+    assert "No longer standing: 1 result (frame 0)" in said
+    with opened(measured) as session:
+        assert session.correction(0) is None
+        assert len(session.history) == 4
+
+
+def test_a_correction_starts_from_what_stands(labapp: Run, measured: Path) -> None:
+    """An undone correction does not come back by way of the result measured with it."""
+    correct = ("session", "correct", measured, "--frame", 0)
+    labapp(*correct, "--delete", "30,140")
+    labapp("session", "undo", measured)
+    labapp(*correct, "--block-row", 2)
+    with opened(measured) as session:
+        correction = session.correction(0)
+        assert correction is not None
+        assert len(correction.dots) == 48
+
+
+def test_a_correction_needs_no_measuring_before(labapp: Run, file: Path) -> None:
+    code, said, _ = labapp("session", "correct", file, "--frame", 3, "--block-row", 2)
+    assert code == 0
+    assert "frame 3: not measured → ok" in said
+    assert "  height        – → 148.0000 mm" in said
+
+
+def test_a_correction_is_carried_on_while_it_fits(labapp: Run, measured: Path) -> None:
+    labapp("session", "correct", measured, "--frame", 3, "--block-row", 5, "--no-measure")
+    code, said, complained = labapp(
+        "session", "correct", measured, "--frame", 1, "--block-row", 2, "--carry-on"
+    )
+    assert code == 0, complained
+    assert "It replaces earlier corrections of frame 3\n" in said
+    assert "Carried on over 3 frames, up to before frame 5: no-dots" in said
+    assert "Corrected: frames 1 to 4 (" in said
+    assert "4 frames, 4 with a surface" in said
+    with opened(measured) as session:
+        overview = session.overview()
+        assert overview.corrected.tolist() == [False, True, True, True, True, False]
+        assert not overview.stale.any()
+        assert overview.measures["height_mm"][:5].tolist() == [48, 148, 148, 148, 148]
+        carried = session.correction(4)
+        assert carried is not None
+        assert carried.lattice.blocked_rows == frozenset({2})
+        assert len(session.history) == 3
+    # All of it is one step.
+    labapp("session", "undo", measured)
+    with opened(measured) as session:
+        assert session.overview().corrected.tolist() == [False] * 3 + [True] + [False] * 2
+
+
+def test_a_correction_alone_can_be_carried_on(labapp: Run, measured: Path) -> None:
+    labapp("session", "correct", measured, "--frame", 3, "--block-row", 5)
+    code, said, _ = labapp("session", "correct", measured, "--frame", 3, "--carry-on")
+    assert code == 0
+    assert "Corrected: frames 3 to 4 (" in said
+
+
+def table_of(file: Path, frame: int) -> list[dict[str, str]]:
+    with opened(file) as session:
+        result = session.result(frame)
+    assert result is not None
+    dots, lattice = result.measurement.dots, result.measurement.lattice
+    assert dots is not None
+    assert lattice is not None
+    return [
+        {
+            "frame": str(frame),
+            "u_px": f"{dots.u_px[k]:.4f}",
+            "v_px": f"{dots.v_px[k]:.4f}",
+            "reflected_row": str(lattice.row[k] or ""),
+            "reflected_column": str(lattice.column[k] or ""),
+            "blocked": "0",
+        }
+        for k in range(len(dots))
+    ]
+
+
+def test_dots_come_from_a_table(labapp: Run, measured: Path, tmp_path: Path) -> None:
+    rows = table_of(measured, 0) + table_of(measured, 2)
+    for row in rows:
+        row["blocked"] = str(int(row["frame"] == "2" and row["reflected_row"] == "2"))
+    with (tmp_path / "dots.csv").open("w", newline="") as stream:
+        writer = csv.DictWriter(stream, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    code, said, complained = labapp(
+        *("session", "correct", measured, "--frame", 2, "--dots", tmp_path / "dots.csv"),
+        *("--delete", "33,140"),
+    )
+    assert (code, complained) == (0, "")
+    assert "  height  48.0000 → 147.0000 mm" in said
+    with opened(measured) as session:
+        correction = session.correction(2)
+        assert correction is not None
+        assert correction.lattice.blocked_rows == frozenset({2})
+        assert not correction.manual.any()
+
+
+# --- undo, redo -------------------------------------------------------------------------------
+
+
+def test_undo_and_redo_say_what_they_do(labapp: Run, measured: Path) -> None:
+    labapp("session", "correct", measured, "--frame", 1, "--block-row", 2)
+    code, said, _ = labapp("session", "undo", measured)
+    assert code == 0
+    assert said.startswith("Undone: frame 1: block-row 2 (of 2")
+    assert "No longer standing: 1 result (frame 1)" in said
+    code, said, _ = labapp("session", "redo", measured)
+    assert said.startswith("Done again: frame 1: block-row 2 (of 2")
+    assert "Standing again: 1 result (frame 1)" in said
+    assert labapp("session", "redo", measured)[:2] == (0, "Nothing to redo\n")
+    labapp("session", "undo", measured)
+    labapp("session", "undo", measured)
+    assert labapp("session", "undo", measured)[:2] == (0, "Nothing to undo\n")
+
+
+# --- export -----------------------------------------------------------------------------------
+
+
+def test_results_are_exported(labapp: Run, measured: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    before = measured.read_bytes()
+    code, said, complained = labapp("session", "export", measured, "--out", out)
+    assert (code, complained) == (0, "")
+    assert said == f"4 files and the manifest are in {out}\n"
+    with (out / "measures.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row["status"] for row in rows] == ["ok"] * DARK + ["no-dots"]
+    assert rows[3]["time_s"] == "0.030000"
+    code, _, _ = labapp(
+        *("session", "export", measured, "--out", out, "--frames", "::2", "--no-tables"),
+        *("--surfaces", "none", "--hdf5", "--pictures", "frames,trends"),
+    )
+    assert code == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        *(f"frame_{k:06d}.png" for k in (0, 2, 4)),
+        *("manifest.json", "results.h5", "trends.png"),
+    ]
+    nothing = ("--frames", DARK, "--no-tables", "--surfaces", "none")
+    code, said, _ = labapp("session", "export", measured, "--out", out, *nothing, "--report")
+    assert (code, said) == (0, f"1 file and the manifest are in {out}\n")
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert measured.read_bytes() == before
+
+
+def test_an_exported_table_comes_back_as_a_correction(
+    labapp: Run, measured: Path, tmp_path: Path
+) -> None:
+    labapp("session", "export", measured, "--out", tmp_path / "out", "--surfaces", "none")
+    code, _, complained = labapp(
+        *("session", "correct", measured, "--frame", 1),
+        *("--dots", tmp_path / "out" / "dots.csv", "--no-measure"),
+    )
+    assert (code, complained) == (0, "")
+    with opened(measured) as session:
+        correction, result = session.correction(1), session.result(1)
+    assert correction is not None
+    assert result is not None
+    assert result.measurement.dots is not None
+    np.testing.assert_array_equal(correction.dots.u_px, result.measurement.dots.u_px)
+    assert not correction.manual.any()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--surfaces obj", "export: surfaces: obj; expected some of csv, stl"),
+        ("--pictures all", "export: pictures: all; expected some of frames, surfaces, trends"),
+        ("--surfaces csv --solid", "export: solid: no mesh format; expected one of stl"),
+        ("--scheme ers", "results: none by ers; expected frames to be measured"),
+        ("--scheme irs", "--scheme"),
+        ("--frames 6", "--frames: frames: 6; expected some of the frames 0 to 5"),
+    ],
+)
+def test_what_cannot_be_exported_leaves_no_folder(
+    labapp: Run, measured: Path, tmp_path: Path, options: str, said: str
+) -> None:
+    out = tmp_path / "out"
+    code, _, complained = labapp("session", "export", measured, "--out", out, *options.split())
+    assert code == 2
+    assert said in complained
+    assert not out.exists()
+
+
+def test_stale_results_are_not_exported(labapp: Run, measured: Path, tmp_path: Path) -> None:
+    labapp("session", "correct", measured, "--frame", 1, "--block-row", 2, "--no-measure")
+    export = ("session", "export", measured, "--out", tmp_path / "out")
+    code, _, complained = labapp(*export)
+    assert code == 2
+    assert "1 of 6 frames no longer stand: the dots or rows were corrected" in complained
+    assert labapp(*export, "--frames", "2:")[0] == 0
+
+
+def test_somebodys_own_files_stay(labapp: Run, measured: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "measures.csv").write_text("mine")
+    code, _, complained = labapp("session", "export", measured, "--out", tmp_path / "out")
+    assert code == 2
+    assert "folder: holds measures.csv and no manifest.json; expected" in complained
+    assert (tmp_path / "out" / "measures.csv").read_text() == "mine"
+
+
+# --- info, verify -----------------------------------------------------------------------------
+
+
+def test_info_tells_how_far_a_session_is(labapp: Run, measured: Path) -> None:
+    labapp("session", "correct", measured, "--frame", 1, "--block-row", 2, "--no-measure")
+    code, said, complained = labapp("session", "info", measured, "--history")
+    assert (code, complained) == (0, "")
+    lines = said.splitlines()
+    assert lines[0].startswith(f"session    {measured} (0.")
+    assert lines[1] == "record     empty"
+    assert lines[2].startswith("recording  stack.npy: ")
+    assert lines[3] == "           6 frames, of which 0:6:1; 100 frames/s; frame-exact"
+    assert "set-up     complete" in lines
+    assert "settings   all as usual" in lines
+    assert "frames     6: 5 ok, 1 no-dots (fit)" in lines
+    assert "corrected  frame 1" in lines
+    assert "stale      frame 1" in lines
+    assert f"results    6 fit by labapp {package.__version__}" in lines
+    assert "changes    2 to undo, 0 to redo" in lines
+    assert lines[-1].endswith("  frame 1: block-row 2")
+
+
+def test_info_for_programs_is_json(labapp: Run, measured: Path) -> None:
+    labapp("session", "measure", measured, "--scheme", "irs", "--frames", "1")
+    labapp("session", "undo", measured)
+    code, said, _ = labapp("session", "info", measured, "--json", "--history")
+    assert code == 0
+    told = json.loads(said)
+    assert told["size_bytes"] == measured.stat().st_size
+    assert (told["scheme"], told["statuses"]) == ("fit", {"ok": 5, "no-dots": 1})
+    assert (told["setup_lacks"], told["stale"], told["corrected"]) == ([], [], [])
+    assert [(r["scheme"], r["count"]) for r in told["results"]] == [("fit", 6), ("irs-opa", 1)]
+    assert told["recording"]["frame_rate_hz"] == 100
+    assert told["recording"]["missing"] is None
+    assert [(c["label"], c["undone"]) for c in told["history"]] == [
+        ("setup", False),
+        ("scheme irs", True),
+    ]
+
+
+def test_info_tells_what_is_missing_and_what_is_not_as_usual(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "a.labsession"
+    labapp("session", "new", file, "--operator", "A. Weld")
+    with Session.open(file) as session:
+        session.calibrate_laser([13.675], [18.561], [7.874])
+        session.calibrate_plane(SAMPLE / "calibration.png", 6.35)
+        fit = replace(Settings().fit, knot_mm=0.8)
+        session.set_settings(Settings(correspondence="S/S", fit=fit))
+        code, said, _ = labapp("session", "info", file)  # while it is open here
+    assert code == 0
+    assert "record     operator A. Weld" in said
+    assert "recording  none imported yet" in said
+    assert "set-up     pattern: missing; expected a table [pattern] with rows" in said
+    assert re.search(r"laser +(30\.0|29\.9)\d+ ± .* degrees, (90\.0|89\.9)\d+ ± .* mm", said)
+    assert re.search(r"plane +5\.6\d+ px/mm along X′, 5\.6\d+ px/mm along Z′", said)
+    assert "settings   correspondence S/S, fit.knot_mm 0.8" in said
+    assert "frames     0: none (fit)" in said
+
+
+def test_a_whole_session_is_told_so(labapp: Run, measured: Path) -> None:
+    before = measured.read_bytes()
+    assert labapp("session", "verify", measured) == (
+        0,
+        "whole: 6 frames, 6 results, 1 change\n",
+        "",
+    )
+    assert measured.read_bytes() == before
+
+
+def test_problems_are_told_a_line_each(labapp: Run, measured: Path) -> None:
+    with Session.open(measured) as session, session._database.transaction() as connection:
+        connection.execute("UPDATE result SET height_mm = 7 WHERE frame IN (1, 2)")
+    (measured.parent / "stack.npy").unlink()
+    code, said, _ = labapp("session", "verify", measured)
+    assert code == 1
+    assert len(said.splitlines()) == 3
+    assert "stack.npy" in said
+    code, said, _ = labapp("session", "verify", measured, "--no-recording")
+    assert code == 1
+    assert said.splitlines() == [
+        f"result of frame {k} (fit) is not what its frame gave" for k in (1, 2)
+    ]
+
+
+# --- any session ------------------------------------------------------------------------------
+
+COMMANDS = {
+    "setup": [SETUP],
+    "import": [SAMPLE / "recording.avi"],
+    "relink": [SAMPLE / "recording.avi"],
+    "measure": [],
+    "correct": ["--frame", "0", "--block-row", "1"],
+    "undo": [],
+    "redo": [],
+    "export": ["--out", "no_export"],
+    "info": [],
+    "verify": [],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("content", [None, b"", b"SQLite format 3\0" + bytes(500), b"text" * 99])
+def test_what_is_no_session_is_refused_in_a_line(
+    labapp: Run, tmp_path: Path, command: str, content: bytes | None
+) -> None:
+    file = tmp_path / "a.labsession"
+    if content is not None:
+        file.write_bytes(content)
+    code, said, complained = labapp("session", command, file, *COMMANDS[command])
+    assert (code, said) == (2, "")
+    assert complained.startswith(f"labapp: {file}: ")
+    assert complained.count("\n") == 1
+    assert (file.read_bytes() if file.exists() else None) == content
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_only_one_program_writes(
+    labapp: Run, measured: Path, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(measured.parent)
+    with Session.open(measured):
+        code, _, complained = labapp("session", command, measured, *COMMANDS[command])
+    if command in ("export", "info", "verify"):
+        assert (code, complained) == (0, "")
+    else:
+        assert code == 2
+        assert "read-only" in complained
+
+
+@pytest.mark.parametrize("command", ["", "new", *COMMANDS])
+def test_help_tells_units(labapp: Run, command: str) -> None:
+    code, said, _ = labapp("session", *command.split(), "--help")
+    assert code == 0
+    if command in ("new", "import", "correct", "export"):
+        assert re.search(r"mm|px|Hz", said)
