@@ -125,7 +125,7 @@ def write_trend_picture(
         plot.plot(axis, values, "o-", markersize=3, linewidth=1)
         known = values[np.isfinite(values)]
         if len(known) > 1:
-            spread = f"mean {known.mean():.4f}, standard deviation {known.std(ddof=1):.4f} mm"
+            spread = f"mean {known.mean():.4f}, standard deviation {known.std():.4f} mm"
             plot.set_title(spread, fontsize="small", loc="right")
         plot.set_ylabel(f"{name} (mm)")
         plot.grid(alpha=0.3)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -30,6 +30,7 @@ from labapp.media import Frame, GreyImage, open_source
 from labapp.session.blobs import fingerprint
 from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Change, Documents, Key
+from labapp.session.export import ExportChoice, ExportedFile
 from labapp.session.frames import Frames, Progress
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
@@ -380,21 +381,76 @@ class Session:
             self._documents.fingerprints("correction"),
         )
 
+    def corrected_frames(self) -> IntArray:
+        """Frames with a correction by hand, ascending, shape (n,)."""
+        return np.array(sorted(self._documents.fingerprints("correction")), np.int64)
+
     def stale_frames(self) -> IntArray:
         """Frames that are not measured, or whose measures no longer stand, shape (n,)."""
         seen = self.overview()
         missing = np.array([status == "" for status in seen.status], bool)
         return np.asarray(seen.frame[seen.stale | missing], np.int64)
 
-    def problems(self, progress: Progress | None = None) -> list[str]:
-        """Check the whole session, its recording included: what is wrong, a sentence each."""
+    def export(
+        self,
+        folder: str | os.PathLike[str],
+        choice: ExportChoice | None = None,
+        *,
+        frames: Sequence[int] | None = None,
+        scheme: str | None = None,
+        report: bool = False,
+        progress: Callable[[int], None] | None = None,
+    ) -> tuple[ExportedFile, ...]:
+        """Write results into a folder: all of them, or nothing and what was there stays.
+
+        Parameters
+        ----------
+        folder
+            A new or empty folder, or an earlier export, which is replaced.
+        choice
+            What to write; None: the tables and surfaces that `labapp reconstruct` writes.
+        frames
+            Which of the measured frames; None: all.
+        scheme
+            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+        report
+            Whether to add ``report.pdf``.
+        progress
+            Called with the number of frames done; may raise to stop.
+
+        Raises
+        ------
+        InputError
+            If a result no longer stands, nothing was measured, or the folder cannot be written.
+        """
+        from labapp.session.outgoing import export_session  # which reports on a `Session`
+
+        return export_session(
+            self, folder, choice or ExportChoice(), frames, scheme, report, progress
+        )
+
+    @property
+    def measured_by(self) -> dict[tuple[str, str], int]:
+        """How many results there are: (scheme, version of labapp) → count."""
+        return self._results.counts()
+
+    def problems(self, progress: Progress | None = None, recording: bool = True) -> list[str]:
+        """Check the whole session: what is wrong, a sentence each.
+
+        Parameters
+        ----------
+        progress
+            Called with frames done and frames in all.
+        recording
+            Whether to read through the recording, or the frames kept in the session, too.
+        """
         found = self._database.problems()
         if found:
             return found
         return [
             *self._documents.problems(),
             *self._pictures_problems(),
-            *self._frames.problems(progress),
+            *(self._frames.problems(progress) if recording else ()),
             *self._results.problems(),
         ]
 

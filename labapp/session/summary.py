@@ -58,7 +58,7 @@ class Summary:
         for label, name in TOLD.items():
             values = self._finite(name)
             if len(values) > 1:
-                spread = f"± {np.std(values, ddof=1):.4f} mm (mean, standard deviation)"
+                spread = f"± {np.std(values):.4f} mm (mean, standard deviation)"
                 lines.append(f"{label:7}{np.mean(values):z8.4f} {spread}")
             elif len(values):
                 sigma = self._finite(name.replace("_mm", "_sigma_mm"))

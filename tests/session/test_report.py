@@ -20,15 +20,13 @@ from labapp.core.pipeline import Measurement, Settings
 from labapp.core.plane_calibration import PlaneCalibration
 from labapp.core.rig import Laser
 from labapp.errors import InputError
-from labapp.session import report_data as data
-from labapp.session import report_figures, report_layout
 from labapp.session.error_budget import SIZES, Contribution, calibration_budget, together
 from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
-from labapp.session.report import report_pdf
-from labapp.session.report_data import FrameLine, Told
-from labapp.session.report_layout import Story, plain
-from labapp.session.report_results import tell_corrections, tell_example, tell_results
+from labapp.session.report import data, figures, layout, report_pdf
+from labapp.session.report.data import FrameLine, Told
+from labapp.session.report.layout import Story, plain
+from labapp.session.report.results import tell_corrections, tell_example, tell_results
 from labapp.session.session import Session
 from labapp.session.setup import Setup, parse_setup
 from labapp.simulation.forward import exact_match, trace
@@ -44,7 +42,7 @@ NOW = datetime.datetime(2026, 11, 21, 4, 0)
 @pytest.fixture(autouse=True)
 def coarse_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Most of a report's time goes into pixels."""
-    for module in (report_figures, report_layout):
+    for module in (figures, layout):
         monkeypatch.setattr(module, "DPI", 40)
 
 

@@ -12,12 +12,11 @@ import scipy
 
 import labapp
 from labapp.errors import InputError
-from labapp.session import report_data as data
-from labapp.session import report_figures as figures
 from labapp.session.error_budget import laser_in_use, plane_in_use
-from labapp.session.report_data import Told, number, with_unit
-from labapp.session.report_layout import Story
-from labapp.session.report_results import (
+from labapp.session.report import data, figures
+from labapp.session.report.data import Told, number, with_unit
+from labapp.session.report.layout import Story
+from labapp.session.report.results import (
     tell_budget,
     tell_corrections,
     tell_example,

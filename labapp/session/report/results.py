@@ -9,11 +9,10 @@ import numpy as np
 from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.session import report_data as data
-from labapp.session import report_figures as figures
 from labapp.session.error_budget import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX, calibration_budget
-from labapp.session.report_data import FrameLine, Told
-from labapp.session.report_layout import Story
+from labapp.session.report import data, figures
+from labapp.session.report.data import FrameLine, Told
+from labapp.session.report.layout import Story
 from labapp.session.setup import parse_setup
 
 LATEST_CHANGES = 40

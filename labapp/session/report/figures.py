@@ -21,7 +21,7 @@ from labapp.core.plane_calibration import PlaneCalibration
 from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.media import GreyImage
-from labapp.session.report_layout import DPI
+from labapp.session.report.layout import DPI
 
 INCHES = 6.7
 """Width of a page's text."""

@@ -18,7 +18,7 @@ from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.session.error_budget import SIZES, Contribution, together
 from labapp.session.measured import scheme_name
-from labapp.session.report_layout import Cells
+from labapp.session.report.layout import Cells
 from labapp.session.session import Session
 from labapp.session.setup import Setup
 

@@ -1,0 +1,87 @@
+"""From a session to an export: which results go out, and what is told of where they come from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from labapp.errors import InputError
+from labapp.session.export import ExportChoice, ExportedFile, export
+from labapp.session.measured import Result, scheme_name
+from labapp.session.report import report_pdf
+from labapp.session.session import Session
+
+
+def export_session(
+    session: Session,
+    folder: str | os.PathLike[str],
+    choice: ExportChoice,
+    frames: Sequence[int] | None,
+    scheme: str | None,
+    report: bool,
+    progress: Callable[[int], None] | None,
+) -> tuple[ExportedFile, ...]:
+    """Write a session's results into a folder; see `Session.export`."""
+    scheme = scheme or scheme_name(session.settings)
+    numbers = _standing(session, scheme, frames)
+    times_s = dict(zip(session.frames.tolist(), session.overview(scheme).time_s, strict=True))
+    extras = {"report.pdf": report_pdf(session, scheme, numbers)} if report else {}
+    measured = (
+        (number, times_s[number], _result(session, number, scheme).measurement)
+        for number in numbers
+    )
+    return export(
+        folder,
+        measured,
+        session.setup.calibration,
+        _provenance(session, scheme, numbers),
+        choice,
+        image_of=lambda number: session.frame(number).image,
+        extras=extras,
+        progress=progress,
+    )
+
+
+def _standing(session: Session, scheme: str, frames: Sequence[int] | None) -> list[int]:
+    """Frames whose results go out: those measured, or some of them; all must stand."""
+    seen = session.overview(scheme)
+    chosen = np.array([status != "" for status in seen.status], bool)
+    if frames is not None:
+        chosen &= np.isin(seen.frame, frames)
+    stale = seen.frame[chosen & seen.stale]
+    if len(stale):
+        why = ", ".join(_result(session, int(stale[0]), scheme).stale)
+        raise InputError(
+            session.path,
+            "results",
+            f"{len(stale)} of {chosen.sum()} frames no longer stand: {why}",
+            "them to be measured again, or the change undone",
+        )
+    if not chosen.any():
+        raise InputError(session.path, "results", f"none by {scheme}", "frames to be measured")
+    return [int(number) for number in seen.frame[chosen]]
+
+
+def _result(session: Session, frame: int, scheme: str) -> Result:
+    result = session.result(frame, scheme)
+    assert result is not None
+    return result
+
+
+def _provenance(session: Session, scheme: str, frames: Sequence[int]) -> dict[str, object]:
+    """What an export tells of source, setup, settings and versions; plain values."""
+    recording, first = session.recording, _result(session, frames[0], scheme)
+    source = {} if recording is None else asdict(recording)
+    source.pop("index", None)
+    return {
+        "session": session.path.name,
+        "record": asdict(session.record),
+        "source": source,
+        "setup": {"toml": first.setup},
+        "settings": asdict(first.settings),
+        "measured_by": sorted({version for name, version in session.measured_by if name == scheme}),
+        "corrected_frames": sorted(set(session.corrected_frames().tolist()) & set(frames)),
+    }
