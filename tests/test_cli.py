@@ -396,8 +396,12 @@ def test_the_demo_measures_the_sample_run(
     code, said, complained = labapp("demo")
     assert code == 1  # the measurement is replaced by one that finds nothing
     assert len(measured_images) == 30 == complained.count("no-dots")
-    assert f"Results are in {tmp_path / 'demo_results'}" in said
-    assert len(table(tmp_path / "demo_results" / "measures.csv")) == 30
+    assert f"Results are in {tmp_path / 'demo_results' / 'results'}" in said
+    assert len(table(tmp_path / "demo_results" / "results" / "measures.csv")) == 30
+    assert (tmp_path / "demo_results" / "results" / "report.pdf").stat().st_size > 10_000
+    code, said, _ = labapp("session", "info", tmp_path / "demo_results" / "gtaw.labsession")
+    assert code == 0
+    assert "30" in said
 
 
 # --- detect, calibrate ------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from labapp.cli.shared import (
     INTERRUPTED,
     NOTHING,
     failure,
+    measure_frames,
     note,
     progress_bar,
 )
@@ -355,14 +356,22 @@ def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo_results"),
 ) -> None:
-    """Measure the sample run, write its results and draw pictures of them."""
-    from labapp.core.pipeline import Settings
-    from labapp.session.demo import draw_pictures, sample_folder
+    """Measure the sample run in a session of yours, export its results and draw pictures."""
+    from labapp.session.demo import draw_surface, open_demo
+    from labapp.session.export import ExportChoice
 
-    sample = sample_folder()
-    recording = sample / "recording.avi"
-    summary = _run(recording, sample / "setup.toml", out, Settings())
-    for name, done in draw_pictures(recording, summary, out):
-        typer.echo(f"  {name}" if done is None else f"  no {name}: {done}")
-    if not summary.statuses["ok"]:
+    out = out.absolute()
+    with open_demo(out) as session:
+        summary = measure_frames(session, session.frames.tolist())
+        typer.echo(summary.text())
+        pictures = frozenset({"frames", "trends"})
+        session.export(out / "results", ExportChoice(hdf5=True, pictures=pictures), report=True)
+        typer.echo(f"The session is {session.path}")
+    typer.echo(f"Results are in {out / 'results'}: tables, surfaces, pictures, report.pdf")
+    if summary.example is None:
         raise typer.Exit(NOTHING)
+    frame, measurement = summary.example
+    assert measurement.reconstruction is not None
+    picture = out / f"surface_{frame:06d}.png"
+    problem = draw_surface(measurement.reconstruction, picture)
+    typer.echo(f"No picture in 3-D: {problem}" if problem else f"In 3-D: {picture}")

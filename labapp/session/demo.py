@@ -1,21 +1,15 @@
-"""The sample run: where it is, and the pictures that show what was measured in it."""
+"""The sample run as a session of the user's own: what `labapp demo` measures and shows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
 from pathlib import Path
 
 import labapp
+from labapp.core.reconstruction import Reconstruction
 from labapp.errors import InputError
-from labapp.media import open_source
-from labapp.session.pictures import (
-    write_frame_picture,
-    write_surface_picture,
-    write_trend_picture,
-)
-from labapp.session.summary import Summary
+from labapp.session.pictures import write_surface_picture
+from labapp.session.session import Session
 
 
 def sample_folder() -> Path:
@@ -32,41 +26,43 @@ def sample_folder() -> Path:
     return folder
 
 
-def draw_pictures(recording: Path, summary: Summary, out: Path) -> Iterator[tuple[str, str | None]]:
-    """Draw pictures of a run into its folder.
+def open_demo(folder: Path) -> Session:
+    """Open the session of the sample run in a folder; it is made there if it is not yet.
 
-    Yields
+    It starts with the recording and the setup; measuring is left to the caller.
+
+    Raises
     ------
-    name, problem
-        Each picture's file name, and None or why it could not be drawn.
+    InputError
+        If the folder cannot be written, or the session is open elsewhere.
     """
-    if summary.example is None:
-        return
-    frame, measurement = summary.example
-    assert measurement.reconstruction is not None
-    with open_source(recording) as source:
-        image = source.frame(frame).image
-    timed = all(time_s is not None for _, time_s, _ in summary.frames)
-    axis = [time_s if timed else index for index, time_s, _ in summary.frames]
-    label = "time (s)" if timed else "frame"
-    series = {name: summary.series(f"{name}_mm") for name in ("width", "length", "height")}
-    pictures: dict[str, Callable[[Path], None]] = {
-        f"frame_{frame:06d}.png": partial(
-            write_frame_picture, image=image, measurement=measurement
-        ),
-        "trends.png": partial(write_trend_picture, axis=axis, label=label, series=series),
-        f"surface_{frame:06d}.png": partial(
-            write_surface_picture, reconstruction=measurement.reconstruction
-        ),
-    }
-    for name, draw in pictures.items():
-        try:
-            draw(out / name)
-        except ImportError as error:
-            yield name, f"{error.name} is not installed (pip install 'labapp[gui]')"
-        except BrokenProcessPool:
-            yield name, "OpenGL cannot be used here"
-        except OSError as error:
-            yield name, str(error.strerror)
-        else:
-            yield name, None
+    path = folder / "gtaw.labsession"
+    if path.exists():
+        return Session.open(path)
+    sample = sample_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(folder, "folder", error.strerror, "one that can be written") from error
+    session = Session.create(path)
+    try:
+        session.set_setup((sample / "setup.toml").read_text("utf-8"))
+        session.import_recording(sample / "recording.avi")
+    except BaseException:
+        session.close()
+        path.unlink()
+        raise
+    return session
+
+
+def draw_surface(reconstruction: Reconstruction, path: Path) -> str:
+    """Draw a surface in 3-D; returns why it could not be, or nothing."""
+    try:
+        write_surface_picture(path, reconstruction)
+    except ImportError as error:
+        return f"{error.name} is not installed (pip install 'labapp[gui]')"
+    except BrokenProcessPool:
+        return "OpenGL cannot be used here"
+    except OSError as error:
+        return str(error.strerror)
+    return ""

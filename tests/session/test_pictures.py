@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -12,6 +13,7 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.session import demo, pictures
+from labapp.session.record import Record
 from labapp.session.summary import Summary
 
 IMAGE = np.full((40, 60), 20, np.uint8)
@@ -76,36 +78,52 @@ def test_the_sample_run_is_found() -> None:
         demo.sample_folder()
 
 
-def test_pictures_are_drawn(summary: Summary, tmp_path: Path) -> None:
+def test_a_surface_is_drawn(measured: Measurement, tmp_path: Path) -> None:
     pytest.importorskip("pyvista")
-    recording = demo.sample_folder() / "recording.avi"
-    drawn = dict(demo.draw_pictures(recording, summary, tmp_path))
-    assert drawn == dict.fromkeys(["frame_000001.png", "trends.png", "surface_000001.png"])
-    surface = cv2.imread(str(tmp_path / "surface_000001.png"))
+    assert measured.reconstruction is not None
+    assert demo.draw_surface(measured.reconstruction, tmp_path / "surface.png") == ""
+    surface = cv2.imread(str(tmp_path / "surface.png"))
     # viridis: the pool's top is yellow, its rim violet.
     blue, green, red = np.moveaxis(surface.astype(int), 2, 0)
     assert ((red > 180) & (green > 150) & (blue < 90)).sum() > 2000
     assert ((red < 110) & (green < 80) & (blue > 60)).sum() > 2000
-    trends = cv2.imread(str(tmp_path / "trends.png"))
-    assert trends.std() > 5
 
 
-def test_a_picture_that_cannot_be_drawn_stops_nothing(summary: Summary, tmp_path: Path) -> None:
-    recording = demo.sample_folder() / "recording.avi"
-    missing = ModuleNotFoundError("No module named 'pyvista'", name="pyvista")
+@pytest.mark.parametrize(
+    ("problem", "told"),
+    [
+        (
+            ModuleNotFoundError("No module named 'pyvista'", name="pyvista"),
+            "pyvista is not installed (pip install 'labapp[gui]')",
+        ),
+        (BrokenProcessPool(), "OpenGL cannot be used here"),
+        (OSError(28, "disk full"), "disk full"),
+    ],
+)
+def test_a_picture_that_cannot_be_drawn_stops_nothing(
+    measured: Measurement, tmp_path: Path, problem: Exception, told: str
+) -> None:
+    assert measured.reconstruction is not None
+    with mock.patch.object(demo, "write_surface_picture", side_effect=problem):
+        assert demo.draw_surface(measured.reconstruction, tmp_path / "surface.png") == told
+
+
+def test_the_demo_goes_on_with_its_session(tmp_path: Path) -> None:
+    with demo.open_demo(tmp_path / "demo") as session:
+        assert len(session.frames) == 30
+        session.set_record(Record(operator="A. Weld"))
+    with demo.open_demo(tmp_path / "demo") as session:
+        assert session.record.operator == "A. Weld"
+
+
+def test_a_demo_that_cannot_be_made_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "demo").touch()
+    with pytest.raises(InputError, match="one that can be written"):
+        demo.open_demo(tmp_path / "demo")
+    unreadable = InputError("recording.avi", "content", "damaged", "a video")
     with (
-        mock.patch.object(demo, "write_surface_picture", side_effect=missing),
-        mock.patch.object(demo, "write_trend_picture", side_effect=OSError(28, "disk full")),
+        mock.patch.object(demo.Session, "import_recording", side_effect=unreadable),
+        pytest.raises(InputError, match="damaged"),
     ):
-        drawn = dict(demo.draw_pictures(recording, summary, tmp_path))
-    assert drawn["frame_000001.png"] is None
-    assert drawn["trends.png"] == "disk full"
-    assert "pyvista is not installed (pip install 'labapp[gui]')" in str(
-        drawn["surface_000001.png"]
-    )
-
-
-def test_a_run_without_a_surface_has_no_pictures(tmp_path: Path) -> None:
-    assert (
-        list(demo.draw_pictures(demo.sample_folder() / "recording.avi", Summary(), tmp_path)) == []
-    )
+        demo.open_demo(tmp_path / "other")
+    assert not list((tmp_path / "other").glob("*.labsession"))
