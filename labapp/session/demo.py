@@ -5,31 +5,17 @@ from __future__ import annotations
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-import labapp
 from labapp.core.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.session.pictures import write_surface_picture
+from labapp.session.samples import begin_session
 from labapp.session.session import Session
-
-
-def sample_folder() -> Path:
-    """Folder of the sample run, beside the package in the repository.
-
-    Raises
-    ------
-    InputError
-        If it is not there, as in an installed package.
-    """
-    folder = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
-    if not folder.is_dir():
-        raise InputError(folder, "sample run", "missing", "a checkout of labapp's repository")
-    return folder
 
 
 def open_demo(folder: Path) -> Session:
     """Open the session of the sample run in a folder; it is made there if it is not yet.
 
-    It starts with the recording and the setup; measuring is left to the caller.
+    Measuring is left to the caller.
 
     Raises
     ------
@@ -39,20 +25,11 @@ def open_demo(folder: Path) -> Session:
     path = folder / "gtaw.labsession"
     if path.exists():
         return Session.open(path)
-    sample = sample_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(folder, "folder", error.strerror, "one that can be written") from error
-    session = Session.create(path)
-    try:
-        session.set_setup((sample / "setup.toml").read_text("utf-8"))
-        session.import_recording(sample / "recording.avi")
-    except BaseException:
-        session.close()
-        path.unlink()
-        raise
-    return session
+    return begin_session("gtaw", path)
 
 
 def draw_surface(reconstruction: Reconstruction, path: Path) -> str:

@@ -1,18 +1,20 @@
-"""The sample sessions: made from the sample recordings by the calls that a script would make.
+"""The sample runs, and the sessions made of them by the calls that a script would make.
 
 ``python -m labapp.session.samples [NAME …]`` makes those in `sample_sessions` anew.
 """
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import labapp
 from labapp.core.correction import block_row, set_reference
 from labapp.core.pipeline import start_correction
-from labapp.session.demo import sample_folder
+from labapp.errors import InputError
 from labapp.session.record import Record
 from labapp.session.session import Session
 
@@ -94,30 +96,50 @@ SAMPLES = {
 }
 
 
-def make_session(name: str, folder: Path) -> Path:
-    """Make the session of a sample in its folder; one that is there is replaced.
+def sample_folder(name: str) -> Path:
+    """Folder of a sample, beside the package in the repository.
 
     Raises
     ------
     InputError
-        If the folder lacks a part of the sample, or cannot be written.
+        If it is not there, as in an installed package.
     """
-    sample, path = SAMPLES[name], folder / f"{name}.labsession"
-    path.unlink(missing_ok=True)
-    with Session.create(path, sample.record) as session:
+    folder = Path(labapp.__file__).parents[1] / "sample_sessions" / name
+    if not folder.is_dir():
+        raise InputError(folder, "sample run", "missing", "a checkout of labapp's repository")
+    return folder
+
+
+def begin_session(name: str, path: Path) -> Session:
+    """Make a session of a sample: record, setup, calibration, recording; nothing measured yet.
+
+    Raises
+    ------
+    InputError
+        If the sample lacks a part, or the session is there already or cannot be written; no
+        session is left then.
+    """
+    sample, folder = SAMPLES[name], sample_folder(name)
+    with contextlib.ExitStack() as on_failure:
+        session = Session.create(path, sample.record)
+        on_failure.callback(path.unlink)
+        on_failure.callback(session.close)
         session.set_setup((folder / "setup.toml").read_text("utf-8"))
         session.calibrate_plane(folder / "calibration.png", UNIT_MM)
         session.import_recording(folder / sample.recording)
-        for _ in session.measure():
-            pass
-        sample.finish(session)
-    return path
+        on_failure.pop_all()
+    return session
 
 
 def main(names: Sequence[str]) -> None:
-    """Make the sessions named, or all."""
+    """Make the sessions named, or all; those that are there are replaced."""
     for name in names or SAMPLES:
-        make_session(name, sample_folder().parent / name)
+        path = sample_folder(name) / f"{name}.labsession"
+        path.unlink(missing_ok=True)
+        with begin_session(name, path) as session:
+            for _ in session.measure():
+                pass
+            SAMPLES[name].finish(session)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,14 @@ from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Documents
 
 
+@pytest.fixture(scope="module", autouse=True)
+def plain_values() -> Iterator[None]:
+    """Plain values stand for the documents here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "CLASSES", dict.fromkeys(module.CLASSES, object))
+        yield
+
+
 @pytest.fixture
 def database(tmp_path: Path) -> Iterator[Database]:
     database = Database.create(tmp_path / "a.labsession")

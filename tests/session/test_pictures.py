@@ -14,6 +14,7 @@ from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.session import demo, pictures
 from labapp.session.record import Record
+from labapp.session.session import Session
 from labapp.session.summary import Summary
 
 IMAGE = np.full((40, 60), 20, np.uint8)
@@ -69,15 +70,6 @@ def test_a_size_that_rounds_to_nothing_has_no_sign(measured: Measurement) -> Non
         assert re.search(r"^depth +0\.0000 ", summary.text(), re.MULTILINE)
 
 
-def test_the_sample_run_is_found() -> None:
-    assert (demo.sample_folder() / "recording.avi").exists()
-    with (
-        mock.patch.object(demo.labapp, "__file__", "/nowhere/labapp/__init__.py"),
-        pytest.raises(InputError, match="expected a checkout"),
-    ):
-        demo.sample_folder()
-
-
 def test_a_surface_is_drawn(measured: Measurement, tmp_path: Path) -> None:
     pytest.importorskip("pyvista")
     assert measured.reconstruction is not None
@@ -122,7 +114,7 @@ def test_a_demo_that_cannot_be_made_leaves_nothing(tmp_path: Path) -> None:
         demo.open_demo(tmp_path / "demo")
     unreadable = InputError("recording.avi", "content", "damaged", "a video")
     with (
-        mock.patch.object(demo.Session, "import_recording", side_effect=unreadable),
+        mock.patch.object(Session, "import_recording", side_effect=unreadable),
         pytest.raises(InputError, match="damaged"),
     ):
         demo.open_demo(tmp_path / "other")

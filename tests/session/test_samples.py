@@ -1,0 +1,77 @@
+"""The sample sessions: whole, what their recordings give, and read by every later version."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from labapp.errors import InputError
+from labapp.session import samples
+from labapp.session.samples import SAMPLES, sample_folder
+from labapp.session.session import Session
+
+EXPECTED = {
+    "gtaw": ["ok"] * 30,
+    "thumb_tack": ["ok"] * 3,
+    "blocked_rows": ["ok", "ok", "ok", "no-match", "no-match", "no-match"],
+    "concave": ["ok"] * 6,
+}
+
+
+def truth(name: str, column: str) -> np.ndarray:
+    with (sample_folder(name) / "truth.csv").open(encoding="utf-8") as file:
+        return np.array([float(row[column]) for row in csv.DictReader(file)])
+
+
+@pytest.fixture(params=SAMPLES)
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_a_sample_session_is_whole_and_near_the_truth(name: str):
+    path = sample_folder(name) / f"{name}.labsession"
+    before = path.read_bytes()
+    with Session.open(path, read_only=True) as session:
+        assert session.problems() == []
+        assert session.record == SAMPLES[name].record
+        assert session.plane_calibration is not None
+        seen = session.overview()
+        assert list(seen.status) == EXPECTED[name]
+        assert not seen.stale.any()
+        extreme = "depth_mm" if name == "concave" else "height_mm"
+        measured = np.array([status == "ok" for status in seen.status])
+        error = seen.measures[extreme][measured] / truth(name, extreme)[measured] - 1
+        assert np.abs(error).max() < 0.03
+        assert session.frame(int(session.frames[-1])).image.any()
+    assert path.read_bytes() == before
+
+
+def test_the_session_with_blocked_rows_holds_a_correction():
+    path = sample_folder("blocked_rows") / "blocked_rows.labsession"
+    with Session.open(path, read_only=True) as session:
+        assert session.corrected_frames().tolist() == [2]
+        correction = session.correction(2)
+        assert correction is not None
+        assert correction.lattice.reference == (6, 8)
+
+
+def test_a_sample_that_is_not_there_is_told():
+    with (
+        mock.patch.object(samples.labapp, "__file__", "/nowhere/labapp/__init__.py"),
+        pytest.raises(InputError, match="expected a checkout"),
+    ):
+        sample_folder("gtaw")
+
+
+def test_a_session_that_cannot_be_made_leaves_nothing(tmp_path: Path):
+    unreadable = InputError("recording.avi", "content", "damaged", "a video")
+    with (
+        mock.patch.object(Session, "import_recording", side_effect=unreadable),
+        pytest.raises(InputError, match="damaged"),
+    ):
+        samples.begin_session("gtaw", tmp_path / "a.labsession")
+    assert not list(tmp_path.glob("*.labsession"))
