@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 
@@ -14,8 +15,11 @@ from labapp.core.correction import Correction
 from labapp.core.pipeline import Settings
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
+from labapp.media import open_source
+from labapp.session.export import ExportChoice, verify_export
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
+from labapp.session.results import ResultsWriter
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from tests.session.test_blobs import same
@@ -354,3 +358,60 @@ def test_damage_is_told_and_the_rest_still_shows(session: Session):
     assert len(problems) == 2
     assert "result of frame 0 (fit) is damaged" in problems[0]
     assert "result of frame 2 (fit) is not what" in problems[1]
+
+
+# --- out and back -----------------------------------------------------------------------------
+
+
+def test_what_is_exported_is_what_the_command_line_writes(session: Session, tmp_path: Path):
+    """Session → CSV and STL: the same bytes as `labapp reconstruct` of the same frames."""
+    setup = read_setup(SAMPLE / "setup.toml")
+    direct = tmp_path / "direct"
+    with (
+        open_source(session.path.with_name("recording.avi")) as source,
+        ResultsWriter(direct, setup.calibration, {}) as results,
+    ):
+        for number in (0, 2):
+            result = session.result(number)
+            assert result is not None
+            results.write(number, source.frame(number).time_s, result.measurement)
+    session.export(tmp_path / "out")
+    names = {path.name for path in direct.iterdir()} - {"run.json"}
+    assert {"measures.csv", "dots.csv", "surface_000002.stl", "surface_000002.csv"} <= names
+    for name in names:
+        assert (tmp_path / "out" / name).read_bytes() == (direct / name).read_bytes(), name
+
+
+def test_hdf5_holds_every_number_of_the_session_exactly(session: Session, tmp_path: Path):
+    session.export(tmp_path / "out", ExportChoice(hdf5=True))
+    overview = session.overview()
+    with h5py.File(tmp_path / "out" / "results.h5") as file:
+        for name, values in overview.measures.items():
+            np.testing.assert_array_equal(file["measures"][name][:], values[:2])
+        result = session.result(2)
+        assert result is not None
+        assert result.measurement.reconstruction is not None
+        points = file["frames/000002/points"]
+        found = np.column_stack([points[f"{axis}_mm"] for axis in "xyz"])
+        np.testing.assert_array_equal(found, result.measurement.reconstruction.points_mm)
+        assert result.measurement.dots is not None
+        dots = file["frames/000002/dots"]
+        np.testing.assert_array_equal(dots["u_px"], result.measurement.dots.u_px)
+
+
+def test_what_no_longer_stands_is_not_exported(session: Session, tmp_path: Path):
+    session.update_setup({"laser": {"distance_mm": 30.0}})
+    with pytest.raises(InputError, match="2 of 2 frames no longer stand: the rig"):
+        session.export(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    session.undo()
+    files = session.export(tmp_path / "out", frames=[2], report=True)
+    assert "report.pdf" in {file.name for file in files}
+    assert verify_export(tmp_path / "out") == []
+
+
+def test_an_export_needs_something_measured(session: Session, tmp_path: Path):
+    with pytest.raises(InputError, match="none by ers"):
+        session.export(tmp_path / "out", scheme="ers")
+    with pytest.raises(InputError, match="none by fit"):
+        session.export(tmp_path / "out", frames=[4])
