@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import freeze
+from labapp.core.values import FloatArray, freeze
 from labapp.errors import InputError
-from labapp.media.base import FrameSource, GreyImage
+from labapp.media.base import Frame, FrameSource, GreyImage
 from labapp.media.video import VideoSource
 
 CHECKED_FRAMES = 24
@@ -31,6 +31,8 @@ class Survey:
         `frame_checksum` of each frame, shape (n,), uint32; 0 where a frame cannot be read.
     readable
         Whether a frame can be read, shape (n,).
+    time_s
+        Time of each frame since the first, shape (n,), s; NaN where unknown.
     frame_exact
         Whether the frames read again out of order were the same.
     checked
@@ -41,6 +43,7 @@ class Survey:
 
     checksum: npt.NDArray[np.uint32]
     readable: npt.NDArray[np.bool_]
+    time_s: FloatArray
     frame_exact: bool
     checked: int
     warnings: tuple[str, ...]
@@ -72,26 +75,30 @@ def survey(source: FrameSource, progress: Callable[[int, int], None] | None = No
     total = len(source) + len(order)
     checksum = np.zeros(len(source), np.uint32)
     readable = np.zeros(len(source), bool)
+    time_s = np.full(len(source), np.nan)
     for index in range(len(source)):
-        found = _checksum(source, index)
-        readable[index] = found is not None
-        checksum[index] = found or 0
+        frame = _read(source, index)
+        if frame is not None:
+            readable[index] = True
+            checksum[index] = frame_checksum(frame.image)
+            time_s[index] = np.nan if frame.time_s is None else frame.time_s
         if progress is not None:
             progress(index + 1, total)
     exact = True
     with source.reopen() as again:
         for count, index in enumerate(order, 1):
-            exact &= _checksum(again, index) == (int(checksum[index]) if readable[index] else None)
+            frame = _read(again, index)
+            exact &= (frame is not None) == bool(readable[index])
+            exact &= frame is None or frame_checksum(frame.image) == checksum[index]
             if progress is not None:
                 progress(len(source) + count, total)
-    return Survey(
-        checksum, readable, exact, len(order), (*_unread(readable), *_inexact(source, exact))
-    )
+    warnings = (*_unread(readable), *_inexact(source, exact))
+    return Survey(checksum, readable, time_s, exact, len(order), warnings)
 
 
-def _checksum(source: FrameSource, index: int) -> int | None:
+def _read(source: FrameSource, index: int) -> Frame | None:
     try:
-        return frame_checksum(source.frame(index).image)
+        return source.frame(index)
     except InputError:
         return None
 
