@@ -1,0 +1,42 @@
+"""What every page of the guided way is to the window."""
+
+from __future__ import annotations
+
+from PySide6.QtWidgets import QVBoxLayout, QWidget
+
+from labapp.gui.workspace import Workspace
+
+
+class Page(QWidget):
+    """One step: its canvas, which is this widget, and the panel that stands at its right.
+
+    The window calls `refresh` when the page comes into view and whenever, while it is in view, the
+    session, its results or the frame in view changed. A page keeps nothing that the session holds.
+
+    Attributes
+    ----------
+    key
+        Of its step in `steps.STEPS`.
+    workspace
+        What is open.
+    panel
+        Parameters and results; the window puts the step's hint above it.
+    """
+
+    key = ""
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__()
+        self.workspace = workspace
+        self.panel = QWidget()
+        self.canvas_layout = QVBoxLayout(self)
+        self.canvas_layout.setContentsMargins(0, 0, 0, 0)
+        self.panel_layout = QVBoxLayout(self.panel)
+        self.setObjectName(f"page-{self.key}")
+        self.panel.setObjectName(f"panel-{self.key}")
+
+    def refresh(self) -> None:
+        """Show what the session holds now; ``workspace.session`` is not None."""
+
+    def leave(self) -> None:
+        """The page goes out of view, or the window closes: stop what only it needs."""

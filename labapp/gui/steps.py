@@ -1,0 +1,160 @@
+"""The steps of the guided way and how far each is: computed from the session, never stored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from labapp.errors import InputError
+from labapp.session.session import Session
+
+
+class Mark(Enum):
+    """How far a step is."""
+
+    TODO = "to do"
+    READY = "ready"
+    DONE = "done"
+    ATTENTION = "needs attention"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the guided way.
+
+    Parameters
+    ----------
+    key
+        Its name in code.
+    title
+        Its name for the operator.
+    hint
+        What to do there, in two or three sentences.
+    """
+
+    key: str
+    title: str
+    hint: str
+
+
+STEPS = (
+    Step(
+        "setup",
+        "Set-up",
+        "Note the experiment, go through the safety list, and enter what is bolted to the bench. "
+        "The drawing shows which rays come back.",
+    ),
+    Step(
+        "laser",
+        "Laser",
+        "Put the cross-hair lens on the laser and measure the three lengths of the cross, more "
+        "than once. The laser's angle and distance follow.",
+    ),
+    Step(
+        "plane",
+        "Imaging plane",
+        "Take a picture of the target on the imaging plane. O′ and the axes are found in it; drag "
+        "any of them that is not where it should be.",
+    ),
+    Step(
+        "capture",
+        "Recording",
+        "Import a video, images or a stack. It is read through once, and stays where it is.",
+    ),
+    Step(
+        "dots",
+        "Dots",
+        "Check the dots and their rows. Where the program is in doubt it says so: put right what "
+        "is wrong, and go on to the next frame.",
+    ),
+    Step(
+        "surface",
+        "Surface",
+        "Measure the frames and look at the surface. The residuals tell whether to trust it.",
+    ),
+    Step(
+        "trends",
+        "Trends",
+        "See how the pool changes over the recording. Click a point to go to its frame.",
+    ),
+    Step("export", "Export", "Tick what you want to take along, and choose a folder."),
+)
+
+
+@dataclass(frozen=True)
+class State:
+    """How far a step is, and why: the words that explain its mark and its disabled buttons."""
+
+    mark: Mark
+    why: str
+
+
+def states(session: Session | None) -> dict[str, State]:
+    """State of every step, by its key."""
+    if session is None:
+        return {step.key: State(Mark.TODO, "Open or make a session first") for step in STEPS}
+    try:
+        _ = session.setup
+        missing = ""
+    except InputError as error:
+        missing = "; ".join(f"{problem.field}: {problem.value}" for problem in error.problems[:3])
+    return {
+        "setup": State(Mark.DONE, "Complete") if not missing else State(Mark.READY, missing),
+        "laser": _calibrated(session.laser_calibration is not None, "laser." in missing),
+        "plane": _calibrated(session.plane_calibration is not None, "image_calibration" in missing),
+        **_frame_states(session, missing),
+    }
+
+
+def _calibrated(done: bool, needed: bool) -> State:
+    if done:
+        return State(Mark.DONE, "Calibrated")
+    if needed:
+        return State(Mark.READY, "Not calibrated yet, and no values were entered")
+    return State(Mark.READY, "Not calibrated here: the values were entered")
+
+
+def _frame_states(session: Session, missing: str) -> dict[str, State]:
+    recording, gone = session.recording, session.missing_recording
+    if recording is None:
+        first = State(Mark.TODO, "Import a recording first")
+        return {
+            "capture": State(Mark.READY, "No recording yet"),
+            **dict.fromkeys(("dots", "surface", "trends", "export"), first),
+        }
+    seen = session.overview()
+    status = np.array(seen.status, dtype=object)
+    measured = int((status != "").sum())
+    without = int(((status != "") & (status != "ok")).sum())
+    stale = int(seen.stale.sum())
+    count = len(seen.frame)
+    capture = State(Mark.DONE, f"{count} frames")
+    if gone is not None:
+        capture = State(Mark.ATTENTION, f"{gone.name} is not where it was: say where it is now")
+    blocked = f"Set-up: {missing}" if missing else ""
+    if blocked and not measured:
+        surface = State(Mark.TODO, blocked)
+    elif stale:
+        surface = State(Mark.ATTENTION, f"{stale} of {count} frames no longer stand: measure again")
+    elif measured < count:
+        surface = State(Mark.READY, f"{count - measured} of {count} frames are not measured yet")
+    else:
+        surface = State(Mark.DONE, f"All {count} frames are measured")
+    dots = State(Mark.READY if measured < count else Mark.DONE, "No frame is in doubt")
+    if without:
+        dots = State(Mark.ATTENTION, f"{without} frames could not be measured: look at their dots")
+    results = (
+        State(Mark.READY, f"{measured} frames")
+        if measured
+        else State(Mark.TODO, "Measure some frames first")
+    )
+    export = State(Mark.ATTENTION, surface.why) if stale else results
+    return {
+        "capture": capture,
+        "dots": dots,
+        "surface": surface,
+        "trends": results,
+        "export": export,
+    }

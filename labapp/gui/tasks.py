@@ -1,0 +1,197 @@
+"""Long work off the GUI thread: progress, cancel, and errors in words and in the log.
+
+A worker thread holds no QObject: it puts what happens into a queue, which a timer of the GUI thread
+empties.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from PySide6.QtCore import QObject, QTimer, Signal
+
+from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
+from labapp.session.log import NAME
+
+POLL_MS = 30
+
+
+class Cancelled(Exception):
+    """The operator has cancelled the task; raised in its work at the next report of progress."""
+
+
+@dataclass
+class Control:
+    """What a task's work talks to.
+
+    Parameters
+    ----------
+    events
+        Where what happens goes.
+    """
+
+    events: queue.SimpleQueue[tuple[str, Any]] = field(default_factory=queue.SimpleQueue)
+    cancelled: threading.Event = field(default_factory=threading.Event)
+
+    def progress(self, done: int, total: int) -> None:
+        """Say how far the work is.
+
+        Raises
+        ------
+        Cancelled
+            If the operator has cancelled it.
+        """
+        self.check()
+        self.events.put(("progress", (done, total)))
+
+    def part(self, value: object) -> None:
+        """Hand over a part of the result: it reaches ``on_part`` on the GUI thread."""
+        self.check()
+        self.events.put(("part", value))
+
+    def check(self) -> None:
+        """Raise `Cancelled` if the operator has cancelled the task."""
+        if self.cancelled.is_set():
+            raise Cancelled
+
+
+Work = Callable[[Control], Any]
+
+
+@dataclass
+class Task:
+    """One piece of work under way.
+
+    Parameters
+    ----------
+    title
+        What it does, for the operator: "Measuring".
+    control
+        Its side of the talk.
+    thread
+        Where it runs.
+    on_part, on_done
+        Called on the GUI thread with parts and with the result.
+    """
+
+    title: str
+    control: Control
+    thread: threading.Thread
+    on_part: Callable[[Any], None] | None
+    on_done: Callable[[Any], None] | None
+    done: int = 0
+    total: int = 0
+
+    def cancel(self) -> None:
+        """Ask the work to stop; what it has finished stays."""
+        self.control.cancelled.set()
+
+
+class Tasks(QObject):
+    """The tasks of a window.
+
+    Signals
+    -------
+    changed
+        A task began, went on or ended.
+    failed
+        A task failed: its title and what to tell the operator.
+    """
+
+    changed = Signal()
+    failed = Signal(str, str)
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self.active: list[Task] = []
+        self._timer = QTimer(self)
+        self._timer.setInterval(POLL_MS)
+        self._timer.timeout.connect(self._poll)
+
+    def start(
+        self,
+        title: str,
+        work: Work,
+        on_done: Callable[[Any], None] | None = None,
+        on_part: Callable[[Any], None] | None = None,
+    ) -> Task:
+        """Begin work in a thread of its own.
+
+        Parameters
+        ----------
+        title
+            What it does, for the operator.
+        work
+            Called with its `Control`; touches no widget.
+        on_done, on_part
+            Called on the GUI thread with what ``work`` returns, and with each part it hands over.
+            Not called after a cancel or a failure.
+        """
+        control = Control()
+        thread = threading.Thread(target=_run, args=(work, control), name=title, daemon=True)
+        task = Task(title, control, thread, on_part, on_done)
+        self.active.append(task)
+        thread.start()
+        self._timer.start()
+        self.changed.emit()
+        return task
+
+    def cancel_all(self, wait_s: float = 5.0) -> None:
+        """Cancel everything and wait until it has stopped; nothing is called afterwards."""
+        for task in self.active:
+            task.cancel()
+        for task in self.active:
+            task.thread.join(wait_s)
+        self.active.clear()
+        self._timer.stop()
+        self.changed.emit()
+
+    def _poll(self) -> None:
+        for task in list(self.active):
+            while task in self.active:
+                try:
+                    kind, value = task.control.events.get_nowait()
+                except queue.Empty:
+                    break
+                self._take(task, kind, value)
+        if not self.active:
+            self._timer.stop()
+
+    def _take(self, task: Task, kind: str, value: Any) -> None:
+        if kind == "progress":
+            task.done, task.total = value
+        elif kind == "part":
+            if task.on_part is not None and not task.control.cancelled.is_set():
+                task.on_part(value)
+        else:
+            self.active.remove(task)
+            if kind == "failed":
+                self.failed.emit(task.title, value)
+            elif kind == "done" and task.on_done is not None:
+                task.on_done(value)
+        self.changed.emit()
+
+
+def _run(work: Work, control: Control) -> None:
+    try:
+        control.events.put(("done", work(control)))
+    except Cancelled:
+        control.events.put(("cancelled", None))
+    except Exception as error:
+        control.events.put(("failed", in_words(error)))
+
+
+def in_words(error: Exception) -> str:
+    """What to tell the operator of an error; the log gets all of it."""
+    log = logging.getLogger(NAME)
+    if isinstance(error, InputError | CannotMeasure | ValueError):
+        log.error("refused", exc_info=error)
+        return str(error)
+    log.error("fault", exc_info=error)
+    return f"a fault in the program: {type(error).__name__}: {error}; details are in the log"

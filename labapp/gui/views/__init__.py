@@ -1,0 +1,1 @@
+"""Pictures, plots, fields and the 3-D view: reusable, knowing nothing of sessions."""

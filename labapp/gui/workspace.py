@@ -1,0 +1,140 @@
+"""What is open in a window: a session and a frame. Everybody is told when something changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from PySide6.QtCore import QObject, Signal
+
+from labapp.gui.tasks import Control, Task, Tasks, in_words
+from labapp.session.session import Session
+
+T = TypeVar("T")
+
+
+class Workspace(QObject):
+    """The session that a window shows, the frame in view, and the work under way.
+
+    Pages read the session through `session`, change it through `attempt`, and start long work
+    through `tasks`. They show what the session holds whenever a signal says that it changed.
+
+    Signals
+    -------
+    opened
+        Another session is open, or none.
+    changed
+        A document, the recording or a result changed; pages in view show the session anew.
+    frame_changed
+        Another frame is in view.
+    said
+        Something for the operator to read: a sentence, and whether it is a problem.
+    """
+
+    opened = Signal()
+    changed = Signal()
+    frame_changed = Signal(int)
+    said = Signal(str, bool)
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self.session: Session | None = None
+        self.frame = 0
+        self.tasks = Tasks(self)
+        self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
+
+    def show(self, session: Session | None) -> None:
+        """Show a session in place of the present one, which is closed."""
+        self.tasks.cancel_all()
+        if self.session is not None:
+            self.session.close()
+        self.session = session
+        frames = [] if session is None else session.frames.tolist()
+        self.frame = frames[0] if frames else 0
+        self.opened.emit()
+        self.changed.emit()
+
+    def open(self, path: Path, read_only: bool = False) -> bool:
+        """Open a session file; False if it was refused, which is said."""
+        session = self.tried(lambda: Session.open(path, read_only))
+        if session is not None:
+            self.show(session)
+        return session is not None
+
+    def create(self, path: Path) -> bool:
+        """Make a new session file and open it; False if it was refused, which is said."""
+        session = self.tried(lambda: Session.create(path))
+        if session is not None:
+            self.show(session)
+        return session is not None
+
+    def tried(self, work: Callable[[], T]) -> T | None:
+        """Do something short; a refusal is said in words and gives None."""
+        try:
+            return work()
+        except Exception as error:
+            self.said.emit(in_words(error), True)
+            return None
+
+    def attempt(self, change: Callable[[Session], object]) -> bool:
+        """Change the session and tell everybody; False if it was refused, which is said."""
+        session = self.session
+        if session is None:
+            return False
+        try:
+            change(session)
+        except Exception as error:
+            self.said.emit(in_words(error), True)
+            return False
+        self.changed.emit()
+        return True
+
+    def undo(self) -> None:
+        """Take back the last change."""
+        self._step("undo", "Undone", "Nothing to undo")
+
+    def redo(self) -> None:
+        """Make the last change again that was taken back."""
+        self._step("redo", "Done again", "Nothing to redo")
+
+    def _step(self, name: str, done: str, nothing: str) -> None:
+        session = self.session
+        if session is None:
+            return
+        step = self.tried(session.undo if name == "undo" else session.redo)
+        self.said.emit(nothing if step is None else f"{done}: {step.label}", False)
+        if step is not None:
+            frames = [frame for _, frame in step.keys if frame >= 0]
+            if frames and self.frame not in frames:
+                self.show_frame(frames[0])
+            self.changed.emit()
+
+    def show_frame(self, number: int) -> None:
+        """Bring a frame of the session into view."""
+        if self.session is not None and number != self.frame:
+            self.frame = number
+            self.frame_changed.emit(number)
+
+    def measure(self, frames: Sequence[int] | None = None) -> Task | None:
+        """Measure frames in the background; None: those not measured, or stale.
+
+        Each frame that is kept makes `changed` go out.
+        """
+        session = self.session
+        if session is None:
+            return None
+        numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
+
+        def work(control: Control) -> int:
+            done = 0
+            for done, _ in enumerate(session.measure(numbers), 1):
+                control.progress(done, len(numbers))
+                control.part(None)
+            return done
+
+        def finished(count: int) -> None:
+            self.said.emit(f"{count} frame{'s' * (count != 1)} measured", False)
+            self.changed.emit()
+
+        return self.tasks.start("Measuring", work, finished, lambda _: self.changed.emit())
