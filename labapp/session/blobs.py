@@ -10,8 +10,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import struct
 import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +33,9 @@ from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.spline import SplineBasis, SplineSurface
 from labapp.core.surface import FlatSurface
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.errors import InputError
+from labapp.session.kinds import check_fields, is_a
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 
 MAGIC = b"LAB1"
@@ -50,13 +55,20 @@ DATACLASSES: dict[str, Any] = {
     )
 }
 
-SURFACES: dict[str, tuple[Any, str]] = {
-    "CloughTocherSurface": (CloughTocherSurface, "points_mm"),
-    "ThinPlateSurface": (ThinPlateSurface, "points_mm"),
-    "FlatSurface": (FlatSurface, "level_mm"),
+SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
+    "CloughTocherSurface": (CloughTocherSurface, "points_mm", FloatArray, (3,)),
+    "ThinPlateSurface": (ThinPlateSurface, "points_mm", FloatArray, (3,)),
+    "FlatSurface": (FlatSurface, "level_mm", float, ()),
 }
-"""Surfaces that are not dataclasses, and the one thing each is made from."""
+"""Surfaces that are not dataclasses; the one thing each is made from, what it is, its shape."""
 
+LARGEST = 100_000_000
+"""No value takes more bytes, unpacked: a few bytes cannot fill the memory."""
+
+UNREADABLE = (
+    *(zlib.error, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError),
+    *(RecursionError, MemoryError, CannotMeasure),
+)
 
 CONTAINERS: dict[str, Any] = {kind.__name__: kind for kind in (list, tuple, frozenset)}
 
@@ -72,27 +84,67 @@ def pack(value: object) -> bytes:
     ------
     TypeError
         If a value of another class is in it.
+    InputError
+        If it is larger than `LARGEST`.
     """
-    body = zlib.compress(_canonical(value), 1)
+    content = _canonical(value)
+    if len(content) > LARGEST:
+        raise InputError("session", "value", f"{len(content)} bytes", f"{LARGEST} bytes or less")
+    body = zlib.compress(content, 1)
     return HEAD.pack(MAGIC, zlib.crc32(body)) + body
 
 
-def unpack(blob: bytes) -> Any:
+def unpack(blob: object, kind: Any = Any) -> Any:
     """The value that was packed; numbers and arrays bit for bit, arrays read-only.
+
+    Parameters
+    ----------
+    blob
+        What `pack` gave.
+    kind
+        What it must be: a class or a type hint.
 
     Raises
     ------
     Damaged
-        If the bytes were changed, cut off, or hold a class that this version does not know.
+        If the bytes were changed, cut off, hold something else, a class that this version does
+        not know, or one whose fields are not what it says.
     """
+    if not isinstance(blob, bytes):
+        raise Damaged("it is no blob")
     if len(blob) < HEAD.size or HEAD.unpack_from(blob) != (MAGIC, zlib.crc32(blob[HEAD.size :])):
         raise Damaged("its checksum does not fit")
     try:
-        content = zlib.decompress(blob[HEAD.size :])
+        content = _decompressed(blob[HEAD.size :])
         length = int.from_bytes(content[:4], "little")
-        return _read(json.loads(content[4 : 4 + length]), memoryview(content)[4 + length :])
-    except (zlib.error, ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        value = _read(json.loads(content[4 : 4 + length]), memoryview(content)[4 + length :])
+    except UNREADABLE as error:
         raise Damaged(f"it cannot be read: {error}") from error
+    if not is_a(value, kind):
+        raise Damaged(f"it is a {type(value).__name__}")
+    return value
+
+
+def unpack_from(path: Path, named: str, blob: object, kind: Any) -> Any:
+    """`unpack` what a session file holds under a name.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    try:
+        return unpack(blob, kind)
+    except Damaged as error:
+        raise InputError(path, named, error, "what was written there") from error
+
+
+def _decompressed(content: bytes) -> bytes:
+    unpacker = zlib.decompressobj()
+    plain = unpacker.decompress(content, LARGEST)
+    if not unpacker.eof or unpacker.unused_data:
+        raise ValueError("it is cut off, or too large")
+    return plain
 
 
 def fingerprint(value: object) -> str:
@@ -152,7 +204,9 @@ def _read(tree: Any, content: memoryview) -> Any:
     ((kind, held),) = tree.items()
     if kind == "array":
         dtype, shape, place = held
-        count = int(np.prod(shape, dtype=int))
+        if not (isinstance(dtype, str) and all(isinstance(n, int) and n >= 0 for n in shape)):
+            raise TypeError(f"an array of {dtype}, {shape}")
+        count = math.prod(shape)
         array = np.frombuffer(content, dtype, count, place) if count else np.empty(0, dtype)
         array = array.reshape(shape).copy()  # aligned, and free of the rest
         array.flags.writeable = False
@@ -165,5 +219,11 @@ def _read(tree: Any, content: memoryview) -> Any:
     if kind == "dict":
         return {key: _read(item, content) for key, item in held}
     if kind in SURFACES:
-        return SURFACES[kind][0](_read(held, content))
-    return DATACLASSES[kind](**{name: _read(item, content) for name, item in held.items()})
+        surface, _, hint, shape = SURFACES[kind]
+        from_what = _read(held, content)
+        if not is_a(from_what, hint) or (shape and np.shape(from_what)[1:] != shape):
+            raise TypeError(f"a {kind} of a {type(from_what).__name__}")
+        return surface(from_what)
+    value = DATACLASSES[kind](**{name: _read(item, content) for name, item in held.items()})
+    check_fields(value)
+    return value

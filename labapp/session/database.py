@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from labapp.errors import InputError
@@ -25,6 +27,8 @@ from labapp.session.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 SUFFIX = ".labsession"
 A_SESSION = f"a labapp session ({SUFFIX})"
 
+WHOLE_SESSION = "a whole session: a copy from before"
+
 BUSY_S = 5.0
 """A reader waits this long for the writer's change to end, and the writer for a reader."""
 
@@ -32,6 +36,8 @@ LARGEST_BLOB = 1 << 30
 
 HEADER_BYTES = 100
 SQLITE_MAGIC = b"SQLite format 3\x00"
+ROLLBACK_JOURNAL = b"\x01\x01"
+"""In the header, of the program that wrote the file last and of those that may read it."""
 
 
 class SessionInUse(InputError):
@@ -176,6 +182,19 @@ class Database:
         found = self.rows(sql, *values)
         return found[0][0] if found else None
 
+    def array(self, values: Sequence[object], kind: type[np.generic]) -> npt.NDArray[Any]:
+        """Values of a column as an array; None becomes NaN.
+
+        Raises
+        ------
+        InputError
+            If they are no numbers, which is damage.
+        """
+        try:
+            return np.array(values, kind)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise InputError(self.path, "content", f"damaged ({error})", WHOLE_SESSION) from error
+
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
         """One change: all of it is in the file at the end, or nothing of it.
@@ -236,6 +255,9 @@ def _check_header(path: Path) -> int:
         raise InputError(path, "content", "not a session" if header else "0 bytes", A_SESSION)
     if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
         raise InputError(path, "content", "a database of another program", A_SESSION)
+    if header[18:20] != ROLLBACK_JOURNAL:
+        # SQLite would leave files of its own beside it, even to read.
+        raise InputError(path, "content", "another kind of journal, or damaged", WHOLE_SESSION)
     version = int.from_bytes(header[60:64], "big")
     if version > VERSION:
         raise InputError(
@@ -384,7 +406,7 @@ def _told(path: Path) -> Iterator[None]:
             path,
             "content",
             f"damaged ({error})",
-            "a whole session: a copy from before",
+            WHOLE_SESSION,
         ) from error
     except (OverflowError, UnicodeDecodeError, sqlite3.InterfaceError) as error:
-        raise InputError(path, "content", f"damaged ({error})", "a whole session") from error
+        raise InputError(path, "content", f"damaged ({error})", WHOLE_SESSION) from error

@@ -11,11 +11,13 @@ import datetime
 import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Never
 
-from labapp.errors import InputError
-from labapp.session.blobs import Damaged, fingerprint, pack, unpack
+from labapp.core.correction import Correction
+from labapp.core.pipeline import Settings
+from labapp.session.blobs import Damaged, fingerprint, pack, unpack, unpack_from
 from labapp.session.database import Database
+from labapp.session.record import LaserReadings, PlanePicture, Record
 
 Kind = Literal[
     "record", "setup", "settings", "laser-calibration", "plane-calibration", "correction"
@@ -24,6 +26,16 @@ Key = tuple[Kind, int]
 """Kind, and the frame of a correction; `WHOLE` for what belongs to no frame."""
 
 WHOLE = -1
+
+CLASSES: dict[str, type] = {
+    "record": Record,
+    "setup": str,
+    "settings": Settings,
+    "laser-calibration": LaserReadings,
+    "plane-calibration": PlanePicture,
+    "correction": Correction,
+}
+"""What a document of each kind is."""
 
 KEPT_CHANGES = 500
 KEPT_BYTES = 64_000_000
@@ -80,11 +92,7 @@ class Documents:
         )
         if blob is None:
             return None
-        try:
-            return unpack(blob)
-        except Damaged as error:
-            named = kind if frame == WHOLE else f"{kind} of frame {frame}"
-            raise InputError(self._database.path, named, error, "what was written there") from error
+        return unpack_from(self._database.path, _named(kind, frame), blob, CLASSES[kind])
 
     def fingerprints(self, kind: Kind) -> dict[int, str]:
         """SHA-256 of every document of a kind, by frame."""
@@ -152,6 +160,9 @@ class Documents:
                 f"SELECT kind, frame, {side} FROM change_part WHERE change = ?", (number,)
             ).fetchall()
             for kind, frame, content in parts:
+                if content is not None:  # what is damaged is left in the history
+                    named = f"{_named(kind, frame)} in the history"
+                    unpack_from(self._database.path, named, content, CLASSES.get(kind, Never))
                 _put(connection, kind, frame, content)
             connection.execute("UPDATE change SET undone = ? WHERE id = ?", (not undone, number))
         return next(change for change in self.history() if change.number == number)
@@ -164,7 +175,7 @@ class Documents:
         ):
             keys.setdefault(number, []).append((kind, frame))
         return tuple(
-            Change(number, label, made, bool(undone), tuple(keys.get(number, ())))
+            Change(number, str(label), str(made), bool(undone), tuple(keys.get(number, ())))
             for number, label, made, undone in self._database.rows(
                 "SELECT id, label, made, undone FROM change ORDER BY id"
             )
@@ -193,11 +204,11 @@ class Documents:
             )
         }
         for (kind, frame), (sha256, content) in held.items():
-            named = kind if frame == WHOLE else f"{kind} of frame {frame}"
+            named = _named(kind, frame)
             try:
-                if fingerprint(unpack(content)) != sha256:
+                if fingerprint(unpack(content, CLASSES.get(kind, Never))) != sha256:
                     found.append(f"{named} is not what was written")
-            except (Damaged, TypeError) as error:
+            except Damaged as error:
                 found.append(f"{named} is damaged: {error}")
         found += [
             f"{kind} ({frame}) is not what the history says"
@@ -205,6 +216,10 @@ class Documents:
             if held.get((kind, frame), (None, None))[1] != content
         ]
         return found
+
+
+def _named(kind: str, frame: int) -> str:
+    return kind if frame == WHOLE else f"{kind} of frame {frame}"
 
 
 def _content(connection: sqlite3.Connection, kind: str, frame: int) -> bytes | None:

@@ -11,6 +11,7 @@ import hashlib
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ import numpy.typing as npt
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource, GreyImage, open_source
-from labapp.media.survey import frame_checksum, survey
-from labapp.session.blobs import Damaged, pack, unpack
+from labapp.media.survey import Survey, frame_checksum, survey
+from labapp.session.blobs import MAGIC, pack, unpack_from
 from labapp.session.database import Database
 from labapp.session.record import Recording
 from labapp.session.run import select_frames
@@ -52,20 +53,22 @@ class Frames:
     def recording(self) -> Recording | None:
         """The recording; None before one was imported."""
         blob = self._database.value("SELECT content FROM recording")
-        return None if blob is None else self._unpacked(blob, "recording")
+        if blob is None:
+            return None
+        found: Recording = unpack_from(self._database.path, "recording", blob, Recording)
+        return found
 
     @property
     def numbers(self) -> IntArray:
         """Numbers of the session's frames in the recording, from 0, ascending, shape (n,)."""
-        return np.array(
-            [number for (number,) in self._database.rows("SELECT number FROM frame")], np.int64
-        )
+        rows = self._database.rows("SELECT number FROM frame")
+        return self._database.array([number for (number,) in rows], np.int64)
 
     @property
     def times_s(self) -> FloatArray:
         """Time of each since the recording's first frame, shape (n,), s; NaN where unknown."""
         rows = self._database.rows("SELECT time_s FROM frame ORDER BY number")
-        return np.array([np.nan if time_s is None else time_s for (time_s,) in rows], np.float64)
+        return self._database.array([time_s for (time_s,) in rows], np.float64)
 
     def time_s(self, number: int) -> float | None:
         """Time of one frame, s; None where unknown.
@@ -79,7 +82,7 @@ class Frames:
         if not found:
             raise InputError(self._database.path, "frame", number, self._which())
         (time_s,) = found[0]
-        return None if time_s is None else float(time_s)
+        return None if time_s is None else float(self._database.array(time_s, np.float64))
 
     def take_in(
         self,
@@ -131,23 +134,24 @@ class Frames:
                 frame_exact=found.frame_exact,
                 selected=(selected.start, selected.stop, selected.step),
                 embedded=embed,
-                warnings=source.warnings,
+                warnings=tuple(dict.fromkeys((*source.warnings, *found.warnings))),
                 index=source.index,
                 imported=datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
             )
-            checksum = {k: int(found.checksum[k]) for k in selected if found.readable[k]}
-            self._store(recording, source, selected, checksum)
-        return recording
+            return self._store(recording, source, selected, found)
 
     def _store(
         self,
         recording: Recording,
         source: FrameSource,
         selected: range,
-        checksum: dict[int, int],
-    ) -> None:
+        found: Survey,
+    ) -> Recording:
         before = self.recording
-        rate = recording.frame_rate_hz if recording.rate_is_given else None
+        time_s = found.time_s
+        if recording.rate_is_given:
+            assert recording.frame_rate_hz is not None
+            time_s = np.arange(recording.frames) / recording.frame_rate_hz
         with self._database.transaction() as connection:
             kept = {
                 frame
@@ -169,31 +173,33 @@ class Frames:
                     f"frame {min(kept - set(selected))} is measured or corrected and left out",
                     "frames that include these",
                 )
-            connection.execute("INSERT OR REPLACE INTO recording VALUES (1, ?)", (pack(recording),))
             connection.executemany(
                 "DELETE FROM frame WHERE number = ?",
                 [(int(k),) for k in self.numbers if int(k) not in selected],
             )
             connection.execute("DELETE FROM frame_image")
-            for number in selected:
-                time_s = None if rate is None else number / rate
-                if rate is None or recording.embedded:
-                    try:
-                        frame = source.frame(number)
-                    except InputError:
-                        frame = None
-                    if frame is not None and rate is None:
-                        time_s = frame.time_s
-                connection.execute(
-                    "INSERT INTO frame VALUES (?, ?, ?) ON CONFLICT (number) DO UPDATE "
-                    "SET time_s = excluded.time_s, checksum = excluded.checksum",
-                    (number, time_s, checksum.get(number)),
+            connection.executemany(
+                "INSERT INTO frame VALUES (?, ?, ?) ON CONFLICT (number) DO UPDATE "
+                "SET time_s = excluded.time_s, checksum = excluded.checksum",
+                [
+                    (k, float(time_s[k]), int(found.checksum[k]) if found.readable[k] else None)
+                    for k in selected
+                ],
+            )
+            if recording.embedded:
+                connection.executemany(
+                    "INSERT INTO frame_image VALUES (?, ?)",
+                    ((k, _encoded(source.frame(k).image)) for k in selected if found.readable[k]),
                 )
-                if recording.embedded and frame is not None:
-                    connection.execute(
-                        "INSERT INTO frame_image VALUES (?, ?)", (number, _encoded(frame.image))
-                    )
+            recording = replace(recording, frames_sha256=self._fingerprint())
+            connection.execute("INSERT OR REPLACE INTO recording VALUES (1, ?)", (pack(recording),))
         self.close()
+        return recording
+
+    def _fingerprint(self) -> str:
+        """SHA-256 of what is noted of every frame: its number, time and checksum."""
+        rows = self._database.rows("SELECT number, time_s, checksum FROM frame ORDER BY number")
+        return hashlib.sha256(repr(rows).encode()).hexdigest()
 
     def read(self, number: int) -> Frame:
         """Frame ``number`` as it was imported.
@@ -209,7 +215,7 @@ class Frames:
         held = self._database.value("SELECT content FROM frame_image WHERE frame = ?", number)
         with self._turn:
             image = (
-                self._opened().frame(number).image
+                self._recorded(number)
                 if held is None
                 else self._decoded(held, f"image of frame {number}")
             )
@@ -239,9 +245,7 @@ class Frames:
             If what is there is another recording.
         """
         path = Path(path).absolute()
-        recording = self.recording
-        if recording is None:
-            raise InputError(self._database.path, "recording", "none", "one to be imported first")
+        recording = self._imported()
         size, sha256 = identify(path)
         if (size, sha256) != (recording.size, recording.sha256):
             raise InputError(
@@ -269,15 +273,18 @@ class Frames:
         except InputError as error:
             return [str(error)]
         if recording is None:
-            return []
+            noted = self._database.value("SELECT max(coalesce(time_s, checksum)) FROM frame")
+            return [] if noted is None else ["there are frames, and not what they were taken from"]
+        found = []
+        if recording.frames_sha256 not in (None, self._fingerprint()):
+            found.append("the frames' numbers, times or checksums are not those of the import")
         if not recording.embedded:
             try:
                 if identify(self._place()) != (recording.size, recording.sha256):
-                    return [f"{self._place().name} is not what was imported"]
+                    found.append(f"{self._place().name} is not what was imported")
             except InputError as error:
-                return [str(error)]
-            return []
-        found = []
+                found.append(str(error))
+            return found
         for done, number in enumerate(self.numbers):
             try:
                 self.read(int(number))
@@ -287,10 +294,17 @@ class Frames:
                 progress(done + 1, len(self.numbers))
         return found
 
+    def _recorded(self, number: int) -> GreyImage:
+        source = self._opened()
+        if number >= len(source):
+            raise InputError(
+                self._database.path, "frame", number, f"one of the recording's {len(source)}"
+            )
+        return source.frame(number).image
+
     def _opened(self) -> FrameSource:
         if self._source is None:
-            recording, place = self.recording, self._place()
-            assert recording is not None
+            recording, place = self._imported(), self._place()
             if not place.exists():
                 raise InputError(
                     place, "recording", "is not there", "the recording; say where it is now"
@@ -312,10 +326,15 @@ class Frames:
             self._source = source
         return self._source
 
+    def _imported(self) -> Recording:
+        recording = self.recording
+        if recording is None:
+            raise InputError(self._database.path, "recording", "none", "one to be imported first")
+        return recording
+
     def _place(self) -> Path:
         """Where the recording is: where it was, else beside the session."""
-        recording = self.recording
-        assert recording is not None
+        recording = self._imported()
         folder = self._database.path.parent
         place = Path(os.path.normpath(folder / recording.path))
         beside = folder / Path(recording.path).name
@@ -333,19 +352,14 @@ class Frames:
             return "a recording to be imported first"
         return f"one of the session's {len(numbers)} frames, {numbers[0]} to {numbers[-1]}"
 
-    def _unpacked(self, blob: bytes, named: str) -> Any:
-        try:
-            return unpack(blob)
-        except Damaged as error:
-            raise InputError(self._database.path, named, error, "what was written there") from error
-
-    def _decoded(self, content: bytes, named: str) -> GreyImage:
-        if not content.startswith(b"LAB1"):
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-            if image is None or image.ndim != 2:
-                raise InputError(self._database.path, named, "damaged", "what was written there")
-            return np.asarray(image)
-        return np.asarray(self._unpacked(content, named))
+    def _decoded(self, content: object, named: str) -> GreyImage:
+        if isinstance(content, bytes) and content.startswith(MAGIC):
+            image = unpack_from(self._database.path, named, content, np.ndarray)
+        else:
+            image = decoded(content)
+        if image is None or image.ndim != 2:
+            raise InputError(self._database.path, named, "damaged", "what was written there")
+        return np.asarray(image)
 
 
 def identify(path: Path) -> tuple[int, str]:
@@ -381,6 +395,16 @@ def _files(path: Path) -> list[Path]:
             p for p in path.parent.iterdir() if p.stem == path.stem and p.suffix.lower() in PAIRED
         )
     return [path]
+
+
+def decoded(content: object) -> npt.NDArray[Any] | None:
+    """The picture that an encoded one holds; None if it is damaged."""
+    if not isinstance(content, bytes) or not content:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError):
+        return None
 
 
 def _encoded(image: npt.NDArray[Any]) -> bytes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import functools
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -13,13 +12,14 @@ import labapp
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.errors import InputError
-from labapp.session.blobs import Damaged, fingerprint, pack, unpack
+from labapp.session.blobs import Damaged, fingerprint, pack, unpack, unpack_from
 from labapp.session.database import Database
 from labapp.session.schema import MEASURES
 from labapp.session.setup import Setup, parse_setup
 
 SETUP_CHANGED = "the rig or a calibration was changed"
 SETTINGS_CHANGED = "the settings were changed"
+INPUTS_DAMAGED = "what it was measured from is damaged"
 CORRECTION_CHANGED = "the dots or rows were corrected"
 
 
@@ -199,7 +199,7 @@ class Results:
             If it is damaged.
         """
         found = self._database.rows(
-            "SELECT result.inputs, version, setup, settings, correction, measured, content "
+            "SELECT version, setup, settings, correction, measured, content "
             "FROM result JOIN inputs ON inputs.id = result.inputs "
             "JOIN detail ON detail.result = result.id WHERE frame = ? AND scheme = ?",
             frame,
@@ -207,17 +207,17 @@ class Results:
         )
         if not found:
             return None
-        inputs, version, setup, settings, corrected, measured, content = found[0]
-        named = f"result of frame {frame}"
-        outdated = self._outdated(basis).get(inputs, ())
+        version, setup, settings, corrected, measured, content = found[0]
+        path, named = self._database.path, f"result of frame {frame}"
+        outdated = _differences(basis, self._inputs(setup, settings))
         return Result(
             frame=frame,
-            measurement=self._unpacked(content, named),
+            measurement=unpack_from(path, named, content, Measurement),
             scheme=scheme,
             version=version,
             measured=measured,
-            setup=self._unpacked(setup, named),
-            settings=self._unpacked(settings, named),
+            setup=unpack_from(path, named, setup, str),
+            settings=unpack_from(path, named, settings, Settings),
             stale=(*outdated, *((CORRECTION_CHANGED,) if corrected != correction else ())),
         )
 
@@ -244,11 +244,12 @@ class Results:
             "FROM frame LEFT JOIN result ON frame = number AND scheme = ? ORDER BY number",
             scheme,
         )
-        sizes = np.array([row[5:] for row in rows], np.float64).reshape(-1, len(MEASURES))
+        array = self._database.array
+        sizes = array([row[5:] for row in rows], np.float64).reshape(-1, len(MEASURES))
         return Overview(
-            frame=np.array([row[0] for row in rows], np.int64),
-            time_s=np.array([row[1] for row in rows], np.float64),
-            status=tuple(row[4] or "" for row in rows),
+            frame=array([row[0] for row in rows], np.int64),
+            time_s=array([row[1] for row in rows], np.float64),
+            status=tuple(str(row[4] or "") for row in rows),
             corrected=np.array([row[0] in corrections for row in rows], bool),
             stale=np.array(
                 [
@@ -266,8 +267,8 @@ class Results:
         found = []
         for number, version, setup, settings in self._database.rows("SELECT * FROM inputs"):
             try:
-                parse_setup(unpack(setup), self._database.path)
-                unpack(settings)
+                parse_setup(unpack(setup, str), self._database.path)
+                unpack(settings, Settings)
             except (Damaged, InputError) as error:
                 found.append(f"inputs {number} of version {version} are damaged: {error}")
         names = ", ".join(MEASURES)
@@ -277,7 +278,7 @@ class Results:
             content = self._database.value("SELECT content FROM detail WHERE result = ?", result)
             named = f"result of frame {frame} ({scheme})"
             try:
-                measurement = unpack(content or b"")
+                measurement = unpack(content, Measurement)
             except Damaged as error:
                 found.append(f"{named} is damaged: {error}")
                 continue
@@ -289,11 +290,15 @@ class Results:
 
     def _outdated(self, basis: Basis | None) -> dict[int, tuple[str, ...]]:
         """Why results of each row of `inputs` no longer stand."""
-        rows = self._database.rows("SELECT id, setup, settings FROM inputs")
-        return {
-            number: _differences(basis, self._inputs(setup, settings))
-            for number, setup, settings in rows
-        }
+        outdated = {}
+        for number, setup, settings in self._database.rows(
+            "SELECT id, setup, settings FROM inputs"
+        ):
+            try:
+                outdated[number] = _differences(basis, self._inputs(setup, settings))
+            except InputError:
+                outdated[number] = (INPUTS_DAMAGED,)
+        return outdated
 
     def _inputs(self, setup: bytes, settings: bytes) -> Basis:
         try:
@@ -303,16 +308,10 @@ class Results:
                 self._database.path, "inputs", error, "what was written there"
             ) from error
 
-    def _unpacked(self, blob: bytes, named: str) -> Any:
-        try:
-            return unpack(blob)
-        except Damaged as error:
-            raise InputError(self._database.path, named, error, "what was written there") from error
-
 
 @functools.lru_cache(maxsize=64)
 def _read_inputs(setup: bytes, settings: bytes) -> Basis:
-    return Basis(parse_setup(unpack(setup), "setup"), unpack(settings))
+    return Basis(parse_setup(unpack(setup, str), "setup"), unpack(settings, Settings))
 
 
 def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:

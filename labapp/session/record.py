@@ -116,6 +116,8 @@ class Recording:
         What opening it again needs to know (`FrameSource.index`).
     imported
         When, ISO 8601.
+    frames_sha256
+        Of the number, time and checksum of every frame that the session uses.
     """
 
     path: str
@@ -134,3 +136,4 @@ class Recording:
     warnings: tuple[str, ...]
     index: bytes | None
     imported: str
+    frames_sha256: str | None = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -31,7 +32,7 @@ from labapp.session.blobs import fingerprint
 from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Change, Documents, Key
 from labapp.session.export import ExportChoice, ExportedFile
-from labapp.session.frames import Frames, Progress
+from labapp.session.frames import Frames, Progress, decoded
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.run import measure_each
@@ -233,10 +234,11 @@ class Session:
             If it does not keep it, or it is damaged.
         """
         content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)
-        if content is None or hashlib.sha256(content).hexdigest() != sha256:
+        image = decoded(content) if _is_whole(content, sha256) else None
+        if image is None:
             value = "missing" if content is None else "damaged"
             raise InputError(self.path, "calibration picture", value, "what was kept there")
-        return np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED))
+        return np.asarray(image)
 
     @property
     def settings(self) -> Settings:
@@ -321,7 +323,9 @@ class Session:
 
     # --- what was measured ------------------------------------------------------------------
 
-    def measure(self, frames: Iterable[int] | None = None) -> Iterator[tuple[int, Measurement]]:
+    def measure(
+        self, frames: Iterable[int] | None = None, pool: Executor | None = None
+    ) -> Iterator[tuple[int, Measurement]]:
         """Measure frames and keep what they give; yields (frame, measurement) once it is kept.
 
         A frame that cannot be read is kept with the status ``unreadable``.
@@ -330,6 +334,8 @@ class Session:
         ----------
         frames
             Which ones; None: those not measured yet, or measured from what was changed since.
+        pool
+            Processes to measure in (`run.measuring_pool`); None: here.
 
         Raises
         ------
@@ -347,7 +353,7 @@ class Session:
 
         numbers = (int(number) for number in chosen)
         for number, _, measurement in measure_each(
-            numbers, self.frame, basis.setup, basis.settings, correction
+            numbers, self.frame, basis.setup, basis.settings, correction, pool
         ):
             # What it was measured with, whatever has been corrected meanwhile.
             used = corrections.pop(number, None)
@@ -482,8 +488,12 @@ class Session:
         return [
             f"calibration picture {name} is damaged"
             for sha256, name, content in self._database.rows("SELECT * FROM picture")
-            if hashlib.sha256(content).hexdigest() != sha256
+            if not _is_whole(content, sha256)
         ]
+
+
+def _is_whole(content: object, sha256: str) -> bool:
+    return isinstance(content, bytes) and hashlib.sha256(content).hexdigest() == sha256
 
 
 POINTS = ("origin", "x_axis", "z_axis")

@@ -64,7 +64,7 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
     path = Path(path)
     try:
         values = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
         raise InputError(path, "syntax", error, A_SETUP) from error
     problems = [
         *_unknown_sections(path, values),
@@ -111,7 +111,7 @@ def updated_setup(
     """Put values into a setup's text, read from ``path``; see `update_setup`."""
     try:
         document = tomlkit.parse(text)
-    except (tomlkit.exceptions.TOMLKitError, RecursionError) as error:
+    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
         raise InputError(path, "syntax", error, A_SETUP) from error
     for section, keys in values.items():
         if section not in document:
@@ -171,7 +171,10 @@ def _check(path: Path, section: str, values: dict[str, Any]) -> list[InputError]
 
 def _shown(value: object) -> str:
     """A value as TOML writes it."""
-    shown = json.dumps(value, default=str, ensure_ascii=False)
+    try:
+        shown = json.dumps(value, default=str, ensure_ascii=False)
+    except (ValueError, RecursionError):
+        return "a number of thousands of digits, or too deep a list"
     return shown.replace("NaN", "nan").replace("Infinity", "inf")
 
 

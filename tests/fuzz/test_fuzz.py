@@ -1,0 +1,16 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.fuzz.contract import KINDS
+from tests.fuzz.fuzz import fuzz
+
+
+def test_damaged_files_are_refused_with_a_sentence_or_still_good(tmp_path: Path):
+    outcome = fuzz(200, 7, tmp_path)
+    assert outcome.failures == []
+    assert sum(outcome.files.values()) == 200
+    # Nothing refused, or everything, would mean that nothing was tried.
+    for kind in set(KINDS):
+        assert outcome.refused[kind] > 0, kind
+    assert all(outcome.used[kind] > 0 for kind in ("session", "setup", "recording", "manifest"))
