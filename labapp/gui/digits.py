@@ -1,0 +1,115 @@
+"""Numbers as an operator reads them: units, and no more digits than are known. Without Qt."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+MINUS = "−"
+"""As wide as a digit's plus; a hyphen reads as a dash."""
+
+NOTHING = "–"
+"""Stands where there is no number."""
+
+EXTRA_DECIMALS = 3
+"""A number with this many decimals more than its field shows was typed so: it is shown whole."""
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """One line of a result table.
+
+    Parameters
+    ----------
+    name
+        The quantity.
+    value
+        A number, or words; None or NaN where there is none.
+    sigma
+        Its standard uncertainty; None where there is none.
+    unit
+        "mm", "°", "px/mm" …
+    decimals
+        How many to show where no σ says it.
+    note
+        More about it, as a tooltip.
+    """
+
+    name: str
+    value: float | str | None
+    sigma: float | None = None
+    unit: str = ""
+    decimals: int = 3
+    note: str = ""
+
+    @property
+    def texts(self) -> tuple[str, str, str, str]:
+        """Name, value, ± and unit as they are shown."""
+        if isinstance(self.value, str):
+            return self.name, self.value, "", self.unit
+        value, sigma = rounded(self.value, self.sigma, self.decimals)
+        return self.name, value, sigma, self.unit
+
+
+def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tuple[str, str]:
+    """A value and its σ as texts: σ to two significant digits, the value to the same place.
+
+    Parameters
+    ----------
+    value, sigma
+        None or NaN: unknown.
+    decimals
+        Of the value where σ is unknown or 0.
+    """
+    if value is None or not math.isfinite(value):
+        return NOTHING, ""
+    if sigma is None or not (math.isfinite(sigma) and sigma > 0):
+        return plain(value, decimals), ""
+    # Rounding may carry: 0.0996 to two digits is 0.10.
+    place = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))
+    return plain(value, place), plain(sigma, place)
+
+
+def plain(value: float, decimals: int) -> str:
+    """A number with so many decimals (negative: rounded to tens …), without a negative zero."""
+    text = f"{round(value, decimals):.{max(decimals, 0)}f}"
+    return text.lstrip("-") if float(text) == 0 else text.replace("-", MINUS)
+
+
+def entered(value: float, decimals: int) -> str:
+    """A number in a field: with its decimals, or with a few more where somebody typed more."""
+    whole = np.format_float_positional(value, trim="-")
+    more = len(whole.partition(".")[2])
+    return plain(value, more if decimals < more <= decimals + EXTRA_DECIMALS else decimals)
+
+
+def parsed(text: str) -> float | None:
+    """The number that was typed, with a point or a comma; None if it is not one."""
+    try:
+        value = float(text.strip().replace(MINUS, "-").replace(",", "."))
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def as_text(rows: Iterable[ResultRow]) -> str:
+    """Result rows for a text or a letter: one line each, in tabs."""
+    return "\n".join("\t".join(row.texts) for row in rows)
+
+
+def as_csv(rows: Iterable[ResultRow]) -> str:
+    """Result rows for a program: comma-separated, numbers in full."""
+    lines = ["quantity,value,sigma,unit"]
+    for row in rows:
+        value = "" if row.value is None else f"{row.value}"
+        sigma = "" if row.sigma is None else f"{row.sigma}"
+        lines.append(",".join(_quoted(cell) for cell in (row.name, value, sigma, row.unit)))
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(cell: str) -> str:
+    quoted = cell.replace('"', '""')
+    return f'"{quoted}"' if any(mark in cell for mark in ',"\n') else cell

@@ -1,0 +1,212 @@
+"""Fields tell of finished edits only, keep what was right, and say in words what is wrong."""
+
+import math
+
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QGuiApplication
+
+from labapp.gui.digits import NOTHING, ResultRow, as_csv, entered, parsed, plain, rounded
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable, TextField
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "texts"),
+    [
+        (27.1234, 0.0312, ("27.123", "0.031")),
+        (27.1234, 0.0996, ("27.12", "0.10")),
+        (27.1234, 0.31, ("27.12", "0.31")),
+        (1234.5, 120.0, ("1230", "120")),
+        (-0.00004, 0.01, ("0.000", "0.010")),
+        (-2.5, None, ("−2.500", "")),
+        (2.5, 0.0, ("2.500", "")),
+        (None, 0.1, (NOTHING, "")),
+        (math.nan, None, (NOTHING, "")),
+    ],
+)
+def test_a_value_is_rounded_to_its_sigma(value, sigma, texts):
+    assert rounded(value, sigma) == texts
+
+
+def test_a_typed_number_is_shown_whole_and_a_computed_one_rounded():
+    assert entered(0.77, 2) == "0.77"
+    assert entered(38.6, 2) == "38.60"
+    assert entered(0.7735, 2) == "0.7735"
+    assert entered(38.6 / 7, 2) == "5.51"
+    assert entered(19, 0) == "19"
+    assert plain(-0.001, 2) == "0.00"
+
+
+def test_numbers_are_read_with_point_or_comma_and_either_minus():
+    assert parsed(" 27,5 ") == parsed("27.5") == 27.5
+    assert parsed("−3") == -3
+    for text in ("", "x", "1 2", "nan", "inf"):
+        assert parsed(text) is None
+
+
+def test_csv_holds_the_numbers_in_full():
+    rows = [ResultRow("angle", 27.123456, 0.03, "°"), ResultRow('a "b", c', None)]
+    lines = as_csv(rows).splitlines()
+    assert lines == ["quantity,value,sigma,unit", "angle,27.123456,0.03,°", '"a ""b"", c",,,']
+
+
+@pytest.fixture
+def number(qtbot):
+    field = NumberField("Angle", "°", lowest=0, highest=90, decimals=2, tooltip="Of the laser")
+    qtbot.addWidget(field)
+    field.set_value(27.0)
+    field.show()
+    field.told = []
+    field.edited.connect(field.told.append)
+    return field
+
+
+def retype(qtbot, field, text):
+    box = field.editor
+    box.setFocus()
+    box.selectAll()
+    qtbot.keyClicks(box, text)
+
+
+def test_a_number_is_told_when_it_is_finished(qtbot, number):
+    retype(qtbot, number, "30,5")
+    assert number.told == []
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    assert number.told == [30.5]
+    assert number.editor.text() == "30.50"
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    assert number.told == [30.5]
+
+
+def test_leaving_a_rounded_number_does_not_change_it(qtbot, number):
+    number.set_value(27.123456789)
+    number.editor.setFocus()
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    assert number.told == []
+    assert number.value() == 27.123456789
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("abc", "not a number"), ("91", "from 0 to 90 °"), ("", "is needed"), ("1e999", "not a")],
+)
+def test_what_is_wrong_is_said_and_the_former_value_stays(qtbot, number, text, words):
+    retype(qtbot, number, text)
+    if not text:
+        number.editor.clear()
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    assert number.told == []
+    assert number.value() == 27.0
+    assert number.editor.text() == "27.00"
+    assert words in number.problem.text()
+    assert words in number.editor.accessibleDescription()
+    assert not number.problem.isHidden()
+    number.set_value(28.0)
+    assert number.problem.isHidden()
+
+
+def test_steps_that_follow_each_other_are_one_edit(qtbot, number):
+    number.editor.setFocus()
+    for _ in range(3):
+        qtbot.keyClick(number.editor, Qt.Key.Key_Up)
+    assert number.editor.text() == "30.00"
+    assert number.told == []
+    number.set_value(27.0)  # a refresh meanwhile
+    qtbot.waitUntil(lambda: number.told == [30.0], timeout=2000)
+    for _ in range(8):
+        qtbot.keyClick(number.editor, Qt.Key.Key_PageUp)
+    number.flush()
+    assert number.told == [30.0, 90.0]
+
+
+def test_a_refresh_leaves_alone_what_is_being_typed(qtbot, number):
+    number.activateWindow()
+    qtbot.waitUntil(number.isActiveWindow)
+    retype(qtbot, number, "30")
+    number.set_value(27.0)
+    assert number.editor.text() == "30"
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    assert number.told == [30.0]
+
+
+def test_whole_numbers_and_empty_ones(qtbot):
+    field = NumberField("Rows", lowest=3, highest=99, step=2, decimals=0, optional=True)
+    qtbot.addWidget(field)
+    told = []
+    field.edited.connect(told.append)
+    retype(qtbot, field, "19")
+    field.flush()
+    retype(qtbot, field, "19.5")
+    field.flush()
+    assert "whole" in field.problem.text()
+    field.editor.clear()
+    field.flush()
+    assert told == [19, None]
+    assert type(told[0]) is int
+
+
+@pytest.mark.parametrize("lines", [1, 3])
+def test_words_are_told_when_they_are_finished(qtbot, lines):
+    field = TextField("Notes", lines=lines)
+    qtbot.addWidget(field)
+    field.set_value("old")
+    told = []
+    field.edited.connect(told.append)
+    field.editor.selectAll()
+    qtbot.keyClicks(field.editor, "steel")
+    assert told == []
+    qtbot.keyClick(field.editor, Qt.Key.Key_Return, Qt.KeyboardModifier.ControlModifier)
+    field.flush()
+    assert told == ["steel"]
+
+
+def test_a_choice_is_told_by_its_key_and_kept_when_others_are_offered(qtbot):
+    field = ChoiceField("Scheme", [("fit", "Fit"), ("ers", "Extrapolation")])
+    qtbot.addWidget(field)
+    told = []
+    field.edited.connect(told.append)
+    field.set_value("fit")
+    qtbot.keyClick(field.editor, Qt.Key.Key_Down)
+    assert told == ["ers"]
+    field.set_choices([("irs", "Interpolation"), ("ers", "Extrapolation")])
+    assert field.value() == "ers"
+    assert told == ["ers"]
+
+
+def test_a_form_lays_out_label_editor_and_unit(qtbot):
+    form = FieldForm()
+    qtbot.addWidget(form)
+    fields = [
+        NumberField("A", "mm", lowest=0, highest=1, tooltip="first"),
+        NumberField("A long label that wraps", "degrees", lowest=0, highest=1, tooltip="second"),
+    ]
+    form.add_heading("Group")
+    for field in fields:
+        form.add(field)
+    form.resize(360, 200)
+    form.show()
+    left, right = (
+        [getattr(f.editor.geometry(), side)() for f in fields] for side in "left right".split()
+    )
+    assert left[0] == left[1]
+    assert right[0] == right[1]
+    for field in fields:
+        assert field.label.buddy() is field.editor
+        assert field.editor.accessibleName()
+        assert field.editor.toolTip()
+
+
+def test_a_table_is_copied_as_text_and_as_csv(qtbot):
+    table = ResultTable("Laser")
+    qtbot.addWidget(table)
+    table.set_rows([ResultRow("angle", 27.1234, 0.031, "°"), ResultRow("check", "good")])
+    assert table.item(0, 1).text() == "27.123"
+    assert table.item(0, 1).textAlignment() & Qt.AlignmentFlag.AlignRight
+    table.show()
+    table.setFocus()
+    table.copy_text()
+    assert QGuiApplication.clipboard().text() == "angle\t27.123\t0.031\t°\ncheck\tgood\t\t"
+    table.copy_csv()
+    assert "27.1234,0.031" in QGuiApplication.clipboard().text()
+    table.set_rows([ResultRow("angle", 28.0, 0.031, "°")])
+    assert table.rowCount() == 1
