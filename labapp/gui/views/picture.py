@@ -1,0 +1,444 @@
+"""A picture with what pages lay over it: zoom, pan, contrast, places in px, points to drag.
+
+Places are (u, v) in px as everywhere: u right, v down, the first pixel's centre at (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import QEvent, QPointF, QRectF, Qt, Signal
+from PySide6.QtGui import QColor, QImage, QKeyEvent, QPalette
+from PySide6.QtWidgets import (
+    QGraphicsItem,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QSizePolicy,
+    QSlider,
+    QToolButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.core.values import BoolArray
+from labapp.media import GreyImage
+
+pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
+
+ZOOM_STEP = 1.25
+MOST_ZOOM_PX = 4.0
+"""No fewer pixels than this fill the view."""
+
+DARKEST, BRIGHTEST = 1.0, 99.7
+"""Percentiles of the levels that are drawn black and white."""
+
+CONTRAST_STEPS = 25
+"""So many steps of the contrast slider halve or double the range of levels."""
+
+NUDGE_PX = 0.1
+FAR_NUDGE_PX = 1.0
+"""How far an arrow key moves a point, without and with Shift."""
+
+ARROWS = {
+    Qt.Key.Key_Left: (-1, 0),
+    Qt.Key.Key_Right: (1, 0),
+    Qt.Key.Key_Up: (0, -1),
+    Qt.Key.Key_Down: (0, 1),
+}
+
+KEYS = "Zoom with the wheel, + and −; F fits; drag with the middle button to move; [ ] contrast"
+
+
+class Tool:
+    """What the left button does in a picture; this one leaves all to the picture, which pans."""
+
+    def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
+        """The left button was pressed and released at a place."""
+
+    def double_click(self, u: float, v: float) -> None:
+        """It was pressed twice."""
+
+    def begin(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> bool:
+        """Begin a drag at a place; False leaves it to the picture."""
+        return False
+
+    def drag(self, u: float, v: float) -> None:
+        """Go on with the drag."""
+
+    def end(self, u: float, v: float) -> None:
+        """Let go."""
+
+    def key(self, event: QKeyEvent) -> bool:
+        """Take a key; False leaves it to the picture."""
+        return False
+
+
+class PictureView(QWidget):
+    """A grey picture; overlays are pyqtgraph items that `add` puts over it, in px.
+
+    Signals
+    -------
+    pointed
+        Where the pointer is and the level there: u, v, level (None outside the picture).
+
+    Attributes
+    ----------
+    tool
+        What the left button does.
+    points
+        The points to drag.
+    """
+
+    pointed = Signal(float, float, object)
+
+    def __init__(self, name: str = "Picture") -> None:
+        super().__init__()
+        self.tool = Tool()
+        self.points: list[DragPoint] = []
+        self._image: GreyImage | None = None
+        self._levels = (0.0, 1.0)
+        self._current: DragPoint | None = None
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setAccessibleName(name)
+        self.setAccessibleDescription(KEYS)
+        self.canvas = pg.GraphicsView()
+        self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        self.canvas.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
+        self.canvas.setMinimumSize(160, 120)
+        self.box = _Box(self)
+        self.canvas.setCentralItem(self.box)
+        self._item = pg.ImageItem()
+        self._item.setZValue(-100)
+        self.box.addItem(self._item)
+        self._place = QLabel()
+        self._place.setTextFormat(Qt.TextFormat.PlainText)
+        self._empty = QLabel("", self.canvas)
+        self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self._empty.setWordWrap(True)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setSpacing(0)
+        over = QGridLayout(self.canvas)
+        over.addWidget(self._empty)
+        layout.addWidget(self.canvas, 1)
+        layout.addLayout(self._bar())
+        self.canvas.scene().sigMouseMoved.connect(self._moved)
+        self._paint()
+
+    # --- the picture --------------------------------------------------------------------------
+
+    def show_picture(self, grey: GreyImage | None, why_not: str = "") -> None:
+        """Show a picture, shape (rows, columns), or none and why in words.
+
+        Zoom and contrast stay where the picture is of the same size and about as bright.
+        """
+        former, self._image = self._image, grey
+        self._empty.setText(why_not if grey is None else "")
+        self._item.setVisible(grey is not None)
+        if grey is None:
+            return
+        same = former is not None and former.shape == grey.shape
+        levels = auto_levels(grey)
+        if not (same and _alike(levels, self._levels)):
+            self._levels = levels
+        self._item.setImage(grey, autoLevels=False, levels=self._shown_levels())
+        rows, columns = grey.shape
+        self._item.setRect(QRectF(-0.5, -0.5, columns, rows))
+        if not same:
+            self.box.setLimits(
+                xMin=-columns, xMax=2 * columns, yMin=-rows, yMax=2 * rows, minXRange=MOST_ZOOM_PX
+            )
+            self.fit()
+
+    @property
+    def picture(self) -> GreyImage | None:
+        """What is shown."""
+        return self._image
+
+    def add(self, item: QGraphicsItem) -> None:
+        """Put an overlay over the picture."""
+        self.box.addItem(item, ignoreBounds=True)
+
+    def remove(self, item: QGraphicsItem) -> None:
+        """Take an overlay away."""
+        self.box.removeItem(item)
+
+    def add_point(self, point: DragPoint) -> None:
+        """Put a point to drag over the picture."""
+        self.add(point)
+        self.points.append(point)
+        point.moved.connect(lambda *_: self.choose_point(point))
+        self.choose_point(self._current or point)
+
+    def remove_point(self, point: DragPoint) -> None:
+        """Take a point away."""
+        self.points.remove(point)
+        self.remove(point)
+        if self._current is point:
+            self._current = None
+            if self.points:
+                self.choose_point(self.points[0])
+
+    def choose_point(self, point: DragPoint) -> None:
+        """Let the arrow keys move a point."""
+        self._current = point
+        for each in self.points:
+            each.show_chosen(each is point)
+
+    def grab_picture(self) -> QImage:
+        """Return what is seen, overlays and all."""
+        picture: QImage = self.canvas.grab().toImage()
+        return picture
+
+    # --- zoom and contrast --------------------------------------------------------------------
+
+    def fit(self) -> None:
+        """Show the whole picture."""
+        if self._image is not None:
+            rows, columns = self._image.shape
+            self.box.setRange(QRectF(-0.5, -0.5, columns, rows), padding=0.01)
+
+    def zoom(self, factor: float) -> None:
+        """Zoom about the middle; more than 1 makes it larger."""
+        self.box.scaleBy((1 / factor, 1 / factor))
+
+    def pan(self, right: float, down: float) -> None:
+        """Move what is seen by shares of the view."""
+        seen = self.box.viewRect()
+        self.box.translateBy(x=right * seen.width(), y=down * seen.height())
+
+    @property
+    def px_per_point(self) -> float:
+        """Picture px that one point of the screen covers: distances for the hand."""
+        return float(abs(self.box.viewPixelSize()[0]))
+
+    def auto_contrast(self) -> None:
+        """Fit black and white to the picture."""
+        if self._image is not None:
+            self._levels = auto_levels(self._image)
+        self._contrast.setValue(0)
+        self._item.setLevels(self._shown_levels())
+
+    def _shown_levels(self) -> tuple[float, float]:
+        black, white = self._levels
+        return black, black + (white - black) * 2 ** (-self._contrast.value() / CONTRAST_STEPS)
+
+    # --- within -------------------------------------------------------------------------------
+
+    def _bar(self) -> QHBoxLayout:
+        bar = QHBoxLayout()
+        bar.setContentsMargins(6, 2, 6, 2)
+        bar.setSpacing(4)
+
+        def button(text: str, name: str, tip: str, do: Callable[[], object]) -> None:
+            one = QToolButton()
+            one.setText(text)
+            one.setAccessibleName(name)
+            one.setToolTip(tip)
+            one.setAutoRaise(True)
+            one.clicked.connect(lambda _: do())
+            bar.addWidget(one)
+
+        button("Fit", "Fit picture", "Show the whole picture (F)", self.fit)
+        button("−", "Zoom out", "Zoom out (−)", lambda: self.zoom(1 / ZOOM_STEP))
+        button("+", "Zoom in", "Zoom in (+)", lambda: self.zoom(ZOOM_STEP))
+        bar.addSpacing(8)
+        label = QLabel("Contrast")
+        bar.addWidget(label)
+        self._contrast = QSlider(Qt.Orientation.Horizontal)
+        self._contrast.setRange(-3 * CONTRAST_STEPS, 5 * CONTRAST_STEPS)
+        self._contrast.setFixedWidth(110)
+        self._contrast.setAccessibleName("Contrast")
+        self._contrast.setToolTip("Brings out faint dots, or calms bright ones ([ and ])")
+        self._contrast.valueChanged.connect(lambda _: self._item.setLevels(self._shown_levels()))
+        label.setBuddy(self._contrast)
+        bar.addWidget(self._contrast)
+        button("Auto", "Automatic contrast", "Fit contrast to the picture (0)", self.auto_contrast)
+        bar.addStretch(1)
+        bar.addWidget(self._place)
+        return bar
+
+    def _moved(self, at: QPointF) -> None:
+        place = self.box.mapSceneToView(at)
+        u, v = float(place.x()), float(place.y())
+        level = level_at(self._image, u, v)
+        self._place.setText("" if level is None else f"u {u:6.1f}  v {v:6.1f} px   level {level:g}")
+        self.pointed.emit(u, v, level)
+
+    def _paint(self) -> None:
+        self.canvas.setBackground(self.palette().color(QPalette.ColorRole.Window).darker(120))
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "canvas"):
+            self._paint()
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Give a key to the tool, to the point chosen, or to zoom and contrast."""
+        if self.tool.key(event) or self._nudged(event):
+            return
+        key = event.key()
+        simple: dict[int, Callable[[], object]] = {
+            Qt.Key.Key_Plus: lambda: self.zoom(ZOOM_STEP),
+            Qt.Key.Key_Equal: lambda: self.zoom(ZOOM_STEP),
+            Qt.Key.Key_Minus: lambda: self.zoom(1 / ZOOM_STEP),
+            Qt.Key.Key_F: self.fit,
+            Qt.Key.Key_0: self.auto_contrast,
+            Qt.Key.Key_BracketLeft: lambda: self._contrast.setValue(self._contrast.value() - 5),
+            Qt.Key.Key_BracketRight: lambda: self._contrast.setValue(self._contrast.value() + 5),
+            Qt.Key.Key_P: self._next_point,
+        }
+        if event.modifiers() & ~Qt.KeyboardModifier.KeypadModifier & ~SHIFT or key not in simple:
+            super().keyPressEvent(event)
+        else:
+            simple[key]()
+
+    def _nudged(self, event: QKeyEvent) -> bool:
+        arrow = ARROWS.get(Qt.Key(event.key()))
+        if arrow is None or event.modifiers() & CONTROL:
+            return False
+        if self._current is None:
+            self.pan(0.1 * arrow[0], 0.1 * arrow[1])
+        else:
+            step = FAR_NUDGE_PX if event.modifiers() & SHIFT else NUDGE_PX
+            self._current.nudge(arrow[0] * step, arrow[1] * step)
+        return True
+
+    def _next_point(self) -> None:
+        if self.points:
+            place = -1 if self._current is None else self.points.index(self._current)
+            self.choose_point(self.points[(place + 1) % len(self.points)])
+
+
+CONTROL = Qt.KeyboardModifier.ControlModifier
+SHIFT = Qt.KeyboardModifier.ShiftModifier
+
+
+class DragPoint(pg.TargetItem):  # type: ignore[misc]
+    """A named point to drag, or to nudge with the arrow keys.
+
+    Signals
+    -------
+    moved
+        It is under way: u, v.
+    dropped
+        It was let go, or nudged: u, v.
+
+    Parameters
+    ----------
+    name
+        Stands beside it.
+    u, v
+        Where it begins, px.
+    color
+        Of cross and name.
+    """
+
+    moved = Signal(float, float)
+    dropped = Signal(float, float)
+
+    def __init__(self, name: str, u: float, v: float, color: str = "#ffb000") -> None:
+        self.name = name
+        self._color = QColor(color)
+        super().__init__(
+            pos=(u, v),
+            size=15,
+            symbol="crosshair",
+            pen=pg.mkPen(color, width=1.5),
+            hoverPen=pg.mkPen(color, width=3),
+            label=name,
+            labelOpts={"color": color, "offset": (10, 0), "fill": (0, 0, 0, 130)},
+        )
+        self.setToolTip(f"{name}: drag it, or use the arrow keys (Shift: {FAR_NUDGE_PX:g} px)")
+        self.sigPositionChanged.connect(lambda *_: self.moved.emit(*self.place))
+        self.sigPositionChangeFinished.connect(lambda *_: self.dropped.emit(*self.place))
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """(u, v), px."""
+        return float(self.pos().x()), float(self.pos().y())
+
+    def set_place(self, u: float, v: float) -> None:
+        """Put it somewhere else; tells nobody. A hand that has it keeps it."""
+        if self.moving:
+            return
+        blocked = self.blockSignals(True)
+        self.setPos(u, v)
+        self.blockSignals(blocked)
+
+    def nudge(self, du: float, dv: float) -> None:
+        """Move it a little, as the arrow keys do."""
+        u, v = self.place
+        self.setPos(u + du, v + dv)
+        self.dropped.emit(*self.place)
+
+    def show_chosen(self, chosen: bool) -> None:
+        """Show whether the arrow keys move it."""
+        self.setPen(pg.mkPen(self._color, width=2.5 if chosen else 1.5))
+
+
+class _Box(pg.ViewBox):  # type: ignore[misc]
+    """The view's own coordinates are px; its mouse is the tool's, then the picture's."""
+
+    def __init__(self, view: PictureView) -> None:
+        super().__init__(lockAspect=True, invertY=True, enableMenu=False, defaultPadding=0)
+        self._view = view
+        self._tool_drags = False
+
+    def mouseClickEvent(self, event: Any) -> None:  # noqa: N802
+        if event.button() != Qt.MouseButton.LeftButton:
+            return
+        event.accept()
+        self._view.setFocus(Qt.FocusReason.MouseFocusReason)
+        place = self.mapSceneToView(event.scenePos())
+        if event.double():
+            self._view.tool.double_click(place.x(), place.y())
+        else:
+            self._view.tool.click(place.x(), place.y(), event.modifiers())
+
+    def mouseDragEvent(self, event: Any, axis: int | None = None) -> None:  # noqa: N802
+        tool = self._view.tool
+        if event.isStart():
+            self._view.setFocus(Qt.FocusReason.MouseFocusReason)
+            start = self.mapSceneToView(event.buttonDownScenePos())
+            left = event.button() == Qt.MouseButton.LeftButton
+            self._tool_drags = left and tool.begin(start.x(), start.y(), event.modifiers())
+        event.accept()
+        if self._tool_drags:
+            place = self.mapSceneToView(event.scenePos())
+            (tool.end if event.isFinish() else tool.drag)(place.x(), place.y())
+            self._tool_drags = not event.isFinish()
+            return
+        there, before = (self.mapSceneToView(p) for p in (event.scenePos(), event.lastScenePos()))
+        self.translateBy(x=before.x() - there.x(), y=before.y() - there.y())
+
+
+def auto_levels(grey: GreyImage) -> tuple[float, float]:
+    """Levels to draw black and white, by percentiles of a part of the pixels."""
+    thin = max(1, min(grey.shape) // 256)
+    part = grey[::thin, ::thin]
+    finite: BoolArray = np.isfinite(part)
+    if not finite.any():
+        return 0.0, 1.0
+    black, white = np.percentile(part[finite], (DARKEST, BRIGHTEST))
+    return float(black), float(max(white, black + 1e-9 + 1e-6 * abs(black)))
+
+
+def level_at(grey: GreyImage | None, u: float, v: float) -> float | None:
+    """Level of the pixel at a place; None outside the picture."""
+    if grey is None or not (np.isfinite(u) and np.isfinite(v)):
+        return None
+    row, column = round(v), round(u)
+    rows, columns = grey.shape
+    return float(grey[row, column]) if 0 <= row < rows and 0 <= column < columns else None
+
+
+def _alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two ranges of levels are near enough for a film not to flicker."""
+    span = max(one[1] - one[0], other[1] - other[0])
+    return max(abs(one[0] - other[0]), abs(one[1] - other[1])) < 0.3 * span

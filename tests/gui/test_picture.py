@@ -1,0 +1,162 @@
+"""The picture: places in px, zoom that stays, contrast, points to drag."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyqtgraph as pg
+import pytest
+from PySide6.QtCore import QPoint, QPointF, Qt
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.views.picture import DragPoint, PictureView, Tool, auto_levels, level_at
+
+KEPT: list[PictureView] = []
+"""Windows with pyqtgraph live to the end of the process: some crash when they are destroyed."""
+
+GREY = (np.add.outer(np.arange(120), np.arange(160)) % 251).astype(np.uint8)
+
+
+@pytest.fixture
+def view(qtbot: QtBot) -> PictureView:
+    view = PictureView()
+    KEPT.append(view)
+    view.resize(700, 560)
+    view.show_picture(GREY)
+    view.show()
+    qtbot.waitExposed(view)
+    QTest.qWait(30)
+    return view
+
+
+def at(view: PictureView, u: float, v: float) -> QPoint:
+    scene = view.box.mapViewToScene(QPointF(u, v))
+    return view.canvas.mapFromScene(scene)
+
+
+class Noting(Tool):
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, float, float]] = []
+
+    def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
+        self.seen.append(("click", u, v))
+
+    def begin(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> bool:
+        self.seen.append(("begin", u, v))
+        return True
+
+    def drag(self, u: float, v: float) -> None:
+        self.seen.append(("drag", u, v))
+
+    def end(self, u: float, v: float) -> None:
+        self.seen.append(("end", u, v))
+
+
+def drag(view: PictureView, start: QPoint, end: QPoint) -> None:
+    port = view.canvas.viewport()
+    QTest.mousePress(port, Qt.MouseButton.LeftButton, pos=start)
+    for part in (0.3, 0.6, 1.0):
+        QTest.mouseMove(port, start + (end - start) * part)
+        QTest.qWait(5)
+    QTest.mouseRelease(port, Qt.MouseButton.LeftButton, pos=end)
+    QTest.qWait(5)
+
+
+def test_the_tool_hears_of_clicks_and_drags_in_px_u_right_v_down(view: PictureView) -> None:
+    view.tool = tool = Noting()
+    QTest.mouseClick(view.canvas.viewport(), Qt.MouseButton.LeftButton, pos=at(view, 40, 30))
+    kind, u, v = tool.seen[0]
+    assert kind == "click"
+    assert (u, v) == pytest.approx((40, 30), abs=0.3)
+    drag(view, at(view, 20, 20), at(view, 60, 90))
+    assert tool.seen[1][0] == "begin"
+    assert tool.seen[1][1:] == pytest.approx((20, 20), abs=0.3)
+    assert tool.seen[-1][0] == "end"
+    assert tool.seen[-1][1:] == pytest.approx((60, 90), abs=0.3)
+
+
+def test_pixel_centres_are_whole_numbers() -> None:
+    assert level_at(GREY, 12.4, 7.4) == GREY[7, 12]
+    assert level_at(GREY, 11.6, 6.6) == GREY[7, 12]
+    assert level_at(GREY, -0.4, 119.4) == GREY[119, 0]
+    assert level_at(GREY, 160, 3) is None
+    assert level_at(GREY, 3, -0.6) is None
+    assert level_at(None, 0, 0) is None
+
+
+def test_the_middle_of_what_is_seen_is_the_middle_of_the_picture(view: PictureView) -> None:
+    middle = view.box.viewRect().center()
+    assert (middle.x(), middle.y()) == pytest.approx((79.5, 59.5), abs=0.01)
+
+
+def test_zoom_stays_for_the_next_frame_and_is_new_for_another_size(view: PictureView) -> None:
+    view.zoom(4)
+    seen = view.box.viewRect()
+    view.show_picture(GREY[::-1].copy())
+    assert view.box.viewRect() == seen
+    view.show_picture(GREY[:60])
+    assert view.box.viewRect() != seen
+
+
+def test_keys_zoom_and_fit(view: PictureView) -> None:
+    whole = view.box.viewRect().width()
+    QTest.keyClick(view, Qt.Key.Key_Plus)
+    assert view.box.viewRect().width() == pytest.approx(whole / 1.25)
+    QTest.keyClick(view, Qt.Key.Key_Right)
+    assert view.box.viewRect().center().x() > 90
+    QTest.keyClick(view, Qt.Key.Key_F)
+    assert view.box.viewRect().width() == pytest.approx(whole)
+
+
+def test_contrast_follows_the_picture_but_does_not_flicker(view: PictureView) -> None:
+    held = auto_levels(GREY)
+    view.show_picture((GREY * 0.9).astype(np.uint8))
+    assert view._shown_levels() == held
+    dim = GREY.astype(np.uint16) * 200
+    view.show_picture(dim)
+    assert view._shown_levels() == auto_levels(dim)
+    QTest.keyClick(view, Qt.Key.Key_BracketRight)
+    assert view._shown_levels()[1] < auto_levels(dim)[1]
+    QTest.keyClick(view, Qt.Key.Key_0)
+    assert view._shown_levels() == auto_levels(dim)
+    # Some tiff stacks hold NaN, and a capped lens gives one level alone.
+    assert auto_levels(np.full((9, 9), np.nan)) == (0.0, 1.0)
+    black, white = auto_levels(np.full((9, 9), 7))
+    assert black == 7 < white
+
+
+def test_a_point_is_dragged_and_nudged(view: PictureView, qtbot: QtBot) -> None:
+    first, second = DragPoint("O′", 40, 40), DragPoint("X axis", 120, 40)
+    for point in (first, second):
+        view.add_point(point)
+    QTest.qWait(20)
+    with qtbot.waitSignal(second.dropped) as told:
+        drag(view, at(view, 120, 40), at(view, 130, 60))
+    assert told.args == pytest.approx([130, 60], abs=0.5)
+    u, v = second.place
+    QTest.keyClick(view, Qt.Key.Key_Left)
+    QTest.keyClick(view, Qt.Key.Key_Down, Qt.KeyboardModifier.ShiftModifier)
+    assert second.place == pytest.approx((u - 0.1, v + 1))
+    QTest.keyClick(view, Qt.Key.Key_P)
+    QTest.keyClick(view, Qt.Key.Key_Right)
+    assert first.place == pytest.approx((40.1, 40))
+    with qtbot.assertNotEmitted(first.moved):
+        first.set_place(10, 10)
+    assert first.place == (10, 10)
+
+
+def test_what_is_seen_can_be_copied_overlays_and_all(view: PictureView) -> None:
+    bare = view.grab_picture()
+    view.add(pg.ScatterPlotItem([80], [60], size=30, brush="r", pen=None))
+    QTest.qWait(20)
+    picture = view.grab_picture()
+    assert picture.size() == bare.size()
+    assert picture.pixelColor(at(view, 80, 60)).red() == 255
+
+
+def test_without_a_picture_it_says_why(view: PictureView) -> None:
+    view.show_picture(None, "frame 3 cannot be read")
+    assert view.picture is None
+    assert view._empty.text() == "frame 3 cannot be read"
+    view.show_picture(GREY)
+    assert view._empty.text() == ""
