@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from labapp.core.dots import Dots, Grey, Image
@@ -149,7 +150,7 @@ def _valley(grey: Grey, dots: Dots) -> float:
     return float(np.clip(np.quantile(depth, 0.1), 0.0, 1.0))
 
 
-def _at(grey: Grey, place_px: FloatArray) -> FloatArray:
+def _at(grey: npt.NDArray[Any], place_px: FloatArray) -> FloatArray:
     u, v = np.rint(place_px).astype(int).T
     rows, columns = grey.shape
     return np.asarray(grey[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)], np.float64)

@@ -37,6 +37,7 @@ from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.session.kinds import check_fields, is_a
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
+from labapp.session.signals import Signals
 
 MAGIC = b"LAB1"
 HEAD = struct.Struct("<4sI")
@@ -46,7 +47,7 @@ DATACLASSES: dict[str, Any] = {
     for kind in (
         *(Boundary, Correction, dots.Dots, ImageCalibration, lattice.Lattice, LaserCalibration),
         *(LaserReadings, Match, Measurement, Measures, PlaneCalibration, PlanePicture, Record),
-        *(Reconstruction, Recording, SplineBasis, SplineSurface, Trial),
+        *(Reconstruction, Recording, Signals, SplineBasis, SplineSurface, Trial),
         *(DotPattern, Electrode, ImagingPlane, Laser, Rig),
         *(Settings, MatchSettings, detection.DotSettings, detection.LatticeSettings),
         *(dots.BandPassSettings, threshold_dots.BlockThresholdSettings),

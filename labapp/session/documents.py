@@ -1,8 +1,8 @@
 """What the operator says, and every change of it: undo, redo, saved with the session.
 
 A document is one thing the operator decides: the record, the setup, the settings, a calibration,
-the correction of one frame. A change sets some of them, in one transaction with what they were
-before.
+the correction of one frame, the weld's current and voltage. A change sets some of them, in one
+transaction with what they were before.
 """
 
 from __future__ import annotations
@@ -18,9 +18,16 @@ from labapp.core.pipeline import Settings
 from labapp.session.blobs import Damaged, fingerprint, pack, unpack, unpack_from
 from labapp.session.database import Database
 from labapp.session.record import LaserReadings, PlanePicture, Record
+from labapp.session.signals import Signals
 
 Kind = Literal[
-    "record", "setup", "settings", "laser-calibration", "plane-calibration", "correction"
+    "record",
+    "setup",
+    "settings",
+    "laser-calibration",
+    "plane-calibration",
+    "correction",
+    "signals",
 ]
 Key = tuple[Kind, int]
 """Kind, and the frame of a correction; `WHOLE` for what belongs to no frame."""
@@ -34,6 +41,7 @@ CLASSES: dict[str, type] = {
     "laser-calibration": LaserReadings,
     "plane-calibration": PlanePicture,
     "correction": Correction,
+    "signals": Signals,
 }
 """What a document of each kind is."""
 

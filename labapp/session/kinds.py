@@ -30,6 +30,7 @@ SHAPES: dict[str, dict[str, str]] = {
         "witness": "rows columns",
     },
     "Reconstruction": {"ray": "n 2", "points_mm": "n 3", "residual_mm": "n 2", "sigma_mm": "n"},
+    "Signals": dict.fromkeys(("time_s", "current_a", "voltage_v"), "n"),
     "SplineBasis": {"x_knots": "x", "y_knots": "y"},
     "SplineSurface": {"coefficients": "n"},
 }
