@@ -6,7 +6,6 @@ and whatever happens before it returns leaves the session as it was.
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -14,7 +13,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import cv2
 import numpy as np
 
 from labapp.core.correction import Correction
@@ -32,11 +30,13 @@ from labapp.session.blobs import fingerprint
 from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Change, Documents, Key
 from labapp.session.export import ExportChoice, ExportedFile
-from labapp.session.frames import Frames, Progress, decoded
+from labapp.session.frames import Frames, Progress
+from labapp.session.kept_pictures import KeptPictures
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.run import measure_each
 from labapp.session.setup import Setup, parse_setup, updated_setup
+from labapp.session.signals import Signals
 
 
 class Session:
@@ -56,6 +56,7 @@ class Session:
         self._database = database
         self._documents = Documents(database)
         self._frames = Frames(database)
+        self._pictures = KeptPictures(database)
         self._results = Results(database)
 
     @classmethod
@@ -164,8 +165,9 @@ class Session:
         l2_mm: Sequence[float],
         l3_mm: Sequence[float],
         fan_angle_deg: float = 10.0,
+        picture: GreyImage | None = None,
     ) -> LaserCalibration:
-        """Find the laser from its cross-hair (Appendix I) and put it into the rig.
+        """Find the laser from its cross-hair (Appendix I), put it into the rig, keep its picture.
 
         Raises
         ------
@@ -173,7 +175,9 @@ class Session:
             If no laser can have drawn such a cross.
         """
         found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg)
-        readings = LaserReadings(tuple(l1_mm), tuple(l2_mm), tuple(l3_mm), fan_angle_deg, found)
+        kept = None if picture is None else self._pictures.keep("cross-hair", picture)
+        lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
+        readings = LaserReadings(*lengths, fan_angle_deg, found, kept)
         laser = {"projection_angle_deg": found.angle_deg, "distance_mm": found.distance_mm}
         self._change(
             "laser calibration",
@@ -210,20 +214,33 @@ class Session:
         with open_source(picture) as source:
             image = source.frame(0).image
         found = calibrate_plane(image, PlaneCalibrationSettings(unit_mm=unit_mm))
-        sha256 = self._keep_picture(Path(picture).name, image)
+        self.use_plane(found, unit_mm, image, Path(picture).name)
+        return found
+
+    def use_plane(
+        self, found: PlaneCalibration, unit_mm: float, image: GreyImage, name: str = "picture"
+    ) -> None:
+        """Use an imaging plane found in a picture, or placed there by hand; keep both.
+
+        Raises
+        ------
+        ValueError
+            If its three points lie on one line.
+        """
+        _ = found.image_calibration  # which refuses such points
         calibration = {
-            **{f"{name}_px": list(getattr(found, f"{name}_px")) for name in POINTS},
-            **{f"{name}_mm": getattr(found, f"{name}_mm") for name in POINTS[1:]},
+            **{f"{point}_px": list(getattr(found, f"{point}_px")) for point in POINTS},
+            **{f"{point}_mm": getattr(found, f"{point}_mm") for point in POINTS[1:]},
             "homography": None,
         }
+        readings = PlanePicture(unit_mm, found, self._pictures.keep(name, image))
         self._change(
             "imaging-plane calibration",
             {
-                ("plane-calibration", WHOLE): PlanePicture(unit_mm, found, sha256),
+                ("plane-calibration", WHOLE): readings,
                 ("setup", WHOLE): self._updated({"image_calibration": calibration}),
             },
         )
-        return found
 
     def picture(self, sha256: str) -> GreyImage:
         """A calibration picture that the session keeps, grey levels, shape (rows, columns).
@@ -233,12 +250,7 @@ class Session:
         InputError
             If it does not keep it, or it is damaged.
         """
-        content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)
-        image = decoded(content) if _is_whole(content, sha256) else None
-        if image is None:
-            value = "missing" if content is None else "damaged"
-            raise InputError(self.path, "calibration picture", value, "what was kept there")
-        return np.asarray(image)
+        return self._pictures.get(sha256)
 
     @property
     def settings(self) -> Settings:
@@ -268,6 +280,16 @@ class Session:
         for frame in corrections:
             self._frames.time_s(frame)
         self._change(label, {("correction", frame): value for frame, value in corrections.items()})
+
+    @property
+    def signals(self) -> Signals | None:
+        """Current and voltage of the weld; None where none were read."""
+        found: Signals | None = self._documents.get("signals")
+        return found
+
+    def set_signals(self, signals: Signals | None) -> None:
+        """Keep current and voltage (`read_signals`); None lets go of them."""
+        self._change("current and voltage", {("signals", WHOLE): signals})
 
     def undo(self) -> Change | None:
         """Take back the last change that stands; None if there is none."""
@@ -455,7 +477,7 @@ class Session:
             return found
         return [
             *self._documents.problems(),
-            *self._pictures_problems(),
+            *self._pictures.problems(),
             *(self._frames.problems(progress) if recording else ()),
             *self._results.problems(),
         ]
@@ -473,27 +495,6 @@ class Session:
             return Basis(self.setup, self.settings)
         except InputError:
             return None
-
-    def _keep_picture(self, name: str, image: GreyImage) -> str:
-        _, encoded = cv2.imencode(".png", image)
-        content = encoded.tobytes()
-        sha256 = hashlib.sha256(content).hexdigest()
-        with self._database.transaction() as connection:
-            connection.execute(
-                "INSERT OR IGNORE INTO picture VALUES (?, ?, ?)", (sha256, name, content)
-            )
-        return sha256
-
-    def _pictures_problems(self) -> list[str]:
-        return [
-            f"calibration picture {name} is damaged"
-            for sha256, name, content in self._database.rows("SELECT * FROM picture")
-            if not _is_whole(content, sha256)
-        ]
-
-
-def _is_whole(content: object, sha256: str) -> bool:
-    return isinstance(content, bytes) and hashlib.sha256(content).hexdigest() == sha256
 
 
 POINTS = ("origin", "x_axis", "z_axis")

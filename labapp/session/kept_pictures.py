@@ -1,0 +1,53 @@
+"""The calibration pictures that a session keeps."""
+
+from __future__ import annotations
+
+import hashlib
+
+import cv2
+import numpy as np
+
+from labapp.errors import InputError
+from labapp.media import GreyImage
+from labapp.session.database import Database
+from labapp.session.frames import decoded
+
+
+class KeptPictures:
+    """Pictures by the SHA-256 of their PNG; what was kept is never changed."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def keep(self, name: str, image: GreyImage) -> str:
+        """Keep a picture, grey levels, shape (rows, columns); returns its SHA-256."""
+        _, encoded = cv2.imencode(".png", image)
+        content = encoded.tobytes()
+        sha256 = hashlib.sha256(content).hexdigest()
+        with self._database.transaction() as connection:
+            connection.execute(
+                "INSERT OR IGNORE INTO picture VALUES (?, ?, ?)", (sha256, name, content)
+            )
+        return sha256
+
+    def get(self, sha256: str) -> GreyImage:
+        """A kept picture; see `Session.picture`."""
+        content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)
+        image = decoded(content) if _is_whole(content, sha256) else None
+        if image is None:
+            value = "missing" if content is None else "damaged"
+            path = self._database.path
+            raise InputError(path, "calibration picture", value, "what was kept there")
+        return np.asarray(image)
+
+    def problems(self) -> list[str]:
+        """What is damaged, a sentence each."""
+        return [
+            f"calibration picture {name} is damaged"
+            for sha256, name, content in self._database.rows("SELECT * FROM picture")
+            if not _is_whole(content, sha256)
+        ]
+
+
+def _is_whole(content: object, sha256: str) -> bool:
+    return isinstance(content, bytes) and hashlib.sha256(content).hexdigest() == sha256

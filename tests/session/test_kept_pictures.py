@@ -1,0 +1,49 @@
+"""Calibrations that keep the picture they were read from."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.session.session import Session
+
+PICTURE = Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "calibration.png"
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Iterator[Session]:
+    with Session.create(tmp_path / "run.labsession") as session:
+        yield session
+
+
+def in_use(session: Session) -> object:
+    kept = session.plane_calibration
+    assert kept is not None
+    return kept.found
+
+
+def test_an_imaging_plane_placed_by_hand_is_used(session: Session):
+    found = session.calibrate_plane(PICTURE, 6.35)
+    u, v = found.origin_px
+    moved = replace(found, origin_px=(u + 1.5, v))
+    image = cv2.imread(str(PICTURE), cv2.IMREAD_UNCHANGED)
+    session.use_plane(moved, 6.35, image)
+    assert in_use(session) == moved
+    assert f"{u + 1.5}" in session.setup_text
+    line = replace(found, z_axis_px=found.x_axis_px)
+    with pytest.raises(ValueError, match="one line"):
+        session.use_plane(line, 6.35, image)
+    session.undo()
+    assert in_use(session) == found
+
+
+def test_a_laser_calibration_keeps_its_picture(session: Session):
+    picture = np.arange(150, dtype=np.uint8).reshape(10, 15)
+    session.calibrate_laser([13.676], [18.561], [7.874], picture=picture)
+    kept = session.laser_calibration
+    assert kept is not None
+    assert kept.picture_sha256 is not None
+    np.testing.assert_array_equal(session.picture(kept.picture_sha256), picture)
