@@ -1,0 +1,286 @@
+"""How the pool changes over a recording: series of its measures, their spread, their spectrum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.signal import detrend
+from scipy.signal.windows import hann
+
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.session.measured import Overview
+
+NEIGHBOURS = 15
+"""A frame is compared with the median of so many frames around it …"""
+
+FEWEST = 8
+"""… and with none where there are fewer in all."""
+
+FAR_SIGMA, FAR_PART = 6.0, 0.05
+"""It is in doubt if a size is farther from that than both, in robust σ and as a part of it …"""
+
+FAR_ARE = 3.0
+"""… or its ARE is so many times the usual one: a wrong column makes it 5 times, a wrong
+orientation 10 times as large."""
+
+EVEN = 0.05
+"""Steps in time that differ by a smaller part are equal."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A measure whose course can be shown.
+
+    Parameters
+    ----------
+    key
+        Its name in `Measures`.
+    label
+        What it is called.
+    unit
+        Its unit.
+    sigma
+        Name of its σ in `Measures`; empty where there is none.
+    """
+
+    key: str
+    label: str
+    unit: str
+    sigma: str = ""
+
+
+QUANTITIES = (
+    Quantity("width_mm", "Width", "mm", "width_sigma_mm"),
+    Quantity("length_mm", "Length", "mm", "length_sigma_mm"),
+    Quantity("height_mm", "Height", "mm", "height_sigma_mm"),
+    Quantity("depth_mm", "Depth", "mm", "depth_sigma_mm"),
+    Quantity("area_mm2", "Area", "mm²", "area_sigma_mm2"),
+    Quantity("volume_mm3", "Volume", "mm³", "volume_sigma_mm3"),
+    Quantity("are_mm", "ARE", "mm"),
+    Quantity("center_x_mm", "Centre X", "mm"),
+    Quantity("center_y_mm", "Centre Y", "mm"),
+    Quantity("peak_x_mm", "Peak X", "mm"),
+    Quantity("peak_y_mm", "Peak Y", "mm"),
+)
+BY_KEY = {quantity.key: quantity for quantity in QUANTITIES}
+
+
+@dataclass(frozen=True)
+class Trend:
+    """One measure over the frames that have it; n frames.
+
+    Parameters
+    ----------
+    quantity
+        What it is.
+    frame
+        Numbers of the frames, ascending, shape (n,).
+    at
+        Their times, s, or where any is unknown, again their numbers, shape (n,).
+    timed
+        Whether ``at`` is in s.
+    place
+        Their places among the session's frames, ascending, shape (n,).
+    value, sigma
+        Shape (n,), in the quantity's unit; σ is NaN where there is none.
+    doubtful, stale, corrected
+        Which stand out (`doubtful_frames`), no longer stand, were corrected by hand, shape (n,).
+    counts
+        Which go into the statistics and the spectrum, shape (n,).
+    """
+
+    quantity: Quantity
+    frame: IntArray
+    at: FloatArray
+    timed: bool
+    place: IntArray
+    value: FloatArray
+    sigma: FloatArray
+    doubtful: BoolArray
+    stale: BoolArray
+    corrected: BoolArray
+    counts: BoolArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean, standard deviation and range of a measure (Eq. 7-2 … 7-4).
+
+    Parameters
+    ----------
+    count
+        How many frames.
+    mean, deviation, lowest, highest
+        In the measure's unit; the deviation is the root of the mean square, divided by n as in the
+        text. NaN without a frame.
+    """
+
+    count: int
+    mean: float
+    deviation: float
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Amplitudes of a measure's oscillation.
+
+    Parameters
+    ----------
+    frequency
+        From the lowest that the series tells to half the rate, shape (k,), Hz, or 1/frame where
+        times are not known.
+    amplitude
+        Of a sine of that frequency, shape (k,), in the measure's unit.
+    timed
+        Whether frequencies are in Hz.
+    first, last
+        The frames it was computed from: all between them that the session uses.
+    count
+        How many they are.
+    resolution
+        Sines nearer to each other than this cannot be told apart: two steps of the frequency, the
+        half width of the Hann window's main lobe.
+    """
+
+    frequency: FloatArray
+    amplitude: FloatArray
+    timed: bool
+    first: int
+    last: int
+    count: int
+    resolution: float
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def peak(self) -> tuple[float, float]:
+        """Frequency and amplitude of the strongest oscillation."""
+        strongest = int(np.argmax(self.amplitude))
+        return float(self.frequency[strongest]), float(self.amplitude[strongest])
+
+
+def trend(seen: Overview, key: str, without_doubtful: bool = False) -> Trend:
+    """The course of a measure.
+
+    Parameters
+    ----------
+    seen
+        All frames at a glance.
+    key
+        Name of the measure, one of `BY_KEY`.
+    without_doubtful
+        Whether frames in doubt are left out of the statistics. What no longer stands always is.
+    """
+    quantity = BY_KEY[key]
+    value = seen.measures[key]
+    has = np.flatnonzero(np.isfinite(value))
+    timed = bool(np.isfinite(seen.time_s).all())
+    doubtful = doubtful_frames(seen)
+    counts = ~seen.stale & ~(doubtful & without_doubtful)
+    sigma = seen.measures[quantity.sigma] if quantity.sigma else np.full(len(value), np.nan)
+    return Trend(
+        quantity=quantity,
+        frame=seen.frame[has],
+        at=(seen.time_s if timed else seen.frame.astype(float))[has],
+        timed=timed,
+        place=has.astype(np.int64),
+        value=value[has],
+        sigma=sigma[has],
+        doubtful=doubtful[has],
+        stale=seen.stale[has],
+        corrected=seen.corrected[has],
+        counts=counts[has],
+    )
+
+
+def doubtful_frames(seen: Overview) -> BoolArray:
+    """Which frames have a surface that stands out from those around it, shape (n,).
+
+    Width, length or height far from the median of the neighbours, or an ARE far above the usual
+    one. It says "look at this frame", not that it is wrong.
+    """
+    doubtful = np.zeros(len(seen.frame), bool)
+    has = np.isfinite(seen.measures["height_mm"]) & ~seen.stale
+    if has.sum() < FEWEST:
+        return doubtful
+    are = seen.measures["are_mm"][has]
+    out = are > FAR_ARE * np.nanmedian(are) if np.isfinite(are).any() else np.zeros(len(are), bool)
+    for key in ("width_mm", "length_mm", "height_mm"):
+        size = seen.measures[key][has]
+        # Mirrored, an odd one at the end does not meet itself again.
+        usual = median_filter(size, min(NEIGHBOURS, len(size)), mode="mirror")
+        off = np.abs(size - usual)
+        out |= off > np.maximum(
+            FAR_SIGMA * 1.4826 * np.nanmedian(off), FAR_PART * np.abs(np.nanmedian(size))
+        )
+    doubtful[has] = out
+    return doubtful
+
+
+def spread(course: Trend) -> Spread:
+    """Mean, standard deviation and range of the frames that count (Eq. 7-2 … 7-4)."""
+    value = course.value[course.counts]
+    if not len(value):
+        return Spread(0, *(4 * (float("nan"),)))
+    return Spread(
+        len(value),
+        float(value.mean()),
+        float(value.std()),
+        float(value.min()),
+        float(value.max()),
+    )
+
+
+def spectrum(course: Trend) -> Spectrum:
+    """Spectrum of the longest part whose frames all count and follow each other evenly.
+
+    The straight line through it is taken off; the window is Hann's.
+
+    Raises
+    ------
+    CannotMeasure
+        ``too-few-frames`` if that part is too short.
+    """
+    members = _even_part(course)
+    count = len(members)
+    if count < FEWEST:
+        raise CannotMeasure(
+            "too-few-frames",
+            f"a spectrum needs {FEWEST} frames in a row, evenly spaced in time; "
+            f"there are {count} at most",
+        )
+    window = hann(count, sym=False)
+    step = float(course.at[members[-1]] - course.at[members[0]]) / (count - 1)
+    value = detrend(course.value[members]) * window
+    amplitude = 2 * np.abs(np.fft.rfft(value)) / window.sum()
+    frequency = np.asarray(np.fft.rfftfreq(count, step), np.float64)
+    return Spectrum(
+        frequency=frequency[1:],
+        amplitude=amplitude[1:],
+        timed=course.timed,
+        first=int(course.frame[members[0]]),
+        last=int(course.frame[members[-1]]),
+        count=count,
+        resolution=2 / (count * step),
+    )
+
+
+def _even_part(course: Trend) -> IntArray:
+    """Indices of the longest run of frames that count, none missing, steps equal."""
+    kept = np.flatnonzero(course.counts)
+    if len(kept) < 2:
+        return kept.astype(np.int64)
+    step = np.diff(course.at[kept])
+    usual = float(np.median(step))
+    joined = (np.diff(course.place[kept]) == 1) & (np.abs(step - usual) <= EVEN * usual)
+    ends = np.flatnonzero(np.concatenate([[True], ~joined, [True]]))
+    longest = int(np.argmax(np.diff(ends)))
+    return np.asarray(kept[ends[longest] : ends[longest + 1]], np.int64)

@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from labapp.core.values import CannotMeasure
+from labapp.session.measured import Overview
+from labapp.session.schema import MEASURES
+from labapp.session.trends import FEWEST, doubtful_frames, spectrum, spread, trend
+
+RATE_HZ = 60.0
+
+
+def overview(height: np.ndarray, time_s: np.ndarray | None = None, **sizes) -> Overview:
+    count = len(height)
+    measures = {name: np.full(count, 1.0) for name in MEASURES}
+    measures["height_mm"] = np.asarray(height, float)
+    measures.update(sizes)
+    return Overview(
+        frame=np.arange(count),
+        time_s=np.arange(count) / RATE_HZ if time_s is None else time_s,
+        status=tuple("ok" if np.isfinite(h) else "no-match" for h in height),
+        corrected=np.zeros(count, bool),
+        stale=np.zeros(count, bool),
+        measures=measures,
+    )
+
+
+def noisy(count: int = 40) -> np.ndarray:
+    return 0.3 + np.random.default_rng(3).normal(0, 0.003, count)
+
+
+def test_spread_is_that_of_the_text() -> None:
+    """Eq. 7-4 divides by n: 15 heights, here 1 … 15."""
+    found = spread(trend(overview(np.arange(1.0, 16.0)), "height_mm"))
+    assert (found.count, found.mean, found.lowest, found.highest) == (15, 8.0, 1.0, 15.0)
+    assert found.deviation == pytest.approx(np.sqrt(224 / 12))
+
+
+def test_frames_without_a_surface_and_stale_ones_do_not_count() -> None:
+    height = noisy()
+    height[[3, 7]] = np.nan
+    seen = overview(height)
+    seen = replace(seen, stale=np.arange(40) < 10)
+    course = trend(seen, "height_mm")
+    assert course.frame.tolist() == [k for k in range(40) if k not in (3, 7)]
+    assert spread(course).mean == pytest.approx(height[10:].mean())
+    assert spread(trend(replace(seen, stale=np.ones(40, bool)), "height_mm")).count == 0
+
+
+def test_sigma_marks_and_axis() -> None:
+    seen = replace(overview(noisy()), corrected=np.arange(40) == 5)
+    course = trend(seen, "height_mm")
+    assert course.timed
+    assert course.at[6] == pytest.approx(0.1)
+    assert course.corrected.tolist() == seen.corrected.tolist()
+    assert (course.sigma == 1).all()
+    assert np.isnan(trend(seen, "are_mm").sigma).all()
+    untimed = trend(overview(noisy(), np.full(40, np.nan)), "height_mm")
+    assert not untimed.timed
+    assert untimed.at.tolist() == list(range(40))
+
+
+@pytest.mark.parametrize("odd", [0, 1, 20, 39])
+def test_a_frame_that_stands_out_is_in_doubt(odd: int) -> None:
+    height = noisy()
+    height[odd] *= 1.16  # a row shifted by one
+    assert np.flatnonzero(doubtful_frames(overview(height))).tolist() == [odd]
+    course = trend(overview(height), "height_mm", without_doubtful=True)
+    assert spread(course).count == 39
+    assert spread(trend(overview(height), "height_mm")).count == 40
+    are = np.full(40, 0.02)
+    are[odd] = 0.1  # a wrong column
+    assert np.flatnonzero(doubtful_frames(overview(noisy(), are_mm=are))).tolist() == [odd]
+
+
+def test_a_pool_that_grows_and_noise_are_not_in_doubt() -> None:
+    growing = noisy(200) + np.linspace(0, 0.3, 200)
+    assert not doubtful_frames(overview(growing)).any()
+    assert not doubtful_frames(overview(noisy(2000))).any()
+    swinging = 0.3 + 0.02 * np.sin(np.arange(200))
+    assert not doubtful_frames(overview(swinging)).any()
+    assert not doubtful_frames(overview(noisy(FEWEST - 1) * np.array([9, *[1] * 6]))).any()
+
+
+def test_the_spectrum_gives_frequency_and_amplitude_of_an_oscillation() -> None:
+    count = 240
+    time_s = np.arange(count) / RATE_HZ
+    height = 0.3 + 0.05 * time_s + 0.02 * np.sin(2 * np.pi * 12.5 * time_s)
+    found = spectrum(trend(overview(height), "height_mm"))
+    frequency, amplitude = found.peak
+    assert frequency == pytest.approx(12.5, abs=0.01)
+    assert amplitude == pytest.approx(0.02, rel=0.02)
+    assert found.timed
+    assert found.frequency[-1] == pytest.approx(RATE_HZ / 2)
+    assert found.resolution == pytest.approx(2 * RATE_HZ / count)
+    slow = spectrum(trend(overview(height, np.full(count, np.nan)), "height_mm"))
+    assert slow.peak[0] == pytest.approx(12.5 / RATE_HZ)
+    assert not slow.timed
+
+
+def test_the_spectrum_takes_the_longest_even_part() -> None:
+    height = noisy(100)
+    height[30] = np.nan
+    found = spectrum(trend(overview(height), "height_mm"))
+    assert (found.first, found.last, found.count) == (31, 99, 69)
+    gap = np.arange(100) / RATE_HZ
+    gap[80:] += 0.5
+    found = spectrum(trend(overview(height, gap), "height_mm"))
+    assert (found.first, found.last) == (31, 79)
+
+
+def test_too_short_a_series_has_no_spectrum() -> None:
+    for count in (0, 1, FEWEST - 1):
+        with pytest.raises(CannotMeasure, match="in a row"):
+            spectrum(trend(overview(noisy(count)), "height_mm"))
