@@ -152,10 +152,11 @@ class Results:
         reconstruction = measurement.reconstruction
         if reconstruction is not None:
             reconstruction = replace(reconstruction, variants=())
-        content = pack(replace(measurement, reconstruction=reconstruction))
+        key, made = (labapp.__version__, setup, settings), (correction, _now())
+        seal = fingerprint((frame, basis.scheme, *key, *made))
+        content = pack((replace(measurement, reconstruction=reconstruction), seal))
         sizes = [getattr(measurement.measures, name, None) for name in MEASURES]
         with self._database.transaction() as connection:
-            key = (labapp.__version__, setup, settings)
             connection.execute(
                 "INSERT OR IGNORE INTO inputs (version, setup, settings) VALUES (?, ?, ?)", key
             )
@@ -170,7 +171,7 @@ class Results:
                 f"correspondence, {', '.join(MEASURES)}) "
                 f"VALUES ({', '.join('?' * (7 + len(MEASURES)))})",
                 (
-                    *(frame, basis.scheme, inputs, correction, _now(), measurement.status),
+                    *(frame, basis.scheme, inputs, *made, measurement.status),
                     None if measurement.match is None else measurement.match.orientation,
                     *sizes,
                 ),
@@ -209,10 +210,14 @@ class Results:
             return None
         version, setup, settings, corrected, measured, content = found[0]
         path, named = self._database.path, f"result of frame {frame}"
+        try:
+            measurement = _unsealed(content, (frame, scheme, *found[0][:-1]))
+        except Damaged as error:
+            raise InputError(path, named, error, "what was written there") from error
         outdated = _differences(basis, self._inputs(setup, settings))
         return Result(
             frame=frame,
-            measurement=unpack_from(path, named, content, Measurement),
+            measurement=measurement,
             scheme=scheme,
             version=version,
             measured=measured,
@@ -275,10 +280,15 @@ class Results:
         for result, frame, scheme, status, *sizes in self._database.rows(
             f"SELECT id, frame, scheme, status, {names} FROM result"
         ):
-            content = self._database.value("SELECT content FROM detail WHERE result = ?", result)
             named = f"result of frame {frame} ({scheme})"
+            kept = self._database.rows(
+                "SELECT frame, scheme, version, setup, settings, correction, measured, content "
+                "FROM result JOIN inputs ON inputs.id = inputs "
+                "LEFT JOIN detail ON result = result.id WHERE result.id = ?",
+                result,
+            )
             try:
-                measurement = unpack(content, Measurement)
+                measurement = _unsealed(kept[0][-1], kept[0][:-1])
             except Damaged as error:
                 found.append(f"{named} is damaged: {error}")
                 continue
@@ -307,6 +317,24 @@ class Results:
             raise InputError(
                 self._database.path, "inputs", error, "what was written there"
             ) from error
+
+
+def _unsealed(content: object, kept_with: tuple[object, ...]) -> Measurement:
+    """The measurement in a detail, which vouches for what stands beside it in the tables.
+
+    Raises
+    ------
+    Damaged
+        If it is, or if frame, scheme, version, set-up, settings, correction or time are others.
+    """
+    held = unpack(content, Measurement | tuple[Measurement, str])
+    if isinstance(held, Measurement):  # without a seal, as labapp first kept them
+        return held
+    measurement: Measurement
+    measurement, seal = held
+    if seal != fingerprint(kept_with):
+        raise Damaged("it is of another frame, or was measured from something else")
+    return measurement
 
 
 @functools.lru_cache(maxsize=64)

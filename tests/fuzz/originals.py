@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import os
 import sqlite3
@@ -140,7 +141,11 @@ def _session(folder: Path, *, embed: bool) -> Path:
     with Session.create(path, record) as session:
         session.set_setup(SETUP.read_text("utf-8"))
         session.calibrate_laser([13.676], [18.561], [7.874])
-        sha256 = session._keep_picture("target.png", pictures(1)[0])
+        picture = cv2.imencode(".png", pictures(1)[0])[1].tobytes()
+        sha256 = hashlib.sha256(picture).hexdigest()
+        with session._database.transaction() as connection:
+            row = (sha256, "target.png", picture)
+            connection.execute("INSERT INTO picture VALUES (?, ?, ?)", row)
         plane = PlaneCalibration(
             (44.0, 590.0), (242.0, 588.0), 34.9, (43.0, 500.0), 15.9, (0.1, 0.1, 0.1), 90.0
         )
