@@ -1,0 +1,210 @@
+"""Positioning of laser, torch and imaging plane: which rays come back (§4.2.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.rig import Rig
+from labapp.core.values import FloatArray
+from labapp.simulation.forward import PoolSurface, Reflections, trace
+from labapp.simulation.pools import ellipsoidal_cap
+
+USUAL_WIDTH_MM, USUAL_LENGTH_MM = 5.0, 6.0
+"""A pool in gas tungsten arc welding is at most this large (§4.2.1.1)."""
+
+RUN_OUT_MM = 60.0
+"""How far a ray that never meets the imaging plane is followed."""
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """What the torch leaves room for, in the plane through laser and electrode (§4.2.1.1).
+
+    Parameters
+    ----------
+    l1_mm
+        Longest tail, electrode to the pool's end at −Y, whose incident rays the torch lets pass
+        (Eq. 4-14); infinite for a laser that stands no higher than the tip.
+    l2_mm
+        Longest head, electrode to the pool's end at +Y, whose reflected rays the torch lets pass
+        (Eq. 4-15, 4-17, 4-18).
+    least_plane_mm, most_plane_mm
+        Distances from the electrode between which a vertical imaging plane with the rig's edges
+        catches the steepest of those rays, the one that grazes the tip (Eq. 4-16 with H the height
+        of the lower and of the upper edge).
+    """
+
+    l1_mm: float
+    l2_mm: float
+    least_plane_mm: float
+    most_plane_mm: float
+
+
+def clearance(rig: Rig, head_slope_deg: float = 0.0) -> Clearance:
+    """L1, L2 and the plane distances of §4.2.1.1 (Eq. 4-14 … 4-18).
+
+    Parameters
+    ----------
+    rig
+        The bench.
+    head_slope_deg
+        How steeply the pool falls towards its head's edge: 0 for a flat one, β of Eq. 4-17 for a
+        convex one, −γ of Eq. 4-18 for a concave one, degrees.
+
+    Notes
+    -----
+    With H2 the tip's height and the diode at height H3 and horizontal distance D2, Eq. 4-17 is
+    ``L2·tan(C + 2β) = H2``, ``(D2 − L2)·tan C = H3``. Without C it is the quadratic
+    ``t·L2² − (H2 + H3 + t·D2)·L2 + H2·(D2 − t·H3) = 0`` with t = tan 2β, of which the root wanted
+    becomes Eq. 4-15 for t = 0.
+    """
+    tip = rig.electrode.height_mm
+    _, away, height = rig.laser.position_mm
+    turn = np.tan(np.radians(2 * head_slope_deg))
+    l1 = tip * away / (height - tip) if height > tip else np.inf
+    linear, constant = tip + height + turn * away, tip * (away - turn * height)
+    root = np.sqrt(linear**2 - 4 * turn * constant)
+    l2 = float(np.clip(2 * constant / (linear + root), 0, away))
+    plane = rig.imaging_plane
+    low, high = (
+        l2 * (edge - tip) / tip if tip > 0 else np.inf
+        for edge in (plane.origin_mm[2], plane.origin_mm[2] + plane.height_mm * plane.z_axis[2])
+    )
+    return Clearance(float(l1), l2, max(float(low), 0.0), max(float(high), 0.0))
+
+
+class Fate(Enum):
+    """What becomes of a ray."""
+
+    CAUGHT = "meets the imaging plane"
+    PAST = "misses the imaging plane"
+    BLOCKED = "is blocked by the torch"
+    UNUSED = "does not meet the pool"
+
+
+@dataclass(frozen=True)
+class SideRay:
+    """A ray of the central column, seen from the side.
+
+    Parameters
+    ----------
+    row
+        i of the ray, from 1.
+    fate
+        What becomes of it.
+    path_mm
+        (y, z) of the laser, of where it meets pool or work piece, and of its end, shape (2 or 3,
+        2), mm.
+    """
+
+    row: int
+    fate: Fate
+    path_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class SideView:
+    """The bench from the side, looking along −X: what is drawn of it, (y, z), mm.
+
+    Parameters
+    ----------
+    rays
+        Of the central column.
+    pool_mm, plane_mm
+        The pool's profile at x = 0, shape (n, 2); the plane's lower and upper edge, shape (2, 2).
+    laser_mm, tip_mm
+        The diode; the electrode's tip, shape (2,).
+    clearance
+        L1, L2 and the plane distances.
+    tally
+        How many rays of the whole pattern have which fate.
+    """
+
+    rays: tuple[SideRay, ...]
+    pool_mm: FloatArray
+    plane_mm: FloatArray
+    laser_mm: FloatArray
+    tip_mm: FloatArray
+    clearance: Clearance
+    tally: dict[Fate, int]
+
+
+def side_view(
+    rig: Rig,
+    width_mm: float = USUAL_WIDTH_MM,
+    length_mm: float = USUAL_LENGTH_MM,
+    height_mm: float = 0.0,
+) -> SideView:
+    """Follow the rays by way of a pool of the expected size, centred under the electrode.
+
+    Parameters
+    ----------
+    rig
+        The bench.
+    width_mm, length_mm, height_mm
+        Size of the pool, part of an ellipsoid; a negative height is a concave one.
+
+    Raises
+    ------
+    ValueError
+        If there is no such pool.
+    """
+    pool = ellipsoidal_cap(width_mm, length_mm, height_mm)
+    edge = np.array([length_mm / 2 * (1 - 1e-9)])
+    slope = float(pool.gradient(np.zeros(1), edge)[0, 1])
+    along = np.linspace(-1, 1, 81) * edge
+    plane = rig.imaging_plane
+    middle = np.array([[plane.width_mm / 2, 0.0], [plane.width_mm / 2, plane.height_mm]])
+    return SideView(
+        rays=_central_rays(pool, rig),
+        pool_mm=np.stack([along, pool.height(np.zeros_like(along), along)], axis=-1),
+        plane_mm=plane.to_universal(middle)[:, 1:],
+        laser_mm=rig.laser.position_mm[1:],
+        tip_mm=np.array([0.0, rig.electrode.height_mm]),
+        clearance=clearance(rig, float(np.degrees(np.arctan(-slope)))),
+        tally=_tally(trace(pool, rig)),
+    )
+
+
+def _central_rays(pool: PoolSurface, rig: Rig) -> tuple[SideRay, ...]:
+    pattern = rig.pattern
+    column = (pattern.columns + 1) // 2
+    absent = frozenset((i, 1) for i, j in pattern.absent_rays if j == column)
+    alone = replace(rig, pattern=replace(pattern, columns=1, absent=absent))
+    seen = trace(pool, alone)
+    fates = _fates(seen)
+    return tuple(
+        SideRay(row + 1, fates[row, 0], _path(seen, row, alone))
+        for row in range(pattern.rows)
+        if not seen.absent[row, 0] and seen.incident[row, 0, 2] < 0
+    )
+
+
+def _path(seen: Reflections, row: int, rig: Rig) -> FloatArray:
+    laser = rig.laser.position_mm
+    if not seen.hit[row, 0]:
+        incident = seen.incident[row, 0]
+        ground = laser - laser[2] / incident[2] * incident
+        return np.stack([laser, ground])[:, 1:]
+    point, place = seen.point_mm[row, 0], seen.plane_mm[row, 0]
+    end = point + RUN_OUT_MM * seen.reflected[row, 0]
+    if np.isfinite(place).all():
+        end = rig.imaging_plane.to_universal(place)
+    return np.stack([laser, point, end])[:, 1:]
+
+
+def _fates(seen: Reflections) -> npt.NDArray[np.object_]:
+    fates = np.full(seen.hit.shape, Fate.PAST, object)
+    fates[seen.on_plane] = Fate.CAUGHT
+    fates[seen.blocked] = Fate.BLOCKED
+    fates[~seen.hit] = Fate.UNUSED
+    return fates
+
+
+def _tally(seen: Reflections) -> dict[Fate, int]:
+    fates = _fates(seen)[~seen.absent].tolist()
+    return {fate: fates.count(fate) for fate in Fate}
