@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import multiprocessing
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
@@ -15,6 +19,9 @@ from labapp.errors import InputError
 from labapp.media import Frame, FrameSource
 from labapp.session.results import ResultsWriter
 from labapp.session.setup import Setup
+
+AHEAD = 8
+"""So many frames are given to a pool before the first of them must be done."""
 
 SOME_FRAMES = "A:B:STEP, frames A to before B (from 0), every STEP-th; each may be left out"
 
@@ -71,8 +78,9 @@ def measure_each(
     setup: Setup,
     settings: Settings,
     correction: Callable[[int], Correction | None] = lambda _: None,
+    pool: Executor | None = None,
 ) -> Iterator[tuple[int, float | None, Measurement]]:
-    """Measure frames one after the other; yields (frame, time in s, measurement).
+    """Measure frames; yields (frame, time in s, measurement) in their order.
 
     Parameters
     ----------
@@ -84,20 +92,48 @@ def measure_each(
         What they are measured with.
     correction
         The dots and rows of a frame as they were corrected by hand, or None.
+    pool
+        Where to measure (`measuring_pool`), some frames ahead; None: here, one after the other.
     """
-    threads = ThreadpoolController()
-    for number in frames:
-        try:
-            frame = read(number)
-        except InputError as error:
-            yield number, None, Measurement("unreadable", str(error), settings.scheme)
-            continue
-        # The matrices are small: more threads than one get in each other's way.
-        with threads.limit(limits=1, user_api="blas"):
-            measurement = measure(
-                frame.image, setup.rig, setup.calibration, settings, correction(number)
-            )
-        yield number, frame.time_s, measurement
+    waiting: deque[tuple[int, float | None, Future[Measurement]]] = deque()
+    try:
+        for number in frames:
+            try:
+                frame = read(number)
+            except InputError as error:
+                future: Future[Measurement] = Future()
+                future.set_result(Measurement("unreadable", str(error), settings.scheme))
+                waiting.append((number, None, future))
+            else:
+                given = (frame.image, setup.rig, setup.calibration, settings, correction(number))
+                waiting.append((number, frame.time_s, _begun(pool, given)))
+            while waiting and (pool is None or len(waiting) > AHEAD or waiting[0][2].done()):
+                first, time_s, future = waiting.popleft()
+                yield first, time_s, future.result()
+        for later, time_s, future in waiting:
+            yield later, time_s, future.result()
+    finally:
+        for _, _, future in waiting:
+            future.cancel()
+
+
+def measuring_pool(workers: int) -> ProcessPoolExecutor:
+    """Processes that measure: a window stays quick while they do."""
+    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+
+
+def _begun(pool: Executor | None, given: tuple[Any, ...]) -> Future[Measurement]:
+    if pool is not None:
+        return pool.submit(_measured, *given)
+    future: Future[Measurement] = Future()
+    future.set_result(_measured(*given))
+    return future
+
+
+def _measured(*given: Any) -> Measurement:
+    # The matrices are small: more threads than one get in each other's way.
+    with ThreadpoolController().limit(limits=1, user_api="blas"):
+        return measure(*given)
 
 
 def measure_frames(

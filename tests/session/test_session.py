@@ -20,6 +20,7 @@ from labapp.session.export import ExportChoice, verify_export
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
 from labapp.session.results import ResultsWriter
+from labapp.session.run import measuring_pool
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from tests.session.test_blobs import same
@@ -415,3 +416,19 @@ def test_an_export_needs_something_measured(session: Session, tmp_path: Path):
         session.export(tmp_path / "out", scheme="ers")
     with pytest.raises(InputError, match="none by fit"):
         session.export(tmp_path / "out", frames=[4])
+
+
+def test_processes_measure_the_same(session: Session):
+    here = [kept for _, kept in session.measure([4])]
+    with measuring_pool(1) as pool:
+        there = dict(session.measure([4, 6], pool))
+    assert list(there) == [4, 6]
+    assert same(there[4], here[0])
+
+
+def test_measuring_that_is_stopped_keeps_what_was_finished(session: Session):
+    with measuring_pool(1) as pool:
+        measuring = session.measure([4, 6, 0], pool)
+        assert next(measuring)[0] == 4
+        measuring.close()
+    assert session.overview().status == ("ok", "ok", "ok", "")
