@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui.tasks import Control, Task, Tasks, in_words
+from labapp.session.run import measuring_pool
 from labapp.session.session import Session
 
 T = TypeVar("T")
@@ -41,6 +44,7 @@ class Workspace(QObject):
         super().__init__(parent)
         self.session: Session | None = None
         self.frame = 0
+        self._pool: ProcessPoolExecutor | None = None
         self.tasks = Tasks(self)
         self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
 
@@ -68,6 +72,13 @@ class Workspace(QObject):
         if session is not None:
             self.show(session)
         return session is not None
+
+    def close(self) -> None:
+        """Stop all work and close the session: the window goes."""
+        self.show(None)
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
 
     def tried(self, work: Callable[[], T]) -> T | None:
         """Do something short; a refusal is said in words and gives None."""
@@ -126,9 +137,13 @@ class Workspace(QObject):
             return None
         numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
 
+        if self._pool is None:
+            self._pool = measuring_pool(max(1, (os.cpu_count() or 2) - 1))
+        pool = self._pool
+
         def work(control: Control) -> int:
             done = 0
-            for done, _ in enumerate(session.measure(numbers), 1):
+            for done, _ in enumerate(session.measure(numbers, pool), 1):
                 control.progress(done, len(numbers))
                 control.part(None)
             return done
