@@ -1,1 +1,8 @@
 """The steps of the guided way, one page each."""
+
+from __future__ import annotations
+
+from labapp.gui.pages.page import Page
+
+PAGES: tuple[type[Page], ...] = ()
+"""In the order of `steps.STEPS`; a step without a page is not shown."""

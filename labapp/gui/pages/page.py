@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from PySide6.QtGui import QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.workspace import Workspace
@@ -40,3 +43,13 @@ class Page(QWidget):
 
     def leave(self) -> None:
         """The page goes out of view, or the window closes: stop what only it needs."""
+
+    def take(self, path: Path) -> None:
+        """Take a recording that was dropped on the window or chosen in its menu; for ``capture``.
+
+        The page is in view.
+        """
+
+    def picture(self) -> QPixmap:
+        """What *Copy picture* puts on the clipboard."""
+        return self.grab()

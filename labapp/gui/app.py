@@ -1,0 +1,154 @@
+"""The app: what has to be there, the window, and what happens when something goes wrong."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from PySide6.QtCore import (
+    QMessageLogContext,
+    QObject,
+    Qt,
+    QTimer,
+    QtMsgType,
+    Signal,
+    qInstallMessageHandler,
+)
+from PySide6.QtWidgets import QApplication
+
+import labapp
+from labapp.errors import InputError
+from labapp.session.log import NAME, start_log
+
+WITHOUT = "labapp --help tells what can be done on the command line"
+
+BAD_INPUT = 2
+
+HEARTBEAT_MS = 300
+"""So often Python gets a turn to notice Ctrl-C in the terminal."""
+
+
+def has_display(environment: Mapping[str, str]) -> bool:
+    """Whether a window can be shown."""
+    names = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
+    return any(environment.get(name) for name in names)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Open the app, and a session or a recording in it; returns when its window was closed.
+
+    Parameters
+    ----------
+    arguments
+        Nothing, or one file or folder.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or no display.
+    """
+    path = Path(arguments[0]).absolute() if arguments else None
+    if path is not None and not path.exists():
+        raise InputError(path, "file", "is not there", "a session, or a recording to import")
+    if not has_display(os.environ):
+        value = "none: neither DISPLAY nor WAYLAND_DISPLAY is set"
+        raise InputError("the app", "display", value, f"a desktop; {WITHOUT}")
+    app = start_app()
+
+    from labapp.gui.preferences import preferences_file, read_preferences
+    from labapp.gui.window import MainWindow
+
+    file = preferences_file()
+    preferences, problem = read_preferences(file)
+    window = MainWindow(preferences, file)
+    window.apply_theme()
+    app.styleHints().colorSchemeChanged.connect(window.apply_theme)
+    faults = Faults(window.say, window)
+    faults.install()
+    heartbeat = QTimer(window)
+    heartbeat.timeout.connect(lambda: None)
+    heartbeat.start(HEARTBEAT_MS)
+    former = signal.signal(signal.SIGINT, lambda *_: window.close())
+    if problem:
+        window.say(problem, True)
+    window.show()
+    if path is not None:
+        QTimer.singleShot(0, window, lambda: window.open_path(path))
+    try:
+        return app.exec()
+    finally:
+        signal.signal(signal.SIGINT, former)
+        faults.uninstall()
+
+
+def start_app() -> QApplication:
+    """Qt's application, made if there is none yet."""
+    present = QApplication.instance()
+    if isinstance(present, QApplication):
+        return present
+    qInstallMessageHandler(_take_message)
+    QApplication.setHighDpiScaleFactorRoundingPolicy(
+        Qt.HighDpiScaleFactorRoundingPolicy.PassThrough
+    )
+    app = QApplication([NAME])
+    app.setApplicationName(NAME)
+    app.setApplicationDisplayName(NAME)
+    app.setApplicationVersion(labapp.__version__)
+    app.setDesktopFileName(NAME)
+    return app
+
+
+class Faults(QObject):
+    """Uncaught errors: all of them to the log, and in words to the operator; the window stays.
+
+    Parameters
+    ----------
+    say
+        Tells the operator: a sentence, and that it is a problem.
+    """
+
+    _happened = Signal(str, bool)
+
+    def __init__(self, say: Callable[[str, bool], None], parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._happened.connect(say)
+        self._former = sys.excepthook, threading.excepthook
+
+    def install(self) -> None:
+        """Take the errors from now on."""
+        self._former = sys.excepthook, threading.excepthook
+        sys.excepthook = self.take
+        threading.excepthook = self._take_in_thread
+
+    def uninstall(self) -> None:
+        """Leave them to who had them before."""
+        sys.excepthook, threading.excepthook = self._former
+
+    def take(
+        self, kind: type[BaseException], error: BaseException, trace: TracebackType | None
+    ) -> None:
+        """Log an error and tell of it; may be called in any thread."""
+        start_log().error("fault", exc_info=(kind, error, trace))
+        words = f"A fault in the program: {kind.__name__}: {error}. Your session is saved; "
+        self._happened.emit(f"{words}details are in the log (Help, Show the log folder)", True)
+
+    def _take_in_thread(self, told: threading.ExceptHookArgs) -> None:
+        if told.exc_value is not None:
+            self.take(told.exc_type, told.exc_value, told.exc_traceback)
+
+
+def _take_message(kind: QtMsgType, _context: QMessageLogContext, message: str) -> None:
+    """What Qt says goes to the log; that it cannot open a window, to the terminal too."""
+    log = start_log()
+    if kind == QtMsgType.QtFatalMsg:
+        log.critical("Qt: %s", message)
+        sys.stderr.write(f"labapp: no window can be opened: {message.strip()}\n{WITHOUT}\n")
+        sys.stderr.flush()
+        os._exit(BAD_INPUT)  # Qt would abort with a core dump
+    log.log(logging.INFO if kind == QtMsgType.QtInfoMsg else logging.WARNING, "Qt: %s", message)

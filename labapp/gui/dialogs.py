@@ -1,0 +1,72 @@
+"""What the window asks: which file, and whether."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
+
+from labapp.media import RECORDING_SUFFIXES
+from labapp.media.images import IMAGE_SUFFIXES
+from labapp.media.tiff import TIFF_SUFFIXES
+from labapp.session.database import SUFFIX
+
+SESSIONS = f"Sessions (*{SUFFIX})"
+RECORDINGS = "Recordings ({})".format(
+    " ".join(f"*{suffix}" for suffix in sorted(RECORDING_SUFFIXES | IMAGE_SUFFIXES | TIFF_SUFFIXES))
+)
+EVERYTHING = "All files (*)"
+
+
+def ask_session(parent: QWidget, folder: Path) -> Path | None:
+    """Ask which session to open."""
+    name, _ = QFileDialog.getOpenFileName(
+        parent, "Open a session", str(folder), f"{SESSIONS};;{EVERYTHING}"
+    )
+    return Path(name) if name else None
+
+
+def ask_new_session(parent: QWidget, proposed: Path, title: str = "New session") -> Path | None:
+    """Ask for the file of a new session; the ending is added where it was left out."""
+    options = QFileDialog.Option.DontConfirmOverwrite  # nothing is ever written over
+    name, _ = QFileDialog.getSaveFileName(parent, title, str(proposed), SESSIONS, options=options)
+    if not name:
+        return None
+    path = Path(name)
+    return path if path.suffix.lower() == SUFFIX else path.with_name(path.name + SUFFIX)
+
+
+def ask_recording(parent: QWidget, folder: Path) -> Path | None:
+    """Ask which recording to import."""
+    name, _ = QFileDialog.getOpenFileName(
+        parent, "Import a recording", str(folder), f"{RECORDINGS};;{EVERYTHING}"
+    )
+    return Path(name) if name else None
+
+
+def ask_read_only(parent: QWidget, path: Path) -> bool:
+    """Offer to open read-only a session that another program has open."""
+    box = QMessageBox(parent)
+    box.setObjectName("read-only")
+    box.setIcon(QMessageBox.Icon.Question)
+    box.setWindowTitle("The session is in use")
+    box.setText(f"{path.name} is open in another window or program.")
+    box.setInformativeText(
+        "You can look at it read-only: nothing can be changed or measured in it until it is "
+        "closed there."
+    )
+    look = box.addButton("Open &read-only", QMessageBox.ButtonRole.AcceptRole)
+    look.setToolTip("Look at the session without changing it")
+    box.addButton(QMessageBox.StandardButton.Cancel)
+    box.setDefaultButton(look)
+    box.exec()
+    return box.clickedButton() is look
+
+
+def new_path(folder: Path, stem: str) -> Path:
+    """A name for a session that is not taken yet."""
+    path, number = folder / f"{stem}{SUFFIX}", 1
+    while path.exists():
+        number += 1
+        path = folder / f"{stem} {number}{SUFFIX}"
+    return path

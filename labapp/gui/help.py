@@ -1,0 +1,109 @@
+"""The guide, the keys and what the program is: made from what the window is made from."""
+
+from __future__ import annotations
+
+import sys
+from html import escape
+
+import numpy
+import PySide6
+import scipy
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QKeySequence
+from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
+
+import labapp
+from labapp.gui.actions import ACTIONS, MENUS
+from labapp.gui.standing import Standing
+from labapp.gui.steps import STEPS
+from labapp.session.log import log_file
+
+TITLES = {"guide": "Guide", "keys": "Keys", "about": "About labapp"}
+
+INTRODUCTION = """
+<p>The steps at the left lead from the bench to the results. Take them from the top; a mark shows
+how far each is, and the pointer on it why: ○ to do, ▶ ready, ✓ done, ▲ needs attention. You may go
+back at any time.</p>
+<p>Everything is saved as you do it: there is no Save. Every change of set-up, calibration,
+settings, dots and rows can be undone (Ctrl+Z), also after the session was closed.</p>
+"""
+CLOSING = """
+<p>Drop a video, an image, a folder of images or a session on the window to open it. Long work runs
+in the background: the status line shows how far it is, Cancel stops it, and what was finished is
+kept. A problem stays in the status line until you have read it; F4 shows all messages.</p>
+"""
+
+
+def guide() -> str:
+    """What to do, step by step; HTML."""
+    steps = "".join(
+        f"<h3>{number} {escape(step.title)}</h3><p>{escape(step.hint)}</p>"
+        for number, step in enumerate(STEPS, 1)
+    )
+    ticks = "".join(f"<li>{escape(standing.words)}</li>" for standing in Standing)
+    frames = (
+        "<h3>The frames</h3><p>The bar at the bottom has a tick for every frame. Its colour, its "
+        f"height and its tip tell how the frame stands:</p><ul>{ticks}</ul>"
+    )
+    return f"<h2>Guide</h2>{INTRODUCTION}{steps}{frames}{CLOSING}"
+
+
+def keys() -> str:
+    """Every action that has a key; HTML."""
+    parts = []
+    for menu in MENUS:
+        rows = "".join(
+            f"<tr><td>{escape(_shown(action.key))}&nbsp;&nbsp;</td>"
+            f"<td><b>{escape(action.text.replace('&', ''))}</b></td>"
+            f"<td>&nbsp;&nbsp;{escape(action.tip)}</td></tr>"
+            for action in ACTIONS
+            if action.menu == menu and action.key
+        )
+        parts.append(f"<h3>{escape(menu.replace('&', ''))}</h3><table>{rows}</table>")
+    return f"<h2>Keys</h2>{''.join(parts)}"
+
+
+def about() -> str:
+    """What the program is; HTML."""
+    built_on = (
+        f"Python {sys.version.split()[0]}, numpy {numpy.__version__}, scipy {scipy.__version__}, "
+        f"Qt for Python {PySide6.__version__}"
+    )
+    return (
+        f"<h2>labapp {labapp.__version__}</h2>"
+        "<p>The three-dimensional surface of a molten weld pool, measured from a reflected laser "
+        "dot matrix.</p>"
+        f"<p>BSD 3-Clause licence. {built_on}.</p><p>The log is {escape(str(log_file()))}.</p>"
+    )
+
+
+TEXTS = {"guide": guide, "keys": keys, "about": about}
+
+
+class HelpDialog(QDialog):
+    """One of the help texts, beside the window.
+
+    Parameters
+    ----------
+    kind
+        ``guide``, ``keys`` or ``about``.
+    """
+
+    def __init__(self, kind: str, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setObjectName(f"help-{kind}")
+        self.setWindowTitle(TITLES[kind])
+        self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        self.browser = QTextBrowser()
+        self.browser.setAccessibleName(TITLES[kind])
+        self.browser.setHtml(TEXTS[kind]())
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
+        buttons.rejected.connect(self.reject)
+        layout = QVBoxLayout(self)
+        layout.addWidget(self.browser)
+        layout.addWidget(buttons)
+        self.resize(*((520, 300) if kind == "about" else (720, 600)))
+
+
+def _shown(key: str) -> str:
+    return QKeySequence(key).toString(QKeySequence.SequenceFormat.NativeText)

@@ -1,0 +1,155 @@
+"""The first page: sessions opened before, a new one, and a sample to try."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from PySide6.QtCore import QSize, Qt, Signal
+from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPixmap
+from PySide6.QtWidgets import (
+    QFrame,
+    QHBoxLayout,
+    QLabel,
+    QListWidget,
+    QListWidgetItem,
+    QPushButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
+from labapp.gui.tasks import Control
+from labapp.gui.workspace import Workspace
+
+BUTTONS = (
+    ("new", "&New session …", "Make a file for a new experiment (Ctrl+N)"),
+    ("open", "&Open a session …", "Open a session that is not in the list (Ctrl+O)"),
+    ("sample", "&Try the sample", "Open a copy of a recorded run that is measured already"),
+)
+
+WIDTH_PX = 760
+
+
+class Welcome(QWidget):
+    """Recent sessions with thumbnail, date and frames; New; Open; Try the sample.
+
+    Signals
+    -------
+    asked
+        A button was pressed: the name of its action.
+    chosen
+        A session of the list was chosen.
+    forgotten
+        A session is to be taken off the list.
+    """
+
+    asked = Signal(str)
+    chosen = Signal(Path)
+    forgotten = Signal(Path)
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__()
+        self.setObjectName("page-welcome")
+        self._workspace = workspace
+        self._shown: tuple[Path, ...] = ()
+        self.buttons: dict[str, QPushButton] = {}
+        inner = QWidget()
+        inner.setMaximumWidth(WIDTH_PX)
+        column = QVBoxLayout(inner)
+        column.setSpacing(12)
+        title = QLabel("labapp")
+        font = title.font()
+        font.setPointSizeF(font.pointSizeF() * 2.2)
+        title.setFont(font)
+        column.addWidget(title)
+        about = QLabel(
+            "The surface of a molten weld pool, measured from the reflections of a laser dot "
+            "matrix. An experiment is one session file; everything you do is saved in it at once."
+        )
+        about.setWordWrap(True)
+        column.addWidget(about)
+        row = QHBoxLayout()
+        for name, text, tip in BUTTONS:
+            button = QPushButton(text)
+            button.setToolTip(tip)
+            button.setMinimumHeight(button.fontMetrics().height() * 2)
+            button.clicked.connect(lambda *_, asked=name: self.asked.emit(asked))
+            self.buttons[name] = button
+            row.addWidget(button)
+        column.addLayout(row)
+        self.label = QLabel("&Recent sessions")
+        column.addWidget(self.label)
+        self.list = QListWidget()
+        self.list.setAccessibleName("Recent sessions")
+        self.list.setToolTip(
+            "Enter or a double click opens a session, Delete takes it off the list"
+        )
+        self.list.setIconSize(QSize(*THUMBNAIL_PX))
+        self.list.setFrameShape(QFrame.Shape.StyledPanel)
+        self.list.setTextElideMode(Qt.TextElideMode.ElideMiddle)
+        self.list.setAlternatingRowColors(True)
+        self.list.itemActivated.connect(self._open)
+        self.label.setBuddy(self.list)
+        column.addWidget(self.list, 1)
+        self.nothing = QLabel(
+            "None yet. Drop a video, an image, a folder of images or a session anywhere on this "
+            "window to begin, or try the sample."
+        )
+        self.nothing.setWordWrap(True)
+        column.addWidget(self.nothing)
+        column.addStretch(0)
+        layout = QHBoxLayout(self)
+        layout.setContentsMargins(24, 20, 24, 12)
+        layout.addStretch(1)
+        layout.addWidget(inner, 100)
+        layout.addStretch(1)
+
+    def show_recent(self, paths: Sequence[Path]) -> None:
+        """List these sessions; what is in them is looked at in the background."""
+        self._shown = tuple(paths)
+        self.list.clear()
+        blank = QPixmap(*THUMBNAIL_PX)
+        blank.fill(QColor(0, 0, 0, 0))
+        for path in paths:
+            item = QListWidgetItem(QIcon(blank), f"{path.stem}\n \n{path.parent}")
+            item.setData(Qt.ItemDataRole.UserRole, path)
+            item.setToolTip(str(path))
+            self.list.addItem(item)
+        for widget in (self.label, self.list):
+            widget.setVisible(bool(paths))
+        self.nothing.setVisible(not paths)
+        if paths:
+            self.list.setCurrentRow(0)
+
+            def look(control: Control) -> None:
+                for path in paths:
+                    control.part(look_at(path))
+
+            self._workspace.tasks.start("Looking at recent sessions", look, on_part=self._show)
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Take a session off the list."""
+        if event.key() == Qt.Key.Key_Delete and self.list.hasFocus():
+            for item in self.list.selectedItems():
+                self.forgotten.emit(item.data(Qt.ItemDataRole.UserRole))
+        else:
+            super().keyPressEvent(event)
+
+    def _show(self, recent: Recent) -> None:
+        """Show what was found in a session."""
+        if recent.path not in self._shown:
+            return
+        item = self.list.item(self._shown.index(recent.path))
+        item.setText(f"{recent.title}\n{recent.about}\n{recent.path}")
+        item.setData(Qt.ItemDataRole.AccessibleTextRole, f"{recent.title}, {recent.about}")
+        if not recent.there:
+            item.setForeground(self.palette().placeholderText())
+        if recent.thumbnail is not None:
+            rows, columns = recent.thumbnail.shape
+            grey = QImage.Format.Format_Grayscale8
+            image = QImage(recent.thumbnail.tobytes(), columns, rows, columns, grey).copy()
+            item.setIcon(QIcon(QPixmap.fromImage(image)))
+
+    def _open(self, item: QListWidgetItem) -> None:
+        self.chosen.emit(item.data(Qt.ItemDataRole.UserRole))

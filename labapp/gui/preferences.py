@@ -1,0 +1,138 @@
+"""What the app remembers between starts. Nothing in it can stop the program from starting."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from labapp.session.files import as_bytes, write_whole
+from labapp.session.log import NAME
+
+VERSION = 1
+KEPT_RECENT = 12
+THEMES = ("system", "light", "dark")
+LARGEST_BYTES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """What is remembered.
+
+    Parameters
+    ----------
+    recent
+        Session files, the last opened first.
+    theme
+        One of `THEMES`.
+    geometry, layout
+        Of the window, as Qt tells them, base64; empty for the default.
+    last_folder
+        Where a file was chosen last; empty for the documents folder.
+    """
+
+    recent: tuple[str, ...] = ()
+    theme: str = "system"
+    geometry: str = ""
+    layout: str = ""
+    last_folder: str = ""
+
+    def with_recent(self, path: Path) -> Preferences:
+        """The same with a session as the last opened."""
+        name = str(path.absolute())
+        others = (other for other in self.recent if other != name)
+        return replace(self, recent=(name, *others)[:KEPT_RECENT], last_folder=str(path.parent))
+
+    def without_recent(self, path: Path) -> Preferences:
+        """The same with a session forgotten."""
+        name = str(path.absolute())
+        return replace(self, recent=tuple(other for other in self.recent if other != name))
+
+    @property
+    def folder(self) -> Path:
+        """Where a file dialog begins."""
+        last = Path(self.last_folder)
+        return last if self.last_folder and last.is_dir() else documents_folder()
+
+    @property
+    def samples_folder(self) -> Path:
+        """Where copies of samples go."""
+        documents = platformdirs.user_documents_path()
+        if documents.is_dir():
+            return documents / NAME
+        return platformdirs.user_data_path(NAME, appauthor=False) / "samples"
+
+
+def documents_folder() -> Path:
+    """The user's documents, or the home folder where there are none."""
+    documents = platformdirs.user_documents_path()
+    return documents if documents.is_dir() else Path.home()
+
+
+def preferences_file() -> Path:
+    """Where preferences are kept."""
+    return Path(platformdirs.user_config_dir(NAME, appauthor=False)) / "preferences.json"
+
+
+def read_preferences(path: Path) -> tuple[Preferences, str]:
+    """Read preferences; what cannot be used is kept aside and the defaults hold.
+
+    Returns
+    -------
+    preferences, problem
+        ``problem`` tells the operator what was wrong; empty if nothing was.
+    """
+    try:
+        if path.stat().st_size > LARGEST_BYTES:
+            return Preferences(), _keep_aside(path, f"is larger than {LARGEST_BYTES} bytes")
+        held = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return Preferences(), ""
+    except OSError as error:
+        return Preferences(), f"Preferences could not be read ({error.strerror}): {path}"
+    except (ValueError, RecursionError):
+        return Preferences(), _keep_aside(path, "is damaged")
+    if not isinstance(held, dict) or held.pop("version", None) != VERSION:
+        return Preferences(), _keep_aside(path, "is of another version of labapp")
+    try:
+        return _checked(held), ""
+    except (TypeError, ValueError):
+        return Preferences(), _keep_aside(path, "is damaged")
+
+
+def write_preferences(path: Path, preferences: Preferences) -> str:
+    """Write preferences, all or nothing; returns what went wrong, or nothing."""
+    held = {"version": VERSION, **dataclasses.asdict(preferences)}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, as_bytes(json.dumps(held, indent=1, ensure_ascii=False) + "\n"))
+    except OSError as error:
+        return f"Preferences could not be saved ({error.strerror}): {path}"
+    return ""
+
+
+def _checked(held: dict[str, Any]) -> Preferences:
+    recent = held.get("recent", [])
+    if not isinstance(recent, list):
+        raise TypeError("recent")
+    found = Preferences(**{**held, "recent": tuple(recent)})
+    texts: list[Any] = [*recent, found.theme, found.geometry, found.layout, found.last_folder]
+    if not all(isinstance(text, str) and "\0" not in text for text in texts):
+        raise TypeError("a text")
+    if found.theme not in THEMES:
+        raise ValueError(found.theme)
+    return replace(found, recent=found.recent[:KEPT_RECENT])
+
+
+def _keep_aside(path: Path, why: str) -> str:
+    aside = path.with_suffix(".kept.json")
+    try:
+        os.replace(path, aside)
+    except OSError:
+        return f"The preferences file {why}; the defaults are used: {path}"
+    return f"The preferences file {why}; the defaults are used, and it is kept as {aside}"

@@ -1,0 +1,80 @@
+"""What the welcome page tells of a session without opening it to work on. Without Qt."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from labapp.errors import InputError
+from labapp.media import GreyImage
+from labapp.session.session import Session
+
+THUMBNAIL_PX = (128, 96)
+
+
+@dataclass(frozen=True)
+class Recent:
+    """A session opened before.
+
+    Parameters
+    ----------
+    path
+        Its file.
+    title
+        Of the experiment, or the file's name.
+    about
+        Date, frames, what is measured; or why it cannot be opened.
+    thumbnail
+        Its first frame, small; None where it cannot be read.
+    there
+        Whether it can be opened.
+    """
+
+    path: Path
+    title: str
+    about: str
+    thumbnail: GreyImage | None = None
+    there: bool = True
+
+
+def look_at(path: Path) -> Recent:
+    """Look into a session file without changing anything."""
+    try:
+        changed = datetime.datetime.fromtimestamp(path.stat().st_mtime)
+        with Session.open(path, read_only=True) as session:
+            title = session.record.title or path.stem
+            frames = session.frames
+            measured = sum(status != "" for status in session.overview().status)
+            about = f"{changed:%Y-%m-%d %H:%M} · {_counted(len(frames), measured)}"
+            return Recent(path, title, about, _thumbnail(session, frames))
+    except InputError as error:
+        return Recent(path, path.stem, f"{error.field}: {error.value}", there=False)
+    except OSError as error:
+        return Recent(path, path.stem, str(error.strerror), there=False)
+
+
+def _counted(frames: int, measured: int) -> str:
+    if not frames:
+        return "no recording yet"
+    counted = f"{frames} frame{'s' * (frames != 1)}"
+    return f"{counted}, {'all' if measured == frames else measured or 'none'} measured"
+
+
+def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:
+    if not len(frames):
+        return None
+    try:
+        image = session.frame(int(frames[0])).image
+    except InputError:  # the recording is elsewhere; the session is whole all the same
+        return None
+    rows, columns = image.shape
+    scale = min(THUMBNAIL_PX[0] / columns, THUMBNAIL_PX[1] / rows)
+    size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
+    small = cv2.resize(np.asarray(image, np.float32), size, interpolation=cv2.INTER_AREA)
+    low, high = float(small.min()), float(small.max())
+    grey = np.asarray((small - low) * (255 / max(high - low, 1e-9)), np.uint8)
+    return grey

@@ -1,0 +1,184 @@
+"""The steps at the left, each with its mark, and the panel at the right that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtGui import QColor, QIcon, QPainter, QPalette, QPen, QPixmap, QPolygonF
+from PySide6.QtWidgets import (
+    QFrame,
+    QLabel,
+    QListWidget,
+    QListWidgetItem,
+    QScrollArea,
+    QSizePolicy,
+    QStackedWidget,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.steps import Mark, State, Step
+from labapp.gui.theme import is_dark
+
+ICON_PX = 18
+COLOURS = {
+    Mark.TODO: ("#6b7480", "#929ba6"),
+    Mark.READY: ("#0a6fc2", "#6db8f2"),
+    Mark.DONE: ("#1d7f45", "#58c783"),
+    Mark.ATTENTION: ("#b35300", "#f2a35e"),
+}
+"""On a light and on a dark ground."""
+
+SIGNS = {Mark.TODO: "○", Mark.READY: "▶", Mark.DONE: "✓", Mark.ATTENTION: "▲"}
+
+CHECK = ((0.22, 0.52), (0.42, 0.72), (0.78, 0.28))
+ARROW = ((0.32, 0.2), (0.8, 0.5), (0.32, 0.8))
+WARNING = ((0.5, 0.1), (0.93, 0.88), (0.07, 0.88))
+
+
+def mark_icon(mark: Mark, dark: bool) -> QIcon:
+    """The mark's shape in its colour."""
+    scale = 3  # sharp on a screen of any scaling
+    pixmap = QPixmap(ICON_PX * scale, ICON_PX * scale)
+    pixmap.fill(Qt.GlobalColor.transparent)
+    painter = QPainter(pixmap)
+    painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+    painter.scale(ICON_PX * scale, ICON_PX * scale)
+    colour = QColor(COLOURS[mark][dark])
+    pen = QPen(colour, 0.1)
+    pen.setCapStyle(Qt.PenCapStyle.RoundCap)
+    pen.setJoinStyle(Qt.PenJoinStyle.RoundJoin)
+    painter.setPen(pen)
+    if mark is Mark.TODO:
+        painter.drawEllipse(QRectF(0.22, 0.22, 0.56, 0.56))
+    elif mark is Mark.DONE:
+        painter.setPen(QPen(colour, 0.16, c=Qt.PenCapStyle.RoundCap))
+        painter.drawPolyline(QPolygonF([QPointF(*point) for point in CHECK]))
+    else:
+        painter.setBrush(colour)
+        corners = ARROW if mark is Mark.READY else WARNING
+        painter.drawPolygon(QPolygonF([QPointF(*point) for point in corners]))
+        if mark is Mark.ATTENTION:
+            painter.setPen(QPen(QColor("#22262a" if dark else "#ffffff"), 0.1))
+            painter.drawLine(QPointF(0.5, 0.38), QPointF(0.5, 0.6))
+            painter.drawPoint(QPointF(0.5, 0.76))
+    painter.end()
+    return QIcon(pixmap)
+
+
+class StepList(QListWidget):
+    """The steps that have a page.
+
+    Signals
+    -------
+    chosen
+        The operator chose a step: its key.
+    """
+
+    chosen = Signal(str)
+
+    def __init__(self, steps: Sequence[Step], parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._steps = tuple(steps)
+        self.setAccessibleName("Steps")
+        self.setFrameShape(QFrame.Shape.NoFrame)
+        self.setIconSize(QSize(ICON_PX, ICON_PX))
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
+        self.setSpacing(1)
+        for number, step in enumerate(self._steps, 1):
+            item = QListWidgetItem(f"{number}  {step.title}")
+            item.setSizeHint(QSize(0, self.fontMetrics().height() + 14))
+            self.addItem(item)
+        self.currentRowChanged.connect(self._told)
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """As wide as the longest title needs."""
+        width = (
+            max(
+                (self.sizeHintForIndex(self.indexFromItem(self.item(row))).width())
+                for row in range(self.count())
+            )
+            if self.count()
+            else 0
+        )
+        metrics = self.fontMetrics()
+        texts = [metrics.horizontalAdvance(self.item(row).text()) for row in range(self.count())]
+        return QSize(max([width, *texts]) + ICON_PX + 32, 200)
+
+    def show_states(self, states: Mapping[str, State]) -> None:
+        """Show how far every step is."""
+        dark = is_dark(self.palette())
+        for row, step in enumerate(self._steps):
+            state, item = states[step.key], self.item(row)
+            item.setIcon(mark_icon(state.mark, dark))
+            item.setToolTip(f"{state.mark.value.capitalize()}: {state.why}")
+            told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
+            item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
+
+    def show_step(self, key: str) -> None:
+        """Mark the step in view; none for the welcome page."""
+        keys = [step.key for step in self._steps]
+        self.blockSignals(True)
+        self.setCurrentRow(keys.index(key) if key in keys else -1)
+        self.blockSignals(False)
+
+    def _told(self, row: int) -> None:
+        if row >= 0:
+            self.chosen.emit(self._steps[row].key)
+
+
+class SidePanel(QWidget):
+    """What to do now, how far the step is, and the page's own panel, which scrolls."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.title = QLabel()
+        font = self.title.font()
+        font.setPointSizeF(font.pointSizeF() * 1.25)
+        font.setBold(True)
+        self.title.setFont(font)
+        self.hint = QLabel()
+        self.state = QLabel()
+        for label in (self.hint, self.state):
+            label.setWordWrap(True)
+            label.setTextFormat(Qt.TextFormat.PlainText)
+            label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.stack = QStackedWidget()
+        self._areas: dict[QWidget, QScrollArea] = {}
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(10, 8, 6, 6)
+        for widget in (self.title, self.hint, self.state):
+            layout.addWidget(widget)
+        line = QFrame()
+        line.setFrameShape(QFrame.Shape.HLine)
+        line.setForegroundRole(QPalette.ColorRole.Mid)
+        layout.addWidget(line)
+        layout.addWidget(self.stack, 1)
+        self.setMinimumWidth(260)
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Room for two columns of numbers."""
+        return QSize(340, 500)
+
+    def show_panel(self, panel: QWidget, step: Step) -> None:
+        """Show a page's panel."""
+        if panel not in self._areas:
+            area = QScrollArea()
+            area.setWidgetResizable(True)
+            area.setFrameShape(QFrame.Shape.NoFrame)
+            area.setWidget(panel)
+            self._areas[panel] = area
+            self.stack.addWidget(area)
+        self.stack.setCurrentWidget(self._areas[panel])
+        self.title.setText(step.title)
+        self.hint.setText(step.hint)
+
+    def show_state(self, state: State) -> None:
+        """Show how far the step is, and why."""
+        self.state.setText(f"{SIGNS[state.mark]}  {state.why}")
+        palette = self.state.palette()
+        colour = COLOURS[state.mark][is_dark(self.palette())]
+        palette.setColor(QPalette.ColorRole.WindowText, QColor(colour))
+        self.state.setPalette(palette)

@@ -1,0 +1,95 @@
+"""Light and dark: palettes with one accent colour, for Qt's own Fusion style."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor, QPalette
+from PySide6.QtWidgets import QApplication
+
+Role = QPalette.ColorRole
+
+LIGHT = {
+    Role.Window: "#f3f4f5",
+    Role.WindowText: "#1c2024",
+    Role.Base: "#ffffff",
+    Role.AlternateBase: "#f0f2f4",
+    Role.Text: "#1c2024",
+    Role.PlaceholderText: "#6b7480",
+    Role.Button: "#e7e9ec",
+    Role.ButtonText: "#1c2024",
+    Role.BrightText: "#ffffff",
+    Role.ToolTipBase: "#ffffff",
+    Role.ToolTipText: "#1c2024",
+    Role.Link: "#0a62a8",
+    Role.LinkVisited: "#0a62a8",
+    Role.Highlight: "#0a6fc2",
+    Role.HighlightedText: "#ffffff",
+    Role.Accent: "#0a6fc2",
+    Role.Light: "#ffffff",
+    Role.Midlight: "#e2e5e9",
+    Role.Mid: "#b7bec7",
+    Role.Dark: "#8f98a3",
+    Role.Shadow: "#5d656f",
+}
+DARK = {
+    Role.Window: "#22262a",
+    Role.WindowText: "#e4e7ea",
+    Role.Base: "#191c1f",
+    Role.AlternateBase: "#202428",
+    Role.Text: "#e4e7ea",
+    Role.PlaceholderText: "#929ba6",
+    Role.Button: "#31363c",
+    Role.ButtonText: "#e4e7ea",
+    Role.BrightText: "#ffffff",
+    Role.ToolTipBase: "#31363c",
+    Role.ToolTipText: "#e4e7ea",
+    Role.Link: "#6db8f2",
+    Role.LinkVisited: "#6db8f2",
+    Role.Highlight: "#2a7fc4",
+    Role.HighlightedText: "#ffffff",
+    Role.Accent: "#4ba3e3",
+    Role.Light: "#4a5159",
+    Role.Midlight: "#3a4047",
+    Role.Mid: "#50575f",
+    Role.Dark: "#14171a",
+    Role.Shadow: "#0b0c0e",
+}
+DISABLED = {False: "#8b939d", True: "#767e88"}
+"""Text of what is disabled, light and dark."""
+
+
+def palette(dark: bool) -> QPalette:
+    """The light or the dark palette."""
+    made = QPalette()
+    for role, colour in (DARK if dark else LIGHT).items():
+        made.setColor(role, QColor(colour))
+    for role in (Role.WindowText, Role.Text, Role.ButtonText, Role.HighlightedText):
+        made.setColor(QPalette.ColorGroup.Disabled, role, QColor(DISABLED[dark]))
+    made.setColor(
+        QPalette.ColorGroup.Disabled, Role.Highlight, QColor("#50575f" if dark else "#b7bec7")
+    )
+    return made
+
+
+def is_dark(look: QPalette) -> bool:
+    """Whether a palette is a dark one; what no role can say is chosen by this."""
+    return look.color(Role.Window).lightness() < 128
+
+
+def apply_theme(app: QApplication, theme: str) -> None:
+    """Show the app light, dark or as the desktop is; dark where the desktop does not say.
+
+    Parameters
+    ----------
+    app
+        The application.
+    theme
+        ``light``, ``dark`` or ``system``.
+    """
+    if app.style().name().lower() != "fusion":
+        app.setStyle("Fusion")
+    desktop_is_light = app.styleHints().colorScheme() == Qt.ColorScheme.Light
+    dark = theme == "dark" or (theme == "system" and not desktop_is_light)
+    made = palette(dark)
+    if app.palette() != made:
+        app.setPalette(made)

@@ -1,0 +1,448 @@
+"""The timeline: one tick a frame, the frame in view, playing and jumping. Quick for any length."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEvent, QPointF, QRectF, QSize, Qt, QTimer, Signal
+from PySide6.QtGui import (
+    QColor,
+    QHelpEvent,
+    QImage,
+    QKeyEvent,
+    QMouseEvent,
+    QPainter,
+    QPaintEvent,
+    QPalette,
+    QPen,
+    QPolygonF,
+    QResizeEvent,
+    QWheelEvent,
+)
+from PySide6.QtWidgets import (
+    QHBoxLayout,
+    QLabel,
+    QSizePolicy,
+    QSpinBox,
+    QStyle,
+    QStyleOptionFocusRect,
+    QToolButton,
+    QToolTip,
+    QVBoxLayout,
+    QWidget,
+)
+
+PLAY_HZ = 30.0
+"""Most frames a second while playing; every frame is shown."""
+
+GAP_FROM_PX = 4
+"""Ticks at least this wide stand apart."""
+
+RAIL_PX = 9
+"""Room above the ticks for the marker of the frame in view."""
+
+Shape = Sequence[tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Tick:
+    """How ticks of one kind look.
+
+    Parameters
+    ----------
+    words
+        What it means.
+    light, dark
+        Colour on a light and on a dark ground; empty for the palette's.
+    parts
+        (from, to) up the height, 0 at the foot and 1 at the top: shape tells as much as colour.
+    """
+
+    words: str
+    light: str
+    dark: str
+    parts: Shape
+
+
+def aggregated(kinds: npt.NDArray[np.int64], columns: int) -> npt.NDArray[np.int64]:
+    """The kind that each column of pixels shows: the greatest of its frames, shape (columns,).
+
+    Parameters
+    ----------
+    kinds
+        Of the frames, at least one, shape (n,).
+    columns
+        How many there are.
+    """
+    count = len(kinds)
+    first = np.arange(columns, dtype=np.int64) * count // columns
+    if count <= columns:
+        return np.asarray(kinds[first])
+    return np.asarray(np.maximum.reduceat(kinds, first))
+
+
+class Scrubber(QWidget):
+    """The ticks, and the frame in view on them; it knows positions, not what a frame is.
+
+    Signals
+    -------
+    moved
+        The operator went to a position, counted from 0.
+    """
+
+    moved = Signal(int)
+
+    def __init__(self, ticks: Sequence[Tick], parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._ticks = tuple(ticks)
+        self._kinds: npt.NDArray[np.int64] = np.zeros(0, np.int64)
+        self._position = 0
+        self._picture: QImage | None = None
+        self.describe: Callable[[int], str] = lambda position: f"{position + 1}"
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setAccessibleName("Frames")
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """As wide as there is room, and high enough for the shapes to be told apart."""
+        return QSize(400, self.fontMetrics().height() * 2 + RAIL_PX)
+
+    def set_kinds(self, kinds: npt.NDArray[np.int64]) -> None:
+        """Show frames of these kinds, indices into the ticks, shape (n,)."""
+        if not np.array_equal(kinds, self._kinds):
+            self._kinds = np.asarray(kinds, np.int64)
+            self._picture = None
+            self.update()
+
+    def set_position(self, position: int) -> None:
+        """Mark the frame in view."""
+        if position != self._position:
+            self._position = position
+            self.setAccessibleDescription(self.describe(position) if len(self._kinds) else "")
+            self.update()
+
+    @property
+    def position(self) -> int:
+        """Of the frame in view."""
+        return self._position
+
+    def position_at(self, x: float) -> int:
+        """Position of the frame under a place across the widget, px."""
+        return max(0, min(len(self._kinds) - 1, int(x * len(self._kinds) / max(1, self.width()))))
+
+    def go_to(self, position: int) -> None:
+        """Go to the nearest position there is, as if the operator had."""
+        if len(self._kinds):
+            position = max(0, min(len(self._kinds) - 1, position))
+            if position != self._position:
+                self.moved.emit(position)
+
+    # --- drawing ----------------------------------------------------------------------------
+
+    def paintEvent(self, _event: QPaintEvent) -> None:  # noqa: N802
+        """Draw the ticks, made once for a width and kinds, and the marker over them."""
+        painter = QPainter(self)
+        if not len(self._kinds):
+            return
+        if self._picture is None:
+            self._picture = self._drawn()
+        painter.drawImage(QPointF(0, RAIL_PX), self._picture)
+        width = self.width() / len(self._kinds)
+        left = self._position * width
+        middle = left + width / 2
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        ink = self.palette().color(QPalette.ColorRole.WindowText)
+        if width >= GAP_FROM_PX:
+            painter.setPen(QPen(ink, 1.5))
+            painter.drawRect(QRectF(left + 0.5, RAIL_PX, width - 1, self.height() - RAIL_PX - 1))
+        else:
+            painter.setPen(QPen(ink, 1.5))
+            painter.drawLine(QPointF(middle, RAIL_PX), QPointF(middle, self.height()))
+        painter.setPen(Qt.PenStyle.NoPen)
+        painter.setBrush(ink)
+        half = RAIL_PX * 0.6
+        corners = [(middle - half, 0.0), (middle + half, 0.0), (middle, RAIL_PX - 1.0)]
+        painter.drawPolygon(QPolygonF([QPointF(*corner) for corner in corners]))
+        if self.hasFocus():
+            option = QStyleOptionFocusRect()
+            option.initFrom(self)
+            self.style().drawPrimitive(
+                QStyle.PrimitiveElement.PE_FrameFocusRect, option, painter, self
+            )
+
+    def _drawn(self) -> QImage:
+        scale = self.devicePixelRatioF()
+        columns = max(1, round(self.width() * scale))
+        rows = max(8, round((self.height() - RAIL_PX) * scale))
+        kinds = aggregated(self._kinds, columns)
+        colours, masks = self._looks(rows)
+        pixels = np.where(masks[kinds].T, colours[kinds][None, :], np.uint32(0))
+        if columns / len(self._kinds) >= GAP_FROM_PX * scale:
+            frame = np.arange(columns) * len(self._kinds) // columns
+            pixels[:, 1:][:, frame[1:] != frame[:-1]] = 0
+        pixels = np.ascontiguousarray(pixels, np.uint32)
+        picture = QImage(
+            pixels.tobytes(), columns, rows, 4 * columns, QImage.Format.Format_ARGB32
+        ).copy()
+        picture.setDevicePixelRatio(scale)
+        return picture
+
+    def _looks(self, rows: int) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.bool_]]:
+        """Colour of each kind, shape (kinds,), and which rows of pixels it fills, (kinds, rows)."""
+        palette = self.palette()
+        dark = palette.color(QPalette.ColorRole.Window).lightness() < 128
+        plain = palette.color(QPalette.ColorRole.Shadow if not dark else QPalette.ColorRole.Mid)
+        colours, masks = [], []
+        up = 1 - (np.arange(rows) + 0.5) / rows
+        for tick in self._ticks:
+            name = tick.dark if dark else tick.light
+            colours.append((QColor(name) if name else plain).rgba())
+            fills = [(up >= foot) & (up <= top) for foot, top in tick.parts]
+            masks.append(np.any(fills, axis=0))
+        return np.array(colours, np.uint32), np.array(masks, bool)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+        """Draw the ticks anew for another width."""
+        self._picture = None
+        super().resizeEvent(event)
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Draw the ticks anew for another palette."""
+        if event.type() in (QEvent.Type.PaletteChange, QEvent.Type.StyleChange):
+            self._picture = None
+        super().changeEvent(event)
+
+    # --- going ------------------------------------------------------------------------------
+
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Go to the frame under the pointer."""
+        if event.button() == Qt.MouseButton.LeftButton:
+            self.go_to(self.position_at(event.position().x()))
+
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Scrub."""
+        if event.buttons() & Qt.MouseButton.LeftButton:
+            self.go_to(self.position_at(event.position().x()))
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Step through the frames."""
+        steps = event.angleDelta().y() or event.angleDelta().x()
+        self.go_to(self._position - (steps > 0) + (steps < 0))
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Go a tenth of all frames with Page Up and Down; the other keys are the window's."""
+        page = max(1, len(self._kinds) // 10)
+        if event.key() == Qt.Key.Key_PageUp:
+            self.go_to(self._position - page)
+        elif event.key() == Qt.Key.Key_PageDown:
+            self.go_to(self._position + page)
+        else:
+            event.ignore()
+
+    def event(self, event: QEvent) -> bool:
+        """Tell of the frame under the pointer."""
+        if isinstance(event, QHelpEvent) and len(self._kinds):
+            position = self.position_at(event.pos().x())
+            told = self._ticks[int(self._kinds[position])].words
+            QToolTip.showText(event.globalPos(), f"{self.describe(position)}: {told}", self)
+            return True
+        return super().event(event)
+
+
+class Timeline(QWidget):
+    """The scrubber with its buttons, the frame's number and time.
+
+    It knows no session: numbers, times and kinds of frames are given to it.
+
+    Signals
+    -------
+    moved
+        The operator went to a frame: its number.
+    jumped
+        The operator asked for the next frame in doubt or corrected: ``doubtful`` or
+        ``corrected``, and whether forward.
+    """
+
+    moved = Signal(int)
+    jumped = Signal(str, bool)
+
+    def __init__(self, ticks: Sequence[Tick], parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._ticks = tuple(ticks)
+        self._frames: npt.NDArray[np.int64] = np.zeros(0, np.int64)
+        self._times_s: npt.NDArray[np.float64] = np.zeros(0)
+        self.scrubber = Scrubber(ticks)
+        self.scrubber.describe = self.described
+        self.scrubber.moved.connect(self._moved)
+        self._timer = QTimer(self)
+        self._timer.timeout.connect(self._play_on)
+        self.number = QSpinBox()
+        self.number.setAccessibleName("Frame number")
+        self.number.setToolTip("The frame in view, counted from 0: type a number to go there")
+        self.number.setKeyboardTracking(False)
+        self.number.setAlignment(Qt.AlignmentFlag.AlignRight)
+        self.number.valueChanged.connect(self._typed)
+        self.told = QLabel()
+        self.told.setMinimumWidth(self.fontMetrics().horizontalAdvance("of 10000 · 0000.0000 s  "))
+        self.counts = QLabel()
+        self.counts.setTextFormat(Qt.TextFormat.RichText)
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        style = QStyle.StandardPixmap
+        self.play_button = self._button("Play", "Show one frame after another", style.SP_MediaPlay)
+        self.play_button.setCheckable(True)
+        self.play_button.clicked.connect(self.set_playing)
+        row = QHBoxLayout()
+        row.setContentsMargins(0, 0, 0, 0)
+        for name, tip, icon, go in (
+            ("First frame", "Go to the first frame (Home)", style.SP_MediaSkipBackward, -(10**9)),
+            ("Frame before", "Go to the frame before (←)", style.SP_MediaSeekBackward, -1),
+            (None, None, None, 0),
+            ("Next frame", "Go to the next frame (→)", style.SP_MediaSeekForward, 1),
+            ("Last frame", "Go to the last frame (End)", style.SP_MediaSkipForward, 10**9),
+        ):
+            if name is None:
+                row.addWidget(self.play_button)
+                continue
+            button = self._button(name, tip, icon)
+            button.clicked.connect(lambda *_, by=go: self.step(by))
+            row.addWidget(button)
+        row.addWidget(self.number)
+        row.addWidget(self.told)
+        for kind, text in (("doubtful", "in doubt"), ("corrected", "corrected")):
+            for forward, sign in ((False, "◂"), (True, "▸")):
+                button = QToolButton()
+                button.setText(f"{sign} {text}" if not forward else f"{text} {sign}")
+                key = ("F8" if kind == "doubtful" else "F7") if forward else ""
+                key = key or ("Shift+F8" if kind == "doubtful" else "Shift+F7")
+                where = "next" if forward else "previous"
+                button.setAccessibleName(f"{where.capitalize()} frame {text}")
+                button.setToolTip(f"Go to the {where} frame {text} ({key})")
+                button.clicked.connect(lambda *_, k=kind, f=forward: self.jumped.emit(k, f))
+                row.addWidget(button)
+        row.addStretch(1)
+        row.addWidget(self.counts)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(6, 4, 6, 4)
+        column.setSpacing(4)
+        column.addWidget(self.scrubber)
+        column.addLayout(row)
+
+    def _button(
+        self, name: str, tip: str | None, icon: QStyle.StandardPixmap | None
+    ) -> QToolButton:
+        button = QToolButton()
+        if icon is not None:
+            button.setIcon(self.style().standardIcon(icon))
+        button.setAccessibleName(name)
+        button.setToolTip(tip or name)
+        return button
+
+    # --- what it shows ----------------------------------------------------------------------
+
+    def set_frames(
+        self,
+        frames: npt.NDArray[np.int64],
+        times_s: npt.NDArray[np.float64],
+        kinds: npt.NDArray[np.int64],
+    ) -> None:
+        """Show these frames.
+
+        Parameters
+        ----------
+        frames
+            Their numbers, ascending, shape (n,).
+        times_s
+            Their times, shape (n,), s; NaN where unknown.
+        kinds
+            Indices into the ticks, shape (n,).
+        """
+        self._frames, self._times_s = frames, times_s
+        self.scrubber.set_kinds(kinds)
+        self.setEnabled(len(frames) > 0)
+        self.number.blockSignals(True)
+        self.number.setRange(*((int(frames[0]), int(frames[-1])) if len(frames) else (0, 0)))
+        self.number.blockSignals(False)
+        self._show_counts(kinds)
+
+    def set_frame(self, frame: int) -> None:
+        """Mark the frame in view."""
+        if not len(self._frames):
+            self.told.setText("")
+            return
+        position = int(np.searchsorted(self._frames, frame).clip(0, len(self._frames) - 1))
+        self.scrubber.set_position(position)
+        self.number.blockSignals(True)
+        self.number.setValue(frame)
+        self.number.blockSignals(False)
+        time_s = self._times_s[position]
+        when = "" if np.isnan(time_s) else f" · {time_s:.4f} s"
+        self.told.setText(f"{position + 1} of {len(self._frames)}{when}")
+
+    def described(self, position: int) -> str:
+        """A frame in words."""
+        time_s = self._times_s[position]
+        when = "" if np.isnan(time_s) else f", {time_s:.4f} s"
+        return f"Frame {self._frames[position]}{when}"
+
+    def _show_counts(self, kinds: npt.NDArray[np.int64]) -> None:
+        """A legend that counts: only kinds that occur, so that it stays short."""
+        dark = self.palette().color(QPalette.ColorRole.Window).lightness() < 128
+        found = np.bincount(kinds, minlength=len(self._ticks)) if len(kinds) else ()
+        parts = []
+        for tick, count in zip(self._ticks, found, strict=False):
+            if count:
+                colour = (tick.dark if dark else tick.light) or "gray"
+                words = tick.words.split(":")[0]
+                parts.append(f'<span style="color:{colour}">■</span>&nbsp;{count}&nbsp;{words}')
+        self.counts.setText(" &nbsp; ".join(parts))
+
+    # --- going ------------------------------------------------------------------------------
+
+    def step(self, by: int) -> None:
+        """Go this many frames on, or back, as far as there are any."""
+        self.scrubber.go_to(self.scrubber.position + by)
+
+    @property
+    def playing(self) -> bool:
+        """Whether frames are shown one after another."""
+        return self._timer.isActive()
+
+    def set_playing(self, playing: bool) -> None:
+        """Play from here, or from the first frame at the last; or stop."""
+        playing = playing and len(self._frames) > 1
+        if playing and not self.playing:
+            if self.scrubber.position == len(self._frames) - 1:
+                self.scrubber.go_to(0)
+            self._timer.start(round(1000 / PLAY_HZ))
+        elif not playing:
+            self._timer.stop()
+        self.play_button.setChecked(playing)
+        style = QStyle.StandardPixmap
+        icon = style.SP_MediaPause if playing else style.SP_MediaPlay
+        self.play_button.setIcon(self.style().standardIcon(icon))
+        self.play_button.setAccessibleName("Pause" if playing else "Play")
+        self.play_button.setToolTip(
+            "Stay at this frame (Space)" if playing else "Show one frame after another (Space)"
+        )
+
+    def _play_on(self) -> None:
+        if self.scrubber.position >= len(self._frames) - 1:
+            self.set_playing(False)
+        else:
+            self.step(1)
+
+    def _moved(self, position: int) -> None:
+        self.moved.emit(int(self._frames[position]))
+
+    def _typed(self, number: int) -> None:
+        """Go to the frame with the number typed, or the nearest there is."""
+        position = int(np.abs(self._frames - number).argmin())
+        if position == self.scrubber.position:
+            self.set_frame(int(self._frames[position]))
+        else:
+            self.scrubber.go_to(position)

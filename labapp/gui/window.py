@@ -1,0 +1,577 @@
+"""The window: steps at the left, the page, its panel at the right, the timeline at the bottom."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PySide6.QtCore import QByteArray, Qt, QTimer, QUrl
+from PySide6.QtGui import (
+    QCloseEvent,
+    QDesktopServices,
+    QDragEnterEvent,
+    QDropEvent,
+    QKeyEvent,
+)
+from PySide6.QtWidgets import (
+    QApplication,
+    QDockWidget,
+    QMainWindow,
+    QStackedWidget,
+    QTableView,
+    QWidget,
+)
+
+from labapp.core.values import IntArray
+from labapp.errors import InputError
+from labapp.gui import dialogs
+from labapp.gui.actions import ACTIONS
+from labapp.gui.help import HelpDialog
+from labapp.gui.menus import Menus
+from labapp.gui.messages import LogPanel, StatusLine
+from labapp.gui.pages import PAGES
+from labapp.gui.pages.page import Page
+from labapp.gui.pages.welcome import Welcome
+from labapp.gui.preferences import Preferences, write_preferences
+from labapp.gui.standing import DOUBTFUL, Standing, next_frame, standings
+from labapp.gui.step_list import SidePanel, StepList
+from labapp.gui.steps import STEPS, states
+from labapp.gui.theme import apply_theme
+from labapp.gui.views.timeline import Tick, Timeline
+from labapp.gui.workspace import Workspace
+from labapp.session.copies import copy_sample, copy_session
+from labapp.session.database import SUFFIX, SessionInUse
+from labapp.session.log import log_file
+from labapp.session.session import Session
+
+REST = 4
+"""After showing a change the window rests so many times as long as that took, for the hands."""
+
+LONGEST_REST_MS = 1000
+
+TICKS = (
+    Tick(Standing.NOT_MEASURED.words, "", "", ((0.0, 0.12),)),
+    Tick(Standing.MEASURED.words, "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
+    Tick(Standing.CORRECTED.words, "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
+    Tick(Standing.STALE.words, "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
+    Tick(Standing.NOT_MEASURABLE.words, "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
+)
+"""By `Standing`."""
+
+LAYOUT_VERSION = 1
+
+SIZE_PX = (1280, 760)
+
+
+class MainWindow(QMainWindow):
+    """The app's one window.
+
+    Parameters
+    ----------
+    preferences
+        What is remembered from the last start.
+    preferences_file
+        Where they are kept.
+
+    Attributes
+    ----------
+    workspace
+        What is open.
+    standings
+        How each frame stands, shape (n,).
+    page
+        The page in view; None for the welcome page.
+    """
+
+    preferences: Preferences
+    workspace: Workspace
+    timeline: Timeline
+    status_line: StatusLine
+
+    def __init__(self, preferences: Preferences, preferences_file: Path) -> None:
+        super().__init__()
+        self.setObjectName("labapp")
+        self.preferences = preferences
+        self._preferences_file = preferences_file
+        self.workspace = Workspace(self)
+        self.standings: IntArray = np.zeros(0, np.int64)
+        self.page: Page | None = None
+        self._kinds = {kind.key: kind for kind in PAGES}
+        self._steps = tuple(step for step in STEPS if step.key in self._kinds)
+        self.pages: dict[str, Page] = {}
+        self._changes_due = False
+        self._rest = QTimer(self)
+        self._rest.setSingleShot(True)
+        self._rest.timeout.connect(self._rested)
+        self._make_views()
+        without = {f"step_{step.key}" for step in STEPS} - {f"step_{s.key}" for s in self._steps}
+        self.menus = Menus(self, frozenset(action.name for action in ACTIONS) - without)
+        self._connect()
+        self.setAcceptDrops(True)
+        self._plain_layout = self.saveState(LAYOUT_VERSION)
+        self._restore()
+        self._session_opened()
+
+    def _make_views(self) -> None:
+        self.welcome = Welcome(self.workspace)
+        self.stack = QStackedWidget()
+        self.stack.addWidget(self.welcome)
+        self.setCentralWidget(self.stack)
+        self.step_list = StepList(self._steps)
+        self.side_panel = SidePanel()
+        self.timeline = Timeline(TICKS)
+        self.log_panel = LogPanel()
+        self.status_line = StatusLine(self.workspace.tasks)
+        self.statusBar().setSizeGripEnabled(False)
+        self.statusBar().addWidget(self.status_line, 1)
+        left, right = Qt.DockWidgetArea.LeftDockWidgetArea, Qt.DockWidgetArea.RightDockWidgetArea
+        bottom = Qt.DockWidgetArea.BottomDockWidgetArea
+        self._wanted = {"steps": True, "panel": True, "timeline": True, "log": False}
+        self._docks = {
+            "steps": self._dock("steps", "Steps", self.step_list, left),
+            "panel": self._dock("panel", "Parameters and results", self.side_panel, right),
+            "timeline": self._dock("timeline", "Timeline", self.timeline, bottom),
+            "log": self._dock("log", "Messages", self.log_panel, bottom),
+        }
+        self.splitDockWidget(self._docks["timeline"], self._docks["log"], Qt.Orientation.Vertical)
+
+    def _dock(self, name: str, title: str, widget: QWidget, area: Qt.DockWidgetArea) -> QDockWidget:
+        dock = QDockWidget(title, self)
+        dock.setObjectName(f"dock-{name}")
+        dock.setFeatures(QDockWidget.DockWidgetFeature.NoDockWidgetFeatures)
+        dock.setTitleBarWidget(QWidget())
+        dock.setWidget(widget)
+        self.addDockWidget(area, dock)
+        return dock
+
+    def _connect(self) -> None:
+        space = self.workspace
+        space.opened.connect(self._session_opened)
+        space.changed.connect(self._changed)
+        space.frame_changed.connect(self._frame_changed)
+        space.said.connect(self.say)
+        space.tasks.changed.connect(self.menus.refresh)
+        self.step_list.chosen.connect(self.show_step)
+        self.timeline.moved.connect(space.show_frame)
+        self.timeline.jumped.connect(self.jump)
+        self.status_line.read.connect(self.read_messages)
+        self.welcome.asked.connect(self.menus.do)
+        self.welcome.chosen.connect(self.open_session)
+        self.welcome.forgotten.connect(self.forget)
+
+    # --- what is in view --------------------------------------------------------------------
+
+    def say(self, text: str, problem: bool = False) -> None:
+        """Tell the operator something; a problem stays in the status line until it was read."""
+        self.log_panel.add(text, problem)
+        self.status_line.say(text, problem)
+        if problem:
+            self.timeline.set_playing(False)
+
+    def read_messages(self) -> None:
+        """Show the messages; the problems count as read."""
+        self._wanted["log"] = True
+        self.status_line.mark_read()
+        self._show_docks()
+        self.menus.refresh()
+
+    def show_step(self, key: str) -> None:
+        """Bring a step's page into view; it is made when it is first shown."""
+        if self.workspace.session is None or key not in self._kinds:
+            return
+        if key not in self.pages:
+            made = self.workspace.tried(lambda: self._kinds[key](self.workspace))
+            if made is None:
+                return
+            self.pages[key] = made
+            self.stack.addWidget(made)
+        page = self.pages[key]
+        if page is not self.page:
+            self._leave()
+            self.page = page
+            self.stack.setCurrentWidget(page)
+            step = next(step for step in STEPS if step.key == key)
+            self.side_panel.show_panel(page.panel, step)
+        self.step_list.show_step(key)
+        self._show_session()
+
+    def go_step(self, by: int) -> None:
+        """Go some steps on, or back."""
+        if self.page is not None:
+            keys = [step.key for step in self._steps]
+            place = keys.index(self.page.key) + by
+            self.show_step(keys[max(0, min(len(keys) - 1, place))])
+
+    def jump(self, kind: str, forward: bool) -> None:
+        """Go to the next frame that is ``doubtful`` or ``corrected``, or the one before."""
+        session = self.workspace.session
+        if session is None:
+            return
+        if kind == "doubtful":
+            wanted, words = np.isin(self.standings, DOUBTFUL), "in doubt"
+        else:
+            wanted, words = np.isin(session.frames, session.corrected_frames()), "corrected by hand"
+        found = next_frame(session.frames, wanted, self.workspace.frame, forward)
+        if found is None:
+            self.say(f"No frame {'after' if forward else 'before'} this one is {words}")
+        else:
+            self.workspace.show_frame(found)
+
+    def _leave(self) -> None:
+        if self.page is not None:
+            self.workspace.tried(self.page.leave)
+            self.page = None
+
+    def _session_opened(self) -> None:
+        """Show another session from the start, or the welcome page."""
+        session = self.workspace.session
+        self.timeline.set_playing(False)
+        self._leave()
+        if session is None:
+            self.stack.setCurrentWidget(self.welcome)
+            self._list_recent()
+            self._show_session()
+        elif self._steps:
+            keys = [step.key for step in self._steps]
+            first = self.workspace.tried(lambda: first_step(session)) or "setup"
+            self.show_step(first if first in keys else keys[-1])
+        self._show_docks()
+
+    def _changed(self) -> None:
+        if self._rest.isActive():
+            self._changes_due = True
+        else:
+            self._show_session()
+
+    def _rested(self) -> None:
+        if self._changes_due:
+            self._show_session()
+
+    def _show_session(self) -> None:
+        """Show what the session holds now, everywhere."""
+        began = time.perf_counter()
+        self._changes_due = False
+        session = self.workspace.session
+        seen = None if session is None else self.workspace.tried(session.overview)
+        if seen is None:
+            self.standings = np.zeros(0, np.int64)
+            self.timeline.set_frames(self.standings, np.zeros(0), self.standings)
+        else:
+            self.standings = standings(seen)
+            self.timeline.set_frames(seen.frame, seen.time_s, self.standings)
+        self.timeline.set_frame(self.workspace.frame)
+        found = self.workspace.tried(lambda: states(session)) or states(None)
+        self.step_list.show_states(found)
+        if self.page is not None and session is not None:
+            self.side_panel.show_state(found[self.page.key])
+            self.workspace.tried(self.page.refresh)
+        self.menus.refresh()
+        self.setWindowTitle(title(session))
+        took_ms = (time.perf_counter() - began) * 1000
+        self._rest.start(min(LONGEST_REST_MS, round(REST * took_ms)))
+
+    def _frame_changed(self, frame: int) -> None:
+        self.timeline.set_frame(frame)
+        if self.page is not None:
+            self.workspace.tried(self.page.refresh)
+
+    # --- files ------------------------------------------------------------------------------
+
+    def new_session(self) -> bool:
+        """Ask for a file and make a session in it."""
+        return self._create(dialogs.new_path(self.preferences.folder, "experiment"))
+
+    def choose_session(self) -> None:
+        """Ask for a session and open it."""
+        path = dialogs.ask_session(self, self.preferences.folder)
+        if path is not None:
+            self.open_session(path)
+
+    def choose_recording(self) -> None:
+        """Ask for a recording and import it."""
+        path = dialogs.ask_recording(self, self.preferences.folder)
+        if path is not None:
+            self.import_recording(path)
+
+    def open_path(self, path: Path) -> None:
+        """Open a session, or import anything else."""
+        if path.suffix.lower() == SUFFIX:
+            self.open_session(path)
+        else:
+            self.import_recording(path)
+
+    def open_session(self, path: Path) -> bool:
+        """Open a session file, read-only if it is in use elsewhere and the operator agrees."""
+        present = self.workspace.session
+        if present is not None and path.absolute() == present.path:
+            return True
+        session = self.workspace.tried(lambda: self._opened(path))
+        if session is None:
+            return False
+        self._show(session)
+        return True
+
+    def import_recording(self, path: Path) -> None:
+        """Take a recording to the capture page, in a new session where none is open."""
+        if not path.exists():
+            self.say(f"{path} is not there", True)
+        elif self.workspace.session is not None or self._create(
+            dialogs.new_path(path.parent, path.stem)
+        ):
+            self._remember(replace(self.preferences, last_folder=str(path.parent)))
+            self.show_step("capture")
+            if self.page is not None:
+                self.page.take(path)
+
+    def save_copy(self) -> None:
+        """Ask for a file and save the session in it as it is now."""
+        session = self.workspace.session
+        if session is None:
+            return
+        proposed = dialogs.new_path(session.path.parent, f"{session.path.stem} copy")
+        path = dialogs.ask_new_session(self, proposed, "Save a copy")
+        if path is not None:
+            source = session.path
+            self.workspace.tasks.start(
+                "Saving a copy",
+                lambda _: copy_session(source, path),
+                lambda copied: self.say(f"A copy is in {copied}"),
+            )
+
+    def try_sample(self) -> None:
+        """Open a copy of the sample run, in a folder of the user's."""
+        folder = self.preferences.samples_folder / "gtaw"
+        path = self.workspace.tried(lambda: copy_sample("gtaw", folder))
+        if path is not None and self.open_session(path):
+            self.say(f"This is a copy of the sample, in {path.parent}: change what you like")
+
+    def close_session(self) -> None:
+        """Close the session and go back to the welcome page."""
+        self.workspace.show(None)
+
+    def forget(self, path: Path) -> None:
+        """Take a session off the list of recent ones; the file stays."""
+        self._remember(self.preferences.without_recent(path))
+        self._list_recent()
+
+    def _create(self, proposed: Path) -> bool:
+        path = dialogs.ask_new_session(self, proposed)
+        session = None if path is None else self.workspace.tried(lambda: Session.create(path))
+        if session is None:
+            return False
+        self._show(session)
+        return True
+
+    def _opened(self, path: Path) -> Session | None:
+        try:
+            return Session.open(path)
+        except SessionInUse:
+            if not dialogs.ask_read_only(self, path):
+                return None
+            return Session.open(path, read_only=True)
+
+    def _show(self, session: Session) -> None:
+        self._remember(self.preferences.with_recent(session.path))
+        self.workspace.show(session)
+        missing = self.workspace.tried(lambda: session.missing_recording)
+        if missing is not None:
+            self.say(f"The recording is not where it was: {missing}", True)
+
+    def _list_recent(self) -> None:
+        self.menus.show_recent(self.preferences.recent)
+        if self.workspace.session is None:
+            self.welcome.show_recent([Path(name) for name in self.preferences.recent])
+
+    # --- measuring, copying -----------------------------------------------------------------
+
+    def measure_all(self) -> None:
+        """Measure the frames that are not measured, or no longer stand."""
+        session = self.workspace.session
+        if session is not None and not len(session.stale_frames()):
+            self.say("Every frame is measured, and its measures stand")
+        elif session is not None:
+            self._measure(None)
+
+    def measure_frame(self) -> None:
+        """Measure the frame in view."""
+        self._measure([self.workspace.frame])
+
+    def _measure(self, frames: list[int] | None) -> None:
+        session = self.workspace.session
+        if session is None:
+            return
+        if any(task.title == "Measuring" for task in self.workspace.tasks.active):
+            self.say("Frames are being measured already")
+            return
+        try:
+            _ = session.setup
+        except InputError as error:
+            self.say(f"The set-up is not complete: {error}", True)
+            return
+        self.workspace.measure(frames)
+
+    def copy_picture(self) -> None:
+        """Copy the picture of the page in view."""
+        if self.page is not None:
+            QApplication.clipboard().setPixmap(self.page.picture())
+            self.say("The picture is on the clipboard")
+
+    def copy_table(self) -> None:
+        """Copy the table with the focus, or the first one in view."""
+        tables = [each for each in self.findChildren(QTableView) if each.isVisibleTo(self)]
+        if not tables:
+            self.say("This step has no table")
+            return
+        table = next((each for each in tables if each.hasFocus()), tables[0])
+        QApplication.clipboard().setText(table_text(table))
+        self.say("The table is on the clipboard")
+
+    # --- look -------------------------------------------------------------------------------
+
+    def set_theme(self, theme: str) -> None:
+        """Show the app light, dark or as the desktop is."""
+        self._remember(replace(self.preferences, theme=theme))
+        self.apply_theme()
+
+    def apply_theme(self) -> None:
+        """Apply the theme that is remembered; the desktop may have changed."""
+        app = QApplication.instance()
+        if isinstance(app, QApplication):
+            apply_theme(app, self.preferences.theme)
+        self._show_session()
+
+    def dock_is_wanted(self, name: str) -> bool:
+        """Whether a panel is to be seen while a session is open."""
+        return self._wanted[name]
+
+    def toggle_dock(self, name: str) -> None:
+        """Show or hide a panel."""
+        self._wanted[name] = not self._wanted[name]
+        if name == "log" and self._wanted[name]:
+            self.status_line.mark_read()
+        self._show_docks()
+
+    def _show_docks(self, everywhere: bool = False) -> None:
+        """Show the panels that are wanted; on the welcome page only the log."""
+        here = everywhere or self.workspace.session is not None
+        for name, dock in self._docks.items():
+            dock.setVisible(self._wanted[name] and (here or name == "log"))
+
+    def reset_layout(self) -> None:
+        """Put the panels back where they were at the first start."""
+        self.restoreState(self._plain_layout, LAYOUT_VERSION)
+        self._wanted = {name: name != "log" for name in self._wanted}
+        self._show_docks()
+
+    def toggle_full_screen(self) -> None:
+        """Use all of the screen, or go back to a window."""
+        if self.isFullScreen():
+            self.showNormal()
+        else:
+            self.showFullScreen()
+
+    def show_help(self, kind: str) -> None:
+        """Show the guide, the keys or what the program is."""
+        HelpDialog(kind, self).show()
+
+    def show_log_folder(self) -> None:
+        """Open the folder with the log."""
+        folder = log_file().parent
+        if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(folder))):
+            self.say(f"The log is in {folder}")
+
+    def _restore(self) -> None:
+        self.resize(*SIZE_PX)
+        restored = (
+            (self.restoreGeometry, self.preferences.geometry),
+            (lambda held: self.restoreState(held, LAYOUT_VERSION), self.preferences.layout),
+        )
+        for restore, text in restored:
+            _restored(restore, text)
+        if self.preferences.layout:
+            self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
+
+    def _remember(self, preferences: Preferences) -> None:
+        self.preferences = preferences
+        problem = write_preferences(self._preferences_file, preferences)
+        if problem:
+            self.say(problem)
+        self.menus.show_recent(preferences.recent)
+
+    # --- events -----------------------------------------------------------------------------
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Do what a plain key means that nothing else has taken."""
+        if not self.menus.key(event):
+            super().keyPressEvent(event)
+
+    def dragEnterEvent(self, event: QDragEnterEvent) -> None:  # noqa: N802
+        """Take files."""
+        if any(url.isLocalFile() for url in event.mimeData().urls()):
+            event.acceptProposedAction()
+
+    def dropEvent(self, event: QDropEvent) -> None:  # noqa: N802
+        """Open what was dropped, once the other program has its pointer back."""
+        paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
+        event.acceptProposedAction()
+        if len(paths) > 1:
+            self.say("Drop one file, or the folder that holds the images", True)
+        elif paths:
+            QTimer.singleShot(0, self, lambda: self.open_path(paths[0]))
+
+    def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802
+        """Stop all work, remember the layout and close the session."""
+        self.timeline.set_playing(False)
+        self._show_docks(everywhere=True)
+        self._remember(
+            replace(
+                self.preferences,
+                geometry=_text(self.saveGeometry()),
+                layout=_text(self.saveState(LAYOUT_VERSION)),
+            )
+        )
+        for page in self.pages.values():
+            self.workspace.tried(page.leave)
+        self.page = None
+        self.workspace.opened.disconnect(self._session_opened)
+        self.workspace.close()
+        self._rest.stop()
+        event.accept()
+
+
+def title(session: Session | None) -> str:
+    """The window's title."""
+    if session is None:
+        return "labapp"
+    return f"{session.path.stem}{' (read-only)' if session.read_only else ''} — labapp"
+
+
+def first_step(session: Session) -> str:
+    """Key of the step to begin with: results if there are some, else what is to be done next."""
+    if session.recording is not None:
+        measured = any(status != "" for status in session.overview().status)
+        return "surface" if measured else "dots"
+    return "capture" if states(session)["setup"].why == "Complete" else "setup"
+
+
+def table_text(table: QTableView) -> str:
+    """What a table shows, tabs between its columns, its header first."""
+    model = table.model()
+    columns = [n for n in range(model.columnCount()) if not table.isColumnHidden(n)]
+    rows = [[model.headerData(n, Qt.Orientation.Horizontal) for n in columns]]
+    for row in range(model.rowCount()):
+        if not table.isRowHidden(row):
+            rows.append([model.index(row, n).data() for n in columns])
+    return "\n".join("\t".join("" if v is None else str(v) for v in cells) for cells in rows)
+
+
+def _restored(restore: Callable[[QByteArray], bool], text: str) -> None:
+    if text:
+        restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
+
+
+def _text(held: QByteArray) -> str:
+    return bytes(held.toBase64().data()).decode("ascii")
