@@ -31,7 +31,8 @@ def view(qtbot: QtBot) -> PictureView:
 
 def at(view: PictureView, u: float, v: float) -> QPoint:
     scene = view.box.mapViewToScene(QPointF(u, v))
-    return view.canvas.mapFromScene(scene)
+    port: QPoint = view.canvas.mapFromScene(scene)
+    return port
 
 
 class Noting(Tool):
@@ -103,6 +104,8 @@ def test_keys_zoom_and_fit(view: PictureView) -> None:
     QTest.keyClick(view, Qt.Key.Key_Plus)
     assert view.box.viewRect().width() == pytest.approx(whole / 1.25)
     QTest.keyClick(view, Qt.Key.Key_Right)
+    assert view.box.viewRect().center().x() == pytest.approx(79.5)  # the window's: next frame
+    QTest.keyClick(view, Qt.Key.Key_Right, Qt.KeyboardModifier.ShiftModifier)
     assert view.box.viewRect().center().x() > 90
     QTest.keyClick(view, Qt.Key.Key_F)
     assert view.box.viewRect().width() == pytest.approx(whole)

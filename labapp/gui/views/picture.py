@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QPointF, QRectF, Qt, Signal
-from PySide6.QtGui import QColor, QImage, QKeyEvent, QPalette
+from PySide6.QtGui import QColor, QFocusEvent, QImage, QKeyEvent, QPalette
 from PySide6.QtWidgets import (
     QGraphicsItem,
     QGridLayout,
@@ -50,7 +50,10 @@ ARROWS = {
     Qt.Key.Key_Down: (0, 1),
 }
 
-KEYS = "Zoom with the wheel, + and −; F fits; drag with the middle button to move; [ ] contrast"
+KEYS = (
+    "Zoom with the wheel, + and −; F fits; drag with the middle button, or Shift and arrow keys, "
+    "to move; [ and ] change the contrast"
+)
 
 
 class Tool:
@@ -72,9 +75,15 @@ class Tool:
     def end(self, u: float, v: float) -> None:
         """Let go."""
 
-    def key(self, event: QKeyEvent) -> bool:
-        """Take a key; False leaves it to the picture."""
+    def takes(self, event: QKeyEvent) -> bool:
+        """Whether a key is the tool's; the others go to the picture and to the window."""
         return False
+
+    def key(self, event: QKeyEvent) -> None:
+        """A key that the tool takes was pressed, or repeats while it is held."""
+
+    def release(self) -> None:
+        """The key was let go, or the picture lost the focus."""
 
 
 class PictureView(QWidget):
@@ -278,11 +287,18 @@ class PictureView(QWidget):
         if event.type() == QEvent.Type.PaletteChange and hasattr(self, "canvas"):
             self._paint()
 
+    def event(self, event: QEvent) -> bool:
+        """Keep keys that the tool or a point takes from the window's shortcuts."""
+        if event.type() == QEvent.Type.ShortcutOverride:
+            assert isinstance(event, QKeyEvent)
+            if self.tool.takes(event) or self._step(event) is not None:
+                event.accept()
+                return True
+        return super().event(event)
+
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
         """Give a key to the tool, to the point chosen, or to zoom and contrast."""
-        if self.tool.key(event) or self._nudged(event):
-            return
-        key = event.key()
+        step, key = self._step(event), event.key()
         simple: dict[int, Callable[[], object]] = {
             Qt.Key.Key_Plus: lambda: self.zoom(ZOOM_STEP),
             Qt.Key.Key_Equal: lambda: self.zoom(ZOOM_STEP),
@@ -293,21 +309,34 @@ class PictureView(QWidget):
             Qt.Key.Key_BracketRight: lambda: self._contrast.setValue(self._contrast.value() + 5),
             Qt.Key.Key_P: self._next_point,
         }
-        if event.modifiers() & ~Qt.KeyboardModifier.KeypadModifier & ~SHIFT or key not in simple:
-            super().keyPressEvent(event)
-        else:
+        if self.tool.takes(event):
+            self.tool.key(event)
+        elif step is not None:
+            if self._current is None:
+                self.pan(0.1 * step[0], 0.1 * step[1])
+            else:
+                self._current.nudge(*step)
+        elif key in simple and not event.modifiers() & (CONTROL | ALT):
             simple[key]()
-
-    def _nudged(self, event: QKeyEvent) -> bool:
-        arrow = ARROWS.get(Qt.Key(event.key()))
-        if arrow is None or event.modifiers() & CONTROL:
-            return False
-        if self._current is None:
-            self.pan(0.1 * arrow[0], 0.1 * arrow[1])
         else:
-            step = FAR_NUDGE_PX if event.modifiers() & SHIFT else NUDGE_PX
-            self._current.nudge(arrow[0] * step, arrow[1] * step)
-        return True
+            super().keyPressEvent(event)
+
+    def keyReleaseEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Tell the tool."""
+        if not event.isAutoRepeat():
+            self.tool.release()
+        super().keyReleaseEvent(event)
+
+    def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802
+        """Tell the tool: the key may be let go elsewhere."""
+        self.tool.release()
+        super().focusOutEvent(event)
+
+    def _step(self, event: QKeyEvent) -> tuple[float, float] | None:
+        """Where an arrow key leads a point; without points Shift and an arrow lead the view."""
+        if self._current is None and not event.modifiers() & SHIFT:
+            return None
+        return arrow_step(event)
 
     def _next_point(self) -> None:
         if self.points:
@@ -316,7 +345,17 @@ class PictureView(QWidget):
 
 
 CONTROL = Qt.KeyboardModifier.ControlModifier
+ALT = Qt.KeyboardModifier.AltModifier
 SHIFT = Qt.KeyboardModifier.ShiftModifier
+
+
+def arrow_step(event: QKeyEvent) -> tuple[float, float] | None:
+    """How far an arrow key nudges, (du, dv) px; None for any other key."""
+    if event.key() not in ARROWS or event.modifiers() & (CONTROL | ALT):
+        return None
+    size = FAR_NUDGE_PX if event.modifiers() & SHIFT else NUDGE_PX
+    right, down = ARROWS[Qt.Key(event.key())]
+    return right * size, down * size
 
 
 class DragPoint(pg.TargetItem):  # type: ignore[misc]
