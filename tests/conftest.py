@@ -30,8 +30,10 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def labapp(capfd: pytest.CaptureFixture[str], state: Path) -> Run:
-    """Run the command line: (arguments) -> (exit code, stdout, stderr)."""
+def labapp(capfd: pytest.CaptureFixture[str], state: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run the command line without a display: (arguments) -> (exit code, stdout, stderr)."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM"):
+        monkeypatch.delenv(name, raising=False)
 
     def start(*arguments: object) -> tuple[int, str, str]:
         with pytest.raises(SystemExit) as ended:

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import typer
+import typer.core
+import typer.main
 
 import labapp
 from labapp.cli import session
@@ -31,6 +33,7 @@ from labapp.cli.shared import (
     note,
     progress_bar,
 )
+from labapp.cli.window import asks_for_app, open_app, show_in_app
 from labapp.errors import InputError
 from labapp.session.log import log_file, start_log
 
@@ -48,6 +51,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Measure the 3-D surface of a molten weld pool from a reflected laser dot matrix. "
+    "Alone, labapp opens the app; labapp FILE opens a session or a recording in it. "
     "Lengths are in mm, angles in degrees, places in an image in px (u right, v down, the "
     "centre of the first pixel is 0, 0), times in s.",
     epilog="Exit codes: 0 done; 1 done, but nothing could be measured, or a session is not whole; "
@@ -71,6 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             stream.reconfigure(errors="replace")  # a terminal without "±" is no reason to stop
     with _ctrl_c() as pressed_s:
         try:
+            given = sys.argv[1:] if arguments is None else arguments
+            if asks_for_app(given, _commands()):
+                sys.exit(open_app(given))
             app(args=arguments)
         except InputError as error:
             log.error("bad input", exc_info=True)
@@ -93,6 +100,13 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             )
             sys.exit(FAULT)
     sys.exit(0)
+
+
+def _commands() -> frozenset[str]:
+    """Names of the commands."""
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    return frozenset(group.commands)
 
 
 @contextmanager
@@ -355,6 +369,9 @@ def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo_results"),
+    window: Annotated[
+        bool, typer.Option(help="Open the session in the app, where there is a display.")
+    ] = True,
 ) -> None:
     """Measure the sample run in a session of yours, export its results and draw pictures."""
     from labapp.session.demo import draw_surface, open_demo
@@ -375,3 +392,5 @@ def demo(
     picture = out / f"surface_{frame:06d}.png"
     problem = draw_surface(measurement.reconstruction, picture)
     typer.echo(f"No picture in 3-D: {problem}" if problem else f"In 3-D: {picture}")
+    if window:
+        show_in_app(session.path)

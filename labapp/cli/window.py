@@ -1,0 +1,49 @@
+"""`labapp` and `labapp FILE`: the way into the app."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import typer
+
+from labapp.errors import InputError
+
+
+def asks_for_app(arguments: Sequence[str], commands: Collection[str]) -> bool:
+    """Whether the app is wanted: no argument at all, or one that is a file and no command."""
+    if not arguments:
+        return True
+    (first, *others) = arguments
+    if others or first.startswith("-") or first in commands:
+        return False
+    return bool(Path(first).suffix) or os.sep in first or Path(first).exists()
+
+
+def open_app(arguments: Sequence[str]) -> int:
+    """Open the app; returns its exit code when its window was closed.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, no display, or what windows need is not installed.
+    """
+    try:
+        from labapp.gui.app import main
+    except ImportError as error:
+        expected = "what windows need: pip install 'labapp[gui]'. Without it: labapp --help"
+        raise InputError("the app", error.name or "library", error, expected) from error
+    return main(arguments)
+
+
+def show_in_app(session: Path) -> None:
+    """Open a session in the app where there is a display; elsewhere tell how to."""
+    if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        typer.echo(f"To see it in the app: labapp {session}")
+        return
+    typer.echo("The app opens with it; close its window to end.")
+    # A process of its own: whatever comes over the window, the results are there.
+    subprocess.run([sys.executable, "-m", "labapp", os.fspath(session)], check=False)
