@@ -8,6 +8,7 @@ import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,10 @@ from labapp.core.detection import find_dots, find_lattice
 from labapp.core.measures import Measures
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
 from labapp.session import run
+from labapp.session.frames import Frames
+from labapp.session.measured import Results
 from labapp.session.session import Session
 from tests.conftest import Run
 
@@ -202,11 +206,37 @@ def test_import_says_what_was_read(labapp: Run, tmp_path: Path) -> None:
     assert lines[1:] == [
         "frames     30 in it, 4 frames in the session (0:10:3)",
         "time base  60 frames/s, the recording's own",
-        "at random  frame-exact",
+        "seeking    frame-exact",
         "kept       as recording.avi",
+        "The set-up is not complete:",
+        f"  labapp session setup {file} SETUP.toml",
+        "Measure it:",
+        f"  labapp session measure {file}",
     ]
     with opened(file) as session:
         assert session.frames.tolist() == [0, 3, 6, 9]
+
+
+def test_hints_are_for_the_shell(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "Schweißung 1.labsession"
+    _, said, _ = labapp("session", "new", file, "--setup", SETUP)
+    assert said.splitlines()[-1] == f"  labapp session import '{file}' RECORDING"
+
+
+def test_ctrl_c_is_told_and_imports_nothing(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "a.labsession"
+    labapp("session", "new", file)
+    before = file.read_bytes()
+
+    def pressed(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Frames, "take_in", pressed)
+    answer = labapp("session", "import", file, SAMPLE / "recording.avi")
+    assert answer == (130, "", "stopped reading recording.avi; nothing was changed\n")
+    assert file.read_bytes() == before
 
 
 def test_import_takes_a_rate_and_keeps_frames(labapp: Run, tmp_path: Path) -> None:
@@ -331,6 +361,27 @@ def test_what_cannot_be_measured_changes_nothing(
     assert file.read_bytes() == before
 
 
+def test_measuring_that_is_cut_short_tells_what_is_kept(
+    labapp: Run, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put = Results.put
+
+    def full(results: Results, frame: int, *given: Any) -> None:
+        if frame == 2:
+            raise InputError(file, "disk", "no space left", "room on the disk")
+        put(results, frame, *given)
+
+    monkeypatch.setattr(Results, "put", full)
+    code, said, complained = labapp("session", "measure", file)
+    assert (code, said) == (2, "")
+    assert complained.splitlines() == [
+        "stopped: 2 of 6 frames are done and kept",
+        f"labapp: {file}: disk: no space left; expected room on the disk",
+    ]
+    with opened(file) as session:
+        assert session.stale_frames().tolist() == [2, 3, 4, 5]
+
+
 def test_frames_are_those_that_were_imported(labapp: Run, file: Path) -> None:
     labapp("session", "import", file, file.parent / "stack.npy", "--frames", "::2")
     code, said, _ = labapp("session", "measure", file, "--frames", "1:3")
@@ -445,10 +496,12 @@ def test_every_edit_reaches_the_frame(labapp: Run, measured: Path) -> None:
         ("--add 30,140", "is there already"),
         ("--shift-row 40:1", "row 40 has no dots"),
         ("--merge-rows 1:1", "cannot be merged with itself"),
+        ("--block-row 8", "an edit that fits frame 0: its highest row is 7"),
         ("--unblock-row 1", "row 1 is not marked as blocked"),
         ("--reference 1", "it is of the form ROW,COLUMN"),
         ("--dots none.csv", "none.csv: file: No such file"),
-        ("", "correct: edits: none; expected some of --dots, --delete"),
+        ("", "correct: edits: none; expected some of --dots, --delete, --add, --move"),
+        ("", "--shift-row, --split-row, --merge-rows, --block-row"),
         ("--automatic --carry-on", "--carry-on: edits: --automatic"),
     ],
 )
@@ -652,6 +705,7 @@ def test_an_exported_table_comes_back_as_a_correction(
         ("--surfaces obj", "export: surfaces: obj; expected some of csv, stl"),
         ("--pictures all", "export: pictures: all; expected some of frames, surfaces, trends"),
         ("--surfaces csv --solid", "export: solid: no mesh format; expected one of stl"),
+        ("--no-tables --surfaces none", "export: choice: nothing; expected tables, surfaces"),
         ("--scheme ers", "results: none by ers; expected frames to be measured"),
         ("--scheme irs", "--scheme"),
         ("--frames 6", "--frames: frames: 6; expected some of the frames 0 to 5"),
@@ -665,6 +719,15 @@ def test_what_cannot_be_exported_leaves_no_folder(
     assert code == 2
     assert said in complained
     assert not out.exists()
+
+
+def test_an_export_tells_what_is_not_measured(labapp: Run, file: Path, tmp_path: Path) -> None:
+    labapp("session", "measure", file, "--frames", "1:3")
+    code, said, _ = labapp("session", "export", file, "--out", tmp_path / "out")
+    assert code == 0
+    assert said.startswith("Not measured, so not in it: frames 0, 3 to 5\n4 files and")
+    _, said, _ = labapp("session", "export", file, "--out", tmp_path / "out", "--frames", "1:3")
+    assert "Not measured" not in said
 
 
 def test_stale_results_are_not_exported(labapp: Run, measured: Path, tmp_path: Path) -> None:

@@ -57,8 +57,12 @@ class InOrder(TyperCommand):
         return super().parse_args(ctx, args)
 
 
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 def _edit(name: str, text: str) -> Any:
-    return typer.Option(f"--{name.replace('_', '-')}", metavar=FORMS[name], help=text)
+    return typer.Option(_option(name), metavar=FORMS[name], help=text)
 
 
 Dots = Annotated[
@@ -122,7 +126,9 @@ def correct(
 
     edits = _edits_in_order(context)
     if not edits and not carry_on:
-        raise InputError("correct", "edits", "none", f"some of --{', --'.join(FORMS)}")
+        raise InputError(
+            "correct", "edits", "none", f"some of {', '.join(map(_option, FORMS))}, or --carry-on"
+        )
     with Session.open(file) as session:
         own = session.frames.tolist()
         if frame not in own:
@@ -172,9 +178,8 @@ def _edited(session: Session, frame: int, edits: list[tuple[str, str]]) -> Corre
         try:
             correction = _apply(session, frame, correction, name, value)
         except ValueError as error:
-            option = f"--{name.replace('_', '-')}"
             wanted = f"an edit that fits frame {frame}: {error}"
-            raise InputError(option, FORMS[name], value, wanted) from error
+            raise InputError(_option(name), FORMS[name], value, wanted) from error
     return correction
 
 
@@ -221,6 +226,9 @@ def _apply(
     if name == "reference":
         return core.set_reference(correction, (numbers[0], numbers[1]))
     if name in ("block_row", "unblock_row"):
+        highest = int(correction.lattice.row.max(initial=0))
+        if numbers[0] > highest:
+            raise ValueError(f"its highest row is {highest}")
         return core.block_row(correction, numbers[0], blocked=name == "block_row")
     of_row: dict[str, Callable[..., Correction]] = {
         "shift_row": core.shift_row,
@@ -301,7 +309,9 @@ def _measure(session: Session, frames: list[int], before: Measurement | None) ->
     assert after is not None
     known = "not measured" if before is None else before.status
     typer.echo(f"frame {frames[0]}: {known} → {after.measurement.status}")
-    typer.echo(_compared(None if before is None else before.measures, after.measurement.measures))
+    measures = None if before is None else before.measures, after.measurement.measures
+    if any(measures):
+        typer.echo(_compared(*measures))
     if len(frames) > 1:
         typer.echo(summary.text())
 

@@ -60,7 +60,7 @@ def _facts(session: Session) -> dict[str, Any]:
         if recording is None
         else {name: value for name, value in asdict(recording).items() if name != "index"}
         | {"missing": None if missing is None else str(missing)},
-        "setup_lacks": _setup_problems(session),
+        "setup_lacks": setup_problems(session),
         "laser_calibration": None
         if laser is None
         else {
@@ -89,7 +89,7 @@ def _facts(session: Session) -> dict[str, Any]:
     }
 
 
-def _setup_problems(session: Session) -> list[str]:
+def setup_problems(session: Session) -> list[str]:
     """What the set-up lacks, `key: value; expected …` each; empty if it is complete."""
     try:
         _ = session.setup
@@ -122,7 +122,7 @@ def _text(facts: dict[str, Any]) -> list[str]:
         ("session", f"{facts['file']} ({facts['size_bytes'] / 1e6:.1f} MB)"),
         ("record", _listed(facts["record"]) or "empty"),
         *_recording_lines(facts["recording"]),
-        ("set-up", "; ".join(facts["setup_lacks"]) or "complete"),
+        *_setup_lines(facts["setup_lacks"]),
         *_calibration_lines(facts),
         ("settings", _listed(facts["settings"]) or "all as usual"),
         ("frames", f"{facts['frames']}: {_counts(facts['statuses'])} ({facts['scheme']})"),
@@ -136,6 +136,10 @@ def _text(facts: dict[str, Any]) -> list[str]:
         for c in facts.get("history", ())
     ]
     return [f"{name:11}{text}" for name, text in lines]
+
+
+def _setup_lines(lacks: list[str]) -> list[tuple[str, str]]:
+    return [("set-up" * (not k), text) for k, text in enumerate(lacks or ["complete"])]
 
 
 def _recording_lines(recording: dict[str, Any] | None) -> list[tuple[str, str]]:

@@ -6,19 +6,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from labapp.cli.correct import InOrder, correct
-from labapp.cli.info import info
+from labapp.cli.info import info, setup_problems
 from labapp.cli.shared import (
     FRAMES_HELP,
     FRAMES_METAVAR,
+    INTERRUPTED,
     NOTHING,
     choose_frames,
+    command,
     finite,
+    frames_text,
     measure_frames,
+    note,
     progress_bar,
     several,
     told_effect,
@@ -37,7 +41,10 @@ app = typer.Typer(
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")]
 Frames = Annotated[str | None, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)]
-Quantity = Annotated[float | None, typer.Option(min=0, callback=finite)]
+
+
+def _quantity(text: str) -> Any:
+    return typer.Option(min=0, callback=finite, help=text)
 
 
 @app.command()
@@ -49,15 +56,15 @@ def new(
         Path | None, typer.Option(help="Setup file (TOML; mm, degrees, px) to take over.")
     ] = None,
     *,
-    title: str = "",
-    operator: str = "",
-    material: str = "",
-    thickness_mm: Quantity = None,
-    current_a: Quantity = None,
-    voltage_v: Quantity = None,
-    travel_speed_mm_s: Quantity = None,
-    gas: str = "",
-    notes: str = "",
+    title: Annotated[str, typer.Option(help="What the experiment is called.")] = "",
+    operator: Annotated[str, typer.Option(help="Who did it.")] = "",
+    material: Annotated[str, typer.Option(help="Material of the work piece.")] = "",
+    thickness_mm: Annotated[float | None, _quantity("Thickness of the work piece (mm).")] = None,
+    current_a: Annotated[float | None, _quantity("Welding current (A).")] = None,
+    voltage_v: Annotated[float | None, _quantity("Arc voltage (V).")] = None,
+    travel_speed_mm_s: Annotated[float | None, _quantity("Travel speed (mm/s).")] = None,
+    gas: Annotated[str, typer.Option(help="Shielding gas.")] = "",
+    notes: Annotated[str, typer.Option(help="Anything else.")] = "",
 ) -> None:
     """Make a session, with the set-up and the experiment record as far as they are known."""
     from labapp.session.record import Record
@@ -81,8 +88,8 @@ def new(
             session.set_setup(text)
         typer.echo(f"{session.path} is made")
     if text is None:
-        typer.echo(f"It has no set-up yet:\n  labapp session setup {file} SETUP.toml")
-    typer.echo(f"Import a recording:\n  labapp session import {file} RECORDING")
+        typer.echo(f"It has no set-up yet:\n  {command('setup', file)} SETUP.toml")
+    typer.echo(f"Import a recording:\n  {command('import', file)} RECORDING")
 
 
 @app.command("setup")
@@ -147,8 +154,11 @@ def import_recording(
             f"frames     {found.frames} in it, {used} in the session ({start}:{stop}:{step})"
         )
         typer.echo(f"time base  {time_base}")
-        typer.echo(f"at random  {exact}")
+        typer.echo(f"seeking    {exact}")
         typer.echo(f"kept       {'in the session itself' if embed else f'as {found.path}'}")
+        if setup_problems(session):
+            typer.echo(f"The set-up is not complete:\n  {command('setup', file)} SETUP.toml")
+        typer.echo(f"Measure it:\n  {command('measure', file)}")
 
 
 INEXACT = (
@@ -253,20 +263,25 @@ def export(
     frames: Frames = None,
     scheme: Annotated[
         Literal["fit", "ers", "irs-opa", "irs-epa-r", "irs-epa-c", "irs-epa-rc"] | None,
-        typer.Option(help="Whose results; without it, those of the session's settings."),
+        typer.Option(
+            metavar="SCHEME",
+            help="Whose results: fit, ers, irs-opa, irs-epa-r, irs-epa-c, irs-epa-rc; without it, "
+            "those of the session's settings.",
+        ),
     ] = None,
     tables: Annotated[
         bool, typer.Option(help="Measures, dots, points and boundaries as CSV (mm, px).")
     ] = True,
     surfaces: Annotated[
-        str, typer.Option(help="Some of csv,stl,stl-ascii,ply,vtp, or none (mm).")
+        str,
+        typer.Option(metavar="A,B,…", help="Some of csv, stl, stl-ascii, ply, vtp, or none (mm)."),
     ] = "csv,stl",
     solid: Annotated[
         bool, typer.Option("--solid", help="Each surface as a watertight body, too.")
     ] = False,
     hdf5: Annotated[bool, typer.Option("--hdf5", help="Everything in one HDF5 file.")] = False,
     pictures: Annotated[
-        str, typer.Option(help="Some of frames,surfaces,trends, or none.")
+        str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, or none.")
     ] = "none",
     report: Annotated[bool, typer.Option("--report", help="A PDF report.")] = False,
 ) -> None:
@@ -278,6 +293,10 @@ def export(
     from labapp.session.session import Session
     from labapp.session.tables import TABLES
 
+    if surfaces == pictures == "none" and not (tables or hdf5 or report):
+        raise InputError(
+            "export", "choice", "nothing", "tables, surfaces, HDF5, pictures or report"
+        )
     choice = ExportChoice(
         tables=frozenset(TABLES if tables else ()),
         surfaces=_words(surfaces),
@@ -285,17 +304,21 @@ def export(
         hdf5=hdf5,
         pictures=_words(pictures),
     )
-    with Session.open(file, read_only=True) as session, progress_bar() as progress:
+    with Session.open(file, read_only=True) as session, _counted(f"writing {out.name}") as progress:
         chosen = None if frames is None else choose_frames(session, frames)
-        task = progress.add_task(out.name, total=len(session.frames if chosen is None else chosen))
+        seen = session.overview(scheme)
+        wanted = set(session.frames.tolist() if chosen is None else chosen)
+        missing = {int(f) for f, s in zip(seen.frame, seen.status, strict=True) if not s} & wanted
         files = session.export(
             out,
             choice,
             frames=chosen,
             scheme=scheme,
             report=report,
-            progress=lambda done: progress.update(task, completed=done),
+            progress=lambda done: progress(done, len(wanted - missing)),
         )
+    if missing:
+        typer.echo(f"Not measured, so not in it: {frames_text(missing)}")
     typer.echo(f"{several(len(files), 'file')} and the manifest are in {out.absolute()}")
 
 
@@ -333,6 +356,12 @@ def verify(
         for problem in problems:
             typer.echo(problem)
         if problems:
+            typer.echo(
+                f"What helps\n  a missing recording: {command('relink', file)} RECORDING\n"
+                f"  a damaged result N:  {command('measure', file)} --frames N\n"
+                "  anything else:       a copy from before; what can be read, export still writes",
+                err=True,
+            )
             raise typer.Exit(NOTHING)
         results = sum(session.measured_by.values())
         parts = ((len(session.frames), "frame"), (results, "result"))
@@ -344,7 +373,14 @@ def verify(
 
 @contextmanager
 def _counted(what: str) -> Iterator[Progress]:
-    """Show how far something is; yields what is to be called with done and total."""
+    """Show how far something is that Ctrl-C ends without a change.
+
+    Yields what is to be called with done and total.
+    """
     with progress_bar() as progress:
         task = progress.add_task(what, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+        try:
+            yield lambda done, total: progress.update(task, completed=done, total=total)
+        except KeyboardInterrupt:
+            note(progress.console, f"stopped {what}; nothing was changed")
+            raise typer.Exit(INTERRUPTED) from None

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -48,6 +50,11 @@ def note(console: Console, text: str) -> None:
 def failure(frame: int, measurement: Measurement) -> str:
     """Say of a frame that it gave nothing, and why."""
     return f"frame {frame}: {measurement.status}: {measurement.reason}"
+
+
+def command(name: str, file: Path) -> str:
+    """Tell how to call a command on a session, for the shell: names may have spaces."""
+    return f"labapp session {name} {shlex.quote(str(file))}"
 
 
 def several(count: int, thing: str) -> str:
@@ -117,8 +124,13 @@ def measure_frames(session: Session, frames: Sequence[int]) -> Summary:
                     note(progress.console, failure(frame, measurement))
         except KeyboardInterrupt:
             done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
-            note(progress.console, f"{done}; the others: labapp session measure {session.path}")
+            note(progress.console, f"{done}; the others: {command('measure', session.path)}")
             raise typer.Exit(INTERRUPTED) from None
+        except InputError:
+            if summary.frames:
+                done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
+                note(progress.console, done)
+            raise
     return summary
 
 
@@ -130,7 +142,7 @@ def told_effect(session: Session) -> Iterator[None]:
     after = _stale(session)
     if fallen := after - before:
         typer.echo(f"No longer standing: {_results(fallen)}; to measure again:")
-        typer.echo(f"  labapp session measure {session.path}")
+        typer.echo(f"  {command('measure', session.path)}")
     if risen := before - after:
         typer.echo(f"Standing again: {_results(risen)}")
 
