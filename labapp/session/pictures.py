@@ -9,7 +9,6 @@ import colorsys
 import io
 import multiprocessing
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import ExitStack
@@ -20,20 +19,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.measures import surface_mesh
 from labapp.core.pipeline import Measurement
 from labapp.core.reconstruction import Reconstruction
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import FloatArray
 from labapp.session.files import write_whole
+from labapp.session.scene import draw_scene, scene_of
 
 ENLARGED = 3
 """Screen pixels per pixel of the frame, so that labels can be read."""
-
-EXAGGERATION = 3.0
-"""Height over width in the 3-D view: pools are flat."""
-
-FROM_CAMERA = (0.5, -1.5, 0.9)
-"""Where the 3-D view is taken from: the camera's side, so that X runs to the right."""
 
 UNKNOWN = (150, 150, 150)
 
@@ -138,7 +131,7 @@ def write_trend_picture(
 def drawing_process() -> ProcessPoolExecutor:
     """A process to draw in: VTK ends the one it runs in where there is no OpenGL."""
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, context, initializer=_without_display)
+    return ProcessPoolExecutor(1, context, initializer=_quietly)
 
 
 def write_surface_picture(
@@ -162,74 +155,14 @@ def write_surface_picture(
     BrokenProcessPool
         Where nothing can be drawn.
     """
-    vertices, triangles = surface_mesh(reconstruction, 0.1)
     with ExitStack() as stack:
         process = process or stack.enter_context(drawing_process())
-        drawing = process.submit(draw_surface, vertices, triangles, reconstruction.points_mm)
+        drawing = process.submit(draw_scene, scene_of(reconstruction))
         _, content = cv2.imencode(".png", drawing.result())
     write_whole(path, content.tobytes())
 
 
-def _without_display() -> None:
-    """Draw through EGL where there is no display; keep VTK's warnings off the terminal."""
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+def _quietly() -> None:
+    """Keep VTK's warnings off the terminal."""
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)
-
-
-def draw_surface(
-    vertices_mm: FloatArray, triangles: IntArray, points_mm: FloatArray
-) -> npt.NDArray[np.uint8]:
-    """Draw the surface off-screen, shape (800, 1200, 3), B, G, R; see `write_surface_picture`."""
-    import pyvista
-
-    stretch = np.array([1.0, 1.0, EXAGGERATION])
-    # Whole millimetres, so that the numbers along the axes are; tenths upwards.
-    step = np.array([1.0, 1.0, 0.1])
-    box = np.stack(
-        [np.floor(vertices_mm.min(0) / step + 1e-6), np.ceil(vertices_mm.max(0) / step - 1e-6)]
-    )
-    box = box * step
-    mesh = pyvista.PolyData.from_regular_faces(vertices_mm * stretch, triangles.astype(int))
-    plotter: Any = pyvista.Plotter(off_screen=True, window_size=[1200, 800])
-    plotter.add_mesh(
-        mesh,
-        scalars=vertices_mm[:, 2],
-        cmap="viridis",
-        smooth_shading=True,
-        scalar_bar_args={
-            "title": "height (mm)",
-            "fmt": "%.2f",
-            "vertical": True,
-            "position_x": 0.88,
-            "position_y": 0.25,
-        },
-    )
-    plotter.add_points(
-        points_mm * stretch, color="white", point_size=7, render_points_as_spheres=True
-    )
-    plotter.show_bounds(
-        bounds=(box * stretch).T.ravel().tolist(),
-        axes_ranges=box.T.ravel().tolist(),
-        n_xlabels=int(np.ptp(box[:, 0])) + 1,
-        n_ylabels=int(np.ptp(box[:, 1])) + 1,
-        xtitle="X (mm)",
-        ytitle="Y, welding direction (mm)",
-        ztitle="Z (mm)",
-        fmt="%.1f",
-        n_zlabels=2,
-        location="outer",
-        font_size=12,
-        use_3d_text=False,
-    )
-    plotter.add_text(
-        f"heights drawn {EXAGGERATION:g} times as high; white: reflection points; "
-        "the electrode is above X = Y = 0",
-        font_size=10,
-    )
-    plotter.view_vector(FROM_CAMERA, viewup=(0.0, 0.0, 1.0))
-    plotter.camera.zoom(1.3)
-    picture = plotter.screenshot(return_img=True)
-    plotter.close()
-    return np.ascontiguousarray(picture[..., ::-1])

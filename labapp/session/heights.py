@@ -1,0 +1,116 @@
+"""Heights of a pool surface where one asks: their ±, how two surfaces differ, a section."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.values import FloatArray, freeze
+
+PROFILE_POINTS = 241
+
+
+def sigma_at(reconstruction: Reconstruction, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    """Standard uncertainty of the height at (x, y), from that of the reflection points.
+
+    Linear between the points; outside them that of the nearest.
+
+    Parameters
+    ----------
+    reconstruction
+        Whose.
+    x_mm, y_mm
+        Where, shape (n,), mm.
+
+    Returns
+    -------
+    FloatArray
+        Shape (n,), mm; NaN where the scheme gives none.
+    """
+    known = np.isfinite(reconstruction.sigma_mm)
+    places, sigma = reconstruction.points_mm[known, :2], reconstruction.sigma_mm[known]
+    if len(places) < 4:
+        return np.full(len(x_mm), np.nan)
+    inside = LinearNDInterpolator(places, sigma)(x_mm, y_mm)
+    nearest = NearestNDInterpolator(places, sigma)(x_mm, y_mm)
+    return np.asarray(np.where(np.isfinite(inside), inside, nearest))
+
+
+def difference_at(
+    one: Reconstruction, other: Reconstruction, x_mm: FloatArray, y_mm: FloatArray
+) -> FloatArray:
+    """Height of the first surface minus the other's, shape (n,), mm; NaN outside either pool."""
+    difference = one.surface.height(x_mm, y_mm) - other.surface.height(x_mm, y_mm)
+    within = one.boundary.contains(x_mm, y_mm) & other.boundary.contains(x_mm, y_mm)
+    return np.where(within, difference, np.nan)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A vertical section through a pool; n points, NaN outside the boundary.
+
+    Parameters
+    ----------
+    along_mm
+        Way along the section line from the point of it nearest the origin, shape (n,), mm.
+    place_mm
+        (X, Y) of the points, shape (n, 2), mm.
+    height_mm, sigma_mm
+        Height of the surface and its standard uncertainty, shape (n,), mm.
+    edge_mm
+        (way, height) where the line crosses the boundary, shape (k, 2), mm.
+    """
+
+    along_mm: FloatArray
+    place_mm: FloatArray
+    height_mm: FloatArray
+    sigma_mm: FloatArray
+    edge_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def profile(
+    reconstruction: Reconstruction, angle_deg: float = 90.0, offset_mm: float = 0.0
+) -> Profile:
+    """Cut a pool along a line.
+
+    Parameters
+    ----------
+    reconstruction
+        The pool.
+    angle_deg
+        Direction of the line, from +X towards +Y: 0 cuts across, 90 along the welding direction.
+    offset_mm
+        How far to the left of the origin the line passes, looking along it, mm.
+    """
+    angle = np.radians(angle_deg)
+    way = np.array([np.cos(angle), np.sin(angle)])
+    aside = np.array([-way[1], way[0]])
+    outline = reconstruction.boundary.points_mm
+    edge = _crossings(outline, way, aside, offset_mm)
+    reach = edge[:, 0] if len(edge) else outline[:, :2] @ way
+    along = np.linspace(reach.min(), reach.max(), PROFILE_POINTS)
+    place = along[:, None] * way + offset_mm * aside
+    x, y = place.T
+    within = reconstruction.boundary.contains(x, y)
+    height = np.where(within, reconstruction.surface.height(x, y), np.nan)
+    sigma = np.where(within, sigma_at(reconstruction, x, y), np.nan)
+    return Profile(along, place, height, sigma, edge)
+
+
+def _crossings(
+    outline: FloatArray, way: FloatArray, aside: FloatArray, offset: float
+) -> FloatArray:
+    """(way, height) where a line crosses a closed polygon, shape (k, 2), in order."""
+    after = np.roll(outline, -1, axis=0)
+    a, b = outline[:, :2] @ aside - offset, after[:, :2] @ aside - offset
+    crosses = (a < 0) != (b < 0)
+    share = (a[crosses] / (a[crosses] - b[crosses]))[:, None]
+    at = outline[crosses] + share * (after[crosses] - outline[crosses])
+    found = np.column_stack([at[:, :2] @ way, at[:, 2]])
+    return np.asarray(found[np.argsort(found[:, 0])])

@@ -1,0 +1,452 @@
+"""The pool in 3-D: what is in the picture, and a builder that draws it with pyvista.
+
+The window, the exports and the tests draw the same scene. pyvista is of the extra ``gui`` and is
+imported when something is drawn.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import functools
+import os
+import sys
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.correspondence import Match
+from labapp.core.measures import surface_mesh
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.rig import Rig
+from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.session.heights import difference_at, sigma_at
+
+EXAGGERATION = 3.0
+"""Height over width by default: pools are flat."""
+
+RAY_MM = 3.0
+"""So much of each ray is drawn: laser and imaging plane are ten pools away."""
+
+SPACING_MM = 0.15
+"""Largest distance between rings of the mesh that is drawn, mm."""
+
+SPOKES = 120
+"""About so many vertices a ring: its sides are within a thousandth of a pool's radius."""
+
+Direction = Literal["top", "side", "front", "free"]
+"""Where a scene is looked at from; ``free`` is obliquely from the camera's side."""
+
+VIEWS: dict[Direction, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "top": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    "side": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "front": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    "free": ((0.5, -1.5, 0.9), (0.0, 0.0, 1.0)),
+}
+"""From where, and what is up there: X runs to the right from the top and the front, Y from the
+side."""
+
+COLOURS = {
+    "points": "#ffffff",
+    "incident": "#e69f00",
+    "reflected": "#56b4e9",
+    "section": "#ff5fd2",
+}
+
+EMPTY = np.empty((0, 3))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a 3-D picture shows, in mm, UCS; n vertices.
+
+    Parameters
+    ----------
+    vertices_mm, triangles
+        The surface, shapes (n, 3) and (k, 3).
+    values
+        What colours it, shape (n,).
+    label
+        What the values are, with their unit.
+    limits
+        The values at both ends of the colour scale.
+    diverging
+        Whether the colours run both ways from the middle.
+    points_mm
+        Reflection points, shape (p, 3).
+    lines_mm
+        Closed or open lines by name, each of shape (q, 3): ``boundary``, ``section``.
+    rays_mm
+        Both ends of rays by name, each of shape (r, 2, 3): ``incident``, ``reflected``.
+    electrode
+        Whether to mark the electrode's axis, X = Y = 0.
+    exaggeration
+        Heights are drawn so many times as high; the axes tell true ones.
+    foreground, background
+        Colours of texts and axes, and behind everything.
+    """
+
+    vertices_mm: FloatArray
+    triangles: IntArray
+    values: FloatArray
+    label: str
+    limits: tuple[float, float]
+    diverging: bool = False
+    points_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    lines_mm: dict[str, FloatArray] = field(default_factory=dict)
+    rays_mm: dict[str, FloatArray] = field(default_factory=dict)
+    electrode: bool = True
+    exaggeration: float = EXAGGERATION
+    foreground: str = "#202020"
+    background: str = "#ffffff"
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def scene_of(
+    reconstruction: Reconstruction,
+    colour: Literal["height", "sigma"] = "height",
+    limits: tuple[float, float] | None = None,
+) -> Scene:
+    """The pool's surface, its boundary and reflection points.
+
+    Parameters
+    ----------
+    reconstruction
+        The pool.
+    colour
+        By height, or by the height's standard uncertainty; by height where the scheme gives none.
+    limits
+        Ends of the colour scale, mm; None: those of this surface.
+    """
+    vertices, triangles = _known(*_mesh(reconstruction))
+    values, label = vertices[:, 2], "height (mm)"
+    if colour == "sigma":
+        sigma = sigma_at(reconstruction, vertices[:, 0], vertices[:, 1])
+        if np.isfinite(sigma).all():
+            values, label = sigma, "± height (mm)"
+            limits = (0.0, float(sigma.max())) if limits is None else limits
+    return Scene(
+        vertices,
+        triangles,
+        values,
+        label,
+        _limits(values) if limits is None else limits,
+        points_mm=reconstruction.points_mm,
+        lines_mm={"boundary": _closed(reconstruction.boundary.points_mm)},
+    )
+
+
+def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
+    """The first pool coloured by its height minus the other's, where both are."""
+    vertices, triangles = _mesh(one)
+    # Slightly within, so that the rim of one of two equal boundaries is not lost to rounding.
+    x, y = (one.boundary.center_mm + (vertices[:, :2] - one.boundary.center_mm) * (1 - 1e-9)).T
+    difference = difference_at(one, other, x, y)
+    triangles = triangles[np.isfinite(difference[triangles]).all(axis=1)]
+    used, corners = np.unique(triangles, return_inverse=True)
+    values = difference[used]
+    reach = float(np.abs(values).max(initial=1e-6))
+    return Scene(
+        vertices[used],
+        corners.reshape(-1, 3),
+        values,
+        "difference (mm)",
+        (-reach, reach),
+        diverging=True,
+        lines_mm={"boundary": _closed(one.boundary.points_mm)},
+    )
+
+
+def rays_of(reconstruction: Reconstruction, match: Match, rig: Rig) -> dict[str, FloatArray]:
+    """Ends of the incident and the reflected rays near the pool, by name, shapes (n, 2, 3), mm.
+
+    The reflected rays run to where the computed dots are on the imaging plane.
+    """
+    points = reconstruction.points_mm
+    seen = rig.imaging_plane.to_universal(match.plane_mm + reconstruction.residual_mm)
+    return {
+        name: np.stack([points, points + RAY_MM * way / np.linalg.norm(way, axis=1)[:, None]], 1)
+        for name, way in (
+            ("incident", rig.laser.position_mm - points),
+            ("reflected", seen - points),
+        )
+    }
+
+
+def _mesh(reconstruction: Reconstruction) -> tuple[FloatArray, IntArray]:
+    """Vertices and triangles, as few as show the surface well: the view is to be quick."""
+    boundary = reconstruction.boundary
+    some = slice(None, None, max(len(boundary.points_mm) // SPOKES, 1))
+    thinned = replace(
+        boundary, theta_deg=boundary.theta_deg[some], points_mm=boundary.points_mm[some]
+    )
+    return surface_mesh(replace(reconstruction, boundary=thinned), SPACING_MM)
+
+
+def _known(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
+    """The same without what is not known (NaN)."""
+    if np.isfinite(vertices).all():
+        return vertices, triangles
+    triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
+    used, corners = np.unique(triangles, return_inverse=True)
+    return vertices[used], corners.reshape(-1, 3)
+
+
+def _closed(line: FloatArray) -> FloatArray:
+    return np.vstack([line, line[:1]])
+
+
+def _limits(values: FloatArray) -> tuple[float, float]:
+    low, high = float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
+    return (low, high) if high > low else (min(low, 0.0), max(low, 0.0) + 1e-6)
+
+
+def build_scene(plotter: Any, scene: Scene) -> Drawing:
+    """Draw a scene with a `pyvista.Plotter`, of a window or off-screen; it does not render yet.
+
+    The drawing that it returns takes further scenes.
+    """
+    drawing = Drawing(plotter)
+    drawing.update(scene)
+    drawing.look("free")
+    return drawing
+
+
+class Drawing:
+    """A scene in a plotter. What is there already takes new places and colours.
+
+    Parameters
+    ----------
+    plotter
+        A `pyvista.Plotter`; nothing but scenes is drawn in it.
+    """
+
+    def __init__(self, plotter: Any) -> None:
+        self.plotter = plotter
+        self._box = np.zeros((2, 3))
+        self._stretch = np.ones(3)
+        self._parts: dict[str, tuple[Any, Any]] = {}
+        self._made_for: dict[str, object] = {}
+
+    def update(self, scene: Scene) -> None:
+        """Show another scene; it does not render yet, and the camera stays."""
+        colours = (scene.foreground, scene.background)
+        if self._is_new("colours", colours):
+            self.plotter.clear()
+            self._parts.clear()
+            self._made_for = {"colours": colours}
+            self.plotter.set_background(scene.background)
+            self.plotter.enable_lightkit()
+        self._stretch = np.array([1.0, 1.0, scene.exaggeration])
+        self._surface(scene)
+        points = _polydata(scene.points_mm * self._stretch, "verts", 1)
+        style = {"point_size": 7, "render_points_as_spheres": True}
+        self._put("points", points, COLOURS["points"], **style)
+        for name in ("boundary", "section"):
+            line = scene.lines_mm.get(name, EMPTY) * self._stretch
+            colour = COLOURS.get(name, scene.foreground)
+            self._put(name, _polydata(line, "lines", len(line)), colour, line_width=3)
+        for name in ("incident", "reflected"):
+            ends = scene.rays_mm.get(name, EMPTY).reshape(-1, 3) * self._stretch
+            self._put(name, _polydata(ends, "lines", 2), COLOURS[name], line_width=1)
+        self._axes(scene)
+
+    def look(self, direction: Direction) -> None:
+        """Look from one of the `VIEWS`; from the top, side and front without perspective."""
+        way, up = VIEWS[direction]
+        self.plotter.camera.parallel_projection = direction != "free"
+        self.plotter.view_vector(way, viewup=up, render=False)
+        bounds = (self._box * self._stretch).T.ravel().tolist()
+        self.plotter.reset_camera(render=False, bounds=bounds)
+        self.plotter.camera.zoom(1.3 if direction == "free" else 1.1)
+
+    def _is_new(self, part: str, made_for: object) -> bool:
+        """Whether a part must be made anew: it was made for something else."""
+        changed = self._made_for.get(part) != made_for
+        self._made_for[part] = made_for
+        return changed
+
+    def _put(self, name: str, mesh: Any, colour: str, **style: Any) -> None:
+        """Add a part or move it to another place; None hides it."""
+        held = self._parts.get(name)
+        if mesh is None:
+            if held is not None:
+                held[1].SetVisibility(False)
+        elif held is None:
+            actor = self.plotter.add_mesh(
+                mesh, color=colour, **style, lighting=False, reset_camera=False, render=False
+            )
+            self._parts[name] = (mesh, actor)
+        else:
+            held[0].ShallowCopy(mesh)
+            held[1].SetVisibility(True)
+
+    def _surface(self, scene: Scene) -> None:
+        import pyvista
+
+        mesh = pyvista.PolyData.from_regular_faces(
+            scene.vertices_mm * self._stretch, scene.triangles.astype(int)
+        )
+        mesh.point_data["values"] = scene.values
+        mesh.point_data.active_normals = _normals(np.asarray(mesh.points), scene.triangles)
+        mesh.set_active_scalars("values")
+        if self._is_new("surface", (scene.label, scene.diverging)):
+            for title in list(self.plotter.scalar_bars.keys()):
+                self.plotter.remove_scalar_bar(title, render=False)
+            actor = self.plotter.add_mesh(
+                mesh,
+                scalars="values",
+                name="surface",
+                cmap="coolwarm" if scene.diverging else "viridis",
+                interpolate_before_map=True,
+                ambient=0.35,
+                diffuse=0.75,
+                reset_camera=False,
+                render=False,
+                scalar_bar_args={
+                    "title": scene.label,
+                    "color": scene.foreground,
+                    "vertical": True,
+                    "position_x": 0.85,
+                    "position_y": 0.2,
+                    "height": 0.6,
+                    "title_font_size": 14,
+                    "label_font_size": 13,
+                },
+            )
+            actor.prop.interpolation = "Phong"
+            # Lines that lie on the surface are seen whole.
+            actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
+            actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(2.0, 2.0)
+            self._parts["surface"] = (mesh, actor)
+        held, actor = self._parts["surface"]
+        if held is not mesh:
+            held.ShallowCopy(mesh)
+        actor.mapper.lookup_table.scalar_range = scene.limits
+        actor.mapper.scalar_range = scene.limits
+        self.plotter.scalar_bars[scene.label].SetLabelFormat(_label_format(scene.limits))
+
+    def _axes(self, scene: Scene) -> None:
+        box, steps = _box(scene)
+        self._box = box
+        if not self._is_new("axes", (box.tobytes(), scene.exaggeration, scene.electrode)):
+            return
+        drawn = (box * self._stretch).T.ravel().tolist()
+        self.plotter.remove_bounds_axes()
+        self.plotter.show_bounds(
+            bounds=drawn,
+            axes_ranges=box.T.ravel().tolist(),
+            n_xlabels=steps[0] + 1,
+            n_ylabels=steps[1] + 1,
+            n_zlabels=2,
+            xtitle="X (mm)",
+            ytitle="Y, welding direction (mm)",
+            ztitle="Z (mm)",
+            fmt="%.1f",
+            color=scene.foreground,
+            location="outer",
+            font_size=12,
+            use_3d_text=False,
+            render=False,
+        )
+        axis = np.array([[0, 0, box[0, 2]], [0, 0, box[1, 2] + 0.5]]) * self._stretch
+        mark = _polydata(axis if scene.electrode else EMPTY, "lines", 2)
+        self._put("electrode", mark, scene.foreground, line_width=1)
+        self.plotter.add_text(
+            f"heights drawn {scene.exaggeration:g} times as high"
+            + ("; upright line: the electrode's axis" if scene.electrode else ""),
+            position="upper_left",
+            font_size=8,
+            color=scene.foreground,
+            name="caption",
+            render=False,
+        )
+
+
+def _box(scene: Scene) -> tuple[FloatArray, IntArray]:
+    """Lowest and highest corner of the axes, shape (2, 3), mm, and steps along each, shape (3,).
+
+    Whole millimetres, so that the numbers along the axes are; tenths upwards.
+    """
+    low, high = scene.vertices_mm.min(axis=0), scene.vertices_mm.max(axis=0)
+    extent = float(np.max((high - low)[:2]))
+    along = next((step for step in (1.0, 2.0, 5.0) if extent <= 12 * step), 10.0)
+    step = np.array([along, along, 0.1])
+    first, last = np.floor(low / step + 1e-6), np.ceil(high / step - 1e-6)
+    last = np.maximum(last, first + 1)
+    return np.stack([first, last]) * step, (last - first).astype(int)
+
+
+def _polydata(points: FloatArray, kind: str, length: int) -> Any:
+    """Points, or lines of so many points each, for VTK; None without points."""
+    import pyvista
+
+    if not len(points):
+        return None
+    corner = np.arange(len(points)).reshape(-1, length)
+    cells = np.column_stack([np.full(len(corner), length), corner]).ravel()
+    made: Any = pyvista.PolyData
+    return made(np.ascontiguousarray(points, np.float32), **{kind: cells})
+
+
+def _normals(vertices: FloatArray, triangles: IntArray) -> npt.NDArray[np.float32]:
+    """Unit normals of the surface at its vertices, shape (n, 3)."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    facet = np.cross(b - a, c - a)
+    corners = triangles.ravel()
+    summed = np.column_stack(
+        [np.bincount(corners, np.repeat(facet[:, k], 3), len(vertices)) for k in range(3)]
+    )
+    length = np.linalg.norm(summed, axis=1, keepdims=True)
+    return np.asarray(summed / np.maximum(length, 1e-12), np.float32)
+
+
+def _label_format(limits: tuple[float, float]) -> str:
+    """Digits that tell the labels of a colour scale apart."""
+    step = max((limits[1] - limits[0]) / 4, 1e-9)
+    return f"%.{max(0, -int(np.floor(np.log10(step))))}f"
+
+
+def draw_scene(
+    scene: Scene, size: tuple[int, int] = (1200, 800), direction: Direction = "free"
+) -> npt.NDArray[np.uint8]:
+    """Draw a scene off-screen, shape (height, width, 3), B, G, R.
+
+    It ends the process where nothing can be drawn: ask `can_draw`, or use a process of its own.
+
+    Raises
+    ------
+    ImportError
+        Without pyvista.
+    """
+    import pyvista
+
+    draw_without_display()
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(size))
+    build_scene(plotter, scene).look(direction)
+    picture = plotter.screenshot(return_img=True)
+    plotter.close()
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def draw_without_display() -> None:
+    """Have VTK draw through EGL where there is no display; before it draws for the first time."""
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+
+
+@functools.cache
+def can_draw() -> bool:
+    """Whether this process can draw in 3-D off-screen; VTK would end it otherwise."""
+    try:
+        import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
+        from vtkmodules.vtkRenderingCore import vtkRenderWindow
+    except ImportError:
+        return False
+    draw_without_display()
+    # VTK falls back on Mesa in memory at last, whether it is there or not.
+    last_resort = vtkRenderWindow().GetClassName() == "vtkOSOpenGLRenderWindow"
+    return not last_resort or ctypes.util.find_library("OSMesa") is not None

@@ -1,0 +1,81 @@
+"""How often the 3-D scene can show another frame, drawn by the processor alone.
+
+Run as ``python tests/benchmarks/scene.py``. Prints updates a second, made from a new surface to the
+picture, and renders a second of the same scene when nothing changes.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
+os.environ["LIBGL_ALWAYS_SOFTWARE"] = "1"
+
+import numpy as np
+import pyvista
+
+from labapp.core.boundary import Boundary
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.session.scene import build_scene, scene_of
+
+SIZE = (900, 600)
+SECONDS = 3.0
+LEAST_PER_S = 20.0
+"""What the operator's windows ask for."""
+
+
+def pools(count: int) -> list[Reconstruction]:
+    """Pools that swell and sink, of the form that ``fit`` gives: a spline and 100 points."""
+    basis = SplineBasis(np.linspace(-6.0, 6.0, 25), np.linspace(-6.0, 6.0, 25))
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-2, 2, 10), np.linspace(-2, 2, 10)))
+    a, b = (grid.ravel() for grid in np.meshgrid(np.linspace(-6, 6, 60), np.linspace(-6, 6, 60)))
+    matrix = basis.matrix(a, b)
+    made = []
+    for k in range(count):
+        height, radius = 0.3 + 0.05 * np.sin(k), 3.3 + 0.1 * np.cos(k)
+        bowl = height * (1 - (a**2 + b**2) / radius**2)
+        surface = SplineSurface(basis, np.linalg.lstsq(matrix, bowl, rcond=None)[0])
+        points = np.column_stack([x, y, surface.height(x, y)])
+        boundary = Boundary.polar(np.zeros(2), np.full(360, radius))
+        residual, sigma = np.zeros((100, 2)), np.full(100, 0.002)
+        ray = np.ones((100, 2), np.int64)
+        made.append(Reconstruction("fit", surface, boundary, ray, points, residual, sigma))
+    return made
+
+
+def rate(work: Callable[[int], None]) -> float:
+    """How often work can be done in a second."""
+    work(0)
+    began, done = time.perf_counter(), 0
+    while time.perf_counter() - began < SECONDS:
+        work(done)
+        done += 1
+    return done / (time.perf_counter() - began)
+
+
+def main() -> None:
+    frames = pools(20)
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(SIZE))
+    plotter.disable_anti_aliasing()
+    plotter.render_window.SetMultiSamples(0)
+    drawing = build_scene(plotter, scene_of(frames[0]))
+    plotter.show(auto_close=False)
+
+    def update(k: int) -> None:
+        drawing.update(scene_of(frames[k % len(frames)]))
+        plotter.render()
+
+    bare = rate(lambda _: plotter.render())
+    full = rate(update)
+    print(f"{SIZE[0]}×{SIZE[1]} px, {len(scene_of(frames[0]).triangles)} triangles")
+    print(f"renders   {bare:6.1f} /s")
+    print(f"updates   {full:6.1f} /s ({full / bare:.2f} of the renders; wanted {LEAST_PER_S:g} /s)")
+    plotter.close()
+
+
+if __name__ == "__main__":
+    main()
