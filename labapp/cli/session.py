@@ -358,8 +358,8 @@ def verify(
         if problems:
             typer.echo(
                 f"What helps\n  a missing recording: {command('relink', file)} RECORDING\n"
-                f"  a damaged result N:  {command('measure', file)} --frames N\n"
-                "  anything else:       a copy from before; what can be read, export still writes",
+                f"  a damaged result of frame N: {command('measure', file)} --frames N\n"
+                "  anything else: a copy from before, or export --frames of what can be read",
                 err=True,
             )
             raise typer.Exit(NOTHING)

@@ -22,6 +22,12 @@ BoolArray = npt.NDArray[np.bool_]
 
 MAGIC = b"labapp video index 1\n"
 
+MOST_HEADERS_BYTE = 256
+"""No more lies between two packets of a video alone in its file, unless one was there."""
+
+MOST_AHEAD = 16
+"""No codec stores a frame before more than these that are shown before it."""
+
 UNKNOWN = np.iinfo(np.int64).min
 """Stamp of a packet that has none."""
 
@@ -42,6 +48,8 @@ class Packets:
         Whether decoding can begin with it, shape (n,).
     shown
         Whether a frame comes of it, shape (n,): edited MP4s hold some that are not shown.
+    holed
+        Whether more than headers lies between them: packets that are damaged. True if in doubt.
     """
 
     placed_by: str
@@ -50,6 +58,7 @@ class Packets:
     dts: IntArray
     key: BoolArray
     shown: BoolArray
+    holed: bool = True
 
     def __len__(self) -> int:
         return len(self.place)
@@ -58,6 +67,7 @@ class Packets:
     def read(cls, packets: Iterable[Packet[Any]], file_byte: int) -> Self:
         """List packets; no more of them than the file has bytes for."""
         rows = []
+        ends = []
         byte = 0
         for packet in packets:
             byte += packet.size
@@ -70,12 +80,15 @@ class Packets:
                     not packet.is_discard,
                 ]
             )
+            ends.append(packet.size)
         pos, pts, dts, key, shown = np.array(rows, np.int64).reshape(-1, 5).T
         placed_by, place = next(
             ((name, stamp) for name, stamp in (("pos", pos), ("pts", pts)) if _differ(stamp)),
             ("dts", dts),
         )
-        return cls(placed_by, place, pts, dts, key > 0, shown > 0)
+        between = np.sort(pos)[1:] - np.sort(pos + ends)[:-1]
+        holed = placed_by != "pos" or bool((between > MOST_HEADERS_BYTE).any())
+        return cls(placed_by, place, pts, dts, key > 0, shown > 0, holed)
 
     def completed(self, entries: Iterable[IndexEntry], file_byte: int) -> Self:
         """These as the index at the end of an AVI has them; itself where it has others.
@@ -197,7 +210,7 @@ class PacketTable:
         elapsed_s = stamp_s - (0 if timing.from_0 else stamp_s[0])
         if not (np.diff(elapsed_s) >= 0).all():
             elapsed_s[:] = np.nan
-        place = _places(elapsed_s, timing)
+        place = _places(elapsed_s, timing, packets)
         number = np.where(shown, place[number], -1)
         time_s = _times(elapsed_s, place, timing)
         # Fewer frames over the whole time are a varying rate, not an early end.
@@ -262,10 +275,11 @@ class PacketTable:
             return cls(**others, **{name: arrays[name] for name in arrays.files})
 
 
-def _places(elapsed_s: FloatArray, timing: Timing) -> IntArray:
+def _places(elapsed_s: FloatArray, timing: Timing, packets: Packets) -> IntArray:
     """Number of each frame, shape (n,), with those that are missing counted where stamps tell.
 
-    They do where all stand at multiples of the interval and the last in its place.
+    They do where all stand at multiples of the interval and the last in its place. Where the file
+    has no hole, and gaps are not near an end that may have been cut, the camera left them out.
     """
     plain = np.arange(len(elapsed_s))
     missing = len(plain) < timing.claimed <= 2 * len(plain)
@@ -274,7 +288,9 @@ def _places(elapsed_s: FloatArray, timing: Timing) -> IntArray:
     place = elapsed_s * timing.rate_hz
     number = np.rint(place).astype(np.int64)
     on_grid = np.abs(place - number).max() < 0.25 and (np.diff(number) > 0).all()
-    return number if on_grid and number[-1] == timing.claimed - 1 else plain
+    gaps = np.flatnonzero(np.diff(number) > 1)
+    lost = packets.holed or (gaps >= len(plain) - MOST_AHEAD).all()
+    return number if lost and on_grid and number[-1] == timing.claimed - 1 else plain
 
 
 def _times(elapsed_s: FloatArray, place: IntArray, timing: Timing) -> FloatArray:

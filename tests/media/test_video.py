@@ -193,6 +193,17 @@ def test_a_pause_in_a_recording_is_kept(
     assert [frame.time_s for frame in frames] == pytest.approx([k / 60 for k in place], abs=6e-4)
 
 
+def test_frames_that_a_camera_left_out_are_not_missing(tmp_path: Path, encode: Encode) -> None:
+    """After every fifth frame it pauses for three intervals: a varying rate, and no damage."""
+    stamps = ("-vf", "setpts='(N+floor(N/5)*3)/60/TB'", "-fps_mode", "vfr")
+    path = encode(tmp_path / "v.mkv", numbered(), *FFV1.split(), *stamps)
+    with VideoSource(path) as source:
+        frames = list(source)
+    assert [number_in(frame.image) for frame in frames] == list(range(COUNT))
+    elapsed_s = [(k + k // 5 * 3) / 60 for k in range(COUNT)]
+    assert [frame.time_s for frame in frames] == pytest.approx(elapsed_s, abs=6e-4)
+
+
 @pytest.mark.parametrize(
     ("name", "options"),
     [
