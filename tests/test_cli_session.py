@@ -283,6 +283,16 @@ def test_an_import_that_fails_changes_nothing(
     assert file.read_bytes() == before
 
 
+def test_a_session_is_no_recording(labapp: Run, file: Path, tmp_path: Path) -> None:
+    told = f"labapp: {file}: content: a session, or another database; expected a recording;"
+    out = tmp_path / "out"
+    code, _, complained = labapp("reconstruct", file, "--setup", SETUP, "--out", out)
+    assert code == 2
+    assert complained.startswith(told)
+    assert not out.exists()
+    assert labapp("session", "import", file, file)[2].startswith(told)
+
+
 def test_a_recording_that_was_moved_is_found_again(labapp: Run, measured: Path) -> None:
     moved = (measured.parent / "stack.npy").rename(measured.parent / "moved.npy")
     code, _, complained = labapp("session", "measure", measured, "--all")

@@ -59,6 +59,9 @@ def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> Fra
 
 def _by_content(path: Path, head: bytes, index: bytes | None) -> FrameSource | None:
     """Open what begins with bytes that only one format begins with; None for all else."""
+    if head == b"SQLite forma":
+        wanted = "a recording; sessions are for labapp session: labapp session --help"
+        raise InputError(path, "content", "a session, or another database", wanted)
     if head[:4] in TIFF_MAGICS:
         return TiffStack(path)
     if head[:4] == CINE_MAGIC:
@@ -90,9 +93,7 @@ def _by_name(path: Path, index: bytes | None) -> FrameSource:
 def _open_folder(path: Path, index: bytes | None) -> FrameSource:
     """Open the images in a folder, or the one recording in it."""
     images = images_in(path)
-    if len(images) == 1:
-        return open_source(images[0], index)
-    if images:
+    if len(images) > 1:
         return ImageSequence(path, images)
     recordings = [entry for entry in files_in(path) if entry.suffix.lower() in RECORDING_SUFFIXES]
     headers = {entry.stem for entry in recordings if entry.suffix.lower() in (".cih", ".cihx")}
@@ -102,10 +103,11 @@ def _open_folder(path: Path, index: bytes | None) -> FrameSource:
         for entry in recordings
         if entry.suffix.lower() != ".mraw" or entry.stem not in headers
     ]
-    if len(recordings) == 1:
-        return open_source(recordings[0], index)
-    if recordings:
-        names = ", ".join(entry.name for entry in recordings)
+    found = [*images, *recordings]
+    if len(found) == 1:
+        return open_source(found[0], index)
+    if found:
+        names = ", ".join(entry.name for entry in found)
         raise InputError(path, "folder", names, "one recording in it, or name the one to open")
     raise InputError(
         path,

@@ -165,8 +165,11 @@ def test_the_one_recording_in_a_folder_is_opened(
     video.unlink()
     with open_source(tmp_path) as source:
         assert source.name == cine.name
-    # Images go before recordings: a folder of them often holds the video they came from.
+    # One image beside it may be the calibration picture.
     save(tmp_path / "1.png", GREY)
+    with pytest.raises(InputError, match=r"1\.png, run\.cine; expected one recording in it"):
+        open_source(tmp_path)
+    # Images go before recordings: a folder of them often holds the video they came from.
     save(tmp_path / "2.png", GREY)
     with open_source(tmp_path) as source:
         assert len(source) == 2
