@@ -228,6 +228,7 @@ class Drawing:
         self.plotter = plotter
         self._box = np.zeros((2, 3))
         self._stretch = np.ones(3)
+        self._axes_actor: Any = None
         self._parts: dict[str, tuple[Any, Any]] = {}
         self._made_for: dict[str, object] = {}
 
@@ -237,6 +238,8 @@ class Drawing:
         if self._is_new("colours", colours):
             self.plotter.clear()
             self._parts.clear()
+            self.plotter.remove_bounds_axes()
+            self._axes_actor = None
             self._made_for = {"colours": colours}
             self.plotter.set_background(scene.background)
             self.plotter.enable_lightkit()
@@ -261,7 +264,9 @@ class Drawing:
         self.plotter.view_vector(way, viewup=up, render=False)
         bounds = (self._box * self._stretch).T.ravel().tolist()
         self.plotter.reset_camera(render=False, bounds=bounds)
-        self.plotter.camera.zoom(1.3 if direction == "free" else 1.1)
+        self.plotter.camera.zoom(1.25 if direction == "free" else 1.1)
+        # To the left, beside the colour scale.
+        self.plotter.camera.SetWindowCenter(0.12, 0.0)
 
     def _is_new(self, part: str, made_for: object) -> bool:
         """Whether a part must be made anew: it was made for something else."""
@@ -334,36 +339,36 @@ class Drawing:
         self._box = box
         if not self._is_new("axes", (box.tobytes(), scene.exaggeration, scene.electrode)):
             return
-        drawn = (box * self._stretch).T.ravel().tolist()
-        self.plotter.remove_bounds_axes()
-        self.plotter.show_bounds(
-            bounds=drawn,
-            axes_ranges=box.T.ravel().tolist(),
-            n_xlabels=steps[0] + 1,
-            n_ylabels=steps[1] + 1,
-            n_zlabels=2,
+        axes = self._axes_actor = self._axes_actor or self.plotter.show_bounds(
             xtitle="X (mm)",
             ytitle="Y, welding direction (mm)",
             ztitle="Z (mm)",
+            n_zlabels=2,
             fmt="%.1f",
             color=scene.foreground,
             location="outer",
             font_size=12,
             use_3d_text=False,
+            bounds=(box * self._stretch).T.ravel().tolist(),
             render=False,
         )
-        axis = np.array([[0, 0, box[0, 2]], [0, 0, box[1, 2] + 0.5]]) * self._stretch
-        mark = _polydata(axis if scene.electrode else EMPTY, "lines", 2)
+        axes.bounds = (box * self._stretch).T.ravel().tolist()
+        axes.n_xlabels, axes.n_ylabels = int(steps[0]) + 1, int(steps[1]) + 1
+        axes.x_axis_range, axes.y_axis_range, axes.z_axis_range = map(tuple, box.T.tolist())
+        top = np.array([[0, 0, box[0, 2]], [0, 0, box[1, 2] + 0.5]]) * self._stretch
+        mark = _polydata(top if scene.electrode else EMPTY, "lines", 2)
         self._put("electrode", mark, scene.foreground, line_width=1)
-        self.plotter.add_text(
-            f"heights drawn {scene.exaggeration:g} times as high"
-            + ("; upright line: the electrode's axis" if scene.electrode else ""),
-            position="upper_left",
-            font_size=8,
-            color=scene.foreground,
-            name="caption",
-            render=False,
-        )
+        words = f"heights drawn {scene.exaggeration:g} times as high"
+        words += "; upright line: the electrode's axis" if scene.electrode else ""
+        if self._is_new("caption", words):
+            self.plotter.add_text(
+                words,
+                position="upper_left",
+                font_size=8,
+                color=scene.foreground,
+                name="caption",
+                render=False,
+            )
 
 
 def _box(scene: Scene) -> tuple[FloatArray, IntArray]:

@@ -1,0 +1,367 @@
+"""What the surface page shows of a frame, computed from the session. Without Qt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.correspondence import Match
+from labapp.core.measures import Measures, measure
+from labapp.core.pipeline import Measurement, Settings, reconstruct
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.rig import Rig
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.errors import InputError
+from labapp.gui.digits import ResultRow, rounded
+from labapp.session.heights import Profile, profile
+from labapp.session.measured import Result, scheme_name
+from labapp.session.scene import Scene, rays_of, scene_of
+from labapp.session.session import Session
+from labapp.session.setup import parse_setup
+
+SCHEMES = {
+    "fit": "Fit: all dots at once",
+    "ers": "ERS: extrapolation",
+    "irs-opa": "IRS, one point (OPA)",
+    "irs-epa-r": "IRS, edge points, rows (EPA-R)",
+    "irs-epa-c": "IRS, edge points, columns (EPA-C)",
+    "irs-epa-rc": "IRS, edge points, both (EPA-RC)",
+}
+"""Name that results are kept under → words for the operator."""
+
+CORRESPONDENCES = {
+    "auto": "Automatic",
+    "S/S": "S/S: columns and rows as the rays",
+    "S/I": "S/I: rows inverse",
+    "I/I": "I/I: columns and rows inverse",
+}
+
+SIZES = (
+    ("Width", "width_mm", "width_sigma_mm", "mm", "Extent of the boundary along X"),
+    ("Length", "length_mm", "length_sigma_mm", "mm", "Extent of the boundary along Y"),
+    ("Height", "height_mm", "height_sigma_mm", "mm", "Largest z within the boundary"),
+    ("Depth", "depth_mm", "depth_sigma_mm", "mm", "Smallest z within the boundary"),
+    ("Area", "area_mm2", "area_sigma_mm2", "mm²", "Within the boundary, seen from above"),
+    ("Volume", "volume_mm3", "volume_sigma_mm3", "mm³", "Between surface and work piece"),
+)
+"""Words, value and σ in `Measures`, unit, and what it is."""
+
+ERRORS = (
+    ("ARE", "are_mm", "Average reflection error: computed from captured dots (Eq. 6-3)"),
+    ("MRE", "mre_mm", "Maximum reflection error (Eq. 6-4)"),
+    ("ARE-I", "are_inner_mm", "Average reflection error of the inside points"),
+    ("MRE-I", "mre_inner_mm", "Maximum reflection error of the inside points"),
+)
+
+NO_SIGMA = "This scheme gives no ±"
+
+
+def with_scheme(settings: Settings, name: str) -> Settings:
+    """The same settings with the scheme of a name of `SCHEMES`."""
+    scheme, _, algorithm = name.partition("-")
+    changed: dict[str, object] = {"scheme": scheme}
+    if algorithm:
+        changed["algorithm"] = algorithm
+    return replace(settings, **changed)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the 3-D view shows, as the operator ticked it.
+
+    Parameters
+    ----------
+    colour
+        By ``height``, or by its ``sigma``.
+    points, boundary, rays, electrode
+        Whether they are drawn.
+    same_colours
+        Whether all frames share one scale of colours.
+    exaggeration
+        Heights are drawn so many times as high.
+    section
+        Angle, degrees, and offset, mm, of the section line; None without one.
+    """
+
+    colour: Literal["height", "sigma"] = "height"
+    points: bool = True
+    boundary: bool = True
+    rays: bool = False
+    electrode: bool = True
+    same_colours: bool = False
+    exaggeration: float = 3.0
+    section: tuple[float, float] | None = (90.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is told of one frame.
+
+    Parameters
+    ----------
+    result
+        What the session holds of it; None if it was not measured by the scheme.
+    state
+        ``measured``, ``stale``, ``failed`` or ``unmeasured``.
+    words
+        The same for the operator; why, where there is no surface or it no longer stands.
+    provenance
+        Frame, scheme, version, time, and whether dots were corrected by hand.
+    sizes, errors
+        Lines of the tables; empty without a surface.
+    trials
+        The correspondences that were tried, and their errors.
+    verdict
+        How clearly one of them was chosen.
+    """
+
+    result: Result | None
+    state: Literal["measured", "stale", "failed", "unmeasured"]
+    words: str
+    provenance: str = ""
+    sizes: tuple[ResultRow, ...] = ()
+    errors: tuple[ResultRow, ...] = ()
+    trials: tuple[ResultRow, ...] = ()
+    verdict: str = ""
+
+    @property
+    def reconstruction(self) -> Reconstruction | None:
+        """The surface; None without."""
+        return None if self.result is None else self.result.measurement.reconstruction
+
+
+def shown(session: Session, frame: int) -> Shown:
+    """What to tell of a frame by the scheme that the settings choose.
+
+    Raises
+    ------
+    InputError
+        If what the session holds is damaged.
+    """
+    if not len(session.frames):
+        return Shown(None, "unmeasured", "There are no frames yet: import a recording first.")
+    result = session.result(frame)
+    if result is None:
+        scheme = SCHEMES[scheme_name(session.settings)].split(":")[0]
+        return Shown(None, "unmeasured", f"Frame {frame} is not measured by {scheme} yet.")
+    measurement = result.measurement
+    told = Shown(
+        result,
+        *_state(result),
+        provenance=provenance(result),
+        sizes=size_rows(measurement.measures),
+        errors=error_rows(measurement.measures),
+        trials=trial_rows(measurement.match),
+        verdict=verdict(measurement.match),
+    )
+    return told
+
+
+def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]:
+    measurement = result.measurement
+    failed = measurement.status != "ok"
+    words = f"No surface ({measurement.status}): {measurement.reason}." if failed else "Measured."
+    if result.stale:
+        was = words if failed else "These figures no longer stand."
+        return "stale", f"{was} Since then {' and '.join(result.stale)}."
+    return ("failed" if failed else "measured"), words
+
+
+def provenance(result: Result) -> str:
+    """Where a result comes from, in one line."""
+    by_hand = result.measurement.correction is not None
+    when = result.measured[:16].replace("T", " ")
+    dots = "dots corrected by hand" if by_hand else "dots found automatically"
+    scheme = SCHEMES.get(result.scheme, result.scheme).split(":")[0]
+    return f"Frame {result.frame} · {scheme} · {dots} · labapp {result.version} · {when}"
+
+
+def size_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
+    """Width … volume, each ±; empty without measures."""
+    if measures is None:
+        return ()
+    return tuple(
+        ResultRow(name, getattr(measures, value), sigma, unit, note=_noted(note, sigma))
+        for name, value, of_sigma, unit, note in SIZES
+        for sigma in (getattr(measures, of_sigma),)
+    )
+
+
+def _noted(note: str, sigma: float) -> str:
+    return note if np.isfinite(sigma) else f"{note}. {NO_SIGMA}"
+
+
+def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
+    """ARE … MRE-I; empty without measures."""
+    if measures is None:
+        return ()
+    return tuple(
+        ResultRow(name, getattr(measures, value), None, "mm", decimals=4, note=note)
+        for name, value, note in ERRORS
+    )
+
+
+def trial_rows(match: Match | None) -> tuple[ResultRow, ...]:
+    """Each correspondence that was tried and its error on the imaging plane, the best first."""
+    if match is None:
+        return ()
+    return tuple(
+        ResultRow(
+            f"{trial.orientation} {'✓' if trial.orientation == match.orientation else ''}".strip(),
+            trial.residual_mm if np.isfinite(trial.residual_mm) else "no surface",
+            None,
+            "mm" if np.isfinite(trial.residual_mm) else "",
+            note="Root mean square distance of computed from captured dots on the imaging plane",
+        )
+        for trial in match.trials
+    )
+
+
+def verdict(match: Match | None) -> str:
+    """How much better the chosen correspondence is than the next."""
+    if match is None:
+        return ""
+    if not np.isfinite(match.margin):
+        return f"{match.orientation}: no other correspondence has a surface."
+    times = match.margin
+    told = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
+    return f"{match.orientation}: the next best is off {told} times as far."
+
+
+def rig_of(result: Result) -> Rig:
+    """The rig that a result was measured with."""
+    return parse_setup(result.setup, "setup").rig
+
+
+def height_limits(session: Session) -> tuple[float, float] | None:
+    """Lowest and highest height of all frames, mm; None without any."""
+    measures = session.overview().measures
+    low, high = measures["depth_mm"], measures["height_mm"]
+    known = np.isfinite(low) & np.isfinite(high)
+    if not known.any() or high[known].max() <= low[known].min():
+        return None
+    return float(low[known].min()), float(high[known].max())
+
+
+def scene(result: Result, options: Options, limits: tuple[float, float] | None) -> Scene | None:
+    """What the 3-D view shows of a result; None without a surface.
+
+    Parameters
+    ----------
+    result
+        Of the frame.
+    options
+        What was ticked.
+    limits
+        Colour scale that all frames share, mm; None: that of this frame.
+    """
+    measurement = result.measurement
+    reconstruction, match = measurement.reconstruction, measurement.match
+    if reconstruction is None or match is None:
+        return None
+    made = scene_of(reconstruction, options.colour, limits if options.colour == "height" else None)
+    lines = dict(made.lines_mm) if options.boundary else {}
+    if options.section is not None:
+        lines["section"] = section_line(profile(reconstruction, *options.section))
+    return replace(
+        made,
+        points_mm=made.points_mm if options.points else made.points_mm[:0],
+        lines_mm=lines,
+        rays_mm=rays_of(reconstruction, match, rig_of(result)) if options.rays else {},
+        electrode=options.electrode,
+        exaggeration=options.exaggeration,
+    )
+
+
+def section_line(cut: Profile) -> FloatArray:
+    """A profile as a line on the surface, shape (n, 3), mm."""
+    known = np.isfinite(cut.height_mm)
+    return np.column_stack([cut.place_mm[known], cut.height_mm[known]])
+
+
+def reflected_dots(measurement: Measurement) -> tuple[FloatArray, FloatArray] | None:
+    """Captured and computed dots on the imaging plane (X′, Z′), each of shape (n, 2), mm."""
+    match, reconstruction = measurement.match, measurement.reconstruction
+    if match is None or reconstruction is None:
+        return None
+    return match.plane_mm, match.plane_mm + reconstruction.residual_mm
+
+
+def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
+    """What a scheme makes of a frame's dots as they are matched now; the session is not changed.
+
+    What the session holds of that scheme is taken if it still stands.
+
+    Raises
+    ------
+    CannotMeasure
+        If the frame has no match, or the scheme finds no surface.
+    InputError
+        If what the session holds is damaged.
+    """
+    kept = session.result(frame, scheme)
+    if kept is not None and not kept.stale and kept.measurement.reconstruction is not None:
+        return kept.measurement
+    base = session.result(frame)
+    if base is None or base.measurement.match is None:
+        raise CannotMeasure("no-match", f"frame {frame} has no matched dots: measure it first")
+    match, rig = base.measurement.match, rig_of(base)
+    chosen = with_scheme(base.settings, scheme)
+    reconstruction = reconstruct(match, rig, chosen)
+    return replace(
+        base.measurement,
+        status="ok",
+        reason="",
+        scheme=chosen.scheme,
+        reconstruction=reconstruction,
+        measures=measure(reconstruction, match, rig),
+    )
+
+
+def compared_rows(one: Measures, other: Measures) -> tuple[tuple[str, str, str, str, str], ...]:
+    """Quantity, the first's, the other's, first minus other, unit: one line each, as texts.
+
+    Where only one scheme gives a ±, that says how many digits are shown of both.
+    """
+    lines = []
+    for name, value, of_sigma, unit, _ in SIZES:
+        sigmas = [getattr(each, of_sigma) for each in (one, other)]
+        known = [sigma for sigma in sigmas if np.isfinite(sigma)]
+        lines.append(_compared(name, one, other, value, (sigmas, max(known, default=None)), unit))
+    for name, value, _ in ERRORS:
+        lines.append(_compared(name, one, other, value, ([None, None], None), "mm"))
+    return tuple(lines)
+
+
+def _compared(
+    name: str,
+    one: Measures,
+    other: Measures,
+    value: str,
+    known: tuple[list[float | None], float | None],
+    unit: str,
+) -> tuple[str, str, str, str, str]:
+    (own, others), largest = known
+    a, b = getattr(one, value), getattr(other, value)
+    texts = []
+    for number, sigma in ((a, own), (b, others), (a - b, None)):
+        shown_value, _ = rounded(number, largest)
+        _, shown_sigma = rounded(number, sigma)
+        texts.append(f"{shown_value} ± {shown_sigma}" if shown_sigma else shown_value)
+    return name, texts[0], texts[1], texts[2], unit
+
+
+def why_not(session: Session) -> str:
+    """Why nothing can be measured now; empty if it can."""
+    if not len(session.frames):
+        return "Import a recording first"
+    if (missing := session.missing_recording) is not None:
+        return f"{missing.name} is not where it was: say where it is now"
+    try:
+        _ = session.setup
+    except InputError as error:
+        problem = error.problems[0]
+        return f"The set-up is not complete: {problem.field}: {problem.value}"
+    return ""

@@ -1,0 +1,427 @@
+"""The 3-D view: a scene that can be turned, in the window's own OpenGL or drawn off-screen.
+
+Where Qt has no OpenGL for VTK (no display, or Wayland) the scene is drawn off-screen and shown as
+a picture. Where nothing can be drawn, words say so.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEvent, QObject, QPointF, Qt, QTimer, Signal
+from PySide6.QtGui import (
+    QColor,
+    QGuiApplication,
+    QImage,
+    QKeyEvent,
+    QMouseEvent,
+    QOpenGLContext,
+    QPainter,
+    QPaintEvent,
+    QPalette,
+    QResizeEvent,
+    QShowEvent,
+    QWheelEvent,
+)
+from PySide6.QtWidgets import QVBoxLayout, QWidget
+
+from labapp.session.scene import Direction, Drawing, Scene, build_scene, can_draw
+
+TURN_DEG = 10.0
+"""An arrow key turns the scene so far."""
+
+ZOOM = 1.15
+"""So much nearer or farther at a step of the wheel, or + and −."""
+
+DEGREES_A_PIXEL = 0.4
+
+KEYS: dict[Qt.Key, Direction] = {
+    Qt.Key.Key_1: "top",
+    Qt.Key.Key_2: "side",
+    Qt.Key.Key_3: "front",
+    Qt.Key.Key_4: "free",
+}
+
+TURNS = {
+    Qt.Key.Key_Left: (-TURN_DEG, 0.0),
+    Qt.Key.Key_Right: (TURN_DEG, 0.0),
+    Qt.Key.Key_Up: (0.0, -TURN_DEG),
+    Qt.Key.Key_Down: (0.0, TURN_DEG),
+}
+
+NOTHING_HERE = "The 3-D view needs OpenGL, which cannot be used here. All figures are measured."
+
+Camera = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float, bool]
+"""Position, focal point, up, parallel scale, whether it is without perspective."""
+
+
+class View3d(QWidget):
+    """A scene to look at from all sides; make it with `make_view3d`.
+
+    The mouse turns it, the wheel zooms, Shift or the middle button moves it. Arrow keys turn, + and
+    − zoom, 1 to 4 look from the top, the side, the front and obliquely.
+
+    Parameters
+    ----------
+    name
+        What it shows, for a screen reader.
+
+    Signals
+    -------
+    camera_changed
+        The operator looks from elsewhere: its `Camera`.
+    """
+
+    camera_changed = Signal(object)
+
+    def __init__(self, name: str = "3-D view") -> None:
+        super().__init__()
+        self.setAccessibleName(name)
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setMinimumSize(160, 120)
+        self._name = name
+        self._words = ""
+        self._scene: Scene | None = None
+        self._drawing: Drawing | None = None
+        self._wanted: Camera | Direction | None = None
+        self.set_words("")
+
+    # --- what is shown -----------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is shown."""
+        return self._scene
+
+    def show_scene(self, scene: Scene | None) -> None:
+        """Show a scene in the colours of the window; None shows nothing."""
+        if scene is not None:
+            palette = self.palette()
+            scene = replace(
+                scene,
+                foreground=palette.color(QPalette.ColorRole.Text).name(),
+                background=palette.color(QPalette.ColorRole.Base).name(),
+            )
+        self._scene = scene
+        self._refresh()
+
+    def set_words(self, words: str) -> None:
+        """Say why there is no scene."""
+        self._words = words
+        self.setToolTip(
+            f"{self._name}: drag to turn, wheel to zoom, Shift and drag to move; "
+            "arrow keys turn, + and − zoom, 1 to 4 look from the top, side, front and obliquely"
+        )
+        self.setAccessibleDescription(words or self.toolTip())
+        self.update()
+
+    def look(self, direction: Direction) -> None:
+        """Look from the top, the side, the front, or obliquely (``free``)."""
+        self._wanted = direction
+        if self._drawing is not None:
+            self._drawing.look(direction)
+            self._turned()
+
+    @property
+    def camera(self) -> Camera | None:
+        """Where it is looked at from; None before anything was drawn."""
+        if self._drawing is None:
+            return None
+        camera = self._drawing.plotter.camera
+        return (
+            *(tuple(camera.position), tuple(camera.focal_point), tuple(camera.up)),
+            *(float(camera.parallel_scale), bool(camera.parallel_projection)),
+        )
+
+    def set_camera(self, camera: Camera) -> None:
+        """Look from where another view does; tells nobody."""
+        if self._drawing is None:
+            self._wanted = camera
+        elif camera != self.camera:
+            self._place(camera)
+            self._refresh()
+
+    def picture(self) -> npt.NDArray[np.uint8] | None:
+        """What is seen, shape (height, width, 3), R, G, B; None where nothing is."""
+        if self._drawing is None or self._scene is None:
+            return None
+        self._drawing.plotter.render()
+        return np.ascontiguousarray(self._drawing.plotter.screenshot(return_img=True))
+
+    def image(self) -> QImage | None:
+        """What is seen, for the clipboard or a file."""
+        picture = self.picture()
+        return None if picture is None else as_image(picture)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802
+        """Let go of OpenGL before the window goes."""
+        if event.type() == QEvent.Type.Close:
+            self.close_view()
+        return super().eventFilter(watched, event)
+
+    def close_view(self) -> None:
+        """Let go of OpenGL; it is taken up again when the view is next shown."""
+        if self._drawing is not None:
+            self._wanted = self.camera
+            self._drawing.plotter.close()
+            self._drawing = None
+
+    # --- drawing -----------------------------------------------------------------------------
+
+    def _new_plotter(self) -> Any:
+        """A `pyvista.Plotter` for this view."""
+        raise NotImplementedError
+
+    def _refresh(self) -> None:
+        """Have what changed be seen, soon."""
+        raise NotImplementedError
+
+    def _draw(self) -> bool:
+        """Bring the drawing up to the scene; False if there is nothing to see."""
+        if self._scene is None or not can_draw():
+            return False
+        if self._drawing is None:
+            self.window().installEventFilter(self)
+            self._drawing = build_scene(self._new_plotter(), self._scene)
+            if isinstance(self._wanted, str):
+                self._drawing.look(self._wanted)
+            elif self._wanted is not None:
+                self._place(self._wanted)
+        else:
+            self._drawing.update(self._scene)
+        return True
+
+    def _place(self, camera: Camera) -> None:
+        assert self._drawing is not None
+        held = self._drawing.plotter.camera
+        held.position, held.focal_point, held.up = camera[:3]
+        held.parallel_scale, held.parallel_projection = camera[3:]
+        self._drawing.plotter.renderer.ResetCameraClippingRange()
+
+    def _pixels(self) -> tuple[int, int]:
+        ratio = self.devicePixelRatioF()
+        return max(int(self.width() * ratio), 8), max(int(self.height() * ratio), 8)
+
+    # --- turning -----------------------------------------------------------------------------
+
+    def _turned(self) -> None:
+        self._refresh()
+        self.camera_changed.emit(self.camera)
+
+    def turn(self, azimuth_deg: float, elevation_deg: float) -> None:
+        """Turn the scene to the right and down."""
+        if self._drawing is not None:
+            camera = self._drawing.plotter.camera
+            camera.Azimuth(-azimuth_deg)
+            camera.Elevation(elevation_deg)
+            camera.OrthogonalizeViewUp()
+            self._drawing.plotter.renderer.ResetCameraClippingRange()
+            self._turned()
+
+    def zoom(self, factor: float) -> None:
+        """Come nearer, or with a factor below 1 go farther."""
+        if self._drawing is not None:
+            self._drawing.plotter.camera.Zoom(factor)
+            self._turned()
+
+    def event(self, event: QEvent) -> bool:
+        """Take the view's keys before the window's actions do."""
+        if event.type() == QEvent.Type.ShortcutOverride:
+            assert isinstance(event, QKeyEvent)
+            if event.key() in TURNS or event.key() in KEYS:
+                event.accept()
+        return super().event(event)
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Turn, zoom, or look from one of four sides."""
+        key = Qt.Key(event.key())
+        if key in TURNS:
+            self.turn(*TURNS[key])
+        elif key in (Qt.Key.Key_Plus, Qt.Key.Key_Equal):
+            self.zoom(ZOOM)
+        elif key == Qt.Key.Key_Minus:
+            self.zoom(1 / ZOOM)
+        elif key in KEYS:
+            self.look(KEYS[key])
+        else:
+            super().keyPressEvent(event)
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Follow the window from light to dark."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and self._scene is not None:
+            self.show_scene(self._scene)
+
+    def _paint_words(self, painter: QPainter, words: str) -> None:
+        painter.setPen(self.palette().color(QPalette.ColorRole.Text))
+        area = self.rect().adjusted(24, 24, -24, -24)
+        painter.drawText(area, Qt.AlignmentFlag.AlignCenter | Qt.TextFlag.TextWordWrap, words)
+
+
+class OffscreenView(View3d):
+    """Draws off-screen when it is painted, and shows the picture."""
+
+    def __init__(self, name: str = "3-D view") -> None:
+        super().__init__(name)
+        self._picture: QImage | None = None
+        self._at = QPointF()
+
+    def _new_plotter(self) -> Any:
+        import pyvista
+
+        plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(self._pixels()))
+        plotter.disable_anti_aliasing()
+        plotter.render_window.SetMultiSamples(0)
+        return plotter
+
+    def _refresh(self) -> None:
+        self._picture = None
+        self.update()
+
+    def _render(self) -> None:
+        picture = None
+        if self._draw():
+            assert self._drawing is not None
+            self._drawing.plotter.window_size = list(self._pixels())
+            picture = self.picture()
+        self._picture = None if picture is None else as_image(picture)
+        if self._picture is not None:
+            self._picture.setDevicePixelRatio(self.devicePixelRatioF())
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+        """Draw anew, as large as the view is now."""
+        super().resizeEvent(event)
+        self._refresh()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802
+        """Show the scene, or say why there is none."""
+        if self._picture is None and self._scene is not None:
+            self._render()
+        painter = QPainter(self)
+        painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
+        if self._picture is not None:
+            painter.drawImage(0, 0, self._picture)
+        else:
+            self._paint_words(painter, self._words if self._scene is None else NOTHING_HERE)
+        if self.hasFocus():
+            painter.setPen(QColor(self.palette().color(QPalette.ColorRole.Highlight)))
+            painter.drawRect(self.rect().adjusted(0, 0, -1, -1))
+
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Begin to turn or to move."""
+        self._at = event.position()
+
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Turn with the left button; move with Shift or the middle one."""
+        way, self._at = event.position() - self._at, event.position()
+        shift = event.modifiers() & Qt.KeyboardModifier.ShiftModifier
+        if shift or event.buttons() & Qt.MouseButton.MiddleButton:
+            self._move(way)
+        elif event.buttons() & Qt.MouseButton.LeftButton:
+            self.turn(way.x() * DEGREES_A_PIXEL, way.y() * DEGREES_A_PIXEL)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Zoom."""
+        self.zoom(ZOOM ** (event.angleDelta().y() / 120))
+
+    def _move(self, way: QPointF) -> None:
+        if self._drawing is None:
+            return
+        camera = self._drawing.plotter.camera
+        ahead = np.subtract(camera.focal_point, camera.position)
+        right = np.cross(ahead, camera.up)
+        right, up = right / np.linalg.norm(right), np.asarray(camera.up)
+        tall = 2 * camera.parallel_scale
+        if not camera.parallel_projection:
+            tall = 2 * np.linalg.norm(ahead) * np.tan(np.radians(camera.view_angle / 2))
+        step = (-way.x() * right + way.y() * up) * tall / max(self.height(), 1)
+        camera.position = tuple(np.add(camera.position, step))
+        camera.focal_point = tuple(np.add(camera.focal_point, step))
+        self._turned()
+
+
+class InteractiveView(View3d):
+    """Holds a `pyvistaqt.QtInteractor`, made when the view is first shown."""
+
+    def __init__(self, name: str = "3-D view") -> None:
+        super().__init__(name)
+        self._layout = QVBoxLayout(self)
+        self._layout.setContentsMargins(1, 1, 1, 1)
+        self._late = QTimer(self)
+        self._late.setSingleShot(True)
+        self._late.setInterval(0)
+        self._late.timeout.connect(self._render)
+
+    def _new_plotter(self) -> Any:
+        from pyvistaqt import QtInteractor
+
+        plotter: Any = QtInteractor(
+            self, auto_update=False, multi_samples=1, line_smoothing=False, point_smoothing=False
+        )
+        # Keys are this view's: VTK's own would end the program with q.
+        plotter.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        plotter.disable_anti_aliasing()
+        for event in ("InteractionEvent", "EndInteractionEvent", "MouseWheelForwardEvent"):
+            plotter.iren.add_observer(event, self._interacted)
+        plotter.iren.add_observer("MouseWheelBackwardEvent", self._interacted)
+        self._layout.addWidget(plotter)
+        plotter.show()
+        return plotter
+
+    def _interacted(self, *_: object) -> None:
+        self.camera_changed.emit(self.camera)
+
+    def _refresh(self) -> None:
+        # Several changes of one event are one picture.
+        self._late.start()
+
+    def _render(self) -> None:
+        if not self.isVisible():
+            return
+        if self._draw():
+            assert self._drawing is not None
+            self._drawing.plotter.setVisible(True)
+            self._drawing.plotter.render()
+        elif self._drawing is not None:
+            self._drawing.plotter.setVisible(False)
+
+    def showEvent(self, event: QShowEvent) -> None:  # noqa: N802
+        """Draw what there is by now."""
+        super().showEvent(event)
+        self._refresh()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802
+        """Show the scene, or say why there is none."""
+        painter = QPainter(self)
+        painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
+        if self._scene is None:
+            self._paint_words(painter, self._words)
+        elif not can_draw():
+            self._paint_words(painter, NOTHING_HERE)
+        if self.hasFocus():
+            painter.setPen(QColor(self.palette().color(QPalette.ColorRole.Highlight)))
+            painter.drawRect(self.rect().adjusted(0, 0, -1, -1))
+
+    def close_view(self) -> None:
+        """Let go of OpenGL; it is taken up again when the view is next shown."""
+        self._late.stop()
+        super().close_view()
+
+
+def make_view3d(name: str = "3-D view") -> View3d:
+    """A view in the window's own OpenGL where Qt and VTK share one, else one of pictures."""
+    shared = {"linux": "xcb", "win32": "windows", "darwin": "cocoa"}.get(sys.platform)
+    if QGuiApplication.platformName() == shared and QOpenGLContext().create():
+        return InteractiveView(name)
+    return OffscreenView(name)
+
+
+def as_image(picture: npt.NDArray[np.uint8]) -> QImage:
+    """A picture, shape (height, width, 3), R, G, B, as Qt has it; it keeps no hold of the array."""
+    height, width, _ = picture.shape
+    whole = np.ascontiguousarray(picture)
+    return QImage(whole.data, width, height, 3 * width, QImage.Format.Format_RGB888).copy()
