@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from labapp.gui.pages.page import Page
+from labapp.gui.pages.trends import TrendsPage
 
-PAGES: tuple[type[Page], ...] = ()
+PAGES: tuple[type[Page], ...] = (TrendsPage,)
 """In the order of `steps.STEPS`; a step without a page is not shown."""

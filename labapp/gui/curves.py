@@ -1,0 +1,176 @@
+"""What plots show: curves of points with their σ, marks and keys. Without Qt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.gui.digits import rounded
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How a point looks, and what that means.
+
+    Parameters
+    ----------
+    sign
+        ● or ○ (circles, filled and open), ■ (a square), × (a cross).
+    words
+        What it means.
+    """
+
+    sign: str
+    words: str
+
+
+PLAIN = Mark("●", "")
+
+
+def _none() -> IntArray:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One plot's curve; n points.
+
+    Parameters
+    ----------
+    name, unit
+        Of what goes up.
+    x, y
+        Shape (n,); x ascends, a NaN in y is a gap.
+    sigma
+        ± of each y, shape (n,); NaN where there is none. Empty: no bars.
+    key
+        What each point stands for (a frame's number), ascending, shape (n,). Empty: points are not
+        drawn and cannot be chosen, only the line is.
+    mark
+        Index of each point's mark, shape (n,); empty as ``key`` is.
+    marks
+        What the marks are, the usual one first.
+    level
+        A dashed line at that height: the mean; NaN for none.
+    decimals
+        Of y where no σ says how many.
+    from_zero
+        Whether the axis begins at 0.
+    """
+
+    name: str
+    unit: str
+    x: FloatArray
+    y: FloatArray
+    sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
+    key: IntArray = field(default_factory=_none)
+    mark: IntArray = field(default_factory=_none)
+    marks: tuple[Mark, ...] = (PLAIN,)
+    level: float = float("nan")
+    decimals: int = 3
+    from_zero: bool = False
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+@dataclass(frozen=True)
+class Axis:
+    """What goes to the right.
+
+    Parameters
+    ----------
+    name, unit
+        "Time", "s".
+    decimals
+        Of a place on it in words.
+    key_name
+        What a point's key is: "frame".
+    """
+
+    name: str
+    unit: str
+    decimals: int = 4
+    key_name: str = "frame"
+
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+def point_in_words(curve: Curve, index: int, axis: Axis) -> str:
+    """A point for the read-out and the screen reader."""
+    sigma = float(curve.sigma[index]) if len(curve.sigma) else None
+    value, spread = rounded(float(curve.y[index]), sigma, curve.decimals)
+    told = f"{curve.name} {value}{f' ± {spread}' if spread else ''} {curve.unit}".strip()
+    place, _ = rounded(float(curve.x[index]), None, axis.decimals)
+    where = f"{axis.name.lower()} {place} {axis.unit}".strip()
+    if len(curve.key):
+        where = f"{axis.key_name} {curve.key[index]}" + (f", {place} s" * (axis.unit == "s"))
+        mark = curve.mark[index]
+        where += f", {curve.marks[mark].words}" if mark else ""
+    return f"{where[0].upper()}{where[1:]}: {told}"
+
+
+def nearest(curve: Curve, x: float) -> int | None:
+    """Index of the point nearest to a place on the axis; None if there is no point."""
+    if not len(curve.x):
+        return None
+    after = int(np.searchsorted(curve.x, x))
+    around = [k for k in (after - 1, after) if 0 <= k < len(curve.x)]
+    return min(around, key=lambda k: abs(float(curve.x[k]) - x))
+
+
+def next_key(curves: Sequence[Curve], current: int, step: int) -> int | None:
+    """The key so many points after the present one (before: negative); None without points."""
+    keyed = [curve.key for curve in curves if len(curve.key)]
+    if not keyed:
+        return None
+    keys = np.unique(np.concatenate(keyed))
+    place = int(np.searchsorted(keys, current))
+    there = place < len(keys) and keys[place] == current
+    if step > 0 and not there:
+        place -= 1
+    return int(keys[min(max(place + step, 0), len(keys) - 1)])
+
+
+def as_table(curves: Sequence[Curve], axis: Axis) -> str:
+    """Values of all curves that have keys, in tabs with a line of names: for a spreadsheet."""
+    keyed = [curve for curve in curves if len(curve.key)]
+    keys = np.unique(np.concatenate([curve.key for curve in keyed])) if keyed else _none()
+    names = [axis.key_name, axis.title]
+    columns: list[list[str]] = [[str(key) for key in keys], _spread_out(keys, keyed, axis)]
+    for curve in keyed:
+        names.append(curve.title)
+        columns.append(_cells(keys, curve.key, [f"{value:.9g}" for value in curve.y]))
+        if np.isfinite(curve.sigma).any():
+            names.append(f"{curve.name} σ ({curve.unit})")
+            sigma = ["" if np.isnan(value) else f"{value:.9g}" for value in curve.sigma]
+            columns.append(_cells(keys, curve.key, sigma))
+    if keyed:
+        names.append("mark")
+        words = [keyed[0].marks[mark].words for mark in keyed[0].mark]
+        columns.append(_cells(keys, keyed[0].key, words))
+    lines = ["\t".join(names), *("\t".join(cells) for cells in zip(*columns, strict=True))]
+    return "\n".join(lines) + "\n"
+
+
+def _spread_out(keys: IntArray, keyed: Sequence[Curve], axis: Axis) -> list[str]:
+    places: dict[int, float] = {}
+    for curve in keyed:
+        places.update(zip(curve.key.tolist(), curve.x.tolist(), strict=True))
+    return [f"{places[key]:.9g}" for key in keys.tolist()]
+
+
+def _cells(keys: IntArray, own: IntArray, texts: Sequence[str]) -> list[str]:
+    held = dict(zip(own.tolist(), texts, strict=True))
+    return [held.get(key, "") for key in keys.tolist()]

@@ -1,0 +1,266 @@
+"""The trends page: plots over time, their statistics, a spectrum, current and voltage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QPixmap
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QFileDialog,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QPushButton,
+    QSplitter,
+    QWidget,
+)
+
+from labapp.gui.pages.page import Page
+from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
+from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.plots import PlotStack
+from labapp.gui.workspace import Workspace
+from labapp.session.signals import Signals, read_signals
+from labapp.session.trends import QUANTITIES
+
+FAR_S = 1e6
+
+
+class TrendsPage(Page):
+    """How the pool changes over the recording."""
+
+    key = "trends"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.wish = Wish()
+        self.shown: Shown | None = None
+        self._boxes: dict[str, QCheckBox] = {}
+        self._last_folder = Path()
+        self.plots = PlotStack("Trends over the recording")
+        self.plots.chosen.connect(workspace.show_frame)
+        self.spectrum = PlotStack("Spectrum")
+        self.spectrum.hide()
+        splitter = QSplitter(Qt.Orientation.Vertical)
+        splitter.setChildrenCollapsible(False)
+        splitter.addWidget(self.plots)
+        splitter.addWidget(self.spectrum)
+        splitter.setStretchFactor(0, 3)
+        splitter.setStretchFactor(1, 1)
+        self.canvas_layout.addWidget(splitter, 1)
+        self._make_panel()
+
+    # --- what it shows ------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Show the session's results."""
+        session = self.workspace.session
+        if session is None:
+            return
+        self.shown = shown = show(session, self.wish)
+        self.plots.show_curves(shown.curves, shown.axis)
+        self.plots.set_current(self.workspace.frame)
+        self.plots.setVisible(bool(shown.curves))
+        self.nothing.setVisible(not shown.curves)
+        self.counted.setText(shown.words)
+        self.table.set_rows(shown.rows)
+        self.spectrum.setVisible(bool(shown.spectrum))
+        self.spectrum.show_curves(shown.spectrum, shown.spectrum_axis)
+        self.spectrum_words.setText(shown.spectrum_words)
+        self.spectrum_words.setVisible(bool(shown.spectrum_words))
+        self.signals_words.setText(shown.signals_words)
+        self._show_signals(session.signals, session.read_only)
+
+    def picture(self) -> QPixmap:
+        """Return the plots without what is round them."""
+        return QPixmap.fromImage(self.plots.grab_picture())
+
+    def _show_signals(self, signals: Signals | None, read_only: bool) -> None:
+        self.read_button.setEnabled(not read_only)
+        self.forget_button.setVisible(signals is not None)
+        self.forget_button.setEnabled(not read_only)
+        for widget in (self.start, self.start.label):
+            widget.setVisible(signals is not None)
+            widget.setEnabled(not read_only)
+        self.start.set_value(None if signals is None else signals.start_s)
+        for key in SIGNALS:
+            self._boxes[key].setVisible(signals is not None)
+
+    # --- what the operator does ---------------------------------------------------------------
+
+    def _wish(self, **values: object) -> None:
+        self.wish = replace(self.wish, **values)  # type: ignore[arg-type]
+        self.refresh()
+
+    def _chosen(self) -> None:
+        self._wish(shown=tuple(key for key, box in self._boxes.items() if box.isChecked()))
+
+    def choose_signals(self) -> None:
+        """Ask for a table with current and voltage."""
+        session = self.workspace.session
+        if session is None:
+            return
+        folder = self._last_folder if self._last_folder.name else session.path.parent
+        name, _ = QFileDialog.getOpenFileName(
+            self,
+            "Read current and voltage",
+            str(folder),
+            "Tables (*.csv *.txt *.tsv);;All files (*)",
+        )
+        if name:
+            self._last_folder = Path(name).parent
+            self.read_signals(Path(name))
+
+    def read_signals(self, path: Path) -> None:
+        """Read a table with current and voltage, and keep it in the session."""
+        session = self.workspace.session
+
+        def keep(signals: Signals) -> None:
+            if self.workspace.session is session and self.workspace.attempt(
+                lambda s: s.set_signals(signals)
+            ):
+                self.workspace.said.emit(f"{path.name}: {len(signals.time_s)} samples", False)
+
+        self.workspace.tasks.start(f"Reading {path.name}", lambda _: read_signals(path), keep)
+
+    def _start_at(self, start_s: object) -> None:
+        session = self.workspace.session
+        signals = None if session is None else session.signals
+        if signals is not None and isinstance(start_s, int | float):
+            moved = replace(signals, start_s=float(start_s))
+            self.workspace.attempt(lambda s: s.set_signals(moved))
+
+    # --- the panel ----------------------------------------------------------------------------
+
+    def _make_panel(self) -> None:
+        self.nothing = QLabel(
+            "Nothing to show yet: tick a measure at the right, or measure some frames first."
+        )
+        self.nothing.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        self.nothing.setWordWrap(True)
+        self.canvas_layout.addWidget(self.nothing, 1)
+        layout = self.panel_layout
+        layout.addWidget(_heading("Shown"))
+        layout.addLayout(self._make_choice())
+        layout.addWidget(_heading("Mean ± standard deviation, range"))
+        self.table = ResultTable("Statistics of the measures")
+        layout.addWidget(self.table)
+        self.counted = _words()
+        layout.addWidget(self.counted)
+        self.without = QCheckBox("Leave out frames that stand out")
+        self.without.setToolTip(
+            "Mean, deviation, range and spectrum are of the frames that do not stand out from "
+            "their neighbours by size or ARE; open circles mark those that do"
+        )
+        self.without.toggled.connect(lambda on: self._wish(without_doubtful=on))
+        layout.addWidget(self.without)
+        layout.addLayout(
+            _buttons(
+                (
+                    "Copy values",
+                    "Copy the values of all frames shown, for a spreadsheet",
+                    self.plots.copy_table,
+                ),
+                ("Copy picture", "Copy the plots as a picture", self.plots.copy_picture),
+            )
+        )
+        self._make_spectrum()
+        self._make_signals()
+        layout.addStretch(1)
+
+    def _make_choice(self) -> QGridLayout:
+        grid = QGridLayout()
+        grid.setContentsMargins(0, 0, 0, 0)
+        names = {quantity.key: quantity.label for quantity in QUANTITIES}
+        names |= {key: name for key, (name, _) in SIGNALS.items()}
+        for number, (key, name) in enumerate(names.items()):
+            box = QCheckBox(name)
+            box.setChecked(key in FIRST_SHOWN or key in SIGNALS)
+            box.setToolTip(f"Show {name.lower() if name != 'ARE' else name} over the recording")
+            box.toggled.connect(lambda _: self._chosen())
+            self._boxes[key] = box
+            grid.addWidget(box, number // 2, number % 2)
+        return grid
+
+    def _make_spectrum(self) -> None:
+        self.panel_layout.addWidget(_heading("Spectrum"))
+        choices = [("", "none"), *((q.key, q.label) for q in QUANTITIES)]
+        self.of = ChoiceField("Spectrum of", choices, tooltip="Shows oscillations of a measure")
+        self.of.edited.connect(lambda key: self._wish(spectrum_of=key))
+        self.panel_layout.addLayout(_labelled(self.of))
+        self.spectrum_words = _words()
+        self.spectrum_words.hide()
+        self.panel_layout.addWidget(self.spectrum_words)
+
+    def _make_signals(self) -> None:
+        self.panel_layout.addWidget(_heading("Current and voltage"))
+        self.signals_words = _words()
+        self.panel_layout.addWidget(self.signals_words)
+        self.start = NumberField(
+            "Starts at",
+            "s",
+            lowest=-FAR_S,
+            highest=FAR_S,
+            step=0.01,
+            decimals=3,
+            tooltip="Added to the table's times: when its zero is on the recording's clock",
+        )
+        self.start.edited.connect(self._start_at)
+        self.panel_layout.addLayout(_labelled(self.start))
+        row = QHBoxLayout()
+        self.read_button = _button(
+            "Read a table …",
+            "Read current and voltage from a CSV table and keep them in the session",
+            self.choose_signals,
+        )
+        self.forget_button = _button(
+            "Remove",
+            "Take current and voltage out of the session; undo brings them back",
+            lambda: self.workspace.attempt(lambda session: session.set_signals(None)),
+        )
+        row.addWidget(self.read_button)
+        row.addWidget(self.forget_button)
+        self.panel_layout.addLayout(row)
+
+
+def _heading(words: str) -> QLabel:
+    label = QLabel(words)
+    font = label.font()
+    font.setBold(True)
+    label.setFont(font)
+    label.setWordWrap(True)
+    return label
+
+
+def _words() -> QLabel:
+    label = QLabel()
+    label.setWordWrap(True)
+    label.setTextFormat(Qt.TextFormat.PlainText)
+    return label
+
+
+def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
+    button = QPushButton(words)
+    button.setToolTip(tip)
+    button.setAccessibleDescription(tip)
+    button.clicked.connect(lambda _: work())
+    return button
+
+
+def _buttons(*buttons: tuple[str, str, Callable[[], object]]) -> QHBoxLayout:
+    row = QHBoxLayout()
+    for words, tip, work in buttons:
+        row.addWidget(_button(words, tip, work))
+    return row
+
+
+def _labelled(field: ChoiceField | NumberField) -> QHBoxLayout:
+    row = QHBoxLayout()
+    row.addWidget(field.label)
+    widget: QWidget = field
+    row.addWidget(widget, 1)
+    return row

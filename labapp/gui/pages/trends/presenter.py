@@ -1,0 +1,205 @@
+"""What the trends page shows, computed from the session: curves, their spread, a spectrum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.values import CannotMeasure, IntArray
+from labapp.gui.curves import Axis, Curve, Mark
+from labapp.gui.digits import ResultRow, rounded
+from labapp.session.measured import Overview
+from labapp.session.session import Session
+from labapp.session.signals import Signals
+from labapp.session.trends import BY_KEY, Trend, spectrum, spread, trend
+
+MARKS = (
+    Mark("●", "measured"),
+    Mark("■", "corrected by hand"),
+    Mark("○", "stands out, in doubt"),
+    Mark("×", "no longer stands"),
+)
+MEASURED, CORRECTED, DOUBTFUL, STALE = range(4)
+
+FIRST_SHOWN = ("width_mm", "length_mm", "height_mm", "are_mm")
+
+SIGNALS = {"current": ("Current", "A"), "voltage": ("Voltage", "V")}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the operator wants to see.
+
+    Parameters
+    ----------
+    shown
+        Measures, and ``current``, ``voltage``.
+    without_doubtful
+        Whether frames in doubt are left out of statistics and spectrum.
+    spectrum_of
+        A measure; empty for no spectrum.
+    """
+
+    shown: tuple[str, ...] = (*FIRST_SHOWN, *SIGNALS)
+    without_doubtful: bool = False
+    spectrum_of: str = ""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the page shows.
+
+    Parameters
+    ----------
+    curves, axis
+        Of the course over time.
+    rows
+        Mean ± standard deviation and range, two rows a measure.
+    words
+        How many frames count, and why others do not.
+    spectrum, spectrum_axis
+        Of the measure asked for; no curve where there is none.
+    spectrum_words
+        The strongest oscillation, or why there is no spectrum.
+    signals_words
+        Of current and voltage.
+    """
+
+    curves: tuple[Curve, ...]
+    axis: Axis
+    rows: tuple[ResultRow, ...]
+    words: str
+    spectrum: tuple[Curve, ...]
+    spectrum_axis: Axis
+    spectrum_words: str
+    signals_words: str
+
+
+def show(session: Session, wish: Wish) -> Shown:
+    """What to show of a session."""
+    seen, signals = session.overview(), session.signals
+    courses = [trend(seen, key, wish.without_doubtful) for key in BY_KEY if key in wish.shown]
+    timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
+    axis = Axis("Time", "s") if timed else Axis("Frame", "", decimals=0)
+    curves = [_curve(course) for course in courses if len(course.frame)]
+    if signals is not None and timed:
+        curves += _signal_curves(signals, seen, wish.shown)
+    found, spectrum_axis, told = _spectrum(seen, wish, timed)
+    return Shown(
+        curves=tuple(curves),
+        axis=axis,
+        rows=tuple(row for course in courses for row in _rows(course)),
+        words=_counted(seen, wish.without_doubtful),
+        spectrum=found,
+        spectrum_axis=spectrum_axis,
+        spectrum_words=told,
+        signals_words=_told_signals(signals, seen, timed),
+    )
+
+
+def _curve(course: Trend) -> Curve:
+    mark = np.full(len(course.frame), MEASURED)
+    mark[course.corrected] = CORRECTED
+    mark[course.doubtful] = DOUBTFUL
+    mark[course.stale] = STALE
+    return Curve(
+        name=course.quantity.label,
+        unit=course.quantity.unit,
+        x=course.at,
+        y=course.value,
+        sigma=course.sigma,
+        key=course.frame,
+        mark=np.asarray(mark, np.int64),
+        marks=MARKS,
+        level=spread(course).mean,
+        decimals=4 if course.quantity.key == "are_mm" else 3,
+    )
+
+
+def _rows(course: Trend) -> tuple[ResultRow, ...]:
+    found, quantity = spread(course), course.quantity
+    place = rounded(found.mean, found.deviation)[0].partition(".")[2]
+    ends = [f"{end:.{len(place)}f}" for end in (found.lowest, found.highest)]
+    frames = f"{found.count} frame{'s' * (found.count != 1)}"
+    note = f"Mean and standard deviation (divided by n, Eq. 7-2 … 7-4) of {frames}"
+    unknown = None if not found.count else " … ".join(ends).replace("-", "−")
+    return (
+        ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
+        ResultRow("    range", unknown, unit=quantity.unit, note=f"Least and greatest of {frames}"),
+    )
+
+
+def _counted(seen: Overview, without_doubtful: bool) -> str:
+    course = trend(seen, "height_mm", without_doubtful)
+    total, has = len(seen.frame), len(course.frame)
+    told = [f"{int(course.counts.sum())} of {total} frames count"]
+    unmeasured = sum(status == "" for status in seen.status)
+    reasons = (
+        (unmeasured, "not measured yet"),
+        (total - has - unmeasured, "without a surface"),
+        (int(course.stale.sum()), "no longer stand"),
+        (int(course.doubtful.sum()), "stand out"),
+    )
+    told += [f"{count} {words}" for count, words in reasons if count]
+    return ", ".join(told)
+
+
+def _spectrum(seen: Overview, wish: Wish, timed: bool) -> tuple[tuple[Curve, ...], Axis, str]:
+    axis = Axis("Frequency", "Hz" if timed else "1/frame", 2 if timed else 4)
+    if wish.spectrum_of not in BY_KEY:
+        return (), axis, ""
+    course = trend(seen, wish.spectrum_of, wish.without_doubtful)
+    try:
+        found = spectrum(course)
+    except CannotMeasure as error:
+        return (), axis, error.reason[0].upper() + error.reason[1:]
+    quantity = course.quantity
+    curve = Curve(
+        f"Amplitude, {quantity.label.lower()}" if quantity.label != "ARE" else "Amplitude, ARE",
+        quantity.unit,
+        found.frequency,
+        found.amplitude,
+        decimals=4,
+        from_zero=True,
+    )
+    frequency, amplitude = found.peak
+    place = max(0, 1 - int(np.floor(np.log10(found.resolution))))
+    return (
+        (curve,),
+        axis,
+        f"Strongest at {frequency:.{place}f} {axis.unit}: {amplitude:.2g} {quantity.unit}. "
+        f"Frames {found.first} to {found.last} ({found.count}), Hann window; oscillations nearer "
+        f"than {found.resolution:.2g} {axis.unit} are not told apart.",
+    )
+
+
+def _signal_curves(signals: Signals, seen: Overview, shown: Sequence[str]) -> list[Curve]:
+    """Current and voltage while the recording runs, and a little before and after."""
+    time_s = signals.time_s + signals.start_s
+    low, high = float(seen.time_s.min()), float(seen.time_s.max())
+    room = 0.05 * (high - low) or 0.5
+    within: IntArray = np.flatnonzero((time_s >= low - room) & (time_s <= high + room))
+    curves = []
+    for key, (name, unit) in SIGNALS.items():
+        values = getattr(signals, f"{key}_{unit.lower()}")[within]
+        if key in shown and np.isfinite(values).any():
+            curves.append(Curve(name, unit, time_s[within], values))
+    return curves
+
+
+def _told_signals(signals: Signals | None, seen: Overview, timed: bool) -> str:
+    if signals is None:
+        return "None. A table (CSV) with a time and a current or voltage can be shown along."
+    ends = signals.time_s[[0, -1]] + signals.start_s
+    told = f"{signals.file}: {len(signals.time_s)} samples, {ends[0]:.3f} … {ends[1]:.3f} s"
+    if not timed:
+        return f"{told}. Not shown: the recording has no time base; import it with a frame rate."
+    low, high = float(seen.time_s.min()), float(seen.time_s.max())
+    if ends[1] < low or ends[0] > high:
+        return (
+            f"{told}. None of it falls into the recording's {low:.3f} … {high:.3f} s: "
+            "say below when it starts."
+        )
+    return told

@@ -1,0 +1,403 @@
+"""Curves over a common axis, one plot under the other: zoom, read-out, points to go to, copies.
+
+The wheel and dragging work along the common axis; what goes up always fits what is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import QEvent, QPointF, Qt, Signal
+from PySide6.QtGui import (
+    QAction,
+    QColor,
+    QGuiApplication,
+    QImage,
+    QKeyEvent,
+    QKeySequence,
+    QPalette,
+)
+from PySide6.QtWidgets import QFrame, QLabel, QScrollArea, QSizePolicy, QVBoxLayout, QWidget
+
+from labapp.core.values import IntArray
+from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in_words
+
+pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
+
+MOST_POINTS = 1500
+"""Where more are in view, a line stands for them, and only special ones keep their mark."""
+
+NEAR = 18.0
+"""A click this near to a point, in screen pixels, means it."""
+
+AXIS_WIDTH = 60
+LEAST_HEIGHT = 62
+"""A plot is no lower than this; where they do not fit, they scroll."""
+
+SYMBOLS = {"●": "o", "○": "o", "■": "s", "×": "x"}
+KEYS = "← → step through the points, Home End to the first and last, + − zoom, F shows all"
+Role = QPalette.ColorRole
+
+
+class PlotStack(QWidget):
+    """Plots under each other.
+
+    Signals
+    -------
+    chosen
+        The operator chose a point, with the pointer or the keys: its key.
+
+    Parameters
+    ----------
+    name
+        What it shows, for a screen reader.
+    """
+
+    chosen = Signal(int)
+
+    def __init__(self, name: str = "Plots") -> None:
+        super().__init__()
+        self.curves: tuple[Curve, ...] = ()
+        self.axis = Axis("", "")
+        self._plots: list[_Plot] = []
+        self._current: int | None = None
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setAccessibleName(name)
+        self.setAccessibleDescription(KEYS)
+        self.setToolTip(f"Click a point to go to its frame; wheel or drag along the axis. {KEYS}")
+        self.canvas = pg.GraphicsLayoutWidget()
+        self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        self.canvas.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
+        area = QScrollArea()
+        area.setWidget(self.canvas)
+        area.setWidgetResizable(True)
+        area.setFrameShape(QFrame.Shape.NoFrame)
+        area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        area.setMinimumSize(240, 110)
+        self.legend = QLabel()
+        self.legend.setWordWrap(True)
+        self.legend.setContentsMargins(8, 0, 8, 0)
+        self.read_out = QLabel(" ")
+        self.read_out.setTextFormat(Qt.TextFormat.PlainText)
+        self.read_out.setContentsMargins(8, 0, 8, 4)
+        self.read_out.setWordWrap(True)
+        self.read_out.setAlignment(Qt.AlignmentFlag.AlignTop)
+        self.read_out.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setSpacing(2)
+        layout.addWidget(area, 1)
+        layout.addWidget(self.legend)
+        layout.addWidget(self.read_out)
+        scene = self.canvas.scene()
+        scene.sigMouseClicked.connect(self._clicked)
+        scene.sigMouseMoved.connect(self._moved)
+        self._add_actions()
+
+    # --- what it shows ------------------------------------------------------------------------
+
+    def show_curves(self, curves: Sequence[Curve], axis: Axis) -> None:
+        """Show curves, each in a plot of its own; the part in view stays if they are the same."""
+        titles = [curve.title for curve in curves]
+        same = titles == [curve.title for curve in self.curves] and axis == self.axis
+        self.curves, self.axis = tuple(curves), axis
+        if not same:
+            self._lay_out()
+        for plot, curve in zip(self._plots, curves, strict=True):
+            plot.show_curve(curve, self.palette())
+        if not same:
+            self.fit()
+        self._show_legend()
+        self.set_current(self._current)
+
+    def set_current(self, key: int | None) -> None:
+        """Mark the point with a key in every plot: the frame in view."""
+        self._current = key
+        found = [(curve, _index_of(curve, key)) for curve in self.curves]
+        points = [(curve, index) for curve, index in found if index is not None]
+        place = float(points[0][0].x[points[0][1]]) if points else None
+        for plot in self._plots:
+            plot.mark_place(place)
+        self._tell(_joined([point_in_words(curve, index, self.axis) for curve, index in points]))
+
+    def fit(self) -> None:
+        """Show all of the axis."""
+        ends = [(float(c.x[0]), float(c.x[-1])) for c in self.curves if len(c.x)]
+        if ends and self._plots:
+            low, high = min(low for low, _ in ends), max(high for _, high in ends)
+            room = 0.02 * (high - low) or 0.5
+            self._plots[0].setXRange(low - room, high + room, padding=0)
+
+    def zoom(self, factor: float) -> None:
+        """Zoom about the middle of the axis; more than 1 shows less of it."""
+        if self._plots:
+            self._plots[0].getViewBox().scaleBy(x=1 / factor)
+
+    # --- copies -------------------------------------------------------------------------------
+
+    def grab_picture(self) -> QImage:
+        """Return what is seen."""
+        picture: QImage = self.canvas.grab().toImage()
+        return picture
+
+    def copy_picture(self) -> None:
+        """Put what is seen on the clipboard."""
+        QGuiApplication.clipboard().setImage(self.grab_picture())
+
+    def copy_table(self) -> None:
+        """Put the points of all curves on the clipboard, in tabs."""
+        QGuiApplication.clipboard().setText(as_table(self.curves, self.axis))
+
+    # --- within -------------------------------------------------------------------------------
+
+    def _add_actions(self) -> None:
+        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
+        works: tuple[tuple[str, Callable[[], None]], ...] = (
+            ("Copy picture", self.copy_picture),
+            ("Copy values as table", self.copy_table),
+            ("Show all", self.fit),
+        )
+        for words, work in works:
+            action = QAction(words, self)
+            action.triggered.connect(lambda *_, do=work: do())
+            self.addAction(action)
+        copy = self.actions()[0]
+        copy.setShortcut(QKeySequence.StandardKey.Copy)
+        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+
+    def _lay_out(self) -> None:
+        self.canvas.clear()
+        self._plots = []
+        for row in range(len(self.curves)):
+            plot = _Plot(self._plots[0] if self._plots else None)
+            self.canvas.addItem(plot, row=row, col=0)
+            plot.getAxis("bottom").setStyle(showValues=row == len(self.curves) - 1)
+            self._plots.append(plot)
+        if self._plots:
+            self._plots[-1].setLabel("bottom", self.axis.title)
+        self.canvas.setMinimumHeight(LEAST_HEIGHT * len(self._plots) + 40)
+        lines = 2 if sum(len(curve.key) > 0 for curve in self.curves) > 1 else 1
+        self.read_out.setFixedHeight(lines * self.fontMetrics().lineSpacing() + 6)
+        self._paint()
+
+    def _paint(self) -> None:
+        look = self.palette()
+        self.canvas.setBackground(look.color(Role.Base))
+        for plot, curve in zip(self._plots, self.curves, strict=True):
+            plot.show_curve(curve, look)
+
+    def _show_legend(self) -> None:
+        marks = {
+            curve.marks[number]: None for curve in self.curves for number in np.unique(curve.mark)
+        }
+        self.legend.setText("    ".join(f"{m.sign} {m.words}" for m in marks if m.words))
+        self.legend.setVisible(len(marks) > 1)
+
+    def _tell(self, words: str) -> None:
+        self.read_out.setText(words or " ")
+        self.read_out.setToolTip(words)
+        self.setAccessibleDescription(f"{words}. {KEYS}" if words else KEYS)
+
+    def _under(self, at: QPointF) -> tuple[_Plot, Curve] | None:
+        for plot, curve in zip(self._plots, self.curves, strict=True):
+            if plot.sceneBoundingRect().contains(at):
+                return plot, curve
+        return None
+
+    def _moved(self, at: QPointF) -> None:
+        found = self._under(at)
+        if found is None:
+            for plot in self._plots:
+                plot.show_cross(None)
+            return
+        plot, curve = found
+        x = float(plot.getViewBox().mapSceneToView(at).x())
+        for each in self._plots:
+            each.show_cross(x)
+        index = nearest(curve, x)
+        if index is not None:
+            self._tell(point_in_words(curve, index, self.axis))
+
+    def _clicked(self, event: pg.GraphicsScene.mouseEvents.MouseClickEvent) -> None:
+        self.setFocus(Qt.FocusReason.MouseFocusReason)
+        found = self._under(event.scenePos())
+        if found is None or event.button() != Qt.MouseButton.LeftButton:
+            return
+        plot, curve = found
+        if not len(curve.key):
+            return
+        box = plot.getViewBox()
+        places = np.column_stack([curve.x, curve.y]) / np.array(box.viewPixelSize())
+        here = box.mapSceneToView(event.scenePos())
+        here_px = np.array([here.x(), here.y()]) / np.array(box.viewPixelSize())
+        distance = np.hypot(*(places - here_px).T)
+        if len(distance) and np.nanmin(distance) <= NEAR:
+            self.chosen.emit(int(curve.key[int(np.nanargmin(distance))]))
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Step through the points, or zoom."""
+        steps = {Qt.Key.Key_Left: -1, Qt.Key.Key_Right: 1, Qt.Key.Key_Home: -(10**9)}
+        steps[Qt.Key.Key_End] = 10**9
+        zooms = {Qt.Key.Key_Plus: 1.25, Qt.Key.Key_Equal: 1.25, Qt.Key.Key_Minus: 0.8}
+        key = Qt.Key(event.key())
+        if key in steps:
+            there = next_key(
+                self.curves, -1 if self._current is None else self._current, steps[key]
+            )
+            if there is not None:
+                self.chosen.emit(there)
+        elif key in zooms:
+            self.zoom(zooms[key])
+        elif key == Qt.Key.Key_F:
+            self.fit()
+        else:
+            super().keyPressEvent(event)
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "canvas"):
+            self._paint()
+
+
+class _Plot(pg.PlotItem):  # type: ignore[misc]
+    """One curve with its axis: line, bars, points, level, and two upright lines."""
+
+    def __init__(self, over: _Plot | None) -> None:
+        super().__init__()
+        self._curve: Curve | None = None
+        self._look = QPalette()
+        self.hideButtons()
+        self.setMenuEnabled(False)
+        box = self.getViewBox()
+        box.setMouseEnabled(x=True, y=False)
+        box.setAutoVisible(y=True)
+        box.enableAutoRange(x=False, y=True)
+        if over is not None:
+            self.setXLink(over)
+        for side in ("left", "bottom"):
+            self.getAxis(side).enableAutoSIPrefix(False)
+        self.getAxis("left").setWidth(AXIS_WIDTH)
+        # In the plot: beside a low one its name would be cut off.
+        self.name = pg.LabelItem(justify="left")
+        self.name.setParentItem(box)
+        self.name.anchor(itemPos=(0, 0), parentPos=(0, 0), offset=(4, -2))
+        self.line = pg.PlotDataItem(connect="finite", autoDownsample=True, clipToView=True)
+        self.line.setDownsampling(auto=True, method="peak")
+        self.bars = pg.PlotCurveItem(connect="pairs")
+        self.points = pg.ScatterPlotItem(pxMode=True)
+        self.level = pg.InfiniteLine(angle=0)
+        self.current = pg.InfiniteLine(angle=90)
+        self.cross = pg.InfiniteLine(angle=90)
+        for item in (self.bars, self.line, self.points):
+            self.addItem(item)
+        for item in (self.level, self.current, self.cross):
+            self.addItem(item, ignoreBounds=True)
+            item.hide()
+        box.sigXRangeChanged.connect(lambda *_: self._show_points())
+
+    def show_curve(self, curve: Curve, look: QPalette) -> None:
+        """Show a curve in the colours of a palette."""
+        self._curve, self._look = curve, look
+        accent, text = look.color(Role.Accent), look.color(Role.Text)
+        faint = _faint(accent, 110)
+        for side in ("left", "bottom"):
+            axis = self.getAxis(side)
+            axis.setPen(look.color(Role.Mid))
+            axis.setTextPen(text)
+        self.name.setText(curve.title, color=text.name(), bold=True)
+        if self.getAxis("bottom").labelText:
+            self.setLabel("bottom", self.getAxis("bottom").labelText, color=text.name())
+        self.showGrid(x=True, y=True, alpha=0.18)
+        self.line.setPen(pg.mkPen(faint if len(curve.key) else accent, width=1))
+        self.line.setData(curve.x, curve.y)
+        self.bars.setPen(pg.mkPen(_faint(accent, 150), width=1))
+        self.level.setPen(pg.mkPen(_faint(text, 150), width=1, style=Qt.PenStyle.DashLine))
+        self.level.setVisible(bool(np.isfinite(curve.level)))
+        if np.isfinite(curve.level):
+            self.level.setValue(curve.level)
+        self.current.setPen(pg.mkPen(accent, width=1.5))
+        self.cross.setPen(pg.mkPen(_faint(text, 90), width=1))
+        if curve.from_zero:
+            self.getViewBox().setLimits(yMin=0)
+        self._show_points()
+
+    def mark_place(self, x: float | None) -> None:
+        """Draw an upright line at a place, or none."""
+        self.current.setVisible(x is not None)
+        if x is not None:
+            self.current.setValue(x)
+
+    def show_cross(self, x: float | None) -> None:
+        """Draw the pointer's upright line, or none."""
+        self.cross.setVisible(x is not None)
+        if x is not None:
+            self.cross.setValue(x)
+
+    def _show_points(self) -> None:
+        """Draw points and bars of what is in view, as far as they can be told apart."""
+        curve = self._curve
+        if curve is None or not len(curve.key):
+            self.points.clear()
+            self.bars.clear()
+            return
+        low, high = self.getViewBox().viewRange()[0]
+        first, end = np.searchsorted(curve.x, [low, high]).tolist()
+        seen = np.arange(max(first - 1, 0), min(end + 1, len(curve.x)))
+        many = len(seen) > MOST_POINTS
+        drawn = seen[curve.mark[seen] > 0][:MOST_POINTS] if many else seen
+        looks = [self._brushed(curve.marks[number].sign) for number in range(len(curve.marks))]
+        marks = curve.mark[drawn].tolist()
+        self.points.setData(
+            x=curve.x[drawn],
+            y=curve.y[drawn],
+            symbol=[looks[k][0] for k in marks],
+            size=[looks[k][1] for k in marks],
+            pen=[looks[k][2] for k in marks],
+            brush=[looks[k][3] for k in marks],
+        )
+        self._show_bars(curve, seen[:0] if many else seen)
+
+    def _show_bars(self, curve: Curve, seen: IntArray) -> None:
+        if not len(curve.sigma) or not len(seen):
+            self.bars.clear()
+            return
+        with_bar = seen[np.isfinite(curve.sigma[seen])]
+        x = np.repeat(curve.x[with_bar], 2)
+        up = np.column_stack([-curve.sigma[with_bar], curve.sigma[with_bar]])
+        self.bars.setData(x, (curve.y[with_bar, None] + up).ravel())
+
+    def _brushed(self, sign: str) -> tuple[str, int, pg.QtGui.QPen, pg.QtGui.QBrush]:
+        """Symbol, size, pen and brush of a mark."""
+        look = self._look
+        accent, text, base = (look.color(role) for role in (Role.Accent, Role.Text, Role.Base))
+        if sign == "○":
+            return SYMBOLS[sign], 11, pg.mkPen(text, width=1.8), pg.mkBrush(base)
+        if sign == "■":
+            return SYMBOLS[sign], 9, pg.mkPen(base, width=0.5), pg.mkBrush(text)
+        if sign == "×":
+            return SYMBOLS[sign], 9, pg.mkPen(None), pg.mkBrush(look.color(Role.PlaceholderText))
+        return SYMBOLS[sign], 7, pg.mkPen(base, width=0.5), pg.mkBrush(accent)
+
+
+def _faint(colour: QColor, alpha: int) -> QColor:
+    paler = QColor(colour)
+    paler.setAlpha(alpha)
+    return paler
+
+
+def _index_of(curve: Curve, key: int | None) -> int | None:
+    if key is None or not len(curve.key):
+        return None
+    index = int(np.searchsorted(curve.key, key))
+    return index if index < len(curve.key) and curve.key[index] == key else None
+
+
+def _joined(told: Sequence[str]) -> str:
+    """Points of one frame in one sentence: where it is only once."""
+    if not told:
+        return ""
+    where = told[0].partition(": ")[0]
+    return f"{where}: " + ";  ".join(words.partition(": ")[2] for words in told)

@@ -1,0 +1,167 @@
+"""Trends: what is shown of a session, and the page that shows it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.trends.page import TrendsPage
+from labapp.gui.pages.trends.presenter import CORRECTED, STALE, Wish, show
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+from labapp.session.signals import Signals
+
+KEPT: list[object] = []
+
+
+@pytest.fixture
+def gtaw(copy_sample) -> Path:
+    return copy_sample("gtaw")
+
+
+def logged(start_s: float = 0.0) -> Signals:
+    time_s = np.arange(-1.0, 2.0, 0.01)
+    return Signals("log.csv", time_s, 75 + time_s, np.full(len(time_s), np.nan), start_s)
+
+
+def test_the_course_of_the_sample(gtaw: Path) -> None:
+    with Session.open(gtaw) as session:
+        shown = show(session, Wish())
+    assert [curve.name for curve in shown.curves] == ["Width", "Length", "Height", "ARE"]
+    assert shown.axis.unit == "s"
+    assert all(len(curve.key) == 30 for curve in shown.curves)
+    mean, span = shown.rows[4:6]
+    assert mean.texts == ("Height", "0.293", "0.019", "mm")  # §7.3: 0.294 ± 0.019
+    assert span.texts[1] == "0.255 … 0.323"
+    assert shown.words == "30 of 30 frames count"
+    assert shown.spectrum == ()
+    assert shown.signals_words.startswith("None.")
+
+
+def test_marks_say_how_frames_stand(copy_sample) -> None:
+    with Session.open(copy_sample("blocked_rows")) as session:
+        curve = show(session, Wish()).curves[0]
+        assert dict(zip(curve.key.tolist(), curve.mark.tolist(), strict=True))[2] == CORRECTED
+        words = show(session, Wish()).words
+        assert words == "3 of 6 frames count, 3 without a surface"
+        fit = replace(session.settings.fit, jerk=0.06)
+        session.set_settings(replace(session.settings, fit=fit))
+        shown = show(session, Wish())
+        assert (shown.curves[0].mark == STALE).all()
+        assert shown.rows[0].texts[1:3] == ("–", "")
+        assert "3 no longer stand" in shown.words
+
+
+def test_the_spectrum_is_told_or_why_there_is_none(gtaw: Path, copy_sample) -> None:
+    with Session.open(gtaw) as session:
+        shown = show(session, Wish(spectrum_of="height_mm"))
+        assert len(shown.spectrum[0].x) == 15
+        assert shown.spectrum_axis.unit == "Hz"
+        assert shown.spectrum_words.startswith("Strongest at 2.0 Hz: 0.025 mm. Frames 0 to 29 (30)")
+    with Session.open(copy_sample("concave")) as session:
+        shown = show(session, Wish(spectrum_of="depth_mm"))
+        assert shown.spectrum == ()
+        assert shown.spectrum_words.startswith("A spectrum needs 8 frames in a row")
+        assert shown.axis.unit == ""  # a folder of pictures has no times
+
+
+def test_current_is_shown_while_the_recording_runs(gtaw: Path, copy_sample) -> None:
+    with Session.open(gtaw) as session:
+        session.set_signals(logged())
+        current = show(session, Wish()).curves[-1]
+        assert (current.name, current.unit) == ("Current", "A")
+        assert current.x.min() >= -0.03
+        assert current.x.max() <= 0.52
+        assert [curve.name for curve in show(session, Wish(shown=("voltage",))).curves] == []
+        session.set_signals(logged(start_s=0.25))
+        moved = show(session, Wish()).curves[-1]
+        assert np.interp(0.25, moved.x, moved.y) == pytest.approx(75.0)
+        session.set_signals(logged(start_s=50))
+        shown = show(session, Wish())
+        assert "None of it falls into" in shown.signals_words
+        assert len(shown.curves) == 4
+    with Session.open(copy_sample("concave")) as session:
+        session.set_signals(logged())
+        assert "no time base" in show(session, Wish()).signals_words
+
+
+@pytest.fixture
+def page(qtbot: QtBot, gtaw: Path) -> TrendsPage:
+    workspace = Workspace()
+    workspace.open(gtaw)
+    page = TrendsPage(workspace)
+    KEPT.extend((workspace, page))
+    workspace.changed.connect(page.refresh)
+    workspace.frame_changed.connect(page.refresh)
+    for widget in (page, page.panel):
+        widget.resize(800, 600)
+        widget.show()
+    page.refresh()
+    QTest.qWait(30)
+    yield page
+    workspace.close()
+
+
+def test_keys_on_the_plots_go_to_frames(page: TrendsPage) -> None:
+    page.plots.setFocus()
+    QTest.keyClick(page.plots, Qt.Key.Key_Right)
+    QTest.keyClick(page.plots, Qt.Key.Key_Right)
+    assert page.workspace.frame == 2
+    assert page.plots.read_out.text().startswith("Frame 2, 0.0333 s: Width")
+
+
+def test_ticking_a_measure_shows_it(page: TrendsPage) -> None:
+    assert len(page.plots.curves) == 4
+    QTest.keyClick(page._boxes["volume_mm3"], Qt.Key.Key_Space)
+    assert [curve.name for curve in page.plots.curves][-2:] == ["Volume", "ARE"]
+    for box in page._boxes.values():
+        box.setChecked(False)
+    assert page.nothing.isVisibleTo(page)
+
+
+def test_the_spectrum_comes_and_goes(page: TrendsPage) -> None:
+    page.of.set_value("height_mm")
+    page.of.edited.emit("height_mm")
+    assert page.spectrum.isVisibleTo(page)
+    page.of.edited.emit("")
+    assert not page.spectrum.isVisibleTo(page)
+
+
+def test_a_table_is_read_kept_moved_and_undone(
+    page: TrendsPage, qtbot: QtBot, tmp_path: Path
+) -> None:
+    said: list[tuple[str, bool]] = []
+    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    table = tmp_path / "log.csv"
+    table.write_text("time_s,current_a\n0,75\n0.2,x\n")
+    page.read_signals(table)
+    qtbot.waitUntil(lambda: bool(said))
+    assert "line 3, current_a: x" in said[0][0]
+    assert said[0][1]
+    table.write_text("time_s,current_a\n0,75\n0.2,80\n0.4,70\n")
+    page.read_signals(table)
+    qtbot.waitUntil(lambda: len(page.plots.curves) == 5)
+    page.start.edited.emit(0.1)
+    session = page.workspace.session
+    assert session is not None
+    assert session.signals is not None
+    assert session.signals.start_s == 0.1
+    assert page.start.value() == 0.1
+    page.workspace.undo()
+    page.workspace.undo()
+    assert session.signals is None
+    assert len(page.plots.curves) == 4
+
+
+def test_every_control_has_a_name_and_a_tip(page: TrendsPage) -> None:
+    from PySide6.QtWidgets import QAbstractButton
+
+    for button in page.panel.findChildren(QAbstractButton):
+        if button.text():
+            assert button.toolTip(), button.text()

@@ -1,0 +1,168 @@
+"""Curves in words and tables, and the plots that show them."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, QPointF, Qt
+from PySide6.QtGui import QGuiApplication
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.curves import Axis, Curve, Mark, as_table, nearest, next_key, point_in_words
+from labapp.gui.theme import palette
+from labapp.gui.views.plots import MOST_POINTS, PlotStack
+
+KEPT: list[PlotStack] = []
+"""Windows with pyqtgraph live to the end of the process: some crash when they are destroyed."""
+
+TIME = Axis("Time", "s")
+MARKS = (Mark("●", "measured"), Mark("○", "in doubt"))
+
+
+def curve(count: int = 10, name: str = "Height", step: int = 2) -> Curve:
+    """Frames 0, 2, 4 … at 10 Hz; frame 4 is in doubt."""
+    key = step * np.arange(count)
+    return Curve(
+        name,
+        "mm",
+        key / 10,
+        0.3 + 0.01 * np.sin(key),
+        sigma=np.full(count, 0.004),
+        key=key,
+        mark=(key == 4).astype(np.int64),
+        marks=MARKS,
+        level=0.3,
+    )
+
+
+def current() -> Curve:
+    x = np.linspace(0, 2, 500)
+    return Curve("Current", "A", x, 75 + np.sin(9 * x))
+
+
+def test_points_in_words() -> None:
+    assert point_in_words(curve(), 0, TIME) == "Frame 0, 0.0000 s: Height 0.3000 ± 0.0040 mm"
+    assert point_in_words(curve(), 2, TIME).startswith("Frame 4, 0.4000 s, in doubt: ")
+    frames = Axis("Frame", "", decimals=0)
+    assert point_in_words(curve(), 0, frames).startswith("Frame 0: ")
+    assert point_in_words(current(), 0, TIME) == "Time 0.0000 s: Current 75.000 A"
+
+
+def test_the_nearest_point_and_the_next_one() -> None:
+    assert nearest(curve(), 0.29) == 1
+    assert nearest(curve(), -5) == 0
+    assert nearest(curve(), 99) == 9
+    assert nearest(curve(0), 1) is None
+    both = [curve(), curve(3, step=5), current()]  # keys 0 2 4 … 18 and 0 5 10
+    assert next_key(both, 4, 1) == 5
+    assert next_key(both, 5, 1) == 6
+    assert next_key(both, 7, 1) == 8  # a frame without a point
+    assert next_key(both, 7, -1) == 6
+    assert next_key(both, 18, 1) == 18
+    assert next_key(both, 8, -(10**9)) == 0
+    assert next_key([current()], 3, 1) is None
+
+
+def test_a_table_for_a_spreadsheet() -> None:
+    lines = as_table([curve(), curve(3, "Width", 5), current()], TIME).splitlines()
+    head = "frame|Time (s)|Height (mm)|Height σ (mm)|Width (mm)|Width σ (mm)|mark".split("|")
+    assert lines[0].split("\t") == head
+    cells = [line.split("\t") for line in lines[1:]]
+    assert [row[0] for row in cells] == "0 2 4 5 6 8 10 12 14 16 18".split()
+    assert cells[1] == ["2", "0.2", f"{0.3 + 0.01 * np.sin(2):.9g}", "0.004", "", "", "measured"]
+    assert cells[3][:4] == ["5", "0.5", "", ""]
+    assert cells[2][-1] == "in doubt"
+    assert as_table([current()], TIME) == "frame\tTime (s)\n"
+
+
+@pytest.fixture
+def view(qtbot: QtBot) -> PlotStack:
+    view = PlotStack("Trends")
+    KEPT.append(view)
+    view.resize(800, 600)
+    view.show_curves([curve(), curve(name="Width"), current()], TIME)
+    view.show()
+    qtbot.waitExposed(view)
+    QTest.qWait(40)
+    return view
+
+
+def at(view: PlotStack, plot: int, x: float, y: float) -> QPoint:
+    scene = view._plots[plot].getViewBox().mapViewToScene(QPointF(x, y))
+    port: QPoint = view.canvas.mapFromScene(scene)
+    return port
+
+
+def test_a_click_near_a_point_chooses_its_frame_and_beside_none(view: PlotStack) -> None:
+    chosen: list[int] = []
+    view.chosen.connect(chosen.append)
+    port, left = view.canvas.viewport(), Qt.MouseButton.LeftButton
+    shown = view.curves[1]
+    QTest.mouseClick(port, left, pos=at(view, 1, shown.x[3], shown.y[3]) + QPoint(4, -5))
+    assert chosen == [6]
+    QTest.mouseClick(port, left, pos=at(view, 1, shown.x[3], shown.y[3]) + QPoint(0, 40))
+    QTest.mouseClick(port, left, pos=at(view, 2, 1.0, 75.0))
+    assert chosen == [6]
+
+
+def test_keys_step_through_the_points(view: PlotStack) -> None:
+    chosen: list[int] = []
+    view.chosen.connect(chosen.append)
+    view.chosen.connect(view.set_current)
+    view.setFocus()
+    for key in (Qt.Key.Key_Right, Qt.Key.Key_Right, Qt.Key.Key_End, Qt.Key.Key_Left):
+        QTest.keyClick(view, key)
+    assert chosen == [0, 2, 18, 16]
+    assert view.read_out.text().startswith("Frame 16, 1.6000 s: Height")
+    assert "Width" in view.read_out.text()
+    assert view.read_out.text() in view.accessibleDescription()
+
+
+def test_the_pointer_is_told_what_is_there(view: PlotStack) -> None:
+    place = view._plots[0].getViewBox().mapViewToScene(QPointF(0.41, 0.3))
+    view.canvas.scene().sigMouseMoved.emit(place)
+    assert view.read_out.text().startswith("Frame 4, 0.4000 s, in doubt: Height")
+    assert "○ in doubt" in view.legend.text()
+
+
+def test_zoom_stays_when_values_change_and_goes_when_others_are_shown(view: PlotStack) -> None:
+    QTest.keyClick(view, Qt.Key.Key_Plus)
+    zoomed = view._plots[0].viewRange()[0]
+    view.show_curves([curve(), curve(name="Width"), current()], TIME)
+    assert view._plots[0].viewRange()[0] == zoomed
+    view.show_curves([curve()], TIME)
+    assert view._plots[0].viewRange()[0] != zoomed
+    view.show_curves([], TIME)
+    assert view.read_out.text() == " "
+
+
+def test_copies(view: PlotStack) -> None:
+    view.copy_table()
+    assert QGuiApplication.clipboard().text() == as_table(view.curves, TIME)
+    view.copy_picture()
+    assert not QGuiApplication.clipboard().image().isNull()
+
+
+def test_it_follows_the_palette(view: PlotStack) -> None:
+    for dark in (True, False):
+        view.setPalette(palette(dark))
+        QTest.qWait(20)
+        corner = view.grab_picture().pixelColor(3, 3)
+        assert (corner.lightness() < 128) == dark
+
+
+def test_ten_thousand_frames_pan_at_speed(view: PlotStack) -> None:
+    many = [curve(10_000, name, 1) for name in ("Width", "Length", "Height", "ARE")]
+    view.show_curves(many, TIME)
+    QTest.qWait(50)
+    took = []
+    for step in range(12):
+        began = time.perf_counter()
+        view._plots[0].setXRange(step, 100 + step * 75, padding=0)
+        view.canvas.grab()
+        took.append(time.perf_counter() - began)
+    assert len(view._plots[0].points.data) <= MOST_POINTS
+    assert float(np.median(took)) < 0.2  # 4 plots, software, another program beside
