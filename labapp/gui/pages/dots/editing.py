@@ -1,0 +1,281 @@
+"""What is chosen in a frame and what the operator does to it; without Qt.
+
+Every edit is one of `labapp.core.correction`, handed to the session as one step that can be undone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from labapp.core import correction as core
+from labapp.core.correction import Correction
+from labapp.core.dots import Image
+from labapp.core.lattice import Site
+from labapp.core.pipeline import Settings
+from labapp.core.values import FloatArray, IntArray
+from labapp.gui.pages.dots import picking
+
+Commit = Callable[[str, Callable[[], Correction | None]], bool]
+"""Make an edit, one step of that name; False if it was refused, which the operator is told."""
+
+NOTHING: IntArray = np.zeros(0, np.int64)
+
+
+class Editor:
+    """The hand on one frame: a selection, a drag under way, and the edits.
+
+    Attributes
+    ----------
+    correction
+        The dots and rows that are shown; None without any.
+    selection
+        Indices of the chosen dots, ascending.
+    shift_px
+        How far a drag or a held key has brought the chosen dots so far, shape (2,).
+
+    Parameters
+    ----------
+    commit
+        See `Commit`.
+    """
+
+    def __init__(self, commit: Commit) -> None:
+        self._commit = commit
+        self.correction: Correction | None = None
+        self.selection = NOTHING
+        self.shift_px: FloatArray = np.zeros(2)
+
+    def show(self, correction: Correction | None, same_frame: bool) -> None:
+        """Work on what a frame shows now; the selection stays where its dots do."""
+        before = self.correction
+        self.correction = correction
+        stays = same_frame and before is not None and correction is not None
+        if not stays or before is None or correction is None:
+            self.selection, self.shift_px = NOTHING, np.zeros(2)
+        elif len(before.dots) != len(correction.dots):
+            self.selection = self.selection[self.selection < len(correction.dots)]
+            if len(before.dots) > len(correction.dots):
+                self.selection = NOTHING
+
+    @property
+    def dots_px(self) -> FloatArray:
+        """Where the dots are drawn, shape (n, 2), px, a drag under way included."""
+        if self.correction is None:
+            return np.zeros((0, 2))
+        place = self.correction.dots.image_px.copy()
+        place[self.selection] += self.shift_px
+        return place
+
+    # --- choosing -----------------------------------------------------------------------------
+
+    def at(self, u: float, v: float, within_px: float) -> int | None:
+        """Which dot is at a place; None if none is."""
+        return picking.nearest(self.dots_px, u, v, within_px)
+
+    def click(self, u: float, v: float, within_px: float, add: bool) -> None:
+        """Choose the dot at a place, alone or in addition; a chosen one is let go by adding it."""
+        dot = self.at(u, v, within_px)
+        if dot is None:
+            self.selection = self.selection if add else NOTHING
+        elif add:
+            self.selection = np.setxor1d(self.selection, [dot])
+        else:
+            self.selection = np.array([dot])
+
+    def box(self, one: tuple[float, float], other: tuple[float, float], add: bool) -> None:
+        """Choose the dots in a box."""
+        inside = picking.in_box(self.dots_px, one, other)
+        self.selection = np.union1d(self.selection, inside) if add else inside
+
+    def choose_rows(self, rows: list[int]) -> None:
+        """Choose all dots of some rows; row 0 is the dots in doubt."""
+        if self.correction is not None:
+            self.selection = np.flatnonzero(np.isin(self.correction.lattice.row, rows))
+
+    def choose_all(self) -> None:
+        """Choose every dot."""
+        self.selection = np.arange(len(self.dots_px))
+
+    def choose_doubtful(self) -> None:
+        """Choose the dots without a row or a column."""
+        if self.correction is not None:
+            self.selection = np.flatnonzero(~self.correction.sited)
+
+    def choose_none(self) -> None:
+        """Let all dots go."""
+        self.selection = NOTHING
+
+    def choose_next(self, step: int) -> None:
+        """Choose the next dot, or the one before: row by row from the bottom, left to right."""
+        if self.correction is None or not len(self.correction.dots):
+            return
+        lattice = self.correction.lattice
+        order = np.lexsort((self.correction.dots.u_px, lattice.column, lattice.row))
+        places = np.flatnonzero(np.isin(order, self.selection)).tolist()
+        from_none = -1 if step > 0 else 0
+        at = (places[-1] if step > 0 else places[0]) if places else from_none
+        self.selection = order[[(at + step) % len(order)]]
+
+    @property
+    def rows(self) -> list[int]:
+        """Rows that the chosen dots are in, ascending."""
+        if self.correction is None:
+            return []
+        rows = np.unique(self.correction.lattice.row[self.selection])
+        return [int(k) for k in rows[rows > 0]]
+
+    # --- edits --------------------------------------------------------------------------------
+
+    def add(self, image: Image, u: float, v: float, settings: Settings) -> bool:
+        """Add the dot that is pointed at, numbered by its neighbours if they tell its place."""
+
+        def edit(correction: Correction) -> Correction:
+            added = core.add_dot(correction, image, u, v, settings.dots.band_pass)
+            own = np.array([len(added.dots) - 1])
+            try:
+                return picking.numbered_by_neighbours(added, own)
+            except ValueError:
+                return added
+
+        if not self._edit("add a dot", edit):
+            return False
+        self.selection = np.array([len(self.dots_px) - 1])
+        return True
+
+    def delete(self) -> bool:
+        """Take the chosen dots out."""
+        chosen = self.selection
+        done = self._edit(_of("delete", chosen), lambda c: core.delete_dots(c, chosen))
+        self.selection = NOTHING if done else self.selection
+        return done
+
+    def drop(self) -> bool:
+        """Let the chosen dots be where `shift_px` has brought them."""
+        (du, dv), chosen = self.shift_px.tolist(), self.selection
+        self.shift_px = np.zeros(2)
+        if du == dv == 0:
+            return False
+        return self._edit(_of("move", chosen), lambda c: core.move_dots(c, chosen, du, dv))
+
+    def assign(self, row: int | None = None, column: int | None = None) -> bool:
+        """Give the chosen dots a row, a column or both."""
+        chosen, what = self.selection, "row" if column is None else "column"
+        label = f"{what} of {_count(chosen)}"
+        return self._edit(label, lambda c: core.assign(c, chosen, row, column))
+
+    def number(self) -> bool:
+        """Give the chosen dots the row and the column that their neighbours tell."""
+        chosen = self.selection
+        label = f"number {_count(chosen)}"
+        return self._edit(label, lambda c: picking.numbered_by_neighbours(c, _some(chosen)))
+
+    def put_in_doubt(self) -> bool:
+        """Take row and column from the chosen dots."""
+        chosen = self.selection
+        return self._edit(_of("put in doubt", chosen), lambda c: core.clear_rows(c, chosen))
+
+    def shift(self, columns: int) -> bool:
+        """Shift the rows of the chosen dots by columns: right if positive."""
+        rows = self.rows
+
+        def edit(correction: Correction) -> Correction:
+            # The rows may be counted anew after each; they are shifted from what they were.
+            for row in _wanted(rows):
+                correction = core.shift_row(correction, row, columns)
+            return correction
+
+        way = "right" if columns > 0 else "left"
+        return self._edit(f"shift {_named(rows)} {way}", edit)
+
+    def split(self, above: bool = True) -> bool:
+        """Split the row of the one chosen dot: from it on to the right it is a row of its own."""
+        chosen = self.selection
+
+        def edit(correction: Correction) -> Correction:
+            if len(chosen) != 1 or not correction.sited[chosen[0]]:
+                raise ValueError("choose one dot that has a row: the row is split at it")
+            dot = int(chosen[0])
+            lattice = correction.lattice
+            return core.split_row(
+                correction, int(lattice.row[dot]), int(lattice.column[dot]), above
+            )
+
+        return self._edit(f"split {_named(self.rows)}", edit)
+
+    def merge(self) -> bool:
+        """Make one row of the two that the chosen dots are in."""
+        rows = self.rows
+
+        def edit(correction: Correction) -> Correction:
+            if len(rows) != 2:
+                raise ValueError("choose dots of the two rows that are one")
+            return core.merge_rows(correction, rows[1], into=rows[0])
+
+        return self._edit(f"merge {_named(rows)}", edit)
+
+    def block(self) -> bool:
+        """Mark the rows of the chosen dots as blocked by the torch; if all are, unmark them."""
+        rows, correction = self.rows, self.correction
+        marked = correction is not None and set(rows) <= correction.lattice.blocked_rows
+
+        def edit(correction: Correction) -> Correction:
+            for row in _wanted(rows):
+                correction = core.block_row(correction, row, not marked)
+            return correction
+
+        return self._edit(f"{'un' if marked else ''}block {_named(rows)}", edit)
+
+    def set_reference(self, site: Site | None) -> bool:
+        """Say at which row and column the reference is; None leaves it to be found."""
+        return self._edit("reference", lambda c: core.set_reference(c, site))
+
+    def point_at_reference(self, u: float, v: float) -> bool:
+        """Say that the reference is the site at a place."""
+
+        def edit(correction: Correction) -> Correction:
+            found = picking.site_at(correction, u, v)
+            if found is None:
+                raise ValueError("there are no rows yet to tell the reference's row and column by")
+            return core.set_reference(correction, found[0])
+
+        return self._edit("reference", edit)
+
+    def back_to_automatic(self) -> bool:
+        """Forget the correction."""
+        return self._commit("back to automatic", lambda: None)
+
+    def _edit(self, label: str, edit: Callable[[Correction], Correction]) -> bool:
+        correction = self.correction
+
+        def made() -> Correction:
+            if correction is None:
+                raise ValueError("the dots of this frame are still being looked for")
+            return edit(correction)
+
+        return self._commit(label, made)
+
+
+def _some(dots: IntArray) -> IntArray:
+    if not len(dots):
+        raise ValueError("no dot is chosen")
+    return dots
+
+
+def _wanted(rows: list[int]) -> list[int]:
+    if not rows:
+        raise ValueError("choose a row, or a dot that has one")
+    return rows
+
+
+def _count(dots: IntArray) -> str:
+    return f"{len(dots)} dot{'s' * (len(dots) != 1)}"
+
+
+def _of(what: str, dots: IntArray) -> str:
+    return f"{what}: {_count(dots)}"
+
+
+def _named(rows: list[int]) -> str:
+    return f"row{'s' * (len(rows) != 1)} {', '.join(map(str, rows))}".strip()

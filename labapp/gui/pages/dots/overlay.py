@@ -1,0 +1,191 @@
+"""Dots, rows and columns as they are drawn over a frame: few items, whatever the number of dots.
+
+Every row has its colour and its number. A ring is a dot, a square one that a hand has placed; a
+dashed ring is in doubt, a hatched one in a row that the torch blocks, whose line is dashed too. A
+small cross is where the measured surface puts a dot; a large ring is the reference.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import QRectF, Qt
+from PySide6.QtGui import QBrush, QColor, QPen
+
+from labapp.core.correction import Correction
+from labapp.core.values import FloatArray, IntArray
+from labapp.gui.pages.dots import picking
+from labapp.gui.views.picture import PictureView
+
+ROW_COLORS = ("#e69f00", "#56b4e9", "#2fd39b", "#f0e442", "#6f9bff", "#ff7a3c", "#e58cc0")
+"""Okabe and Ito's, safe for the colour-blind, as light as they have to be over a dark frame."""
+
+DOUBT = "#ffffff"
+CHOSEN = "#ffffff"
+COMPUTED = "#ff5c5c"
+SIZE, CHOSEN_SIZE, REFERENCE_SIZE = 13, 17, 26
+"""Points of the screen."""
+
+
+class DotsOverlay:
+    """The marks of the dots page over a picture.
+
+    Parameters
+    ----------
+    view
+        The picture.
+    """
+
+    def __init__(self, view: PictureView) -> None:
+        self._view = view
+        self._correction: Correction | None = None
+        self._joints: tuple[IntArray, ...] = ()
+        self._columns = _line("#ffffff", 70)
+        self._rows = _line("#ffffff", 150)
+        self._blocked = _line("#ffffff", 200, Qt.PenStyle.DashLine)
+        self._dots = pg.ScatterPlotItem(pxMode=True)
+        self._computed = pg.ScatterPlotItem(
+            pxMode=True, symbol="+", size=9, pen=None, brush=QColor(COMPUTED)
+        )
+        self._reference = pg.ScatterPlotItem(
+            pxMode=True, size=REFERENCE_SIZE, pen=pg.mkPen(CHOSEN, width=2), brush=None
+        )
+        self._box = pg.QtWidgets.QGraphicsRectItem()
+        self._box.setPen(_pen(CHOSEN, 1, Qt.PenStyle.DashLine))
+        self._box.hide()
+        self._labels: list[pg.TextItem] = []
+        for item in (self._columns, self._rows, self._blocked, self._computed):
+            view.add(item)
+        for item in (self._dots, self._reference, self._box):
+            view.add(item)
+
+    def show(
+        self,
+        correction: Correction | None,
+        dots_px: FloatArray,
+        selection: IntArray,
+        computed_px: FloatArray,
+    ) -> None:
+        """Draw dots at places, shape (n, 2), px, which are the correction's unless dragged."""
+        if correction is not self._correction:
+            self._correction = correction
+            self._joints = _joints(correction)
+        self._draw_lines(dots_px)
+        self._draw_dots(correction, dots_px, selection)
+        self._computed.setData(*computed_px.T)
+        self._draw_labels(correction, dots_px)
+        self._draw_reference(correction)
+
+    def toggle(self) -> None:
+        """Hide all marks, or show them again."""
+        visible = not self._dots.isVisible()
+        marks = (self._columns, self._rows, self._blocked, self._dots, self._computed)
+        for item in (*marks, self._reference, *self._labels):
+            item.setVisible(visible)
+
+    def show_box(self, one: tuple[float, float], other: tuple[float, float]) -> None:
+        """Show the box that the pointer draws."""
+        corners = np.sort(np.array([one, other]), axis=0)
+        self._box.setRect(QRectF(*corners[0], *(corners[1] - corners[0])))
+        self._box.show()
+
+    def hide_box(self) -> None:
+        """The box is drawn."""
+        self._box.hide()
+
+    def _draw_lines(self, dots_px: FloatArray) -> None:
+        for item, joints in zip(
+            (self._columns, self._rows, self._blocked), self._joints, strict=False
+        ):
+            item.setData(*dots_px[joints.ravel()].T, connect="pairs")
+        if not self._joints:
+            for item in (self._columns, self._rows, self._blocked):
+                item.setData([], [])
+
+    def _draw_dots(
+        self, correction: Correction | None, dots_px: FloatArray, selection: IntArray
+    ) -> None:
+        if correction is None:
+            self._dots.setData([], [])
+            return
+        lattice = correction.lattice
+        chosen = np.zeros(len(dots_px), bool)
+        chosen[selection] = True
+        sited, rows = correction.sited.tolist(), lattice.row.tolist()
+        looks = [
+            _look(row, known, row in lattice.blocked_rows, one)
+            for row, known, one in zip(rows, sited, chosen.tolist(), strict=True)
+        ]
+        self._dots.setData(
+            *dots_px.T,
+            symbol=["s" if hand else "o" for hand in correction.manual.tolist()],
+            size=np.where(chosen, CHOSEN_SIZE, SIZE),
+            pen=[pen for pen, _ in looks],
+            brush=[brush for _, brush in looks],
+        )
+
+    def _draw_labels(self, correction: Correction | None, dots_px: FloatArray) -> None:
+        ends = () if correction is None else picking.row_ends(correction.lattice.row, dots_px)
+        while len(self._labels) < len(ends):
+            label = pg.TextItem(anchor=(1.4, 0.5), fill=(0, 0, 0, 120))
+            label.setVisible(self._dots.isVisible())
+            self._labels.append(label)
+            self._view.add(label)
+        blocked = frozenset() if correction is None else correction.lattice.blocked_rows
+        for label, end in zip(self._labels, ends, strict=False):
+            row, dot = end
+            label.setText(f"{row} blocked" if row in blocked else str(row), row_color(row))
+            label.setPos(*dots_px[dot])
+        for label in self._labels[len(ends) :]:
+            label.setText("")
+
+    def _draw_reference(self, correction: Correction | None) -> None:
+        site = None if correction is None else correction.lattice.reference
+        place = None if correction is None or site is None else picking.site_px(correction, site)
+        self._reference.setData(
+            [] if place is None else place[:1], [] if place is None else place[1:]
+        )
+
+
+def row_color(row: int) -> str:
+    """Colour of a row."""
+    return ROW_COLORS[row % len(ROW_COLORS)]
+
+
+@lru_cache(maxsize=512)
+def _look(row: int, sited: bool, blocked: bool, chosen: bool) -> tuple[QPen, QBrush]:
+    """Outline and filling of a dot."""
+    color = row_color(row) if row else DOUBT
+    style = Qt.PenStyle.SolidLine if sited else Qt.PenStyle.DashLine
+    pen = _pen(CHOSEN if chosen else color, 2.5 if chosen else 1.5, style)
+    if blocked:
+        return pen, QBrush(QColor(color), Qt.BrushStyle.BDiagPattern)
+    filling = QColor(color)
+    filling.setAlpha(130 if chosen else 0)
+    return pen, QBrush(filling)
+
+
+def _joints(correction: Correction | None) -> tuple[IntArray, ...]:
+    """Joined dots: along columns, along rows, along blocked rows."""
+    if correction is None:
+        return ()
+    lattice = correction.lattice
+    along_rows, along_columns = picking.joints(lattice.row, lattice.column)
+    blocked = np.isin(lattice.row[along_rows[:, 0]], list(lattice.blocked_rows))
+    return along_columns, along_rows[~blocked], along_rows[blocked]
+
+
+def _pen(color: str, width: float, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> QPen:
+    pen = QPen(QColor(color), width, style)
+    pen.setCosmetic(True)
+    return pen
+
+
+def _line(color: str, alpha: int, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> pg.PlotCurveItem:
+    pen = _pen(color, 1, style)
+    shade = QColor(color)
+    shade.setAlpha(alpha)
+    pen.setColor(shade)
+    return pg.PlotCurveItem(pen=pen)

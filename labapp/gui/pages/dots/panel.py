@@ -1,0 +1,269 @@
+"""The panel of the dots page: what is seen, the fit, the edits, the rows, the detector."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt, Signal, SignalInstance
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import (
+    QAbstractItemView,
+    QGridLayout,
+    QHeaderView,
+    QLabel,
+    QSizePolicy,
+    QTableWidget,
+    QTableWidgetItem,
+    QToolButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.core.pipeline import Settings
+from labapp.gui.digits import ResultRow
+from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
+
+MOST_ROWS = 60
+COLUMNS_OF_BUTTONS = 3
+
+
+class DotsPanel(QWidget):
+    """What stands beside the frame.
+
+    Signals
+    -------
+    rows_chosen
+        Rows were chosen in the list: their numbers, 0 for the dots in doubt.
+    row_given, column_given
+        The chosen dots are to have this row, this column.
+    reference_given
+        The reference is to be at this row and column.
+    method_chosen
+        Another detector is wanted.
+    number_given
+        A number of a detector: index in `presenter.NUMBERS`, value or None.
+    """
+
+    rows_chosen = Signal(list)
+    row_given = Signal(int)
+    column_given = Signal(int)
+    reference_given = Signal(int, int)
+    method_chosen = Signal(str)
+    number_given = Signal(int, object)
+
+    def __init__(self, edits: Sequence[QAction], frames: Sequence[QAction]) -> None:
+        super().__init__()
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        self.seen, self.why, self.chosen = _words(), _words(), _words()
+        self.fit = ResultTable("Fit before the last edit and after it")
+        layout.addWidget(self.seen)
+        layout.addWidget(self.why)
+        layout.addWidget(self.fit)
+        layout.addWidget(_heading("Chosen"))
+        layout.addWidget(self.chosen)
+        layout.addLayout(self._sites())
+        layout.addLayout(_buttons(edits))
+        layout.addWidget(_heading("Rows"))
+        self.rows = _RowList()
+        self.rows.itemSelectionChanged.connect(lambda: self.rows_chosen.emit(self.rows.chosen()))
+        layout.addWidget(self.rows)
+        layout.addWidget(_heading("Following frames"))
+        self.most = NumberField(
+            "At most", "frames", lowest=1, highest=1_000_000, decimals=0, optional=True,
+            tooltip="Carry on over no more frames than this; empty: to the end of the recording",
+        )  # fmt: skip
+        form = FieldForm()
+        form.add(self.most)
+        layout.addWidget(form)
+        layout.addLayout(_buttons(frames))
+        layout.addWidget(_heading("Detector"))
+        layout.addWidget(self._detector())
+        layout.addStretch(1)
+
+    def show_frame(
+        self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine]
+    ) -> None:
+        """Show what the session says of the frame in view."""
+        self.seen.setText(seen)
+        self.why.setText(f"⚠ {why}" if why else "")
+        self.why.setVisible(bool(why))
+        self.fit.set_rows(fit)
+        self.rows.show_lines(rows)
+
+    def show_chosen(self, words: str, rows: Sequence[int], site: tuple[int, int]) -> None:
+        """Show what is chosen: in words, its rows, and the site of a single dot (0: none)."""
+        self.chosen.setText(words)
+        self.rows.choose(rows)
+        self.row.set_value(site[0] or None)
+        self.column.set_value(site[1] or None)
+
+    def show_reference(self, site: tuple[int, int] | None) -> None:
+        """Show where the reference is."""
+        row, column = site or (None, None)
+        self.reference_row.set_value(row)
+        self.reference_column.set_value(column)
+
+    def show_settings(self, settings: Settings) -> None:
+        """Show how dots are found."""
+        self.method.set_value(settings.dots.method)
+        for number, field in zip(NUMBERS, self.numbers, strict=True):
+            field.set_value(detector_value(settings, number))
+            field.setVisible(number.method == settings.dots.method)
+            field.label.setVisible(number.method == settings.dots.method)
+
+    def _sites(self) -> QGridLayout:
+        """Row and column of the chosen dots, and of the reference."""
+
+        def field(label: str, tip: str) -> NumberField:
+            made = NumberField(
+                label, lowest=-99, highest=999, decimals=0, optional=True, tooltip=tip
+            )
+            return made
+
+        self.row = field("Row", "Row of the chosen dots, counted from the bottom up (T)")
+        self.column = field("Column", "Column of the chosen dots, counted from the left")
+        self.reference_row = field("Reference: row", "Row of the dark centre of the pattern")
+        self.reference_column = field("column", "Column of the dark centre of the pattern")
+        self.row.edited.connect(lambda value: _told(self.row_given, value))
+        self.column.edited.connect(lambda value: _told(self.column_given, value))
+        for part in (self.reference_row, self.reference_column):
+            part.edited.connect(lambda _: self._tell_reference())
+        grid = QGridLayout()
+        for line, pair in enumerate(
+            ((self.row, self.column), (self.reference_row, self.reference_column))
+        ):
+            for k, one in enumerate(pair):
+                one.label.setWordWrap(False)
+                one.editor.setMinimumWidth(one.fontMetrics().horizontalAdvance("0000") + 34)
+                one.editor.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
+                grid.addWidget(one.label, line, 2 * k)
+                grid.addWidget(one, line, 2 * k + 1)
+        return grid
+
+    def _tell_reference(self) -> None:
+        row, column = self.reference_row.value(), self.reference_column.value()
+        if row is not None and column is not None:
+            self.reference_given.emit(int(row), int(column))
+
+    def _detector(self) -> FieldForm:
+        form = FieldForm()
+        self.method = ChoiceField(
+            "Method", METHODS, tooltip="How dots are found in frames not corrected by hand"
+        )
+        self.method.edited.connect(self.method_chosen.emit)
+        form.add(self.method)
+        self.numbers = []
+        for k, number in enumerate(NUMBERS):
+            field = NumberField(
+                number.label, number.unit, lowest=number.lowest, highest=number.highest,
+                step=number.step, decimals=number.decimals, tooltip=number.tooltip,
+                optional=number.optional,
+            )  # fmt: skip
+            field.edited.connect(lambda value, k=k: self.number_given.emit(k, value))
+            form.add(field)
+            self.numbers.append(field)
+        return form
+
+
+class _RowList(QTableWidget):
+    """The rows from the top down; choosing a line chooses its dots."""
+
+    def __init__(self) -> None:
+        super().__init__(0, 4)
+        self._numbers: list[int] = []
+        self.setAccessibleName("Rows")
+        self.setToolTip(
+            "The rows as they lie in the frame: ↑ and ↓ choose one, Shift adds; then shift it "
+            "(Ctrl+← →), block it (B), merge two (M)"
+        )
+        self.setHorizontalHeaderLabels(["Row", "Dots", "Columns", ""])
+        self.verticalHeader().hide()
+        self.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
+        self.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
+        self.setSelectionMode(QAbstractItemView.SelectionMode.ExtendedSelection)
+        self.setTabKeyNavigation(False)
+        self.setShowGrid(False)
+        self.setWordWrap(False)
+        header = self.horizontalHeader()
+        header.setHighlightSections(False)
+        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        header.setSectionResizeMode(3, QHeaderView.ResizeMode.Stretch)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+
+    def show_lines(self, lines: Sequence[RowLine]) -> None:
+        """Show rows; what is chosen stays with its row."""
+        lines = lines[:MOST_ROWS]
+        chosen = self.chosen()
+        with QSignalBlocker(self):
+            self._numbers = [line.row for line in lines]
+            self.setRowCount(len(lines))
+            for k, line in enumerate(lines):
+                texts = (str(line.row or "–"), str(line.dots), line.columns, line.note)
+                for column, text in enumerate(texts):
+                    item = self.item(k, column)
+                    if item is None:
+                        item = QTableWidgetItem()
+                        if column < 3:
+                            right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+                            item.setTextAlignment(right)
+                        self.setItem(k, column, item)
+                    if item.text() != text:
+                        item.setText(text)
+                        item.setToolTip(text)
+        self.choose(chosen)
+        self.resizeRowsToContents()
+        height = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
+        self.setFixedHeight(height + sum(self.rowHeight(k) for k in range(len(lines))))
+
+    def chosen(self) -> list[int]:
+        """Rows of the chosen lines."""
+        lines = sorted({index.row() for index in self.selectedIndexes()})
+        return [self._numbers[k] for k in lines if k < len(self._numbers)]
+
+    def choose(self, rows: Sequence[int]) -> None:
+        """Choose the lines of rows; tells nobody."""
+        if sorted(self.chosen()) == sorted(rows):
+            return
+        with QSignalBlocker(self):
+            self.clearSelection()
+            model = self.selectionModel()
+            ways = QItemSelectionModel.SelectionFlag
+            for k, row in enumerate(self._numbers):
+                if row in rows:
+                    model.select(self.model().index(k, 0), ways.Select | ways.Rows)
+        self.viewport().update()
+
+
+def _told(signal: SignalInstance, value: float | None) -> None:
+    if value is not None:
+        signal.emit(int(value))
+
+
+def _words() -> QLabel:
+    label = QLabel()
+    label.setWordWrap(True)
+    label.setTextFormat(Qt.TextFormat.PlainText)
+    return label
+
+
+def _heading(text: str) -> QLabel:
+    label = QLabel(text)
+    font = label.font()
+    font.setBold(True)
+    label.setFont(font)
+    return label
+
+
+def _buttons(actions: Sequence[QAction]) -> QGridLayout:
+    grid = QGridLayout()
+    grid.setSpacing(3)
+    for k, action in enumerate(actions):
+        button = QToolButton()
+        button.setDefaultAction(action)
+        button.setAccessibleName(action.text())
+        button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        button.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        grid.addWidget(button, k // COLUMNS_OF_BUTTONS, k % COLUMNS_OF_BUTTONS)
+    return grid

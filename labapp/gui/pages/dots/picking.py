@@ -1,0 +1,132 @@
+"""What lies where in a frame: dots under the pointer, joined dots, sites. Arrays only, no Qt."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from labapp.core.correction import Correction, assign, clear_rows
+from labapp.core.lattice import Site
+from labapp.core.values import FloatArray, IntArray
+
+NEIGHBOURS = 8
+"""A site is told from so many numbered dots round it."""
+
+FAR_OFF = 0.35
+"""A dot farther than this share of a step from every site is not numbered."""
+
+
+def nearest(dots_px: FloatArray, u: float, v: float, within_px: float) -> int | None:
+    """Which dot is at a place; None if none is near enough.
+
+    Parameters
+    ----------
+    dots_px
+        (u, v) of the dots, shape (n, 2), px.
+    within_px
+        Farthest distance, px.
+    """
+    if len(dots_px) == 0:
+        return None
+    away = np.hypot(*(dots_px - (u, v)).T)
+    closest = int(np.argmin(away))
+    return closest if away[closest] <= within_px else None
+
+
+def in_box(dots_px: FloatArray, one: tuple[float, float], other: tuple[float, float]) -> IntArray:
+    """Which dots lie in the box with these two corners, its edges included, shape (m,)."""
+    corners = np.array([one, other])
+    inside = (dots_px >= corners.min(axis=0)) & (dots_px <= corners.max(axis=0))
+    return np.flatnonzero(inside.all(axis=1))
+
+
+def joints(row: IntArray, column: IntArray) -> tuple[IntArray, IntArray]:
+    """Dots that follow each other along rows, and along columns: pairs, each shape (m, 2).
+
+    Along a row the next dot is joined wherever it is; along a column only that of the next row, so
+    that a column that a row shifted by mistake runs through is seen to break.
+    """
+    sited = np.flatnonzero((row > 0) & (column > 0))
+    order = sited[np.lexsort((column[sited], row[sited]))]
+    along_rows = np.stack([order[:-1], order[1:]], axis=1)
+    along_rows = along_rows[row[along_rows[:, 0]] == row[along_rows[:, 1]]]
+    order = sited[np.lexsort((row[sited], column[sited]))]
+    up = np.stack([order[:-1], order[1:]], axis=1)
+    next_up = (column[up[:, 0]] == column[up[:, 1]]) & (row[up[:, 1]] == row[up[:, 0]] + 1)
+    return along_rows, up[next_up]
+
+
+def row_ends(row: IntArray, dots_px: FloatArray) -> tuple[tuple[int, int], ...]:
+    """Each row's number and its leftmost dot."""
+    ends = []
+    for k in np.unique(row[row > 0]).tolist():
+        members = np.flatnonzero(row == k)
+        ends.append((k, int(members[np.argmin(dots_px[members, 0])])))
+    return tuple(ends)
+
+
+def site_at(correction: Correction, u: float, v: float) -> tuple[Site, float] | None:
+    """Which site (k, t) is at a place, and how far its middle is, in steps; None without rows.
+
+    The numbered dots round the place tell it.
+    """
+    sited = np.flatnonzero(correction.sited)
+    places = correction.dots.image_px[sited]
+    away = np.hypot(*(places - (u, v)).T)
+    near = np.argsort(away)[:NEIGHBOURS]
+    if len(near) < 3:
+        return None
+    offset = places[near] - (u, v)
+    if np.linalg.matrix_rank(offset - offset.mean(axis=0), tol=1.0) < 2:
+        return None
+    weight = 1 / (1 + (away[near] / max(away[near].min(), 1.0)) ** 2)
+    numbers = np.stack([correction.lattice.row, correction.lattice.column], axis=1)[sited[near]]
+    terms = np.column_stack([np.ones(len(near)), offset])
+    found = np.linalg.lstsq(terms * weight[:, None], numbers * weight[:, None], rcond=None)[0][0]
+    k, t = np.rint(found).astype(int).tolist()
+    return (k, t), float(np.abs(found - (k, t)).max())
+
+
+def site_px(correction: Correction, site: Site) -> FloatArray | None:
+    """Where a site is, shape (2,), px: at its dot, or amid its neighbours; None without rows."""
+    row, column = correction.lattice.row, correction.lattice.column
+    places = correction.dots.image_px
+    own = np.flatnonzero((row == site[0]) & (column == site[1]))
+    if len(own):
+        return np.asarray(places[own[0]])
+    pairs = []
+    for step in (np.array([0, 1]), np.array([1, 0])):
+        ends = [
+            np.flatnonzero((row == k) & (column == t))
+            for k, t in (site + step, site - step)  # beside it, then above and below
+        ]
+        if all(len(end) for end in ends):
+            pairs.append((places[ends[0][0]] + places[ends[1][0]]) / 2)
+    if pairs:
+        return np.asarray(np.mean(pairs, axis=0))
+    sited = np.flatnonzero(correction.sited)
+    offset = np.stack([row, column], axis=1)[sited] - np.array(site)
+    near = np.argsort(np.hypot(*offset.T))[:NEIGHBOURS]
+    if np.linalg.matrix_rank(offset[near] - offset[near].mean(axis=0)) < 2:
+        return None
+    terms = np.column_stack([np.ones(len(near)), offset[near]])
+    return np.asarray(np.linalg.lstsq(terms, places[sited[near]], rcond=None)[0][0])
+
+
+def numbered_by_neighbours(correction: Correction, dots: IntArray) -> Correction:
+    """Give dots the row and the column that the dots round them tell.
+
+    Raises
+    ------
+    ValueError
+        If there are none to tell it, a dot lies between sites, or another dot has its site.
+    """
+    correction = clear_rows(correction, dots)
+    for dot in dots.tolist():
+        u, v = correction.dots.image_px[dot].tolist()
+        found = site_at(correction, u, v)
+        if found is None or found[1] > FAR_OFF:
+            raise ValueError(
+                f"the dots round ({u:.1f}, {v:.1f}) px do not tell its row and column; type them"
+            )
+        correction = assign(correction, [dot], *found[0])
+    return correction

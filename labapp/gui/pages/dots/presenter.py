@@ -1,0 +1,423 @@
+"""What the dots page shows of a session, without Qt."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from labapp.core.correction import Correction
+from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.dots import Dots, Image
+from labapp.core.lattice import Lattice
+from labapp.core.pipeline import Measurement, Settings, start_correction
+from labapp.core.tracking import carry_on
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.errors import InputError
+from labapp.gui.digits import ResultRow, plain
+from labapp.gui.tasks import Cancelled, Control
+from labapp.session.measured import CORRECTION_CHANGED, Result
+from labapp.session.session import Session
+from labapp.session.setup import parse_setup
+
+NO_PLACES: FloatArray = np.zeros((0, 2))
+
+Origin = Literal["corrected", "measured", "found", "looked for"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a detector found in a frame.
+
+    Parameters
+    ----------
+    frame
+        Its number.
+    by
+        The settings that it was found with.
+    correction
+        Dots and rows, as a correction would begin.
+    why
+        What could not be found, a sentence; empty if all was.
+    """
+
+    frame: int
+    by: tuple[DotSettings, LatticeSettings]
+    correction: Correction
+    why: str
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the page shows of one frame.
+
+    Parameters
+    ----------
+    frame
+        Its number.
+    origin
+        Where dots and rows come from.
+    correction
+        The dots and rows, and what an edit begins with; None while they are looked for.
+    computed_px
+        Where the measured surface puts the dots, shape (m, 2), px.
+    result
+        What the frame gave last, which may no longer stand.
+    why
+        What could not be done, a sentence or two.
+    """
+
+    frame: int
+    origin: Origin
+    correction: Correction | None
+    computed_px: FloatArray
+    result: Result | None
+    why: str
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What tells whether an edit made the fit better; lengths in mm, NaN where there are none."""
+
+    status: str
+    matched: int
+    are_mm: float
+    mre_mm: float
+    height_mm: float
+    height_sigma_mm: float
+
+
+@dataclass(frozen=True)
+class RowLine:
+    """One line of the list of rows; row 0 is that of the dots in doubt."""
+
+    row: int
+    dots: int
+    columns: str
+    note: str
+
+
+# --- the frame in view ------------------------------------------------------------------------
+
+
+def shown(session: Session, frame: int, found: Found | None) -> Shown:
+    """What a frame shows: its correction, else what was measured, else what was found."""
+    correction, result = session.correction(frame), session.result(frame)
+    computed = computed_px(result)
+    if correction is not None:
+        why = "" if result is None or result.stale else result.measurement.reason
+        return Shown(frame, "corrected", correction, computed, result, why)
+    by = _by(session)
+    if result is not None and _automatic(result, by):
+        measurement = result.measurement
+        start = start_correction(measurement)
+        return Shown(frame, "measured", start, computed, result, measurement.reason)
+    if found is not None and (found.frame, found.by) == (frame, by):
+        return Shown(frame, "found", found.correction, computed, result, found.why)
+    return Shown(frame, "looked for", None, NO_PLACES, result, "")
+
+
+def wanted(session: Session, frame: int) -> tuple[int, DotSettings, LatticeSettings] | None:
+    """What has to be looked for in a frame, and how; None if the session knows its dots."""
+    if session.correction(frame) is not None:
+        return None
+    by, result = _by(session), session.result(frame)
+    return None if result is not None and _automatic(result, by) else (frame, *by)
+
+
+def _by(session: Session) -> tuple[DotSettings, LatticeSettings]:
+    settings = session.settings
+    return settings.dots, settings.lattice
+
+
+def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
+    """Whether a result holds what these settings find."""
+    measurement = result.measurement
+    same = (result.settings.dots, result.settings.lattice) == by
+    return same and measurement.correction is None and measurement.dots is not None
+
+
+def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) -> Found:
+    """Find dots and rows in a frame without measuring it."""
+    dots: Dots | None = None
+    lattice: Lattice | None = None
+    why = ""
+    try:
+        dots = find_dots(image, by[0])
+        lattice = find_lattice(dots, (image.shape[0], image.shape[1]), by[1])
+    except CannotMeasure as answer:
+        why = answer.reason
+    start = start_correction(Measurement("", "", "fit", dots, lattice))
+    return Found(frame, by, start, why)
+
+
+def computed_px(result: Result | None) -> FloatArray:
+    """Where a measured surface puts the dots that were matched, shape (m, 2), px."""
+    if result is None:
+        return NO_PLACES
+    match, surface = result.measurement.match, result.measurement.reconstruction
+    if match is None or surface is None:
+        return NO_PLACES
+    pair_of = {tuple(ray): n for n, ray in enumerate(match.ray.tolist())}
+    points = [
+        (n, pair_of[tuple(ray)])
+        for n, ray in enumerate(surface.ray.tolist())
+        if tuple(ray) in pair_of
+    ]
+    point, pair = np.array(points, int).reshape(-1, 2).T
+    plane = match.plane_mm[pair] + surface.residual_mm[point]
+    return parse_setup(result.setup, "setup").calibration.to_image(plane)
+
+
+def needs_fit(session: Session, frame: int) -> bool:
+    """Whether a frame's fit has to be redone because its dots or rows were changed by hand."""
+    result = session.result(frame)
+    if result is None:
+        return session.correction(frame) is not None
+    return CORRECTION_CHANGED in result.stale
+
+
+def why_no_fit(session: Session) -> str:
+    """Why no fit can be made at all, a sentence; empty if it can."""
+    if session.read_only:
+        return "The session is open read-only: nothing can be changed or measured"
+    if session.missing_recording is not None:
+        return f"{session.missing_recording.name} is not where it was: say where it is now"
+    try:
+        _ = session.setup
+    except InputError as error:
+        problem = error.problems[0]
+        return f"The set-up is not complete ({problem.field}): no fit yet"
+    return ""
+
+
+# --- in words and numbers ---------------------------------------------------------------------
+
+
+def sentence(seen: Shown) -> str:
+    """What is seen, in a sentence or two."""
+    if seen.correction is None:
+        return "Looking for the dots …"
+    lattice, dots = seen.correction.lattice, seen.correction.dots
+    doubtful = int((~seen.correction.sited).sum())
+    rows = len(set(lattice.row[lattice.row > 0].tolist()))
+    told = {
+        "corrected": "Corrected by hand",
+        "measured": "As measured",
+        "found": "As found, not measured",
+        "looked for": "",
+    }[seen.origin]
+    words = f"{told}: {_several(len(dots), 'dot')} in {_several(rows, 'row')}"
+    words += f", {doubtful} in doubt" if doubtful else ", none in doubt"
+    if lattice.reference is None:
+        words += ". The reference is not known"
+    else:
+        words += ". Reference in row {}, column {}".format(*lattice.reference)
+    return f"{words}."
+
+
+def row_lines(correction: Correction | None) -> tuple[RowLine, ...]:
+    """The list of rows, from the top of the picture down as they are seen, doubtful dots last."""
+    if correction is None:
+        return ()
+    lattice = correction.lattice
+    reference = lattice.reference or (0, 0)
+    numbers = {int(k) for k in lattice.row} | set(lattice.blocked_rows) | {reference[0]}
+    lines = []
+    for k in sorted(numbers - {0}, reverse=True):
+        columns = lattice.column[(lattice.row == k) & (lattice.column > 0)]
+        notes = ["blocked"] * (k in lattice.blocked_rows)
+        notes += [f"reference {reference[1]}"] * (k == reference[0])
+        missing = int(np.sum((lattice.row == k) & (lattice.column == 0)))
+        notes += [f"{missing} without column"] * bool(missing)
+        span = f"{columns.min()}–{columns.max()}" if len(columns) else ""
+        lines.append(RowLine(k, int(np.sum(lattice.row == k)), span, ", ".join(notes)))
+    doubtful = int(np.sum(lattice.row == 0))
+    return (*lines, RowLine(0, doubtful, "", "in doubt")) if doubtful else tuple(lines)
+
+
+def chosen_words(correction: Correction | None, selection: Sequence[int]) -> str:
+    """What is chosen, in a few words."""
+    if correction is None or not len(selection):
+        return "Nothing chosen: click a dot, or draw a box"
+    if len(selection) > 1:
+        return f"{len(selection)} dots chosen"
+    n = int(selection[0])
+    row, column = int(correction.lattice.row[n]), int(correction.lattice.column[n])
+    u, v = correction.dots.image_px[n]
+    site = f"row {row or '–'}, column {column or '–'}"
+    hand = ", by hand" if correction.manual[n] else ""
+    return f"Dot at u {u:.1f}, v {v:.1f} px: {site}{hand}"
+
+
+def figures(result: Result | None) -> Figures | None:
+    """What a result says of its fit; None if it was not measured."""
+    if result is None:
+        return None
+    measurement = result.measurement
+    size = measurement.measures
+    matched = 0 if measurement.match is None else len(measurement.match.dot)
+    names = ("are_mm", "mre_mm", "height_mm", "height_sigma_mm")
+    values = (math.nan if size is None else float(getattr(size, name)) for name in names)
+    return Figures(measurement.status, matched, *values)
+
+
+def compared(before: Figures | None, after: Figures | None, pending: str = "") -> list[ResultRow]:
+    """The fit before the last edit and after it; ``pending`` stands for what is not known yet."""
+
+    def pair(texts: Sequence[str]) -> str:
+        first, last = texts
+        last = pending or last
+        return last if before is None else f"{first} → {last}"
+
+    def length(name: str, digits: int = 3) -> str:
+        values = [math.nan if f is None else getattr(f, name) for f in (before, after)]
+        return pair([plain(v, digits) if math.isfinite(v) else "–" for v in values])
+
+    told = [("–", "–") if f is None else (f.status, str(f.matched)) for f in (before, after)]
+    sigma = math.nan if after is None or pending else after.height_sigma_mm
+    height = length("height_mm") + (f" ± {plain(sigma, 3)}" if math.isfinite(sigma) else "")
+    return [
+        ResultRow("Fit", pair([t[0] for t in told]), note="Status before the edit, and now"),
+        ResultRow("Dots matched", pair([t[1] for t in told])),
+        ResultRow("ARE", length("are_mm"), unit="mm", note="Average reflection error (Eq. 6-3)"),
+        ResultRow("MRE", length("mre_mm"), unit="mm", note="Largest reflection error (Eq. 6-4)"),
+        ResultRow("Height", height, unit="mm", note="Largest height of the pool, with its ±"),
+    ]
+
+
+# --- following frames -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Carried:
+    """How far a correction could be carried on.
+
+    Parameters
+    ----------
+    corrections
+        Frame → correction, without the frame it began with.
+    words
+        Where it stopped and why, a sentence.
+    """
+
+    corrections: dict[int, Correction]
+    words: str
+
+
+def carry(session: Session, seen: Shown, most: int | None, control: Control) -> Carried:
+    """Carry a frame's dots and rows on over the following frames, as far as they fit.
+
+    What was carried when the operator cancels stays.
+
+    Parameters
+    ----------
+    seen
+        The frame to begin with.
+    most
+        No more frames than this; None: to the end.
+    """
+    later = session.frames[session.frames > seen.frame].tolist()[:most]
+    settings, last = session.settings.dots, _confirmed(seen)
+    carried: dict[int, Correction] = {}
+    stopped = "there is no frame after it" if not later else f"up to frame {later[-1]}"
+    for done, number in enumerate(later):
+        try:
+            control.progress(done, len(later))
+            following = carry_on(last, find_dots(session.frame(number).image, settings))
+            why = "it no longer fits there"
+        except Cancelled:
+            following, why = None, "it was cancelled"
+        except (CannotMeasure, InputError) as answer:
+            following, why = None, str(answer)
+        if following is None:
+            stopped = f"stopped before frame {number}: {why}"
+            break
+        carried[number] = last = following
+    return Carried(carried, f"Carried on over {_several(len(carried), 'frame')}, {stopped}")
+
+
+def _confirmed(seen: Shown) -> Correction:
+    """The dots of a frame with the rows that its measurement has confirmed, if it stands."""
+    assert seen.correction is not None
+    result = seen.result
+    if result is None or result.stale or result.measurement.lattice is None:
+        return seen.correction
+    rows = result.measurement.lattice
+    return replace(seen.correction, lattice=rows) if seen.origin == "corrected" else seen.correction
+
+
+# --- the detector -----------------------------------------------------------------------------
+
+METHODS = (
+    ("band-pass", "Band-pass (default)"),
+    ("block-threshold", "Block threshold (§5.2.1)"),
+    ("wavelet", "Wavelet (§5.3)"),
+)
+
+
+@dataclass(frozen=True)
+class DetectorNumber:
+    """A number of a detector that can be set; see the settings class for what it is."""
+
+    method: str
+    name: str
+    label: str
+    unit: str
+    lowest: float
+    highest: float
+    step: float
+    decimals: int
+    tooltip: str
+    optional: bool = False
+
+    @property
+    def group(self) -> str:
+        """Name of the method's part of `DotSettings`."""
+        return self.method.replace("-", "_")
+
+
+NUMBERS = (
+    DetectorNumber("band-pass", "size_px", "Dot size σ", "px", 0.5, 20, 0.1, 1,
+                   "Standard deviation of a dot's light; empty: estimated from the frame", True),
+    DetectorNumber("band-pass", "threshold", "Threshold", "σ", 1, 50, 0.5, 1,
+                   "A dot stands so many times the noise above the background"),
+    DetectorNumber("band-pass", "contrast", "Contrast", "", 0, 1, 0.05, 2,
+                   "… and is at least this fraction of a typical dot"),
+    DetectorNumber("block-threshold", "block_px", "Block size", "px", 8, 200, 1, 0,
+                   "Side of a block: each has its own threshold"),
+    DetectorNumber("block-threshold", "delta_grey", "Threshold ΔI", "levels", 0, 100, 1, 1,
+                   "So far above its block's mean a dot's light is (Eq. 5-9)"),
+    DetectorNumber("block-threshold", "size_divisor", "Size divisor", "", 1, 50, 0.5, 1,
+                   "A dot smaller than the average size over this is noise (Eq. 5-11)"),
+    DetectorNumber("wavelet", "offset_sigma", "Threshold", "σ", 0, 50, 0.5, 1,
+                   "So many times the noise above the mean of its window a dot's light is"),
+    DetectorNumber("wavelet", "soft_threshold", "Denoising", "σ", 0, 10, 0.1, 1,
+                   "Details are shrunk by so many times the noise"),
+)  # fmt: skip
+
+
+def detector_value(settings: Settings, number: DetectorNumber) -> float | None:
+    """What a number of a detector is set to."""
+    value: float | None = getattr(getattr(settings.dots, number.group), number.name)
+    return value
+
+
+def with_detector_value(
+    settings: Settings, number: DetectorNumber, value: float | None
+) -> Settings:
+    """The settings with another number of a detector."""
+    part: Any = replace(getattr(settings.dots, number.group), **{number.name: value})
+    return replace(settings, dots=replace(settings.dots, **{number.group: part}))
+
+
+def with_method(settings: Settings, method: Any) -> Settings:
+    """The settings with another detector."""
+    return replace(settings, dots=replace(settings.dots, method=method))
+
+
+def _several(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"

@@ -1,0 +1,407 @@
+"""The dots page: the frame, its dots and rows, and the keys and buttons that put them right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from PySide6.QtCore import QEvent, QObject, Qt
+from PySide6.QtGui import QAction, QKeyEvent, QKeySequence, QPixmap
+
+from labapp.core.correction import Correction
+from labapp.core.lattice import Site
+from labapp.core.pipeline import Settings
+from labapp.gui.pages.dots import presenter
+from labapp.gui.pages.dots.background import Looking, Refit, carry_on
+from labapp.gui.pages.dots.editing import Editor
+from labapp.gui.pages.dots.overlay import DotsOverlay
+from labapp.gui.pages.dots.panel import DotsPanel
+from labapp.gui.pages.dots.presenter import Figures, Shown
+from labapp.gui.pages.page import Page
+from labapp.gui.views.picture import SHIFT, PictureView, Tool, arrow_step
+from labapp.gui.workspace import Workspace
+
+REACH = 9.0
+"""A dot is meant by a pointer this near, in points of the screen."""
+
+
+class Command(NamedTuple):
+    """One thing a key or button does: its words, its key, what it does in a sentence, and it."""
+
+    text: str
+    key: str
+    tip: str
+    do: Callable[[], object]
+
+
+class DotsPage(Page):
+    """Step 5; see `operator.md`: what is found is shown, and put right by hand."""
+
+    key = "dots"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.editor = Editor(self._commit)
+        self.view = PictureView("Frame with its dots")
+        self.overlay = DotsOverlay(self.view)
+        self.view.tool = self.hand = Hand(self)
+        self.looking = Looking(workspace)
+        self.refit = Refit(workspace)
+        self.seen: Shown | None = None
+        self._before: tuple[int, Figures | None] | None = None
+        self._pointer: tuple[float, float] | None = None
+        self._in_view = False
+        edits = [self._action(command) for command in self._edits()]
+        frames = [self._action(command) for command in self._frame_commands()]
+        for command in self._keys():
+            self._action(command)
+        self.dots_panel = DotsPanel(edits, frames)
+        self.canvas_layout.addWidget(self.view)
+        self.panel_layout.addWidget(self.dots_panel)
+        self.setFocusProxy(self.view)
+        self._connect()
+
+    def _connect(self) -> None:
+        panel = self.dots_panel
+        panel.rows_chosen.connect(lambda rows: self.choose(self.editor.choose_rows, rows))
+        panel.row_given.connect(lambda row: self.editor.assign(row=row))
+        panel.column_given.connect(lambda column: self.editor.assign(column=column))
+        panel.reference_given.connect(lambda *site: self._refer(site))
+        panel.method_chosen.connect(
+            lambda method: self._set(lambda now: presenter.with_method(now, method), "detector")
+        )
+        panel.number_given.connect(self._set_number)
+        self.view.pointed.connect(self._point)
+        self.view.canvas.installEventFilter(self)
+        self.looking.ready.connect(self._again)
+        self.workspace.opened.connect(self._forget)
+
+    # --- what is shown ------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Show the frame in view as the session has it now."""
+        session = self.workspace.session
+        if session is None:
+            return
+        self._in_view = True
+        frame = self.workspace.frame
+        if not len(session.frames):
+            self.view.show_picture(None, "Import a recording first")
+            return
+        same = self.seen is not None and self.seen.frame == frame
+        self.looking.want(frame)
+        self.refit.want(frame)
+        self.seen = presenter.shown(session, frame, self.looking.found)
+        if self.looking.frame == frame:
+            self.view.show_picture(self.looking.image, self.looking.why)
+        self.editor.show(self.seen.correction, same)
+        correction = self.seen.correction
+        self.dots_panel.show_reference(None if correction is None else correction.lattice.reference)
+        self.dots_panel.show_settings(session.settings)
+        self._show_words()
+        self.draw()
+
+    def _show_words(self) -> None:
+        session, seen = self.workspace.session, self.seen
+        assert session is not None
+        assert seen is not None
+        before = self._before
+        figures = presenter.figures(seen.result)
+        stands = seen.result is not None and not seen.result.stale
+        pending = "fitting …" if self.refit.pending else "" if stands else "–"
+        self.dots_panel.show_frame(
+            presenter.sentence(seen),
+            seen.why or (presenter.why_no_fit(session) if not stands else ""),
+            presenter.compared(
+                before[1] if before is not None and before[0] == seen.frame else None,
+                figures,
+                pending,
+            ),
+            presenter.row_lines(seen.correction),
+        )
+
+    def draw(self) -> None:
+        """Draw the marks where the hand has them."""
+        computed = presenter.NO_PLACES if self.seen is None else self.seen.computed_px
+        editor = self.editor
+        self.overlay.show(editor.correction, editor.dots_px, editor.selection, computed)
+        lattice = None if editor.correction is None else editor.correction.lattice
+        site = (0, 0)
+        if lattice is not None and len(editor.selection) == 1:
+            dot = int(editor.selection[0])
+            site = int(lattice.row[dot]), int(lattice.column[dot])
+        elif len(editor.rows) == 1:
+            site = editor.rows[0], 0
+        words = presenter.chosen_words(editor.correction, editor.selection.tolist())
+        self.dots_panel.show_chosen(words, editor.rows, site)
+
+    def choose(self, way: Callable[..., None], *given: object) -> None:
+        """Choose dots some way, and show it."""
+        way(*given)
+        self.draw()
+
+    def leave(self) -> None:
+        """Let go of what is under the hand; a fit under way goes on."""
+        self._in_view = False
+        self.hand.release()
+        self.looking.stop()
+
+    def picture(self) -> QPixmap:
+        """The frame with its marks."""
+        return QPixmap.fromImage(self.view.grab_picture())
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802
+        """Note when the pointer leaves the picture."""
+        if event.type() == QEvent.Type.Leave:
+            self._pointer = None
+        return super().eventFilter(watched, event)
+
+    def _point(self, u: float, v: float, level: object) -> None:
+        self._pointer = (u, v) if level is not None else None
+
+    def _again(self) -> None:
+        if self._in_view:
+            self.refresh()
+
+    def _forget(self) -> None:
+        self.seen = self._before = None
+        self.editor.show(None, same_frame=False)
+
+    # --- what is changed ----------------------------------------------------------------------
+
+    def _commit(self, label: str, edit: Callable[[], Correction | None]) -> bool:
+        """Make an edit of the frame in view one step of the session."""
+        seen = self.seen
+        if seen is None:
+            return False
+        stood = seen.result is not None and not seen.result.stale
+        before, self._before = self._before, (seen.frame, presenter.figures(seen.result))
+        if not stood and before is not None and before[0] == seen.frame:
+            self._before = before  # edits before the fit is done are compared as one
+        done = self.workspace.attempt(
+            lambda session: session.correct({seen.frame: edit()}, f"{label}, frame {seen.frame}")
+        )
+        if not done:
+            self._before = before
+            self.draw()
+        return done
+
+    def _refer(self, site: Site) -> None:
+        correction = self.editor.correction
+        if correction is not None and correction.lattice.reference != site:
+            self.editor.set_reference(site)
+
+    def _set(self, change: Callable[[Settings], Settings], label: str) -> None:
+        self.workspace.attempt(lambda own: own.set_settings(change(own.settings), label))
+
+    def _set_number(self, index: int, value: float | None) -> None:
+        number = presenter.NUMBERS[index]
+        if value is not None or number.optional:
+            label = f"detector: {number.label.lower()}"
+            self._set(lambda now: presenter.with_detector_value(now, number, value), label)
+
+    def add_at(self, u: float, v: float) -> None:
+        """Add the dot at a place."""
+        image, session = self.looking.image, self.workspace.session
+        if image is not None and session is not None and self.looking.frame == self.workspace.frame:
+            self.editor.add(image, u, v, session.settings)
+            self.draw()
+
+    def _at_pointer(self, do: Callable[[float, float], object], ask: str) -> None:
+        """Do something where the pointer is; a button asks for a click first."""
+        if self._pointer is not None:
+            do(*self._pointer)
+        else:
+            self.hand.next_click = do
+            self.workspace.said.emit(f"{ask} (Esc: leave it)", False)
+            self.view.setFocus()
+
+    def _carry_on(self) -> None:
+        seen = self.seen
+        if seen is None or seen.correction is None:
+            self.workspace.said.emit("There are no dots yet to carry on", True)
+            return
+        most = self.dots_panel.most.value()
+        carry_on(self.workspace, seen, None if most is None else int(most))
+
+    def _automatic(self) -> None:
+        if self.seen is not None and self.seen.origin != "corrected":
+            self.workspace.said.emit("This frame is as it was found: nothing was corrected", False)
+        else:
+            self.editor.back_to_automatic()
+
+    def _escape(self) -> None:
+        if self.hand.busy:
+            self.hand.give_up()
+        else:
+            self.editor.choose_none()
+        self.draw()
+
+    def _type_row(self) -> None:
+        self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
+
+    # --- keys and buttons ---------------------------------------------------------------------
+
+    def _action(self, command: Command) -> QAction:
+        action = QAction(command.text, self)
+        tip = f"{command.tip} ({command.key})" if command.key else command.tip
+        action.setToolTip(tip)
+        action.setStatusTip(tip)
+        if command.key:
+            action.setShortcut(QKeySequence(command.key))
+        action.setShortcutContext(Qt.ShortcutContext.WidgetWithChildrenShortcut)
+        action.triggered.connect(lambda *_: command.do())
+        for widget in (self, self.panel):
+            widget.addAction(action)
+        return action
+
+    def _edits(self) -> tuple[Command, ...]:
+        editor = self.editor
+        return (
+            Command("Add dot", "A", "Add the dot under the pointer, or double click it",
+                    lambda: self._at_pointer(self.add_at, "Click where the dot is")),
+            Command("Delete", "Del", "Take the chosen dots out", lambda: self._then(editor.delete)),
+            Command("Number", "N", "Give the chosen dots the row and column their neighbours tell",
+                    editor.number),
+            Command("Row ◂", "Ctrl+Left", "Shift the chosen rows left by a column",
+                    lambda: editor.shift(-1)),
+            Command("Row ▸", "Ctrl+Right", "Shift the chosen rows right by a column",
+                    lambda: editor.shift(1)),
+            Command("In doubt", "U", "Take row and column from the chosen dots",
+                    editor.put_in_doubt),
+            Command("Split up", "S", "From the chosen dot on to the right, a row of its own above",
+                    editor.split),
+            Command("Split down", "Shift+S",
+                    "From the chosen dot on to the right, a row of its own below",
+                    lambda: editor.split(above=False)),
+            Command("Merge", "M", "Make one row of the two that the chosen dots are in",
+                    editor.merge),
+            Command("Blocked", "B", "Mark the chosen rows as hidden in part by the torch, or not",
+                    editor.block),
+            Command("Reference", "R", "The dark centre of the pattern is under the pointer",
+                    lambda: self._at_pointer(editor.point_at_reference,
+                                             "Click where the dark centre of the pattern is")),
+            Command("No reference", "Shift+R", "Leave it to the program to find the reference",
+                    lambda: editor.set_reference(None)),
+        )  # fmt: skip
+
+    def _frame_commands(self) -> tuple[Command, ...]:
+        return (
+            Command("Carry on", "Ctrl+Return", "Apply these dots and rows to the following frames "
+                    "by tracking, until they no longer fit", self._carry_on),
+            Command("Back to automatic", "Ctrl+Backspace", "Forget the corrections of this frame",
+                    self._automatic),
+        )  # fmt: skip
+
+    def _keys(self) -> tuple[Command, ...]:
+        editor = self.editor
+        return (
+            Command("Choose all", "Ctrl+A", "Choose every dot",
+                    lambda: self.choose(editor.choose_all)),
+            Command("Choose none", "Esc", "Let the dots go, or give up a drag", self._escape),
+            Command("Choose in doubt", "D", "Choose the dots in doubt",
+                    lambda: self.choose(editor.choose_doubtful)),
+            Command("Next dot", ".", "Choose the next dot along the row",
+                    lambda: self.choose(editor.choose_next, 1)),
+            Command("Dot before", ",", "Choose the dot before it",
+                    lambda: self.choose(editor.choose_next, -1)),
+            Command("Whole row", "W", "Choose the whole rows of the chosen dots",
+                    lambda: self.choose(editor.choose_rows, editor.rows)),
+            Command("Type a row", "T", "Type the row of the chosen dots", self._type_row),
+            Command("Hide marks", "H", "Hide the marks, or show them again",
+                    self.overlay.toggle),
+        )  # fmt: skip
+
+    def _then(self, edit: Callable[[], bool]) -> None:
+        edit()
+        self.draw()
+
+
+class Hand(Tool):
+    """The pointer and the arrow keys on the dots.
+
+    Attributes
+    ----------
+    next_click
+        What the next click does, where a button asked for one.
+    """
+
+    def __init__(self, page: DotsPage) -> None:
+        self._page = page
+        self._start: tuple[float, float] | None = None
+        self._boxing = self._adds = False
+        self.next_click: Callable[[float, float], object] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a drag is under way or a click is asked for."""
+        return self._start is not None or self.next_click is not None
+
+    def give_up(self) -> None:
+        """Leave the dots where they were."""
+        self._start = self.next_click = None
+        self._page.editor.shift_px[:] = 0
+        self._page.overlay.hide_box()
+
+    def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
+        """Choose a dot, Shift: in addition; or do what a button asked a click for."""
+        if self.next_click is not None:
+            do, self.next_click = self.next_click, None
+            do(u, v)
+            return
+        self._page.choose(self._page.editor.click, u, v, self._reach(), bool(modifiers & SHIFT))
+
+    def double_click(self, u: float, v: float) -> None:
+        """Add a dot."""
+        self._page.add_at(u, v)
+
+    def begin(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> bool:
+        """Take hold of a dot, and of the others chosen with it; or begin a box."""
+        editor = self._page.editor
+        add = bool(modifiers & SHIFT)
+        on = editor.at(u, v, self._reach())
+        self._start, self._adds, self._boxing = (u, v), add, on is None
+        if on is not None and on not in editor.selection:
+            editor.click(u, v, self._reach(), add)
+        return True
+
+    def drag(self, u: float, v: float) -> None:
+        """Move what is held, or draw the box."""
+        if self._start is None:
+            return
+        if self._boxing:
+            self._page.overlay.show_box(self._start, (u, v))
+        else:
+            self._page.editor.shift_px[:] = u - self._start[0], v - self._start[1]
+            self._page.draw()
+
+    def end(self, u: float, v: float) -> None:
+        """Let go: one step that can be undone, or a choice."""
+        if self._start is None:
+            return
+        start, self._start = self._start, None
+        self._page.overlay.hide_box()
+        if self._boxing:
+            self._page.choose(self._page.editor.box, start, (u, v), self._adds)
+        else:
+            self._page.editor.shift_px[:] = u - start[0], v - start[1]
+            self._page.editor.drop()
+
+    def takes(self, event: QKeyEvent) -> bool:
+        """Arrow keys are for the chosen dots; without any they go through the frames."""
+        return bool(len(self._page.editor.selection)) and arrow_step(event) is not None
+
+    def key(self, event: QKeyEvent) -> None:
+        """Nudge; all of a held key is one step that can be undone."""
+        step = arrow_step(event)
+        if step is not None:
+            self._page.editor.shift_px += step
+            self._page.draw()
+
+    def release(self) -> None:
+        """Let the nudged dots be where they are."""
+        if self._start is None and self._page.editor.shift_px.any():
+            self._page.editor.drop()
+
+    def _reach(self) -> float:
+        return REACH * self._page.view.px_per_point
