@@ -8,6 +8,7 @@ small cross is where the measured surface puts a dot; a large ring is the refere
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
@@ -25,6 +26,9 @@ ROW_COLORS = ("#e69f00", "#56b4e9", "#2fd39b", "#f0e442", "#6f9bff", "#ff7a3c", 
 DOUBT = "#ffffff"
 CHOSEN = "#ffffff"
 COMPUTED = "#ff5c5c"
+BLOCKED = "⊘"
+"""Beside the number of a row that the torch blocks."""
+
 SIZE, CHOSEN_SIZE, REFERENCE_SIZE = 13, 17, 26
 """Points of the screen."""
 
@@ -45,11 +49,9 @@ class DotsOverlay:
         self._columns = _line("#ffffff", 70)
         self._rows = _line("#ffffff", 150)
         self._blocked = _line("#ffffff", 200, Qt.PenStyle.DashLine)
-        self._dots = pg.ScatterPlotItem(pxMode=True)
-        self._computed = pg.ScatterPlotItem(
-            pxMode=True, symbol="+", size=9, pen=None, brush=QColor(COMPUTED)
-        )
-        self._reference = pg.ScatterPlotItem(
+        self._dots = _Marks(pxMode=True)
+        self._computed = _Marks(pxMode=True, symbol="+", size=9, pen=None, brush=QColor(COMPUTED))
+        self._reference = _Marks(
             pxMode=True, size=REFERENCE_SIZE, pen=pg.mkPen(CHOSEN, width=2), brush=None
         )
         self._box = pg.QtWidgets.QGraphicsRectItem()
@@ -129,14 +131,14 @@ class DotsOverlay:
     def _draw_labels(self, correction: Correction | None, dots_px: FloatArray) -> None:
         ends = () if correction is None else picking.row_ends(correction.lattice.row, dots_px)
         while len(self._labels) < len(ends):
-            label = pg.TextItem(anchor=(1.4, 0.5), fill=(0, 0, 0, 120))
+            label = pg.TextItem(anchor=(1.4, 0.5), fill=(0, 0, 0, 60))
             label.setVisible(self._dots.isVisible())
             self._labels.append(label)
             self._view.add(label)
         blocked = frozenset() if correction is None else correction.lattice.blocked_rows
         for label, end in zip(self._labels, ends, strict=False):
             row, dot = end
-            label.setText(f"{row} blocked" if row in blocked else str(row), row_color(row))
+            label.setText(f"{row} {BLOCKED}" if row in blocked else str(row), row_color(row))
             label.setPos(*dots_px[dot])
         for label in self._labels[len(ends) :]:
             label.setText("")
@@ -147,6 +149,14 @@ class DotsOverlay:
         self._reference.setData(
             [] if place is None else place[:1], [] if place is None else place[1:]
         )
+
+
+class _Marks(pg.ScatterPlotItem):  # type: ignore[misc]
+    """Marks that leave clicks to the picture's tool."""
+
+    def mouseClickEvent(self, event: Any) -> None:  # noqa: N802
+        """Leave it."""
+        event.ignore()
 
 
 def row_color(row: int) -> str:

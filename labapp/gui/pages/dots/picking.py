@@ -106,7 +106,7 @@ def site_px(correction: Correction, site: Site) -> FloatArray | None:
     sited = np.flatnonzero(correction.sited)
     offset = np.stack([row, column], axis=1)[sited] - np.array(site)
     near = np.argsort(np.hypot(*offset.T))[:NEIGHBOURS]
-    if np.linalg.matrix_rank(offset[near] - offset[near].mean(axis=0)) < 2:
+    if len(near) < 3 or np.linalg.matrix_rank(offset[near] - offset[near].mean(axis=0)) < 2:
         return None
     terms = np.column_stack([np.ones(len(near)), offset[near]])
     return np.asarray(np.linalg.lstsq(terms, places[sited[near]], rcond=None)[0][0])

@@ -1,0 +1,388 @@
+"""The dots page: what it shows of a session, and a hand that puts a frame right."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
+from PySide6.QtGui import QMouseEvent
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QHBoxLayout, QWidget
+from pytestqt.qtbot import QtBot
+
+from labapp.core.correction import Correction, add_dot, delete_dots, shift_row
+from labapp.core.pipeline import start_correction
+from labapp.gui.pages.dots import DotsPage, presenter
+from labapp.gui.tasks import Control
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+
+CopySample = Callable[[str], Path]
+KEPT: list[QWidget] = []
+CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftModifier
+
+
+@pytest.fixture
+def page(qtbot: QtBot) -> Iterator[DotsPage]:
+    """The page with its panel beside it, and the signals as the window connects them."""
+    space = Workspace()
+    page = DotsPage(space)
+    space.changed.connect(page.refresh)
+    space.frame_changed.connect(lambda _: page.refresh())
+    beside = QWidget()
+    layout = QHBoxLayout(beside)
+    layout.addWidget(page, 1)
+    layout.addWidget(page.panel)
+    KEPT.append(beside)
+    beside.resize(1300, 900)
+    beside.show()
+    beside.activateWindow()
+    qtbot.waitExposed(beside)
+    yield page
+    page.leave()
+    space.close()
+
+
+@pytest.fixture
+def unfitted(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
+    """Frames that would have been measured."""
+    asked: list[list[int]] = []
+    monkeypatch.setattr(Workspace, "measure", lambda self, frames=None: asked.append(list(frames)))
+    return asked
+
+
+def show(page: DotsPage, qtbot: QtBot, path: Path, frame: int) -> Session:
+    assert page.workspace.open(path)
+    page.workspace.show_frame(frame)
+    session = page.workspace.session
+    assert session is not None
+    qtbot.waitUntil(lambda: page.looking.frame == frame and page.editor.correction is not None)
+    QTest.qWait(20)
+    return session
+
+
+def origin(page: DotsPage) -> str:
+    return "" if page.seen is None else page.seen.origin
+
+
+def at(page: DotsPage, u: float, v: float) -> QPoint:
+    port: QPoint = page.view.canvas.mapFromScene(page.view.box.mapViewToScene(QPointF(u, v)))
+    return port
+
+
+def click(page: DotsPage, place: np.ndarray, *, shift: bool = False) -> None:
+    port = page.view.canvas.viewport()
+    modifier = SHIFT if shift else Qt.KeyboardModifier.NoModifier
+    QTest.mouseClick(port, Qt.MouseButton.LeftButton, modifier, at(page, *place))
+
+
+def double_click(page: DotsPage, place: np.ndarray) -> None:
+    # As a mouse does it; QTest.mouseDClick presses once more in between.
+    port, there, left = page.view.canvas.viewport(), at(page, *place), Qt.MouseButton.LeftButton
+    click(page, place)
+    again = QMouseEvent(
+        QEvent.Type.MouseButtonDblClick, QPointF(there), QPointF(port.mapToGlobal(there)),
+        left, left, Qt.KeyboardModifier.NoModifier,
+    )  # fmt: skip
+    QApplication.sendEvent(port, again)
+    QTest.mouseRelease(port, left, pos=there)
+
+
+def drag(page: DotsPage, start: np.ndarray, end: np.ndarray) -> None:
+    port = page.view.canvas.viewport()
+    first, last = at(page, *start), at(page, *end)
+    QTest.mousePress(port, Qt.MouseButton.LeftButton, pos=first)
+    for part in (0.25, 0.5, 0.75, 1.0):
+        QTest.mouseMove(port, first + (last - first) * part)
+        QTest.qWait(5)
+    QTest.mouseRelease(port, Qt.MouseButton.LeftButton, pos=last)
+
+
+def key(page: DotsPage, which: Qt.Key, modifier: Qt.KeyboardModifier | None = None) -> None:
+    QTest.keyClick(page.view, which, modifier or Qt.KeyboardModifier.NoModifier)
+
+
+def spoiled(session: Session, frame: int) -> tuple[Correction, np.ndarray, int]:
+    """One row off by a column, two false dots, one dot missed: its place, and the row."""
+    result = session.result(frame)
+    assert result is not None
+    good = start_correction(result.measurement)
+    image = session.frame(frame).image
+    lattice = good.lattice
+    missed = int(np.flatnonzero((lattice.row == 3) & (lattice.column == 7))[0])
+    place = good.dots.image_px[missed]
+    bad = delete_dots(good, [missed])
+    for u, v in ((60.0, 60.0), (430.0, 90.0)):
+        bad = add_dot(bad, image, u, v)
+    return shift_row(bad, 5, 1), place, 5
+
+
+def truth(path: Path, frame: int) -> dict[str, float]:
+    with (path.parent / "truth.csv").open() as file:
+        return {name: float(value) for name, value in list(csv.DictReader(file))[frame].items()}
+
+
+def test_a_spoiled_frame_is_put_right_in_fifteen_actions(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample
+) -> None:
+    path = copy_sample("gtaw")
+    with Session.open(path) as session:
+        bad, missed, row = spoiled(session, 0)
+        session.correct({0: bad})
+        steps = len(session.history)
+    session = show(page, qtbot, path, 0)
+    actions = 0
+
+    for false in (bad.dots.image_px[-1], bad.dots.image_px[-2]):
+        click(page, false)
+        key(page, Qt.Key.Key_Delete)
+        actions += 2
+    double_click(page, missed)
+    actions += 1
+    own = bad.lattice.row == row
+    click(page, bad.dots.image_px[np.flatnonzero(own)[3]])
+    key(page, Qt.Key.Key_Left, CONTROL)
+    actions += 2
+
+    assert actions <= 15
+    assert len(session.history) == steps + 4
+    qtbot.waitUntil(lambda: not presenter.needs_fit(session, 0), timeout=60_000)
+    result = session.result(0)
+    assert result is not None
+    assert not result.stale
+    assert result.measurement.status == "ok"
+    size = result.measurement.measures
+    assert size is not None
+    known = truth(path, 0)
+    assert size.height_mm == pytest.approx(known["height_mm"], rel=0.03)
+    assert size.width_mm == pytest.approx(known["width_mm"], rel=0.02)
+    assert size.length_mm == pytest.approx(known["length_mm"], rel=0.02)
+    assert size.mre_mm < 0.05
+    # What was before the edits and what is now stand beside each other.
+    qtbot.waitUntil(lambda: not page.refit.pending)
+    table = {row.name: row.value for row in page.dots_panel.fit.rows}
+    assert str(table["Fit"]).endswith("→ ok")
+
+
+def test_an_unmeasured_frame_shows_what_is_found_in_it(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    path = copy_sample("gtaw")
+    session = show(page, qtbot, path, 4)
+    assert origin(page) == "measured"
+    count = len(page.editor.dots_px)
+    # Other settings: the dots are found anew, in the background, and the fewer are shown.
+    page.dots_panel.number_given.emit(1, 40.0)
+    assert session.settings.dots.band_pass.threshold == 40
+    qtbot.waitUntil(lambda: page.editor.correction is not None)
+    assert origin(page) == "found"
+    assert 0 < len(page.editor.dots_px) < count
+    page.workspace.undo()
+    qtbot.waitUntil(lambda: len(page.editor.dots_px) == count)
+    assert unfitted == []
+
+
+def test_clicks_boxes_drags_and_keys(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("blocked_rows"), 0)
+    editor, start = page.editor, page.editor.dots_px.copy()
+    steps = len(session.history)
+    click(page, start[10])
+    assert editor.selection.tolist() == [10]
+    click(page, start[11], shift=True)
+    assert editor.selection.tolist() == [10, 11]
+    click(page, start[10], shift=True)
+    assert editor.selection.tolist() == [11]
+
+    drag(page, start[11], start[11] + (6, -4))
+    assert len(session.history) == steps + 1
+    moved = editor.dots_px[11] - start[11]
+    assert moved == pytest.approx((6, -4), abs=0.7)
+    kept = session.correction(0)
+    assert kept is not None
+    np.testing.assert_array_equal(kept.dots.image_px, editor.dots_px)
+    assert kept.manual.tolist() == [n == 11 for n in range(len(start))]
+
+    key(page, Qt.Key.Key_Right)
+    key(page, Qt.Key.Key_Up, SHIFT)
+    assert editor.dots_px[11] - start[11] == pytest.approx(moved + np.array([0.1, -1]))
+    assert len(session.history) == steps + 3
+    page.workspace.undo()
+    page.workspace.undo()
+    page.workspace.undo()
+    np.testing.assert_array_equal(editor.dots_px, start)
+    assert session.correction(0) is None
+
+    low, high = start.min(axis=0) - 8, start.max(axis=0) + 8
+    drag(page, low, high)
+    assert len(editor.selection) == len(start)
+    key(page, Qt.Key.Key_Escape)
+    assert len(editor.selection) == 0
+    assert unfitted[0] == [0]
+
+
+def test_a_refused_edit_says_why_and_changes_nothing(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("blocked_rows"), 0)
+    steps, said = len(session.history), []
+    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    for which in (Qt.Key.Key_Delete, Qt.Key.Key_M, Qt.Key.Key_S, Qt.Key.Key_B, Qt.Key.Key_N):
+        key(page, which)
+    lattice = page.editor.correction.lattice if page.editor.correction else None
+    assert lattice is not None
+    page.editor.choose_rows([4])
+    page.dots_panel.row_given.emit(5)  # where other dots are
+    assert [problem for _, problem in said] == [True] * 6
+    assert "no dot is chosen" in said[0][0]
+    assert "and cannot be that of" in said[-1][0]
+    assert len(session.history) == steps
+    assert unfitted == []
+
+
+def test_rows_are_edited_from_the_list_by_keyboard(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("blocked_rows"), 0)
+    rows = page.dots_panel.rows
+    before = page.editor.correction
+    assert before is not None
+    rows.setFocus()
+    rows.selectRow(0)
+    top = int(before.lattice.row.max())
+    assert page.editor.rows == [top]
+    QTest.keyClick(rows, Qt.Key.Key_Down)
+    assert page.editor.rows == [top - 1]
+    QTest.keyClick(rows, Qt.Key.Key_B)
+    after = session.correction(0)
+    assert after is not None
+    assert after.lattice.blocked_rows == before.lattice.blocked_rows | {top - 1}
+    assert page.editor.rows == [top - 1]
+    note = rows.item(1, 3)
+    assert note is not None
+    assert "blocked" in note.text()
+    QTest.keyClick(rows, Qt.Key.Key_Right, CONTROL)
+    after = session.correction(0)
+    assert after is not None
+    own = before.lattice.row == top - 1
+    np.testing.assert_array_equal(after.lattice.column[own], before.lattice.column[own] + 1)
+    np.testing.assert_array_equal(after.lattice.column[~own], before.lattice.column[~own])
+    assert [change.label for change in session.history][-2:] == [
+        f"block row {top - 1}, frame 0",
+        f"shift row {top - 1} right, frame 0",
+    ]
+
+
+def test_split_merge_and_reference(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    show(page, qtbot, copy_sample("blocked_rows"), 3)
+    editor = page.editor
+    before = editor.correction
+    assert before is not None
+    assert before.lattice.reference is None
+    # The README of the sample says where it is on the picture, and which site that is.
+    page._pointer = (278.0, 281.0)
+    key(page, Qt.Key.Key_R)
+    assert editor.correction is not None
+    assert editor.correction.lattice.reference == (6, 8)
+    dot = int(np.flatnonzero((before.lattice.row == 4) & (before.lattice.column == 8))[0])
+    editor.selection = np.array([dot])
+    key(page, Qt.Key.Key_S)
+    split = editor.correction.lattice
+    assert split.row.max() == before.lattice.row.max() + 1
+    assert split.reference == (7, 8)
+    editor.choose_rows([4, 5])
+    key(page, Qt.Key.Key_M)
+    np.testing.assert_array_equal(editor.correction.lattice.row, before.lattice.row)
+    assert editor.correction.lattice.reference == (6, 8)
+
+
+def test_a_correction_is_carried_on_and_taken_back(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("blocked_rows"), 2)
+    said: list[str] = []
+    page.workspace.said.connect(lambda words, problem: said.append(words))
+    earlier = session.correction(2)
+    key(page, Qt.Key.Key_Return, CONTROL)
+    qtbot.waitUntil(lambda: bool(said), timeout=20_000)
+    assert "Carried on over 3 frames, up to frame 5" in said[0]
+    assert session.corrected_frames().tolist() == [2, 3, 4, 5]
+    assert unfitted == [[3, 4, 5]]
+    for frame in (3, 4, 5):
+        carried = session.correction(frame)
+        assert carried is not None
+        assert carried.lattice.reference == (6, 8)
+    page.workspace.undo()
+    assert session.corrected_frames().tolist() == [2]
+    page.workspace.show_frame(2)
+    key(page, Qt.Key.Key_Backspace, CONTROL)
+    assert session.correction(2) is None
+    page.workspace.undo()
+    again = session.correction(2)
+    assert again is not None
+    assert earlier is not None
+    np.testing.assert_array_equal(again.lattice.row, earlier.lattice.row)
+
+
+def test_carrying_on_keeps_what_was_done_when_it_is_cancelled(copy_sample: CopySample) -> None:
+    with Session.open(copy_sample("blocked_rows")) as session:
+        control = Control()
+
+        def progress(done: int, total: int) -> None:
+            if done == 2:
+                control.cancelled.set()
+            control.check()
+
+        control.progress = progress  # type: ignore[method-assign]
+        carried = presenter.carry(session, presenter.shown(session, 2, None), None, control)
+        assert list(carried.corrections) == [3, 4]
+        assert "stopped before frame 5: it was cancelled" in carried.words
+
+
+def test_what_is_shown_without_a_window(copy_sample: CopySample) -> None:
+    with Session.open(copy_sample("blocked_rows")) as session:
+        seen = presenter.shown(session, 0, None)
+        assert seen.origin == "measured"
+        assert presenter.wanted(session, 0) is None
+        assert seen.correction is not None
+        # Computed dots lie on the captured ones: the sample's surface fits.
+        near = np.linalg.norm(
+            seen.computed_px[:, None] - seen.correction.dots.image_px[None], axis=-1
+        ).min(axis=1)
+        assert len(near) > 90
+        assert near.max() < 1.0
+        assert presenter.sentence(seen).startswith("As measured: 99 dots in 9 rows")
+        lines = presenter.row_lines(seen.correction)
+        assert [line.row for line in lines if line.row] == list(range(9, 0, -1))
+        assert sum(line.dots for line in lines) == 99
+        assert [line.note for line in lines if line.row == 6] == ["reference 8"]
+        assert not presenter.needs_fit(session, 0)
+        session.correct({0: shift_row(seen.correction, 4, 1)})
+        assert presenter.needs_fit(session, 0)
+        assert presenter.shown(session, 0, None).origin == "corrected"
+        session.correct({0: None})
+        assert presenter.shown(session, 0, None).origin == "measured"
+        assert not presenter.needs_fit(session, 0)
+
+
+def test_figures_before_and_after() -> None:
+    before = presenter.Figures("no-match", 0, *[float("nan")] * 4)
+    after = presenter.Figures("ok", 94, 0.1234, 0.5, 0.25, 0.006)
+    rows = {row.name: row.value for row in presenter.compared(before, after)}
+    assert rows == {
+        "Fit": "no-match → ok",
+        "Dots matched": "0 → 94",
+        "ARE": "– → 0.123",
+        "MRE": "– → 0.500",
+        "Height": "– → 0.250 ± 0.006",
+    }
+    waiting = {row.name: row.value for row in presenter.compared(after, after, "fitting …")}
+    assert waiting["ARE"] == "0.123 → fitting …"
+    assert presenter.compared(None, after)[0].value == "ok"
