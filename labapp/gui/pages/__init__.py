@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends import TrendsPage
 
-PAGES: tuple[type[Page], ...] = (TrendsPage,)
+PAGES: tuple[type[Page], ...] = (
+    DotsPage,
+    TrendsPage,
+)
 """In the order of `steps.STEPS`; a step without a page is not shown."""
