@@ -10,13 +10,14 @@ import pytest
 
 from labapp.session.export import verify_export
 from labapp.session.session import Session
+from tests.conftest import Run
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_the_examples_of_the_python_api_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+) -> None:
     for name in ("thumb_tack", "blocked_rows"):
         shutil.copytree(ROOT / "sample_sessions" / name, tmp_path / "sample_sessions" / name)
     monkeypatch.chdir(tmp_path)
@@ -37,3 +38,29 @@ def test_the_examples_of_the_python_api_run(
     for session in ("tack", "blocked"):
         with Session.open(f"{session}.labsession", read_only=True) as opened:
             assert opened.problems() == []
+
+
+def test_the_worked_example_of_the_command_line_says_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, labapp: Run
+) -> None:
+    sample = ROOT / "sample_sessions/blocked_rows"
+    for name in ("blocked_rows.labsession", "recording.mkv", "setup.toml"):
+        shutil.copy(sample / name, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs/command-line.md").read_text("utf-8").replace("\\\n", " ")
+    example = text.partition("### A worked example")[2].partition("### correct")[0]
+    commands = re.findall(r"^    labapp session (.*)$", example, re.MULTILINE)
+    assert [line.split()[0] for line in commands] == "new import measure correct export".split()
+    # The sample is what the first three make, with a set-up found and frame 2 corrected.
+    (tmp_path / "blocked_rows.labsession").rename("run.labsession")
+    assert labapp("session", "undo", "run.labsession")[0] == 0
+    assert labapp("session", "setup", "run.labsession", "setup.toml")[0] == 0
+    assert labapp("session", "measure", "run.labsession", "--frames", "2")[0] == 1
+    code, told, _ = labapp("session", *commands[3].split())
+    assert code == 0
+    expected = re.findall(r"^    (.*)$", example.partition("--carry-on")[2], re.MULTILINE)[:6]
+    assert expected.pop(4) == "  …"
+    assert not set(expected) - set(told.splitlines())
+    code, told, _ = labapp("session", *commands[4].removesuffix(" --report").split())
+    assert code == 0
+    assert verify_export("results") == []

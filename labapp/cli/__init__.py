@@ -28,6 +28,7 @@ from labapp.cli.shared import (
     FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING,
+    RECORDING_HELP,
     failure,
     measure_frames,
     note,
@@ -151,9 +152,7 @@ def program(
 
 @app.command()
 def reconstruct(
-    source: Annotated[
-        Path, typer.Argument(help="An image, a folder of images, or a video (AVI, MKV, MP4).")
-    ],
+    source: Annotated[Path, typer.Argument(help=RECORDING_HELP)],
     setup: Annotated[Path, typer.Option(help="Setup file (TOML; mm, degrees, px).")],
     out: Annotated[
         Path,

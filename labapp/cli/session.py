@@ -17,6 +17,7 @@ from labapp.cli.shared import (
     FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING,
+    RECORDING_HELP,
     choose_frames,
     command,
     finite,
@@ -113,10 +114,7 @@ def import_recording(
     file: File,
     recording: Annotated[
         Path,
-        typer.Argument(
-            help="A video, an image, a folder of images, a TIFF or NumPy stack, a Phantom .cine, "
-            "a Photron .mraw or its header."
-        ),
+        typer.Argument(help=RECORDING_HELP),
     ],
     frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
     frame_rate: Annotated[
@@ -294,9 +292,7 @@ def export(
     from labapp.session.tables import TABLES
 
     if surfaces == pictures == "none" and not (tables or hdf5 or report):
-        raise InputError(
-            "export", "choice", "nothing", "tables, surfaces, HDF5, pictures or report"
-        )
+        raise InputError("export", "choice", "nothing", "tables, surfaces, HDF5, pictures, report")
     choice = ExportChoice(
         tables=frozenset(TABLES if tables else ()),
         surfaces=_words(surfaces),
@@ -306,9 +302,8 @@ def export(
     )
     with Session.open(file, read_only=True) as session, _counted(f"writing {out.name}") as progress:
         chosen = None if frames is None else choose_frames(session, frames)
-        seen = session.overview(scheme)
         wanted = set(session.frames.tolist() if chosen is None else chosen)
-        missing = {int(f) for f, s in zip(seen.frame, seen.status, strict=True) if not s} & wanted
+        missing = wanted & _not_measured(session, scheme)
         files = session.export(
             out,
             choice,
@@ -320,6 +315,11 @@ def export(
     if missing:
         typer.echo(f"Not measured, so not in it: {frames_text(missing)}")
     typer.echo(f"{several(len(files), 'file')} and the manifest are in {out.absolute()}")
+
+
+def _not_measured(session: Session, scheme: str | None) -> set[int]:
+    seen = session.overview(scheme)
+    return {int(f) for f, status in zip(seen.frame, seen.status, strict=True) if not status}
 
 
 def _words(text: str) -> frozenset[str]:

@@ -26,6 +26,10 @@ INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 130, 3, 2, 1
 RUNS_SHOWN = 6
 
 FRAMES_METAVAR = "A:B:STEP"
+RECORDING_HELP = (
+    "A video, an image, a folder of images, a TIFF or NumPy stack, a Phantom .cine, "
+    "a Photron .mraw or its header."
+)
 FRAMES_HELP = "Frames A to before B, counted from 0, every STEP-th; parts may be left out."
 
 
