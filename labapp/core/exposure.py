@@ -127,7 +127,7 @@ def _without_dots(grey: Grey, level: float, clipped: float) -> Verdict:
 
 def _clipped(grey: Grey, full: float) -> BoolArray:
     """Pixels at full scale, and plateaus at the brightest level: a 12-bit camera's 16-bit file."""
-    top = grey == grey.max(initial=0.0)
+    top = (grey == grey.max(initial=0.0)) & (np.ptp(grey) > 0 if grey.size else False)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     plateau = cv2.erode(top.astype(np.uint8), cross, borderValue=0).astype(bool)
     return np.asarray((grey >= full) | plateau)

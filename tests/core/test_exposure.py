@@ -94,4 +94,5 @@ def test_one_dot_and_a_tiny_frame_are_judged_too() -> None:
     one = picture(0, noise=1.0)
     one[70:75, 70:75] += 100
     assert judged(one).verdict in {"good", "saturated"}
-    assert judged(np.zeros((4, 4), np.uint8)).verdict == "blank"
+    dark = judged(np.zeros((4, 4), np.uint8))
+    assert (dark.verdict, dark.clipped) == ("blank", 0)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from labapp.gui.pages.capture import CapturePage
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends import TrendsPage
 
 PAGES: tuple[type[Page], ...] = (
+    CapturePage,
     DotsPage,
     TrendsPage,
 )

@@ -1,0 +1,426 @@
+"""The recording page: choose, look, import; what was read; how the frame in view is exposed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QFileDialog,
+    QFormLayout,
+    QHBoxLayout,
+    QLabel,
+    QProgressBar,
+    QPushButton,
+    QSlider,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.dialogs import EVERYTHING, RECORDINGS
+from labapp.gui.pages.capture.presenter import (
+    Choice,
+    Preview,
+    Seen,
+    bars,
+    choice_in_words,
+    look,
+    missing_in_words,
+    recording_in_words,
+    refusal,
+)
+from labapp.gui.pages.page import Page
+from labapp.gui.tasks import Control, Task
+from labapp.gui.views.fields import FieldForm, NumberField
+from labapp.gui.views.picture import PictureView
+from labapp.gui.workspace import Workspace
+from labapp.session.record import Recording
+
+MOST_HZ = 1e7
+NONE_YET = "Choose a video, an image, a folder of images or a stack, or drop it on the window."
+
+
+class CapturePage(Page):
+    """Where the frames come from."""
+
+    key = "capture"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.preview: Preview | None = None
+        self._opening: Task | None = None
+        self._importing: Task | None = None
+        self._reading: Task | None = None
+        self._wanted: tuple[Preview | None, int] | None = None
+        self._seen: tuple[Preview | None, int] | None = None
+        self._told: Recording | None = None
+        self._last_folder = Path()
+        self.title = QLabel()
+        self.title.setContentsMargins(8, 4, 8, 0)
+        self.title.setWordWrap(True)
+        self.picture_view = PictureView("Frame of the recording")
+        self.slider = QSlider(Qt.Orientation.Horizontal)
+        self.slider.setAccessibleName("Frame of the preview")
+        self.slider.setToolTip("Which frame of the recording to look at before importing it")
+        self.slider.valueChanged.connect(lambda _: self._look())
+        self.canvas_layout.addWidget(self.title)
+        self.canvas_layout.addWidget(self.picture_view, 1)
+        self.canvas_layout.addWidget(self.slider)
+        self._make_panel()
+        workspace.opened.connect(self._drop_preview)
+        workspace.tasks.changed.connect(self._show_import)
+
+    # --- what it shows ------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Show the session's recording, or the one to be imported."""
+        session = self.workspace.session
+        if session is None:
+            return
+        recording = session.recording
+        missing = missing_in_words(session)
+        self.missing.setText(missing)
+        self.find_button.setEnabled(not session.read_only)
+        for widget in (self.missing, self.find_button):
+            widget.setVisible(bool(missing))
+        self._show_recording(recording)
+        self._show_import()
+        self._look()
+
+    def take(self, path: Path) -> None:
+        """Look at a recording, to import it."""
+        self.choose(path)
+
+    def _show_recording(self, recording: Recording | None) -> None:
+        self.told_group.setVisible(recording is not None)
+        if recording is None or recording == self._told:
+            return
+        self._told = recording
+        while self.told.rowCount():
+            self.told.removeRow(0)
+        for name, words in recording_in_words(recording):
+            self.told.addRow(f"{name}:", _words(words))
+        for sentence in recording.warnings:
+            self.told.addRow(_words(f"⚠ {sentence}"))
+
+    def _show_import(self) -> None:
+        working = self._importing in self.workspace.tasks.active
+        choice = self.choice()
+        why_not = refusal(self.workspace.session, choice, working)
+        self.choice_group.setVisible(self.preview is not None)
+        self.slider.setVisible(self.preview is not None and self.preview.frames > 1)
+        self.import_button.setEnabled(not why_not)
+        self.import_button.setToolTip(why_not or "Read it through once, and take its frames in")
+        if self.preview is not None and choice is not None:
+            words = choice_in_words(self.preview, choice)
+            self.choice_words.setText(f"{words}. {why_not}" if why_not else words)
+
+    def _show_seen(self, seen: Seen) -> None:
+        self.title.setText(seen.title)
+        self.picture_view.show_picture(seen.image, seen.words)
+        self.exposure_group.setVisible(seen.exposure is not None)
+        if seen.exposure is None:
+            return
+        for bar, widget in zip(bars(seen.exposure), self.bars, strict=True):
+            widget.setValue(round(100 * bar.part))
+            widget.setFormat(bar.words)
+            widget.setAccessibleName(f"{bar.name}: {bar.words}")
+            widget.setToolTip(bar.tip)
+        sign = "●" if seen.exposure.verdict == "good" else "▲"
+        self.verdict.setText(f"{sign} {seen.exposure.verdict.capitalize()}. {seen.exposure.advice}")
+
+    # --- frames to look at --------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Read the frame to be seen in the background; of several asked for, the last."""
+        session, preview = self.workspace.session, self.preview
+        if preview is not None:
+            self._wanted = (preview, self.slider.value())
+        elif session is not None and session.recording is not None:
+            self._wanted = (None, self.workspace.frame)
+        else:
+            self._wanted = self._seen = None
+            self._show_seen(Seen("", None, None, NONE_YET))
+            return
+        if self._wanted != self._seen and self._reading not in self.workspace.tasks.active:
+            self._read()
+
+    def _read(self) -> None:
+        session, wanted = self.workspace.session, self._wanted
+        if session is None or wanted is None:
+            return
+        preview, number = wanted
+
+        def work(_: Control) -> Seen:
+            if preview is not None:
+                return preview.look(number, session.settings.dots)
+            return look(session, number)
+
+        def done(seen: Seen) -> None:
+            if self.workspace.session is not session:
+                return
+            self._seen = wanted
+            if self._wanted == wanted or self.slider.isSliderDown():
+                self._show_seen(seen)
+            if self._wanted not in (None, wanted):
+                self._read()
+
+        self._reading = self.workspace.tasks.start("Reading a frame", work, done)
+
+    # --- choosing and importing ---------------------------------------------------------------
+
+    def choose_file(self) -> None:
+        """Ask for a recording that is a file."""
+        name, _ = QFileDialog.getOpenFileName(
+            self, "Choose a recording", str(self._folder()), f"{RECORDINGS};;{EVERYTHING}"
+        )
+        if name:
+            self.choose(Path(name))
+
+    def choose_folder(self) -> None:
+        """Ask for a recording that is a folder of images."""
+        name = QFileDialog.getExistingDirectory(
+            self, "Choose a folder of images", str(self._folder())
+        )
+        if name:
+            self.choose(Path(name))
+
+    def _folder(self) -> Path:
+        session = self.workspace.session
+        if self._last_folder.name or session is None:
+            return self._last_folder
+        return session.path.parent
+
+    def choose(self, path: Path) -> None:
+        """Look at a recording, to import it."""
+        self._last_folder = path.parent
+        if self._opening in self.workspace.tasks.active and self._opening is not None:
+            self._opening.cancel()
+
+        def opened(preview: Preview) -> None:
+            self._drop_preview()
+            self.preview = preview
+            last = preview.frames - 1
+            self.slider.blockSignals(True)
+            self.slider.setRange(0, last)
+            self.slider.setValue(0)
+            self.slider.blockSignals(False)
+            for field, value in ((self.first, 0), (self.last, last), (self.every, 1)):
+                field.highest = max(1, last)
+                field.set_value(value)
+            self.rate.set_value(None)
+            told = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
+            self.source_words.setText(f"{path.name}\n{told}")
+            self._show_import()
+            self._look()
+
+        self._opening = self.workspace.tasks.start(
+            f"Opening {path.name}", lambda _: Preview(path), opened
+        )
+
+    def choice(self) -> Choice | None:
+        """What is chosen to be imported; None before a recording was chosen."""
+        if self.preview is None:
+            return None
+        first, last, every = (
+            int(field.value() or 0) for field in (self.first, self.last, self.every)
+        )
+        return Choice(first, last, max(1, every), self.rate.value(), self.embed.isChecked())
+
+    def import_chosen(self) -> None:
+        """Import what was chosen, in the background."""
+        session, preview, choice = self.workspace.session, self.preview, self.choice()
+        if session is None or preview is None or choice is None or not choice.count:
+            return
+
+        def work(control: Control) -> Recording:
+            return session.import_recording(
+                preview.path,
+                choice.frames,
+                frame_rate_hz=choice.rate_hz,
+                embed=choice.embed,
+                progress=control.progress,
+            )
+
+        def done(recording: Recording) -> None:
+            if self.workspace.session is not session:
+                return
+            self._drop_preview()
+            frames = session.frames.tolist()
+            if self.workspace.frame not in frames:
+                self.workspace.show_frame(frames[0])
+            self._seen = None
+            count = len(frames)
+            told = f"{count} frame{'s' * (count != 1)} of {preview.path.name} imported"
+            self.workspace.said.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
+            self.workspace.changed.emit()
+
+        self._importing = self.workspace.tasks.start(f"Importing {preview.path.name}", work, done)
+        self._show_import()
+
+    def _drop_preview(self) -> None:
+        preview, self.preview = self.preview, None
+        self._seen = None
+        if preview is not None and self.workspace.session is not None:
+            # Not here: a frame may be being read.
+            self.workspace.tasks.start(f"Closing {preview.path.name}", lambda _: preview.close())
+        elif preview is not None:
+            preview.close()
+        self._show_import()
+
+    def cancel_choice(self) -> None:
+        """Look at the session's frames again; nothing is imported."""
+        self._drop_preview()
+        self.refresh()
+
+    def find_recording(self) -> None:
+        """Ask where a missing recording is now."""
+        session = self.workspace.session
+        missing = None if session is None else session.missing_recording
+        if session is None or missing is None:
+            return
+        # A folder of images has no ending; files are chosen otherwise.
+        ask = QFileDialog.getOpenFileName if missing.suffix else QFileDialog.getExistingDirectory
+        found = ask(self, f"Where is {missing.name}?", str(self._folder()))
+        name = found[0] if isinstance(found, tuple) else found
+        if name:
+            self.relink(Path(name))
+
+    def relink(self, path: Path) -> None:
+        """Say where the recording is now; another one is refused, in words."""
+        session = self.workspace.session
+        if session is None:
+            return
+
+        def done(_: object) -> None:
+            if self.workspace.session is session:
+                self._seen = None
+                self.workspace.said.emit(f"The recording is found at {path}", False)
+                self.workspace.changed.emit()
+
+        self.workspace.tasks.start(f"Comparing {path.name}", lambda _: session.relink(path), done)
+
+    # --- the panel ----------------------------------------------------------------------------
+
+    def _make_panel(self) -> None:
+        row = QHBoxLayout()
+        row.addWidget(_button("Choose a file …", "A video, an image or a stack", self.choose_file))
+        row.addWidget(
+            _button("Choose a folder …", "A folder of images in order", self.choose_folder)
+        )
+        self.panel_layout.addLayout(row)
+        self._make_missing()
+        self._make_choice()
+        self._make_exposure()
+        self.told_group, layout = _group("What was read")
+        self.told = QFormLayout()
+        self.told.setRowWrapPolicy(QFormLayout.RowWrapPolicy.DontWrapRows)
+        self.told.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        layout.addLayout(self.told)
+        self.panel_layout.addWidget(self.told_group)
+        self.panel_layout.addStretch(1)
+
+    def _make_missing(self) -> None:
+        self.missing = _words()
+        self.find_button = _button(
+            "Say where it is …", "Find the recording in its new place", self.find_recording
+        )
+        self.panel_layout.addWidget(self.missing)
+        self.panel_layout.addWidget(self.find_button)
+
+    def _make_choice(self) -> None:
+        self.choice_group, layout = _group("To be imported")
+        self.source_words = _words()
+        layout.addWidget(self.source_words)
+        form = FieldForm()
+        self.first = _whole("First frame", 0, "The first frame to use, counted from 0")
+        self.last = _whole("Last frame", 0, "The last frame to use")
+        self.every = _whole("Every n-th", 1, "1: every frame; 2: every second one …")
+        self.rate = NumberField(
+            "Frame rate",
+            "frames/s",
+            lowest=1e-6,
+            highest=MOST_HZ,
+            optional=True,
+            tooltip="The rate it was filmed at, where the recording does not say so, or says it "
+            "wrongly; empty: the recording's own",
+        )
+        for field in (self.first, self.last, self.every, self.rate):
+            form.add(field)
+            field.edited.connect(lambda _: self._show_import())
+        layout.addWidget(form)
+        self.embed = QCheckBox("Keep the frames in the session")
+        self.embed.setToolTip(
+            "The session then needs no other file, and is about as large as the recording; "
+            "otherwise the recording stays where it is and must not be changed"
+        )
+        self.embed.toggled.connect(lambda _: self._show_import())
+        layout.addWidget(self.embed)
+        self.choice_words = _words()
+        layout.addWidget(self.choice_words)
+        row = QHBoxLayout()
+        self.import_button = _button("Import", "", self.import_chosen)
+        self.import_button.setDefault(True)
+        row.addWidget(self.import_button)
+        row.addWidget(
+            _button("Not this one", "Leave it, and see the session's frames", self.cancel_choice)
+        )
+        layout.addLayout(row)
+        self.choice_group.hide()
+        self.panel_layout.addWidget(self.choice_group)
+
+    def _make_exposure(self) -> None:
+        self.exposure_group, layout = _group("Exposure of the frame in view")
+        form = QFormLayout()
+        self.bars = []
+        for name in ("Exposure", "Saturation", "Contrast"):
+            bar = QProgressBar()
+            bar.setRange(0, 100)
+            self.bars.append(bar)
+            form.addRow(f"{name}:", bar)
+        layout.addLayout(form)
+        self.verdict = _words()
+        layout.addWidget(self.verdict)
+        self.panel_layout.addWidget(self.exposure_group)
+
+
+def _group(words: str) -> tuple[QWidget, QVBoxLayout]:
+    group = QWidget()
+    layout = QVBoxLayout(group)
+    layout.setContentsMargins(0, 6, 0, 0)
+    heading = QLabel(words)
+    font = heading.font()
+    font.setBold(True)
+    heading.setFont(font)
+    layout.addWidget(heading)
+    return group, layout
+
+
+def _words(text: str = "") -> QLabel:
+    """Words that wrap, even a SHA-256, and can be copied."""
+    label = QLabel(_breakable(text))
+    label.setWordWrap(True)
+    label.setTextFormat(Qt.TextFormat.PlainText)
+    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+    label.setToolTip(text)
+    return label
+
+
+def _breakable(text: str) -> str:
+    """Let long words (a checksum, a path) break where they must."""
+    return "".join(
+        f"{letter}\u200b" if len(text) > 24 and " " not in text else letter for letter in text
+    )
+
+
+def _whole(label: str, lowest: int, tip: str) -> NumberField:
+    return NumberField(label, lowest=lowest, highest=1, decimals=0, tooltip=tip)
+
+
+def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
+    button = QPushButton(words)
+    button.setToolTip(tip)
+    button.clicked.connect(lambda _: work())
+    return button

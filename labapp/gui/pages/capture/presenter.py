@@ -1,0 +1,247 @@
+"""What the recording page shows: what was read, what would be imported, how frames are exposed."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from labapp.core.detection import DotSettings, find_dots
+from labapp.core.exposure import Exposure, judge_exposure
+from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
+from labapp.media import GreyImage, open_source
+from labapp.session.record import Recording
+from labapp.session.session import Session
+
+UNITS = ("bytes", "kB", "MB", "GB", "TB")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame to look at.
+
+    Parameters
+    ----------
+    title
+        Which it is, in words.
+    image
+        Grey levels, shape (rows, columns); None where it cannot be read.
+    exposure
+        How it is exposed; None where it cannot be read.
+    words
+        Why it cannot be read; empty if it can.
+    """
+
+    title: str
+    image: GreyImage | None
+    exposure: Exposure | None
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar that shows how much.
+
+    Parameters
+    ----------
+    name
+        Of what.
+    part
+        From 0 to 1.
+    words
+        How much, in words.
+    tip
+        What it means.
+    """
+
+    name: str
+    part: float
+    words: str
+    tip: str
+
+
+class Preview:
+    """A recording that may be imported; frames may be read from any thread.
+
+    Parameters
+    ----------
+    path
+        Where it is.
+
+    Raises
+    ------
+    InputError
+        If it cannot be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._source = open_source(path)
+        self._turn = threading.Lock()
+        self.frames = len(self._source)
+        self.frame_rate_hz = self._source.frame_rate_hz
+        self.description = self._source.description
+        self.warnings = self._source.warnings
+
+    def look(self, number: int, settings: DotSettings) -> Seen:
+        """Read a frame and judge its exposure."""
+        title = f"{self.path.name}, frame {number} (of 0 to {self.frames - 1}), not imported yet"
+        with self._turn:
+            try:
+                image = self._source.frame(number).image
+            except InputError as error:
+                return Seen(title, None, None, str(error))
+            depth = self._source.bit_depth
+        return Seen(title, image, _judged(image, settings, depth))
+
+    def close(self) -> None:
+        """Let go of the file."""
+        with self._turn:
+            self._source.close()
+
+
+def look(session: Session, number: int) -> Seen:
+    """Read a frame of the session and judge its exposure."""
+    recording = session.recording
+    title = f"Frame {number} of the session"
+    try:
+        image = session.frame(number).image
+    except InputError as error:
+        return Seen(title, None, None, str(error))
+    depth = None if recording is None else recording.bit_depth
+    return Seen(title, image, _judged(image, session.settings.dots, depth))
+
+
+def _judged(image: GreyImage, settings: DotSettings, bit_depth: int | None) -> Exposure:
+    try:
+        dots = find_dots(image, settings)
+    except CannotMeasure:
+        dots = None
+    return judge_exposure(image, dots, bit_depth)
+
+
+def bars(exposure: Exposure) -> tuple[Bar, Bar, Bar]:
+    """Exposure, saturation and contrast."""
+    dots = exposure.snr > 0
+    of = "dots" if dots else "pixels"
+    contrast = f"{exposure.contrast:.0%}, {exposure.snr:.0f} × the noise" if dots else "no dots"
+    return (
+        Bar(
+            "Exposure",
+            exposure.level,
+            f"{exposure.level:.0%} of full scale",
+            f"Level of the bright {of} as a part of the camera's full scale",
+        ),
+        Bar(
+            "Saturation",
+            exposure.clipped,
+            f"{exposure.clipped:.0%} of the {of} clipped",
+            f"Part of the {of} at the top of the scale: their centres cannot be told well",
+        ),
+        Bar(
+            "Contrast",
+            exposure.contrast,
+            contrast,
+            "How far the dots rise above their background, as a part of their level",
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which frames of a recording to import, and how.
+
+    Parameters
+    ----------
+    first, last, every
+        Frames ``first``, ``first + every`` … up to ``last``.
+    rate_hz
+        The rate it was filmed at; None: the recording's own.
+    embed
+        Whether the session keeps the frames itself.
+    """
+
+    first: int
+    last: int
+    every: int = 1
+    rate_hz: float | None = None
+    embed: bool = False
+
+    @property
+    def frames(self) -> str:
+        """As `Session.import_recording` takes them."""
+        return f"{self.first}:{self.last + 1}:{self.every}"
+
+    @property
+    def count(self) -> int:
+        """How many frames they are."""
+        return len(range(self.first, self.last + 1, self.every))
+
+
+def choice_in_words(preview: Preview, choice: Choice) -> str:
+    """What would be imported."""
+    told = f"{choice.count} of {preview.frames} frames"
+    rate = choice.rate_hz or preview.frame_rate_hz
+    if rate is None:
+        return f"{told}; without a frame rate there are no times"
+    return f"{told}, {choice.count * choice.every / rate:.3f} s at {rate:g} frames/s"
+
+
+def refusal(session: Session | None, choice: Choice | None, working: bool) -> str:
+    """Why nothing can be imported now; empty if it can."""
+    if session is None:
+        return "Open or make a session first"
+    if session.read_only:
+        return "The session is open read-only"
+    if choice is None:
+        return "Choose a recording first"
+    if working:
+        return "A recording is being imported"
+    if not choice.count:
+        return "The last frame comes before the first"
+    return ""
+
+
+def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
+    """What was read at import: (what, words) pairs."""
+    start, stop, step = recording.selected
+    used = len(range(start, stop, step))
+    which = "all" if used == recording.frames else f"{used}, {start} to {stop - 1}"
+    which += f", every {step}." * (step > 1)
+    given = " (entered)" if recording.rate_is_given else ""
+    rate = recording.frame_rate_hz
+    base = f"{rate:g} frames/s{given}" if rate is not None else "none"
+    exact = "frame-exact" if recording.frame_exact else "not frame-exact: wrong frames are refused"
+    return (
+        ("File", Path(recording.path).name),
+        ("Format", recording.description),
+        ("Picture", f"{recording.columns} × {recording.rows} px, {recording.bit_depth} bit"),
+        ("Frames", f"{recording.frames} in the recording, used: {which}"),
+        ("Time base", base),
+        ("At random", exact),
+        ("Kept", "in the session itself" if recording.embedded else recording.path),
+        ("Size", size_in_words(recording.size)),
+        ("SHA-256", recording.sha256),
+        ("Imported", recording.imported.replace("T", " ")),
+    )
+
+
+def size_in_words(size: int) -> str:
+    """A file's size."""
+    value, unit = float(size), 0
+    while value >= 1000 and unit < len(UNITS) - 1:
+        value, unit = value / 1000, unit + 1
+    return f"{value:.0f} {UNITS[unit]}" if unit == 0 else f"{value:.1f} {UNITS[unit]}"
+
+
+def missing_in_words(session: Session) -> str:
+    """That the recording is not where it was, and what follows; empty if it is."""
+    missing = session.missing_recording
+    if missing is None:
+        return ""
+    return (
+        f"{missing.name} is not where it was ({missing.parent}). What was measured is still there, "
+        "but no frame can be seen or measured. Say where it is now: only the same recording is "
+        "taken, which its size and SHA-256 tell."
+    )

@@ -1,0 +1,226 @@
+"""The recording page: what would be imported, importing, what was read, a missing recording."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtWidgets import QAbstractButton
+from pytestqt.qtbot import QtBot
+
+from labapp.core.detection import DotSettings
+from labapp.core.exposure import judge_exposure
+from labapp.errors import InputError
+from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.pages.capture.presenter import (
+    Choice,
+    Preview,
+    bars,
+    choice_in_words,
+    look,
+    missing_in_words,
+    recording_in_words,
+    refusal,
+    size_in_words,
+)
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+
+KEPT: list[object] = []
+
+
+@pytest.fixture
+def stack(tmp_path: Path) -> Path:
+    """Twelve small frames without a time base."""
+    path = tmp_path / "stack.npy"
+    np.save(path, np.random.default_rng(2).integers(0, 200, (12, 40, 50)).astype(np.uint8))
+    return path
+
+
+def test_what_would_be_imported(stack: Path, copy_sample) -> None:
+    preview = Preview(stack)
+    assert preview.frames == 12
+    assert Choice(2, 9, 3).frames == "2:10:3"
+    assert Choice(2, 9, 3).count == 3
+    assert choice_in_words(preview, Choice(0, 11)) == (
+        "12 of 12 frames; without a frame rate there are no times"
+    )
+    assert choice_in_words(preview, Choice(0, 11, 2, 100.0)).endswith("0.120 s at 100 frames/s")
+    seen = preview.look(3, DotSettings())
+    assert seen.image is not None
+    assert seen.image.shape == (40, 50)
+    assert "frame 3 (of 0 to 11)" in seen.title
+    preview.close()
+    with pytest.raises(InputError):
+        Preview(stack.with_name("none.avi"))
+    with Session.open(copy_sample("gtaw"), read_only=True) as session:
+        assert "read-only" in refusal(session, Choice(0, 1), False)
+    with Session.create(stack.with_name("a.labsession")) as session:
+        assert refusal(None, None, False).startswith("Open or make")
+        assert refusal(session, None, False).startswith("Choose a recording")
+        assert refusal(session, Choice(3, 2), False).startswith("The last frame")
+        assert refusal(session, Choice(0, 2), True).endswith("being imported")
+        assert refusal(session, Choice(0, 2), False) == ""
+
+
+def test_what_was_read_is_told(copy_sample) -> None:
+    with Session.open(copy_sample("gtaw")) as session:
+        recording = session.recording
+        assert recording is not None
+        told = dict(recording_in_words(recording))
+        assert told["Frames"] == "30 in the recording, used: all"
+        assert told["Time base"] == "60 frames/s"
+        assert told["At random"] == "frame-exact"
+        assert told["SHA-256"] == recording.sha256
+        assert told["Size"] == "3.9 MB"
+        other = replace(
+            recording, selected=(2, 20, 3), rate_is_given=True, frame_exact=False, embedded=True
+        )
+        told = dict(recording_in_words(other))
+        assert told["Frames"] == "30 in the recording, used: 6, 2 to 19, every 3."
+        assert told["Time base"] == "60 frames/s (entered)"
+        assert told["At random"].startswith("not frame-exact")
+        assert told["Kept"] == "in the session itself"
+        seen = look(session, 0)
+        assert seen.exposure is not None
+        assert seen.exposure.verdict == "good"
+        assert [bar.name for bar in bars(seen.exposure)] == ["Exposure", "Saturation", "Contrast"]
+    assert size_in_words(999) == "999 bytes"
+    assert size_in_words(2_500_000_000) == "2.5 GB"
+    blank = bars(judge_exposure(np.zeros((9, 9), np.uint8), None, 8))
+    assert [bar.part for bar in blank] == [0, 0, 0]
+
+
+def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
+    path = copy_sample("gtaw")
+    (path.parent / "recording.avi").rename(path.parent / "moved.avi")
+    with Session.open(path) as session:
+        assert missing_in_words(session).startswith("recording.avi is not where it was")
+        seen = look(session, 0)
+        assert seen.image is None
+        assert "is not there" in seen.words
+
+
+def made(workspace: Workspace) -> CapturePage:
+    page = CapturePage(workspace)
+    KEPT.extend((workspace, page))
+    workspace.changed.connect(page.refresh)
+    workspace.frame_changed.connect(page.refresh)
+    for widget in (page, page.panel):
+        widget.resize(800, 600)
+        widget.show()
+    page.refresh()
+    return page
+
+
+@pytest.fixture
+def page(qtbot: QtBot, tmp_path: Path) -> CapturePage:
+    workspace = Workspace()
+    assert workspace.create(tmp_path / "new.labsession")
+    yield made(workspace)
+    workspace.close()
+
+
+def session_of(page: CapturePage) -> Session:
+    assert page.workspace.session is not None
+    return page.workspace.session
+
+
+def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
+    assert page.picture_view.picture is None
+    assert not page.choice_group.isVisibleTo(page.panel)
+    page.take(stack)
+    qtbot.waitUntil(lambda: page.picture_view.picture is not None)
+    assert session_of(page).recording is None
+    first = page.picture_view.picture
+    page.slider.setValue(7)
+    qtbot.waitUntil(lambda: "frame 7" in page.title.text())
+    assert page.picture_view.picture is not first
+    page.first.set_value(2)
+    page.every.set_value(2)
+    page.rate.set_value(50.0)
+    page.rate.edited.emit(50.0)
+    assert page.choice_words.text() == "5 of 12 frames, 0.200 s at 50 frames/s"
+    page.import_button.click()
+    assert not page.import_button.isEnabled()
+    qtbot.waitUntil(lambda: session_of(page).recording is not None)
+    qtbot.waitUntil(lambda: "of the session" in page.title.text())
+    assert session_of(page).frames.tolist() == [2, 4, 6, 8, 10]
+    assert page.workspace.frame == 2
+    assert page.told_group.isVisibleTo(page.panel)
+    assert not page.choice_group.isVisibleTo(page.panel)
+
+
+def test_an_import_that_is_cancelled_leaves_the_session_as_it_was(
+    page: CapturePage, stack: Path, qtbot: QtBot, monkeypatch
+) -> None:
+    page.choose(stack)
+    qtbot.waitUntil(lambda: page.preview is not None)
+    begun, go_on = threading.Event(), threading.Event()
+    progress = page.workspace.tasks.start.__globals__["Control"].progress
+
+    def slow(control, done: int, total: int) -> None:
+        begun.set()
+        go_on.wait(5)
+        progress(control, done, total)
+
+    monkeypatch.setattr("labapp.gui.tasks.Control.progress", slow)
+    page.import_chosen()
+    qtbot.waitUntil(begun.is_set)
+    assert page._importing is not None
+    page._importing.cancel()
+    go_on.set()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert session_of(page).recording is None
+    assert page.import_button.isEnabled()
+
+
+def test_what_cannot_be_opened_is_said(page: CapturePage, tmp_path: Path, qtbot: QtBot) -> None:
+    said: list[tuple[str, bool]] = []
+    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    (tmp_path / "notes.txt").write_text("no video")
+    page.choose(tmp_path / "notes.txt")
+    qtbot.waitUntil(lambda: bool(said))
+    assert said[0][1]
+    assert "notes.txt" in said[0][0]
+    assert page.preview is None
+
+
+def test_not_this_one_goes_back(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
+    page.choose(stack)
+    qtbot.waitUntil(lambda: page.picture_view.picture is not None)
+    page.cancel_choice()
+    assert page.preview is None
+    assert page.picture_view.picture is None
+    assert session_of(page).recording is None
+
+
+def test_a_missing_recording_is_found_again(copy_sample, tmp_path: Path, qtbot: QtBot) -> None:
+    path = copy_sample("gtaw")
+    moved = tmp_path / "elsewhere.avi"
+    shutil.move(path.parent / "recording.avi", moved)
+    workspace = Workspace()
+    workspace.open(path)
+    page = made(workspace)
+    said: list[tuple[str, bool]] = []
+    workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    assert page.find_button.isVisibleTo(page.panel)
+    page.relink(path.parent / "calibration.png")
+    qtbot.waitUntil(lambda: len(said) == 1)
+    assert said[0][1]
+    assert "another recording" in said[0][0]
+    page.relink(moved)
+    qtbot.waitUntil(lambda: page.picture_view.picture is not None)
+    assert not page.find_button.isVisibleTo(page.panel)
+    assert page.verdict.text().startswith("● Good.")
+    workspace.close()
+
+
+def test_every_button_says_what_it_does(page: CapturePage) -> None:
+    for button in page.panel.findChildren(QAbstractButton):
+        if button.text():
+            assert button.toolTip(), button.text()
