@@ -246,7 +246,7 @@ class Drawing:
         self._stretch = np.array([1.0, 1.0, scene.exaggeration])
         self._surface(scene)
         points = _polydata(scene.points_mm * self._stretch, "verts", 1)
-        style = {"point_size": 7, "render_points_as_spheres": True}
+        style = {"point_size": 6, "render_points_as_spheres": True}
         self._put("points", points, COLOURS["points"], **style)
         for name in ("boundary", "section"):
             line = scene.lines_mm.get(name, EMPTY) * self._stretch
@@ -264,7 +264,10 @@ class Drawing:
         self.plotter.view_vector(way, viewup=up, render=False)
         bounds = (self._box * self._stretch).T.ravel().tolist()
         self.plotter.reset_camera(render=False, bounds=bounds)
-        self.plotter.camera.zoom(1.25 if direction == "free" else 1.1)
+        # The numbers along the axes are as tall in a small picture.
+        height = self.plotter.window_size[1]
+        fill, margin = (1.3, 75) if direction == "free" else (1.15, 70)
+        self.plotter.camera.zoom(fill * max(1 - margin / height, 0.5))
         # To the left, beside the colour scale.
         self.plotter.camera.SetWindowCenter(0.12, 0.0)
 
@@ -298,6 +301,7 @@ class Drawing:
         mesh.point_data["values"] = scene.values
         mesh.point_data.active_normals = _normals(np.asarray(mesh.points), scene.triangles)
         mesh.set_active_scalars("values")
+        title = scene.label.replace(" (", "\n(")  # narrow, to stay within the picture
         if self._is_new("surface", (scene.label, scene.diverging)):
             for title in list(self.plotter.scalar_bars.keys()):
                 self.plotter.remove_scalar_bar(title, render=False)
@@ -312,7 +316,7 @@ class Drawing:
                 reset_camera=False,
                 render=False,
                 scalar_bar_args={
-                    "title": scene.label,
+                    "title": title,
                     "color": scene.foreground,
                     "vertical": True,
                     "position_x": 0.85,
@@ -320,6 +324,8 @@ class Drawing:
                     "height": 0.6,
                     "title_font_size": 14,
                     "label_font_size": 13,
+                    "unconstrained_font_size": True,
+                    "width": 0.04,
                 },
             )
             actor.prop.interpolation = "Phong"
@@ -332,7 +338,7 @@ class Drawing:
             held.ShallowCopy(mesh)
         actor.mapper.lookup_table.scalar_range = scene.limits
         actor.mapper.scalar_range = scene.limits
-        self.plotter.scalar_bars[scene.label].SetLabelFormat(_label_format(scene.limits))
+        self.plotter.scalar_bars[title].SetLabelFormat(_label_format(scene.limits))
 
     def _axes(self, scene: Scene) -> None:
         box, steps = _box(scene)
@@ -347,7 +353,7 @@ class Drawing:
             fmt="%.1f",
             color=scene.foreground,
             location="outer",
-            font_size=12,
+            font_size=11,
             use_3d_text=False,
             bounds=(box * self._stretch).T.ravel().tolist(),
             render=False,
@@ -378,7 +384,7 @@ def _box(scene: Scene) -> tuple[FloatArray, IntArray]:
     """
     low, high = scene.vertices_mm.min(axis=0), scene.vertices_mm.max(axis=0)
     extent = float(np.max((high - low)[:2]))
-    along = next((step for step in (1.0, 2.0, 5.0) if extent <= 12 * step), 10.0)
+    along = next((step for step in (1.0, 2.0, 5.0) if extent <= 6 * step), 10.0)
     step = np.array([along, along, 0.1])
     first, last = np.floor(low / step + 1e-6), np.ceil(high / step - 1e-6)
     last = np.maximum(last, first + 1)

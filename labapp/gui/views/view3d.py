@@ -286,7 +286,8 @@ class OffscreenView(View3d):
         picture = None
         if self._draw():
             assert self._drawing is not None
-            self._drawing.plotter.window_size = list(self._pixels())
+            if tuple(self._drawing.plotter.window_size) != self._pixels():
+                self._drawing.plotter.window_size = list(self._pixels())
             picture = self.picture()
         self._picture = None if picture is None else as_image(picture)
         if self._picture is not None:

@@ -8,14 +8,14 @@ from typing import Literal
 import numpy as np
 
 from labapp.core.correspondence import Match
-from labapp.core.measures import Measures, measure
-from labapp.core.pipeline import Measurement, Settings, reconstruct
+from labapp.core.measures import Measures
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.gui.digits import ResultRow, rounded
-from labapp.session.heights import Profile, profile
+from labapp.gui.digits import ResultRow
+from labapp.session.heights import Profile
 from labapp.session.measured import Result, scheme_name
 from labapp.session.scene import Scene, rays_of, scene_of
 from labapp.session.session import Session
@@ -245,31 +245,40 @@ def height_limits(session: Session) -> tuple[float, float] | None:
     return float(low[known].min()), float(high[known].max())
 
 
-def scene(result: Result, options: Options, limits: tuple[float, float] | None) -> Scene | None:
-    """What the 3-D view shows of a result; None without a surface.
+def scene(
+    measurement: Measurement,
+    rig: Rig,
+    options: Options,
+    limits: tuple[float, float] | None,
+    cut: Profile | None,
+) -> Scene | None:
+    """What the 3-D view shows of a measurement; None without a surface.
 
     Parameters
     ----------
-    result
+    measurement
         Of the frame.
+    rig
+        What it was measured with.
     options
         What was ticked.
     limits
         Colour scale that all frames share, mm; None: that of this frame.
+    cut
+        The section to mark on the surface; None for none.
     """
-    measurement = result.measurement
     reconstruction, match = measurement.reconstruction, measurement.match
     if reconstruction is None or match is None:
         return None
     made = scene_of(reconstruction, options.colour, limits if options.colour == "height" else None)
     lines = dict(made.lines_mm) if options.boundary else {}
-    if options.section is not None:
-        lines["section"] = section_line(profile(reconstruction, *options.section))
+    if cut is not None:
+        lines["section"] = section_line(cut)
     return replace(
         made,
         points_mm=made.points_mm if options.points else made.points_mm[:0],
         lines_mm=lines,
-        rays_mm=rays_of(reconstruction, match, rig_of(result)) if options.rays else {},
+        rays_mm=rays_of(reconstruction, match, rig) if options.rays else {},
         electrode=options.electrode,
         exaggeration=options.exaggeration,
     )
@@ -289,70 +298,6 @@ def reflected_dots(measurement: Measurement) -> tuple[FloatArray, FloatArray] | 
     return match.plane_mm, match.plane_mm + reconstruction.residual_mm
 
 
-def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
-    """What a scheme makes of a frame's dots as they are matched now; the session is not changed.
-
-    What the session holds of that scheme is taken if it still stands.
-
-    Raises
-    ------
-    CannotMeasure
-        If the frame has no match, or the scheme finds no surface.
-    InputError
-        If what the session holds is damaged.
-    """
-    kept = session.result(frame, scheme)
-    if kept is not None and not kept.stale and kept.measurement.reconstruction is not None:
-        return kept.measurement
-    base = session.result(frame)
-    if base is None or base.measurement.match is None:
-        raise CannotMeasure("no-match", f"frame {frame} has no matched dots: measure it first")
-    match, rig = base.measurement.match, rig_of(base)
-    chosen = with_scheme(base.settings, scheme)
-    reconstruction = reconstruct(match, rig, chosen)
-    return replace(
-        base.measurement,
-        status="ok",
-        reason="",
-        scheme=chosen.scheme,
-        reconstruction=reconstruction,
-        measures=measure(reconstruction, match, rig),
-    )
-
-
-def compared_rows(one: Measures, other: Measures) -> tuple[tuple[str, str, str, str, str], ...]:
-    """Quantity, the first's, the other's, first minus other, unit: one line each, as texts.
-
-    Where only one scheme gives a ±, that says how many digits are shown of both.
-    """
-    lines = []
-    for name, value, of_sigma, unit, _ in SIZES:
-        sigmas = [getattr(each, of_sigma) for each in (one, other)]
-        known = [sigma for sigma in sigmas if np.isfinite(sigma)]
-        lines.append(_compared(name, one, other, value, (sigmas, max(known, default=None)), unit))
-    for name, value, _ in ERRORS:
-        lines.append(_compared(name, one, other, value, ([None, None], None), "mm"))
-    return tuple(lines)
-
-
-def _compared(
-    name: str,
-    one: Measures,
-    other: Measures,
-    value: str,
-    known: tuple[list[float | None], float | None],
-    unit: str,
-) -> tuple[str, str, str, str, str]:
-    (own, others), largest = known
-    a, b = getattr(one, value), getattr(other, value)
-    texts = []
-    for number, sigma in ((a, own), (b, others), (a - b, None)):
-        shown_value, _ = rounded(number, largest)
-        _, shown_sigma = rounded(number, sigma)
-        texts.append(f"{shown_value} ± {shown_sigma}" if shown_sigma else shown_value)
-    return name, texts[0], texts[1], texts[2], unit
-
-
 def why_not(session: Session) -> str:
     """Why nothing can be measured now; empty if it can."""
     if not len(session.frames):
@@ -365,3 +310,13 @@ def why_not(session: Session) -> str:
         problem = error.problems[0]
         return f"The set-up is not complete: {problem.field}: {problem.value}"
     return ""
+
+
+def error_scale(captured: FloatArray, computed: FloatArray) -> float:
+    """How many times as long errors are drawn, that the longest fills a tenth of the picture."""
+    if not len(captured):
+        return 1.0
+    longest = float(np.linalg.norm(computed - captured, axis=1).max())
+    wanted = 0.1 * float(np.ptp(captured, axis=0).max()) / max(longest, 1e-9)
+    steps = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0])
+    return float(steps[max(int(np.searchsorted(steps, wanted, side="right")) - 1, 0)])

@@ -1,0 +1,227 @@
+"""The surface page's charts: reflected dots over each other, the pool from above, its section."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import QEvent, QPointF, Qt, Signal
+from PySide6.QtGui import QPalette
+from PySide6.QtWidgets import QLabel, QVBoxLayout, QWidget
+
+from labapp.core.boundary import Boundary
+from labapp.core.values import FloatArray
+from labapp.gui.pages.surface.presenter import error_scale
+from labapp.session.heights import Profile
+
+BAND_ALPHA = 70
+
+
+class Chart(QWidget):
+    """One plot with a line of words above it, in the colours of the window.
+
+    Parameters
+    ----------
+    name
+        What it shows, for a screen reader.
+    x_label, y_label
+        What the axes are, with units.
+    equal
+        Whether a millimetre is as long on both axes.
+    """
+
+    def __init__(self, name: str, x_label: str, y_label: str, equal: bool) -> None:
+        super().__init__()
+        self.setAccessibleName(name)
+        self.title = QLabel(name)
+        self.title.setWordWrap(True)
+        self.plot = pg.PlotWidget()
+        self.plot.setAccessibleName(name)
+        self.plot.setMinimumSize(120, 90)
+        self.plot.setMenuEnabled(False)
+        self.plot.setLabel("bottom", x_label)
+        self.plot.setLabel("left", y_label)
+        self.plot.setAspectLocked(equal)
+        self.plot.hideButtons()
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setSpacing(0)
+        layout.addWidget(self.title)
+        layout.addWidget(self.plot)
+
+    def say(self, words: str) -> None:
+        """Put words above the plot."""
+        self.title.setText(words)
+        self.setAccessibleDescription(words)
+
+    def paint(self) -> None:
+        """Take the window's colours."""
+        text = self.colour(QPalette.ColorRole.Text)
+        self.plot.setBackground(self.colour(QPalette.ColorRole.Base))
+        for side in ("bottom", "left"):
+            self.plot.getAxis(side).enableAutoSIPrefix(False)
+            axis = self.plot.getAxis(side)
+            axis.setPen(text)
+            axis.setTextPen(text)
+
+    def colour(self, role: QPalette.ColorRole) -> Any:
+        """A colour of the window."""
+        return self.palette().color(role)
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Follow the window from light to dark."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "plot"):
+            self.paint()
+
+
+class DotsChart(Chart):
+    """Captured dots as rings, computed ones as crosses, their errors drawn longer."""
+
+    def __init__(self) -> None:
+        super().__init__("Reflected dots on the imaging plane", "X′ (mm)", "Z′ (mm)", equal=True)
+        self._captured = pg.ScatterPlotItem(size=9, symbol="o")
+        self._computed = pg.ScatterPlotItem(size=7, symbol="+")
+        self._errors = pg.PlotCurveItem(connect="pairs")
+        for item in (self._errors, self._captured, self._computed):
+            self.plot.addItem(item)
+        self.paint()
+
+    def show_dots(self, dots: tuple[FloatArray, FloatArray] | None) -> None:
+        """Show captured and computed dots, each of shape (n, 2), mm; None shows nothing."""
+        captured, computed = dots if dots is not None else (np.empty((0, 2)), np.empty((0, 2)))
+        scale = error_scale(captured, computed)
+        self._captured.setData(pos=captured)
+        self._computed.setData(pos=computed)
+        ends = np.stack([captured, captured + scale * (computed - captured)], axis=1).reshape(-1, 2)
+        self._errors.setData(ends[:, 0], ends[:, 1])
+        told = f"○ captured, + computed; lines: errors, {scale:g} times as long"
+        self.say(told if dots is not None else "No reflected dots to compare")
+        self.plot.autoRange()
+
+    def paint(self) -> None:
+        """Take the window's colours."""
+        super().paint()
+        text, accent = (
+            self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
+        )
+        self._captured.setPen(pg.mkPen(text))
+        self._captured.setBrush(pg.mkBrush(None))
+        self._computed.setPen(pg.mkPen(accent, width=2))
+        self._errors.setPen(pg.mkPen(accent, width=2))
+
+
+class PlanChart(Chart):
+    """The pool from above; both ends of the section line can be dragged, or the whole line.
+
+    Signals
+    -------
+    dragged
+        The line runs elsewhere now: its angle, degrees, and offset, mm (see `profile`).
+    """
+
+    dragged = Signal(float, float)
+
+    def __init__(self) -> None:
+        super().__init__("Section line", "X (mm)", "Y (mm)", equal=True)
+        self._outline = pg.PlotCurveItem()
+        self._line = pg.LineSegmentROI([[0.0, -1.0], [0.0, 1.0]])
+        self._line.setAcceptedMouseButtons(Qt.MouseButton.LeftButton)
+        self._line.sigRegionChanged.connect(self._moved)
+        self._telling = False
+        self.plot.addItem(self._outline)
+        self.plot.addItem(self._line)
+        self.say("Section: drag the line or its ends")
+        self.paint()
+
+    def show_pool(self, boundary: Boundary | None, section: tuple[float, float] | None) -> None:
+        """Show a boundary and the section line through it; None shows nothing of it."""
+        points = np.empty((0, 3)) if boundary is None else boundary.points_mm
+        closed = np.vstack([points, points[:1]])
+        self._outline.setData(closed[:, 0], closed[:, 1])
+        self._line.setVisible(section is not None and boundary is not None)
+        if section is not None and boundary is not None and not self._telling:
+            self._place(boundary, *section)
+        if not self._telling:
+            self.plot.autoRange()
+
+    def _place(self, boundary: Boundary, angle_deg: float, offset_mm: float) -> None:
+        angle = np.radians(angle_deg)
+        way, aside = (np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))
+        reach = boundary.points_mm[:, :2] @ np.array(way)
+        ends = [
+            QPointF(*(end * np.array(way) + offset_mm * np.array(aside)))
+            for end in (reach.min() * 1.15, reach.max() * 1.15)
+        ]
+        self._line.blockSignals(True)
+        self._line.setPos(0.0, 0.0, finish=False)
+        for handle, end in zip(self._line.getHandles(), ends, strict=True):
+            self._line.movePoint(handle, end, finish=False, coords="parent")
+        self._line.blockSignals(False)
+
+    def _moved(self) -> None:
+        a, b = (self._line.mapToParent(handle.pos()) for handle in self._line.getHandles())
+        way = np.array([b.x() - a.x(), b.y() - a.y()])
+        length = float(np.hypot(*way))
+        if length < 1e-6:
+            return
+        angle = float(np.degrees(np.arctan2(way[1], way[0])))
+        offset = float((way[0] * a.y() - way[1] * a.x()) / length)
+        self._telling = True
+        self.dragged.emit(angle, offset)
+        self._telling = False
+
+    def paint(self) -> None:
+        """Take the window's colours."""
+        super().paint()
+        self._outline.setPen(pg.mkPen(self.colour(QPalette.ColorRole.Text), width=2))
+        self._line.setPen(pg.mkPen(self.colour(QPalette.ColorRole.Highlight), width=3))
+
+
+class ProfileChart(Chart):
+    """Height along the section line, ± as a band, the boundary as diamonds."""
+
+    def __init__(self) -> None:
+        super().__init__("Height profile", "Along the section line (mm)", "Height (mm)", False)
+        self._low, self._high = pg.PlotCurveItem(), pg.PlotCurveItem()
+        self._band = pg.FillBetweenItem(self._low, self._high)
+        self._height = pg.PlotCurveItem()
+        self._edge = pg.ScatterPlotItem(size=10, symbol="d")
+        for item in (self._band, self._low, self._high, self._height, self._edge):
+            self.plot.addItem(item)
+        self.paint()
+
+    def show_profile(self, cut: Profile | None) -> None:
+        """Show a profile; None shows nothing."""
+        if cut is None or not len(cut.edge_mm):
+            for curve in (self._low, self._high, self._height):
+                curve.setData([], [])
+            self._edge.setData(pos=np.empty((0, 2)))
+            self.say("The section line misses the pool" if cut is not None else "No section")
+            return
+        known = np.isfinite(cut.height_mm)
+        along, height = cut.along_mm[known], cut.height_mm[known]
+        sigma = np.nan_to_num(cut.sigma_mm[known])
+        self._height.setData(along, height)
+        self._low.setData(along, height - sigma)
+        self._high.setData(along, height + sigma)
+        self._edge.setData(pos=cut.edge_mm)
+        band = "; band: ±" if sigma.any() else "; this scheme gives no ±"
+        self.say(f"Height along the section; ◆ boundary{band}")
+        self.plot.autoRange()
+
+    def paint(self) -> None:
+        """Take the window's colours."""
+        super().paint()
+        text, accent = (
+            self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
+        )
+        self._height.setPen(pg.mkPen(accent, width=2))
+        faint = pg.mkColor(accent)
+        faint.setAlpha(BAND_ALPHA)
+        self._band.setBrush(pg.mkBrush(faint))
+        for edge in (self._low, self._high):
+            edge.setPen(pg.mkPen(faint))
+        self._edge.setPen(pg.mkPen(text))
+        self._edge.setBrush(pg.mkBrush(None))

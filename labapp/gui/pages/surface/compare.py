@@ -1,0 +1,167 @@
+"""Two schemes side by side: their surfaces seen alike, where they differ, and by how much."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import Qt, Signal
+from PySide6.QtWidgets import (
+    QAbstractItemView,
+    QGridLayout,
+    QHBoxLayout,
+    QHeaderView,
+    QLabel,
+    QTableWidget,
+    QTableWidgetItem,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.pages.surface.comparison import Comparison, compared, other_scheme
+from labapp.gui.pages.surface.presenter import SCHEMES, Options
+from labapp.gui.tasks import Control, Task
+from labapp.gui.views.fields import ChoiceField
+from labapp.gui.views.view3d import View3d, make_view3d
+from labapp.gui.workspace import Workspace
+
+COLUMNS = ("", "first", "second", "difference", "unit")
+
+
+class CompareView(QWidget):
+    """The frame in view by two schemes; the cameras of the two turn together.
+
+    Parameters
+    ----------
+    workspace
+        What is open.
+
+    Signals
+    -------
+    closed
+        The operator has seen enough.
+    """
+
+    closed = Signal()
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__()
+        self.workspace = workspace
+        self.first, self.second = (_SchemeBox(order) for order in ("First", "Second"))
+        self.difference = make_view3d("Difference of the two surfaces")
+        self.difference.look("top")
+        self.words = QLabel()
+        self.words.setWordWrap(True)
+        self.table = _table()
+        self._options = Options()
+        self._shown_for: object = None
+        self._task: Task | None = None
+        self.first.view.camera_changed.connect(self.second.view.set_camera)
+        self.second.view.camera_changed.connect(self.first.view.set_camera)
+        for box in (self.first, self.second):
+            box.choice.edited.connect(lambda _: self.refresh(self._options))
+        layout = QGridLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        below = QVBoxLayout()
+        below.addWidget(self.words)
+        below.addWidget(self.table, 1)
+        layout.addWidget(self.first, 0, 0)
+        layout.addWidget(self.second, 0, 1)
+        layout.addWidget(self.difference, 1, 0)
+        layout.addLayout(below, 1, 1)
+        for k in (0, 1):
+            layout.setRowStretch(k, 1)
+            layout.setColumnStretch(k, 1)
+
+    @property
+    def views(self) -> tuple[View3d, View3d, View3d]:
+        """The first surface, the second, and their difference."""
+        return self.first.view, self.second.view, self.difference
+
+    def begin(self, scheme: str) -> None:
+        """Compare a scheme with one that is made otherwise."""
+        self.first.choice.set_value(scheme)
+        self.second.choice.set_value(other_scheme(scheme))
+
+    def refresh(self, options: Options) -> None:
+        """Show the frame in view by the two schemes, computed in the background."""
+        session, frame = self.workspace.session, self.workspace.frame
+        if session is None:
+            return
+        schemes = (self.first.choice.value(), self.second.choice.value())
+        result = session.result(frame)
+        wanted = (frame, schemes, options, None if result is None else result.measured)
+        if wanted == self._shown_for:
+            return
+        self._shown_for, self._options = wanted, options
+        self.words.setText("Computing …")
+        if self._task is not None:
+            self._task.cancel()
+
+        def work(_: Control) -> Comparison:
+            return compared(session, frame, schemes, options)
+
+        def done(comparison: Comparison) -> None:
+            if self._shown_for == wanted:
+                self._show(comparison)
+
+        self._task = self.workspace.tasks.start("Comparing", work, done)
+
+    def leave(self) -> None:
+        """Stop what only this view needs."""
+        self._shown_for = None
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+
+    def _show(self, comparison: Comparison) -> None:
+        for box, scene, why in zip(
+            (self.first, self.second), comparison.scenes, comparison.words, strict=True
+        ):
+            box.view.set_words(why)
+            box.view.show_scene(scene)
+        self.difference.set_words("Nothing to compare")
+        self.difference.show_scene(comparison.difference)
+        self.words.setText(comparison.told)
+        self.table.setRowCount(len(comparison.rows))
+        for k, row in enumerate(comparison.rows):
+            for column, text in enumerate(row):
+                item = QTableWidgetItem(text)
+                if 0 < column < 4:
+                    right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+                    item.setTextAlignment(right)
+                item.setToolTip(f"{row[0]}: {text} {row[4] if 0 < column < 4 else ''}".strip())
+                self.table.setItem(k, column, item)
+        self.table.resizeRowsToContents()
+
+
+class _SchemeBox(QWidget):
+    """A scheme to choose and its surface."""
+
+    def __init__(self, order: str) -> None:
+        super().__init__()
+        self.choice = ChoiceField(
+            order, list(SCHEMES.items()), tooltip=f"{order} of the two to compare"
+        )
+        self.view = make_view3d(f"{order} surface")
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        line = QHBoxLayout()
+        line.addWidget(self.choice.label)
+        line.addWidget(self.choice, 1)
+        layout.addLayout(line)
+        layout.addWidget(self.view, 1)
+
+
+def _table() -> QTableWidget:
+    table = QTableWidget(0, len(COLUMNS))
+    table.setAccessibleName("Figures of both schemes and their difference")
+    table.setToolTip("Figures of both schemes, and the first minus the second")
+    table.setHorizontalHeaderLabels(list(COLUMNS))
+    table.verticalHeader().hide()
+    table.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
+    table.setTabKeyNavigation(False)
+    table.setShowGrid(False)
+    table.setWordWrap(False)
+    header = table.horizontalHeader()
+    header.setHighlightSections(False)
+    header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+    header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+    return table

@@ -1,0 +1,157 @@
+"""What is told of two schemes, computed from the session. Without Qt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.measures import Measures, measure
+from labapp.core.pipeline import Measurement, reconstruct
+from labapp.core.values import CannotMeasure
+from labapp.gui.digits import rounded
+from labapp.gui.pages.surface.presenter import (
+    ERRORS,
+    SCHEMES,
+    SIZES,
+    Options,
+    rig_of,
+    scene,
+    with_scheme,
+)
+from labapp.session.scene import Scene, difference_scene
+from labapp.session.session import Session
+
+Row = tuple[str, str, str, str, str]
+"""Quantity, the first's, the other's, first minus other, unit."""
+
+
+def other_scheme(scheme: str) -> str:
+    """The scheme to compare with at first."""
+    return "ers" if scheme == "fit" else "fit"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A frame by two schemes.
+
+    Parameters
+    ----------
+    scenes
+        Of the first and the second; None where that finds no surface.
+    words
+        Why not; empty where it does.
+    difference
+        The first's surface coloured by how it differs; None without both.
+    rows
+        Figures of both and their difference.
+    told
+        All of it in a sentence.
+    """
+
+    scenes: tuple[Scene | None, Scene | None]
+    words: tuple[str, str]
+    difference: Scene | None
+    rows: tuple[Row, ...]
+    told: str
+
+
+def compared(
+    session: Session, frame: int, schemes: tuple[str, str], options: Options
+) -> Comparison:
+    """Reconstruct a frame by two schemes and hold them against each other.
+
+    Both surfaces are coloured on one scale.
+    """
+    found: list[Measurement | None] = []
+    words = []
+    for scheme in schemes:
+        try:
+            found.append(by_scheme(session, frame, scheme))
+            words.append("")
+        except CannotMeasure as answer:
+            found.append(None)
+            words.append(f"No surface ({answer.status}): {answer.reason}.")
+    first, second = found
+    base = session.result(frame)
+    rig = session.setup.rig if base is None else rig_of(base)
+    measures = [each.measures for each in (first, second) if each and each.measures]
+    limits = None
+    if measures:
+        limits = min(each.depth_mm for each in measures), max(each.height_mm for each in measures)
+    scenes = [None if each is None else scene(each, rig, options, limits, None) for each in found]
+    rows: tuple[Row, ...] = ()
+    difference, told = None, "There are no two surfaces to compare."
+    if first and second and first.measures and second.measures:
+        assert first.reconstruction is not None
+        assert second.reconstruction is not None
+        plain = difference_scene(first.reconstruction, second.reconstruction)
+        difference = replace(plain, exaggeration=options.exaggeration)
+        rows = compared_rows(first.measures, second.measures)
+        names = [SCHEMES[scheme].split(":")[0] for scheme in schemes]
+        largest = float(np.abs(plain.values).max(initial=0.0))
+        told = (
+            f"{names[0]} minus {names[1]}, from the same dots: "
+            f"the heights differ by {largest:.3f} mm at most."
+        )
+    return Comparison((scenes[0], scenes[1]), (words[0], words[1]), difference, rows, told)
+
+
+def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
+    """What a scheme makes of a frame's dots as they are matched now; the session is not changed.
+
+    What the session holds of that scheme is taken if it still stands.
+
+    Raises
+    ------
+    CannotMeasure
+        If the frame has no match, or the scheme finds no surface.
+    InputError
+        If what the session holds is damaged.
+    """
+    kept = session.result(frame, scheme)
+    if kept is not None and not kept.stale and kept.measurement.reconstruction is not None:
+        return kept.measurement
+    base = session.result(frame)
+    if base is None or base.measurement.match is None:
+        raise CannotMeasure("no-match", f"frame {frame} has no matched dots: measure it first")
+    match, rig = base.measurement.match, rig_of(base)
+    chosen = with_scheme(base.settings, scheme)
+    reconstruction = reconstruct(match, rig, chosen)
+    return replace(
+        base.measurement,
+        status="ok",
+        reason="",
+        scheme=chosen.scheme,
+        reconstruction=reconstruction,
+        measures=measure(reconstruction, match, rig),
+    )
+
+
+def compared_rows(one: Measures, other: Measures) -> tuple[Row, ...]:
+    """Sizes and errors of both, and the first minus the other, as texts.
+
+    The larger ± says how many digits are shown of both.
+    """
+    rows = []
+    for name, value, of_sigma, unit, _ in SIZES:
+        sigmas = [getattr(each, of_sigma) for each in (one, other)]
+        rows.append(_row(name, [getattr(each, value) for each in (one, other)], sigmas, unit))
+    for name, value, _ in ERRORS:
+        rows.append(_row(name, [getattr(each, value) for each in (one, other)], [], "mm"))
+    return tuple(rows)
+
+
+def _row(name: str, values: list[float], sigmas: list[float], unit: str) -> Row:
+    largest = max((sigma for sigma in sigmas if np.isfinite(sigma)), default=None)
+    decimals = 3 if sigmas else 4
+    first, second, difference = (
+        rounded(number, largest, decimals)[0] for number in (*values, values[0] - values[1])
+    )
+    told = [
+        f"{text} ± {rounded(value, sigma)[1]}" if np.isfinite(sigma) and sigma > 0 else text
+        for text, value, sigma in zip(
+            (first, second), values, sigmas or [np.nan, np.nan], strict=True
+        )
+    ]
+    return name, told[0], told[1], difference, unit

@@ -1,0 +1,189 @@
+"""The surface page's panel: scheme and correspondence, measuring, and what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from PySide6.QtWidgets import QGridLayout, QLabel, QProgressBar, QPushButton, QVBoxLayout
+
+from labapp.gui.pages.surface.presenter import (
+    CORRESPONDENCES,
+    SCHEMES,
+    Shown,
+    why_not,
+    with_scheme,
+)
+from labapp.gui.tasks import Task
+from labapp.gui.views.fields import ChoiceField, FieldForm, ResultTable
+from labapp.gui.workspace import Workspace
+from labapp.session.measured import scheme_name
+
+SIGNS = {"measured": "✓", "stale": "⟳", "failed": "✗", "unmeasured": "○"}
+"""How a frame stands, by shape."""
+
+
+class SurfacePanel:
+    """Fills a page's panel.
+
+    Parameters
+    ----------
+    workspace
+        What is open.
+    layout
+        Of the panel.
+    """
+
+    def __init__(self, workspace: Workspace, layout: QVBoxLayout) -> None:
+        self.workspace = workspace
+        self._task: Task | None = None
+        self.scheme = ChoiceField(
+            "Scheme", list(SCHEMES.items()), tooltip="How the surface is found from the dots"
+        )
+        self.correspondence = ChoiceField(
+            "Correspondence",
+            list(CORRESPONDENCES.items()),
+            tooltip="Which way columns and rows of the dots run: tried out, or as you say",
+        )
+        self.scheme.edited.connect(self._choose_scheme)
+        self.correspondence.edited.connect(self._choose_correspondence)
+        form = FieldForm()
+        form.add(self.scheme)
+        form.add(self.correspondence)
+        self.status, self.provenance, self.verdict = (_words() for _ in range(3))
+        self.status.setAccessibleName("How this frame stands")
+        self.again = _button(
+            "Measure &again", "Measure this frame anew: its figures no longer stand", self.this_one
+        )
+        self.sizes = ResultTable("Size of the pool")
+        self.errors = ResultTable("Reflection errors")
+        self.trials = ResultTable("Errors of the correspondences tried")
+        layout.addWidget(form)
+        layout.addLayout(self._measuring())
+        for widget in (self.status, self.again, self.sizes, self.errors, self.provenance):
+            layout.addWidget(widget)
+        for widget in (self.verdict, self.trials):
+            layout.addWidget(widget)
+        layout.addStretch(1)
+        workspace.tasks.changed.connect(self._show_progress)
+
+    def _measuring(self) -> QGridLayout:
+        self.one = _button("&This frame", "Measure the frame in view (Shift+F5)", self.this_one)
+        self.missing = _button(
+            "&Not measured",
+            "Measure every frame that is not measured, or no longer stands (F5)",
+            self.not_measured,
+        )
+        self.all = _button("A&ll frames", "Measure every frame anew", self.all_frames)
+        self.progress = QProgressBar()
+        self.progress.setAccessibleName("How far the measurement is")
+        self.progress.setToolTip("How far the measurement is")
+        self.cancel = _button("&Cancel", "Stop measuring; what is done stays (Ctrl+.)", self.stop)
+        grid = QGridLayout()
+        heading = QLabel("Measure")
+        font = heading.font()
+        font.setBold(True)
+        heading.setFont(font)
+        grid.addWidget(heading, 0, 0)
+        grid.addWidget(self.one, 0, 1)
+        grid.addWidget(self.missing, 1, 0)
+        grid.addWidget(self.all, 1, 1)
+        grid.addWidget(self.progress, 2, 0)
+        grid.addWidget(self.cancel, 2, 1)
+        return grid
+
+    # --- what is shown -----------------------------------------------------------------------
+
+    def show(self, told: Shown) -> None:
+        """Show what is told of the frame in view, and what the session's settings are."""
+        session = self.workspace.session
+        if session is None:
+            return
+        settings = session.settings
+        self.scheme.set_value(scheme_name(settings))
+        self.correspondence.set_value(settings.correspondence)
+        self.status.setText(f"{SIGNS[told.state]} {told.words}")
+        self.again.setVisible(told.state == "stale")
+        self.provenance.setText(told.provenance)
+        self.provenance.setVisible(bool(told.provenance))
+        self.verdict.setText(told.verdict)
+        self.verdict.setVisible(bool(told.verdict))
+        for table, rows in (
+            (self.sizes, told.sizes),
+            (self.errors, told.errors),
+            (self.trials, told.trials),
+        ):
+            table.set_rows(rows)
+            table.setVisible(bool(rows))
+        self._show_progress()
+
+    def _show_progress(self) -> None:
+        session, task = self.workspace.session, self._task
+        working = task is not None and task in self.workspace.tasks.active
+        why = "Measuring is under way" if working else "No session is open"
+        if session is not None and not working:
+            why = why_not(session)
+        for button in (self.one, self.missing, self.all, self.again):
+            button.setEnabled(not why)
+            tooltip = button.property("what")
+            button.setToolTip(f"{tooltip}. {why}" if why else tooltip)
+        self.progress.setVisible(working)
+        self.cancel.setVisible(working)
+        if working and task is not None:
+            self.progress.setRange(0, task.total)
+            self.progress.setValue(task.done)
+            self.progress.setFormat(f"{task.done} of {task.total} frames")
+
+    # --- what is done ------------------------------------------------------------------------
+
+    def this_one(self) -> None:
+        """Measure the frame in view."""
+        self._task = self.workspace.measure([self.workspace.frame])
+        self._show_progress()
+
+    def not_measured(self) -> None:
+        """Measure the frames that are not measured, or whose measures no longer stand."""
+        self._task = self.workspace.measure()
+        self._show_progress()
+
+    def all_frames(self) -> None:
+        """Measure every frame anew."""
+        if self.workspace.session is not None:
+            self._task = self.workspace.measure(self.workspace.session.frames.tolist())
+            self._show_progress()
+
+    def stop(self) -> None:
+        """Stop measuring."""
+        if self._task is not None:
+            self._task.cancel()
+
+    def _choose_scheme(self, name: str) -> None:
+        self.workspace.attempt(
+            lambda session: session.set_settings(
+                with_scheme(session.settings, name), f"scheme {SCHEMES[name].split(':')[0]}"
+            )
+        )
+
+    def _choose_correspondence(self, choice: str) -> None:
+        self.workspace.attempt(
+            lambda session: session.set_settings(
+                replace(session.settings, correspondence=choice),  # type: ignore[arg-type]
+                f"correspondence {choice}",
+            )
+        )
+
+
+def _button(text: str, what: str, work: Callable[[], None]) -> QPushButton:
+    button = QPushButton(text)
+    button.setToolTip(what)
+    button.setProperty("what", what)
+    button.setAccessibleName(text.replace("&", ""))
+    button.setAccessibleDescription(what)
+    button.clicked.connect(work)
+    return button
+
+
+def _words() -> QLabel:
+    label = QLabel()
+    label.setWordWrap(True)
+    return label

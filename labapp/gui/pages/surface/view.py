@@ -1,0 +1,300 @@
+"""The surface page: the pool in 3-D, its dots, its section, its figures; two schemes compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QAction, QGuiApplication, QPixmap
+from PySide6.QtWidgets import (
+    QFileDialog,
+    QHBoxLayout,
+    QMenu,
+    QSplitter,
+    QStackedWidget,
+    QToolButton,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.errors import InputError
+from labapp.gui.pages.page import Page
+from labapp.gui.pages.surface.charts import DotsChart, PlanChart, ProfileChart
+from labapp.gui.pages.surface.compare import CompareView
+from labapp.gui.pages.surface.panel import SurfacePanel
+from labapp.gui.pages.surface.presenter import (
+    Options,
+    Shown,
+    height_limits,
+    reflected_dots,
+    rig_of,
+    scene,
+    shown,
+)
+from labapp.gui.views.fields import ChoiceField, NumberField
+from labapp.gui.views.view3d import make_view3d
+from labapp.gui.workspace import Workspace
+from labapp.session.heights import profile
+from labapp.session.measured import scheme_name
+from labapp.session.scene import Direction
+
+LOOKS: dict[Direction, tuple[str, str]] = {
+    "top": ("Top", "Look from the top (1 in the view)"),
+    "side": ("Side", "Look from the side, along −X (2 in the view)"),
+    "front": ("Front", "Look as the camera does, along Y (3 in the view)"),
+    "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
+}
+
+SHOWN_PARTS = {
+    "points": ("Reflection &points", "White dots: where the rays meet the surface"),
+    "boundary": ("&Boundary", "The line where the pool meets unmelted metal"),
+    "rays": ("&Rays", "The last 3 mm of the incident rays, the first of the reflected ones"),
+    "electrode": ("&Electrode's axis", "The upright line X = Y = 0"),
+    "same_colours": ("Same colours in &all frames", "One scale of heights for the recording"),
+}
+
+
+class SurfacePage(Page):
+    """Measure the frames and look at the surface."""
+
+    key = "surface"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.options = Options()
+        self.told = Shown(None, "unmeasured", "")
+        self.view = make_view3d("The pool in 3-D")
+        self.dots, self.plan, self.profile = DotsChart(), PlanChart(), ProfileChart()
+        self.plan.dragged.connect(self._set_section)
+        self.compare = CompareView(workspace)
+        self.side = SurfacePanel(workspace, self.panel_layout)
+        self.stack = QStackedWidget()
+        self.stack.addWidget(self._single())
+        self.stack.addWidget(self.compare)
+        self.canvas_layout.addLayout(self._tools())
+        self.canvas_layout.addWidget(self.stack, 1)
+
+    # --- what is where -----------------------------------------------------------------------
+
+    def _single(self) -> QWidget:
+        left, right = QSplitter(Qt.Orientation.Vertical), QSplitter(Qt.Orientation.Vertical)
+        below = QWidget()
+        column = QVBoxLayout(below)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.addLayout(self._section_fields())
+        column.addWidget(self.profile, 1)
+        for splitter, widgets, sizes in (
+            (left, (self.view, below), (5, 3)),
+            (right, (self.dots, self.plan), (1, 1)),
+        ):
+            for k, (widget, size) in enumerate(zip(widgets, sizes, strict=True)):
+                splitter.addWidget(widget)
+                splitter.setStretchFactor(k, size)
+            splitter.setSizes([100 * size for size in sizes])
+            splitter.setChildrenCollapsible(False)
+        whole = QSplitter(Qt.Orientation.Horizontal)
+        whole.addWidget(left)
+        whole.addWidget(right)
+        whole.setStretchFactor(0, 5)
+        whole.setStretchFactor(1, 3)
+        whole.setSizes([500, 300])
+        whole.setChildrenCollapsible(False)
+        return whole
+
+    def _section_fields(self) -> QHBoxLayout:
+        self.angle = NumberField(
+            *("Section at", "°"),
+            lowest=-180,
+            highest=180,
+            step=5,
+            decimals=1,
+            tooltip="Direction of the section line: 0 along X, 90 along Y",
+        )
+        self.offset = NumberField(
+            *("offset", "mm"),
+            lowest=-50,
+            highest=50,
+            step=0.1,
+            decimals=2,
+            tooltip="How far to the left of the electrode the line passes",
+        )
+        line = QHBoxLayout()
+        for field in (self.angle, self.offset):
+            field.label.setWordWrap(False)
+            line.addWidget(field.label)
+            line.addWidget(field)
+            field.edited.connect(self._enter_section)
+        for words, angle in (("Along X", 0.0), ("Along Y", 90.0)):
+            cut = partial(self._set_section, angle, 0.0)
+            line.addWidget(_tool(words, f"Cut {words.lower()}, through the electrode's axis", cut))
+        line.addStretch(1)
+        return line
+
+    def _tools(self) -> QHBoxLayout:
+        self.colour = ChoiceField(
+            "Colour",
+            [("height", "by height"), ("sigma", "by ±")],
+            tooltip="What the surface is coloured by",
+        )
+        self.colour.edited.connect(lambda key: self._set(colour=key))
+        self.high = NumberField(
+            *("Heights ×", ""),
+            lowest=1,
+            highest=20,
+            step=1,
+            decimals=1,
+            tooltip="Heights are drawn so many times as high; the axes tell true ones",
+        )
+        self.high.edited.connect(lambda value: self._set(exaggeration=value))
+        line = QHBoxLayout()
+        for field in (self.colour, self.high):
+            line.addWidget(field.label)
+            line.addWidget(field)
+        line.addWidget(self._parts_button())
+        for direction, (words, what) in LOOKS.items():
+            line.addWidget(_tool(words, what, partial(self._look, direction)))
+        line.addStretch(1)
+        self.copy = _tool("Copy", "Copy the 3-D picture to the clipboard", self.copy_picture)
+        self.save = _tool("Save …", "Save the 3-D picture as PNG", self.save_picture)
+        self.comparing = _tool("Compare", "Put two schemes side by side", self._toggle_compare)
+        self.comparing.setCheckable(True)
+        for button in (self.copy, self.save, self.comparing):
+            line.addWidget(button)
+        return line
+
+    def _parts_button(self) -> QToolButton:
+        menu = QMenu(self)
+        menu.setToolTipsVisible(True)
+        self.parts: dict[str, QAction] = {}
+        for name, (words, what) in SHOWN_PARTS.items():
+            action = menu.addAction(words)
+            action.setCheckable(True)
+            action.setToolTip(what)
+            action.toggled.connect(lambda ticked, name=name: self._set(**{name: ticked}))
+            self.parts[name] = action
+        button = _tool("Show", "Choose what the 3-D view shows", lambda: None)
+        button.setMenu(menu)
+        button.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
+        return button
+
+    # --- what is shown -----------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Show the frame in view by the scheme that the session's settings choose."""
+        session = self.workspace.session
+        if session is None:
+            return
+        try:
+            self.told = shown(session, self.workspace.frame)
+        except InputError as error:
+            self.told = Shown(None, "failed", str(error))
+        self.side.show(self.told)
+        self._show_options()
+        if self.stack.currentWidget() is self.compare:
+            self.compare.refresh(self.options)
+        else:
+            self._show_surface()
+
+    def leave(self) -> None:
+        """Stop comparing; the measurement goes on."""
+        self.compare.leave()
+
+    def picture(self) -> QPixmap:
+        """The 3-D picture; comparing, all there is."""
+        image = None if self.stack.currentWidget() is self.compare else self.view.image()
+        return self.grab() if image is None else QPixmap.fromImage(image)
+
+    def copy_picture(self) -> None:
+        """Put the picture on the clipboard."""
+        QGuiApplication.clipboard().setPixmap(self.picture())
+        self.workspace.said.emit("The picture is on the clipboard", False)
+
+    def save_picture(self) -> None:
+        """Ask for a file and write the picture to it."""
+        name = f"surface_{self.workspace.frame:06d}.png"
+        chosen, _ = QFileDialog.getSaveFileName(self, "Save picture", name, "PNG (*.png)")
+        if chosen:
+            self.write_picture(Path(chosen))
+
+    def write_picture(self, path: Path) -> None:
+        """Write the picture as PNG; a refusal is said."""
+        path = path if path.suffix.lower() == ".png" else path.with_name(path.name + ".png")
+        written = self.picture().save(str(path), "PNG")
+        words = f"{path.name} is written" if written else f"{path} cannot be written"
+        self.workspace.said.emit(words, not written)
+
+    def _show_surface(self) -> None:
+        result, session = self.told.result, self.workspace.session
+        reconstruction = self.told.reconstruction
+        drawn, cut, dots = None, None, None
+        if reconstruction is not None and self.options.section is not None:
+            cut = profile(reconstruction, *self.options.section)
+        if result is not None and session is not None:
+            measurement = result.measurement
+            limits = height_limits(session) if self.options.same_colours else None
+            drawn = scene(measurement, rig_of(result), self.options, limits, cut)
+            dots = reflected_dots(measurement)
+        self.view.set_words(self.told.words)
+        self.view.show_scene(drawn)
+        self.dots.show_dots(dots)
+        boundary = None if reconstruction is None else reconstruction.boundary
+        self.plan.show_pool(boundary, self.options.section)
+        self.profile.show_profile(cut)
+
+    def _show_options(self) -> None:
+        self.colour.set_value(self.options.colour)
+        self.high.set_value(self.options.exaggeration)
+        for name, action in self.parts.items():
+            action.blockSignals(True)
+            action.setChecked(getattr(self.options, name))
+            action.blockSignals(False)
+        if self.options.section is not None:
+            self.angle.set_value(self.options.section[0])
+            self.offset.set_value(self.options.section[1])
+
+    # --- what is done ------------------------------------------------------------------------
+
+    def _set(self, **changed: object) -> None:
+        self.options = replace(self.options, **changed)  # type: ignore[arg-type]
+        self._show_options()
+        if self.stack.currentWidget() is self.compare:
+            self.compare.refresh(self.options)
+        else:
+            self._show_surface()
+
+    def _enter_section(self, _: object) -> None:
+        self._set_section(float(self.angle.value() or 0.0), float(self.offset.value() or 0.0))
+
+    def _set_section(self, angle_deg: float, offset_mm: float) -> None:
+        self._set(section=(round(angle_deg, 1), round(offset_mm, 2)))
+
+    def _look(self, direction: Direction) -> None:
+        if self.stack.currentWidget() is self.compare:
+            self.compare.first.view.look(direction)
+        else:
+            self.view.look(direction)
+
+    def _toggle_compare(self) -> None:
+        session = self.workspace.session
+        wanted = self.comparing.isChecked() and session is not None
+        self.comparing.setChecked(wanted)
+        if wanted and session is not None:
+            self.compare.begin(scheme_name(session.settings))
+        else:
+            self.compare.leave()
+        self.stack.setCurrentIndex(int(wanted))
+        self.refresh()
+
+
+def _tool(words: str, what: str, work: Callable[[], None]) -> QToolButton:
+    button = QToolButton()
+    button.setText(words)
+    button.setToolTip(what)
+    button.setAccessibleName(words)
+    button.setAccessibleDescription(what)
+    button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+    button.clicked.connect(lambda _: work())
+    return button
