@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QObject, Signal
+from PySide6.QtCore import QObject, QTimer, Signal
 
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.presenter import Carried, Found, Shown
+from labapp.gui.pages.dots.presenter import Carried, Found, Shown, Wanted
 from labapp.gui.tasks import Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
+from labapp.session.session import Session
+
+REST_MS = 120
+"""Dots are looked for where the frame stays in view so long: not while frames rush by."""
 
 
 class Looking(QObject):
@@ -40,6 +44,10 @@ class Looking(QObject):
         super().__init__()
         self._space = workspace
         self._task: Task | None = None
+        self._rest = QTimer(self)
+        self._rest.setSingleShot(True)
+        self._rest.setInterval(REST_MS)
+        self._rest.timeout.connect(self._look)
         self.forget()
         workspace.opened.connect(self.forget)
 
@@ -49,46 +57,60 @@ class Looking(QObject):
         self.image: GreyImage | None = None
         self.why = ""
         self.found: Found | None = None
-        self._task = None
+        self._rest.stop()
 
     def want(self, frame: int) -> None:
         """See to it that a frame, and dots in it, are there to show."""
         session = self._space.session
-        if session is None or (self._task is not None and self._task in self._space.tasks.active):
+        if session is None or self._busy:
             return
-        by = presenter.wanted(session, frame)
-        known = self.found is not None and by == (self.found.frame, *self.found.by)
-        if self.frame == frame and (by is None or known or self.image is None):
-            return
-        kept = self.image if self.frame == frame else None
-
-        def work(control: Control) -> Found | None:
-            image = kept
-            if image is None:
-                try:
-                    image = session.frame(frame).image
-                except InputError as error:
-                    control.part((frame, None, str(error)))
-                    return None
-                control.part((frame, image, ""))
-            return None if by is None else presenter.detect(image, frame, by[1:])
-
-        title = f"Reading frame {frame}" if kept is None else "Looking for dots"
-        self._task = self._space.tasks.start(title, work, self._done, self._read)
+        if frame != self.frame:
+            self._rest.stop()
+            self._read(session, frame)
+        elif self._missing(session) and self.image is not None:
+            self._rest.start()
 
     def stop(self) -> None:
-        """Give up what is under way."""
-        if self._task is not None:
-            self._task.cancel()
+        """Look for nothing more."""
+        self._rest.stop()
 
-    def _read(self, part: tuple[int, GreyImage | None, str]) -> None:
-        self.frame, self.image, self.why = part
-        self.ready.emit()
+    @property
+    def _busy(self) -> bool:
+        return self._task is not None and self._task in self._space.tasks.active
 
-    def _done(self, found: Found | None) -> None:
-        self.found = found or self.found
-        self._task = None
-        self.ready.emit()
+    def _missing(self, session: Session) -> Wanted | None:
+        """What has to be looked for in the frame that was read."""
+        by = None if self.frame is None else presenter.wanted(session, self.frame)
+        known = self.found is not None and by == (self.found.frame, *self.found.by)
+        return None if known else by
+
+    def _read(self, session: Session, frame: int) -> None:
+        def work(_: Control) -> tuple[int, GreyImage | None, str]:
+            try:
+                return frame, session.frame(frame).image, ""
+            except InputError as error:
+                return frame, None, str(error)
+
+        def done(read: tuple[int, GreyImage | None, str]) -> None:
+            self.frame, self.image, self.why = read
+            self.ready.emit()
+
+        self._task = self._space.tasks.start(f"Reading frame {frame}", work, done)
+
+    def _look(self) -> None:
+        session, image = self._space.session, self.image
+        missing = None if session is None or self._busy else self._missing(session)
+        if missing is None or image is None:
+            return
+        frame, dots, lattice = missing
+
+        def done(found: Found) -> None:
+            self.found = found
+            self.ready.emit()
+
+        self._task = self._space.tasks.start(
+            "Looking for dots", lambda _: presenter.detect(image, frame, (dots, lattice)), done
+        )
 
 
 class Refit:

@@ -29,7 +29,7 @@ COMPUTED = "#ff5c5c"
 BLOCKED = "⊘"
 """Beside the number of a row that the torch blocks."""
 
-SIZE, CHOSEN_SIZE, REFERENCE_SIZE = 13, 17, 26
+SIZE, CHOSEN_SIZE, REFERENCE_SIZE = 13, 16, 26
 """Points of the screen."""
 
 
@@ -169,11 +169,11 @@ def _look(row: int, sited: bool, blocked: bool, chosen: bool) -> tuple[QPen, QBr
     """Outline and filling of a dot."""
     color = row_color(row) if row else DOUBT
     style = Qt.PenStyle.SolidLine if sited else Qt.PenStyle.DashLine
-    pen = _pen(CHOSEN if chosen else color, 2.5 if chosen else 1.5, style)
+    pen = _pen(CHOSEN if chosen else color, 2 if chosen else 1.5, style)
     if blocked:
         return pen, QBrush(QColor(color), Qt.BrushStyle.BDiagPattern)
     filling = QColor(color)
-    filling.setAlpha(130 if chosen else 0)
+    filling.setAlpha(60 if chosen else 0)
     return pen, QBrush(filling)
 
 

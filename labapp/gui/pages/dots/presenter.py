@@ -25,6 +25,9 @@ from labapp.session.setup import parse_setup
 
 NO_PLACES: FloatArray = np.zeros((0, 2))
 
+Wanted = tuple[int, DotSettings, LatticeSettings]
+"""A frame, and how dots and rows are to be looked for in it."""
+
 Origin = Literal["corrected", "measured", "found", "looked for"]
 
 
@@ -120,7 +123,7 @@ def shown(session: Session, frame: int, found: Found | None) -> Shown:
     return Shown(frame, "looked for", None, NO_PLACES, result, "")
 
 
-def wanted(session: Session, frame: int) -> tuple[int, DotSettings, LatticeSettings] | None:
+def wanted(session: Session, frame: int) -> Wanted | None:
     """What has to be looked for in a frame, and how; None if the session knows its dots."""
     if session.correction(frame) is not None:
         return None

@@ -88,11 +88,13 @@ class DotsPage(Page):
         if not len(session.frames):
             self.view.show_picture(None, "Import a recording first")
             return
-        same = self.seen is not None and self.seen.frame == frame
         self.looking.want(frame)
+        if self.looking.frame != frame:
+            return  # the frame before it, with its own dots, stays until this one is read
+        same = self.seen is not None and self.seen.frame == frame
         self.refit.want(frame)
         self.seen = presenter.shown(session, frame, self.looking.found)
-        if self.looking.frame == frame:
+        if self.looking.image is None or self.view.picture is not self.looking.image:
             self.view.show_picture(self.looking.image, self.looking.why)
         self.editor.show(self.seen.correction, same)
         correction = self.seen.correction
@@ -166,6 +168,8 @@ class DotsPage(Page):
     def _forget(self) -> None:
         self.seen = self._before = None
         self.editor.show(None, same_frame=False)
+        self.view.show_picture(None)
+        self.draw()
 
     # --- what is changed ----------------------------------------------------------------------
 
@@ -203,7 +207,7 @@ class DotsPage(Page):
     def add_at(self, u: float, v: float) -> None:
         """Add the dot at a place."""
         image, session = self.looking.image, self.workspace.session
-        if image is not None and session is not None and self.looking.frame == self.workspace.frame:
+        if image is not None and session is not None:
             self.editor.add(image, u, v, session.settings)
             self.draw()
 
@@ -263,9 +267,9 @@ class DotsPage(Page):
             Command("Delete", "Del", "Take the chosen dots out", lambda: self._then(editor.delete)),
             Command("Number", "N", "Give the chosen dots the row and column their neighbours tell",
                     editor.number),
-            Command("Row ◂", "Ctrl+Left", "Shift the chosen rows left by a column",
+            Command("Row left", "Ctrl+Left", "Shift the chosen rows left by a column",
                     lambda: editor.shift(-1)),
-            Command("Row ▸", "Ctrl+Right", "Shift the chosen rows right by a column",
+            Command("Row right", "Ctrl+Right", "Shift the chosen rows right by a column",
                     lambda: editor.shift(1)),
             Command("In doubt", "U", "Take row and column from the chosen dots",
                     editor.put_in_doubt),
