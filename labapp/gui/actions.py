@@ -269,7 +269,7 @@ FRAMES = (
     Action(
         "next_corrected",
         "F&rames",
-        "Next &corrected frame",
+        "Next corr&ected frame",
         "F7",
         "Go to the next frame that was corrected by hand",
         lambda window: window.jump("corrected", True),

@@ -166,6 +166,8 @@ class MainWindow(QMainWindow):
 
     def say(self, text: str, problem: bool = False) -> None:
         """Tell the operator something; a problem stays in the status line until it was read."""
+        if problem and text in self.status_line.unread:
+            return
         self.log_panel.add(text, problem)
         self.status_line.say(text, problem)
         if problem:
@@ -237,7 +239,7 @@ class MainWindow(QMainWindow):
         elif self._steps:
             keys = [step.key for step in self._steps]
             first = self.workspace.tried(lambda: first_step(session)) or "setup"
-            self.show_step(first if first in keys else keys[-1])
+            self.show_step(first if first in keys else keys[0])
         self._show_docks()
 
     def _changed(self) -> None:

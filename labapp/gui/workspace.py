@@ -75,10 +75,14 @@ class Workspace(QObject):
 
     def close(self) -> None:
         """Stop all work and close the session: the window goes."""
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            # What they are at is not kept anyway, and can take many seconds of a hard frame.
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
         self.show(None)
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-            self._pool = None
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
 
     def tried(self, work: Callable[[], T]) -> T | None:
         """Do something short; a refusal is said in words and gives None."""

@@ -1,5 +1,48 @@
 """Windows are tested without a screen."""
 
+from __future__ import annotations
+
 import os
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from PySide6.QtWidgets import QApplication, QWidget
+
+from labapp.gui.preferences import Preferences
+from labapp.gui.window import MainWindow
+
+SAMPLES = Path(__file__).parents[2] / "sample_sessions"
+
+KEPT: list[QWidget] = []
+"""Windows with pictures and 3-D views can crash when they are destroyed: these live to the end."""
+
+CopySample = Callable[[str], Path]
+
+
+@pytest.fixture
+def copy_sample(tmp_path: Path) -> CopySample:
+    """Copy a sample with its recording: (name) -> its session file."""
+
+    def copied(name: str) -> Path:
+        folder = tmp_path / "samples" / name
+        shutil.copytree(SAMPLES / name, folder)
+        return folder / f"{name}.labsession"
+
+    return copied
+
+
+@pytest.fixture
+def window(qapp: QApplication, tmp_path: Path, state: Path) -> Iterator[MainWindow]:
+    """The window as it is at the first start; closed, and kept, after the test."""
+    made = MainWindow(Preferences(theme="dark"), tmp_path / "config" / "preferences.json")
+    KEPT.append(made)
+    made.resize(1280, 760)
+    made.show()
+    yield made
+    made.close()
+    assert not made.workspace.tasks.active

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from labapp.gui.preferences import (
+    KEPT_RECENT,
+    VERSION,
+    Preferences,
+    read_preferences,
+    write_preferences,
+)
+
+SOME = Preferences(("/a b.labsession", "/c.labsession"), "light", "AAA=", "BBB=", "/data")
+
+
+def test_what_is_written_is_read_again(tmp_path: Path):
+    file = tmp_path / "new" / "preferences.json"
+    assert write_preferences(file, SOME) == ""
+    assert read_preferences(file) == (SOME, "")
+    assert [path.name for path in file.parent.iterdir()] == ["preferences.json"]
+
+
+def test_the_first_start_has_the_defaults(tmp_path: Path):
+    assert read_preferences(tmp_path / "none.json") == (Preferences(), "")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\x00\xff\xfe",
+        b"{",
+        b"[]",
+        b"null",
+        b"[" * 100_000,
+        b'{"version": 1, "theme": "pink"}',
+        b'{"version": 1, "recent": "abc"}',
+        b'{"version": 1, "recent": [1]}',
+        b'{"version": 1, "recent": ["a\\u0000b"]}',
+        b'{"version": 1, "geometry": null}',
+        b'{"version": 1, "unknown": 2}',
+        b'{"version": 99, "theme": "dark"}',
+        b'{"theme": "dark"}',
+        b'{"version": 1, "theme": "dark"}' + b" " * 2_000_000,
+    ],
+)
+def test_what_cannot_be_used_is_kept_aside_and_said(tmp_path: Path, content: bytes):
+    file = tmp_path / "preferences.json"
+    file.write_bytes(content)
+    found, problem = read_preferences(file)
+    assert found == Preferences()
+    aside = file.with_suffix(".kept.json")
+    assert str(aside) in problem
+    assert aside.read_bytes() == content
+    assert not file.exists()
+
+
+def test_a_folder_in_its_place_is_said(tmp_path: Path):
+    (tmp_path / "preferences.json").mkdir()
+    found, problem = read_preferences(tmp_path / "preferences.json")
+    assert found == Preferences()
+    assert "could not be read" in problem
+    assert "could not be saved" in write_preferences(tmp_path / "preferences.json", SOME)
+
+
+def test_a_file_that_was_there_stays_whole_when_it_cannot_be_written(tmp_path: Path):
+    file = tmp_path / "preferences.json"
+    assert write_preferences(file, SOME) == ""
+    (tmp_path / ".preferences.json.part").mkdir()
+    assert "could not be saved" in write_preferences(file, Preferences())
+    assert json.loads(file.read_bytes())["version"] == VERSION
+    assert read_preferences(file)[0] == SOME
+
+
+def test_the_session_opened_last_comes_first_and_once(tmp_path: Path):
+    held = Preferences()
+    for number in range(20):
+        held = held.with_recent(tmp_path / f"{number}.labsession")
+    assert len(held.recent) == KEPT_RECENT
+    held = held.with_recent(tmp_path / "15.labsession")
+    assert held.recent[0] == str(tmp_path / "15.labsession")
+    assert len(set(held.recent)) == KEPT_RECENT
+    assert held.last_folder == str(tmp_path)
+    assert held.folder == tmp_path
+    assert (
+        str(tmp_path / "15.labsession")
+        not in held.without_recent(tmp_path / "15.labsession").recent
+    )
+
+
+def test_a_last_folder_that_is_gone_is_not_begun_in(tmp_path: Path):
+    assert replace(SOME, last_folder=str(tmp_path / "gone")).folder.is_dir()

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint, Qt
+from PySide6.QtGui import QImage
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.standing import Standing, next_frame, standings
+from labapp.gui.views.timeline import Timeline, aggregated
+from labapp.gui.window import TICKS
+from labapp.session.measured import Overview
+
+
+def overview(status: list[str], corrected: list[bool], stale: list[bool]) -> Overview:
+    count = len(status)
+    return Overview(
+        np.arange(count), np.arange(count) / 60, tuple(status), np.array(corrected),
+        np.array(stale), {},
+    )  # fmt: skip
+
+
+def shown(qtbot: QtBot, kinds: np.ndarray, width: int = 600) -> Timeline:
+    timeline = Timeline(TICKS)
+    qtbot.addWidget(timeline)
+    timeline.resize(width, 80)
+    timeline.set_frames(np.arange(10, 10 + len(kinds)), np.arange(len(kinds)) / 60, kinds)
+    timeline.set_frame(10)
+    timeline.show()
+    return timeline
+
+
+def test_how_frames_stand():
+    seen = overview(
+        ["", "ok", "ok", "ok", "no-dots", "", "no-match"],
+        [False, False, True, True, False, True, True],
+        [False, False, False, True, False, False, False],
+    )
+    assert [Standing(kind).name for kind in standings(seen)] == [
+        "NOT_MEASURED", "MEASURED", "CORRECTED", "STALE", "NOT_MEASURABLE", "CORRECTED",
+        "NOT_MEASURABLE",
+    ]  # fmt: skip
+
+
+def test_the_next_frame_that_is_wanted():
+    frames = np.array([0, 5, 10, 15])
+    wanted = np.array([True, False, False, True])
+    assert next_frame(frames, wanted, 0) == 15
+    assert next_frame(frames, wanted, 15) is None
+    assert next_frame(frames, wanted, 15, forward=False) == 0
+    assert next_frame(frames, wanted, 0, forward=False) is None
+
+
+def test_one_bad_frame_in_ten_thousand_is_seen():
+    kinds = np.full(10_000, Standing.MEASURED, np.int64)
+    kinds[4321] = Standing.NOT_MEASURABLE
+    columns = aggregated(kinds, 700)
+    assert (columns == Standing.NOT_MEASURABLE).sum() == 1
+    assert columns[4321 * 700 // 10_000] == Standing.NOT_MEASURABLE
+    assert aggregated(np.array([1, 2]), 4).tolist() == [1, 1, 2, 2]
+
+
+@pytest.mark.parametrize("count", [1, 7, 599, 600, 601, 10_000])
+def test_every_pixel_goes_to_the_frame_that_it_shows(qtbot: QtBot, count: int):
+    kinds = np.zeros(count, np.int64)
+    scrubber = shown(qtbot, kinds).scrubber
+    width = scrubber.width()
+    positions = [scrubber.position_at(x) for x in range(width)]
+    assert positions[0] == 0
+    assert positions[-1] >= count - 1 - count // width
+    assert (np.diff(positions) >= 0).all()
+
+
+def test_kinds_differ_in_shape_not_only_in_colour(qtbot: QtBot):
+    shapes = set()
+    for kind in range(len(TICKS)):
+        timeline = shown(qtbot, np.full(1000, kind, np.int64))
+        picture = timeline.scrubber._drawn().convertToFormat(QImage.Format.Format_ARGB32)
+        column = [picture.pixelColor(300, y).alpha() > 0 for y in range(picture.height())]
+        shapes.add(tuple(column))
+    assert len(shapes) == len(TICKS)
+
+
+def test_ten_thousand_frames_are_drawn_at_once(qtbot: QtBot):
+    kinds = np.arange(10_000) % 5
+    timeline = shown(qtbot, kinds, width=1900)
+    timeline.grab()
+    began = time.perf_counter()
+    for position in range(30):
+        timeline.set_frames(np.arange(10_000), np.zeros(10_000), np.roll(kinds, position))
+        timeline.set_frame(position * 300)
+        timeline.scrubber.grab()
+    assert (time.perf_counter() - began) / 30 < 0.05
+
+
+def test_clicking_typing_and_keys_go_to_frames(qtbot: QtBot):
+    timeline = shown(qtbot, np.zeros(100, np.int64))
+    went: list[int] = []
+    timeline.moved.connect(went.append)
+    timeline.moved.connect(timeline.set_frame)
+    scrubber = timeline.scrubber
+    middle = QPoint(scrubber.width() // 2, 15)
+    qtbot.mouseClick(scrubber, Qt.MouseButton.LeftButton, pos=middle)
+    assert went[-1] == 60
+    qtbot.keyClick(scrubber, Qt.Key.Key_PageUp)
+    assert went[-1] == 50
+    timeline.step(1)
+    assert went[-1] == 51
+    timeline.step(10**9)
+    assert went[-1] == 109
+    timeline.number.setValue(12)
+    assert went[-1] == 12
+    assert timeline.told.text().startswith("3 of 100 · 0.0333 s")
+    assert scrubber.accessibleDescription() == "Frame 12, 0.0333 s"
+
+
+def test_a_number_between_frames_goes_to_the_nearest(qtbot: QtBot):
+    timeline = shown(qtbot, np.zeros(3, np.int64))
+    timeline.set_frames(np.array([0, 100, 200]), np.full(3, np.nan), np.zeros(3, np.int64))
+    timeline.set_frame(0)
+    with qtbot.waitSignal(timeline.moved) as went:
+        timeline.number.setValue(90)
+    assert went.args == [100]
+    timeline.set_frame(100)
+    timeline.number.setValue(101)
+    assert timeline.number.value() == 100
+
+
+def test_playing_shows_every_frame_and_stops_at_the_last(qtbot: QtBot):
+    timeline = shown(qtbot, np.zeros(4, np.int64))
+    went: list[int] = []
+    timeline.moved.connect(went.append)
+    timeline.moved.connect(timeline.set_frame)
+    timeline.set_playing(True)
+    assert timeline.play_button.accessibleName() == "Pause"
+    qtbot.waitUntil(lambda: not timeline.playing, timeout=2000)
+    assert went == [11, 12, 13]
+    assert timeline.play_button.accessibleName() == "Play"
+    timeline.set_playing(True)
+    assert went[-1] == 10
+    timeline.set_playing(False)
+
+
+def test_nothing_to_show_takes_no_harm(qtbot: QtBot):
+    timeline = shown(qtbot, np.zeros(3, np.int64))
+    timeline.set_frames(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64))
+    timeline.set_frame(0)
+    timeline.step(1)
+    timeline.set_playing(True)
+    assert not timeline.playing
+    assert not timeline.isEnabled()
+    timeline.grab()

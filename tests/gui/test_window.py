@@ -1,0 +1,593 @@
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QMimeData, QPointF, Qt, QTimer, QUrl
+from PySide6.QtGui import QDropEvent
+from PySide6.QtWidgets import QApplication, QMessageBox
+from pytestqt.qtbot import QtBot
+
+from labapp.errors import InputError
+from labapp.gui import app, dialogs
+from labapp.gui import window as window_module
+from labapp.gui.pages.page import Page
+from labapp.gui.preferences import Preferences, read_preferences
+from labapp.gui.recent import look_at
+from labapp.gui.step_list import StepList, mark_icon
+from labapp.gui.steps import STEPS, Mark, states
+from labapp.gui.window import MainWindow, first_step, table_text, title
+from labapp.gui.workspace import Workspace
+from labapp.session.copies import copy_sample as copied_sample
+from labapp.session.copies import copy_session
+from labapp.session.log import log_file
+from labapp.session.record import Record
+from labapp.session.session import Session
+
+from .conftest import KEPT, CopySample
+
+
+class Plain(Page):
+    """A page that counts what the window asks of it."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.refreshed, self.left = 0, 0
+        self.taken: list[Path] = []
+
+    def refresh(self) -> None:
+        assert self.workspace.session is not None
+        self.refreshed += 1
+
+    def leave(self) -> None:
+        self.left += 1
+
+    def take(self, path: Path) -> None:
+        self.taken.append(path)
+
+
+class Broken(Plain):
+    key = "export"
+
+    def refresh(self) -> None:
+        raise RuntimeError("no export today")
+
+
+class Capture(Plain):
+    key = "capture"
+
+
+class Surface(Plain):
+    key = "surface"
+
+
+class SetUp(Plain):
+    key = "setup"
+
+
+@pytest.fixture
+def plain(
+    qapp: QApplication, tmp_path: Path, state: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[MainWindow]:
+    """A window with pages of the tests' own."""
+    monkeypatch.setattr(window_module, "PAGES", (SetUp, Capture, Surface, Broken))
+    made = MainWindow(Preferences(theme="light"), tmp_path / "preferences.json")
+    KEPT.append(made)
+    made.show()
+    yield made
+    if made.isVisible():
+        made.close()
+    assert not made.workspace.tasks.active
+
+
+def plain_page(window: MainWindow) -> Plain:
+    assert isinstance(window.page, Plain)
+    return window.page
+
+
+def problems(window: MainWindow) -> list[str]:
+    return [text for text in window.log_panel.texts() if "▲" in text]
+
+
+def settle(window: MainWindow, qtbot: QtBot) -> None:
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active and not window._rest.isActive())
+
+
+def test_the_first_window_welcomes(window: MainWindow):
+    assert window.stack.currentWidget() is window.welcome
+    assert window.welcome.nothing.isVisible()
+    assert not any(window._docks[name].isVisible() for name in window._docks)
+    assert window.windowTitle() == "labapp"
+
+
+def test_opening_shows_the_results_and_closing_the_welcome_page(
+    plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    path = copy_sample("gtaw")
+    assert plain.open_session(path)
+    page = plain_page(plain)
+    assert page.key == "surface"
+    assert page.refreshed == 1
+    assert plain.windowTitle() == "gtaw — labapp"
+    assert plain.side_panel.title.text() == "Surface"
+    assert "All 30 frames are measured" in plain.side_panel.state.text()
+    assert plain.timeline.told.text().startswith("1 of 30")
+    assert plain.preferences.recent == (str(path),)
+    assert all(plain._docks[name].isVisible() for name in ("steps", "panel", "timeline"))
+    plain.menus.do("close")
+    assert page.left == 1
+    assert plain.workspace.session is None
+    assert plain.stack.currentWidget() is plain.welcome
+    qtbot.waitUntil(lambda: "30 frames, all measured" in plain.welcome.list.item(0).text())
+
+
+def test_the_page_in_view_is_refreshed_and_no_other(
+    plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    plain.open_session(copy_sample("thumb_tack"))
+    surface = plain_page(plain)
+    plain.show_step("setup")
+    settle(plain, qtbot)
+    setup, seen = plain_page(plain), surface.refreshed
+    assert surface.left == 1
+    count = setup.refreshed
+    plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Another")))
+    assert setup.refreshed == count + 1
+    settle(plain, qtbot)
+    plain.workspace.show_frame(1)
+    assert setup.refreshed == count + 2
+    assert surface.refreshed == seen
+
+
+def test_many_changes_in_a_row_are_shown_together_and_the_last_is_seen(
+    plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    plain.open_session(copy_sample("thumb_tack"))
+    settle(plain, qtbot)
+    page = plain_page(plain)
+    page.refresh = lambda: (time.sleep(0.01), setattr(page, "refreshed", page.refreshed + 1))  # type: ignore[method-assign]
+    before = page.refreshed
+    for number in range(50):
+        plain.workspace.attempt(lambda s, n=number: s.set_record(replace(s.record, title=f"{n}")))
+    assert page.refreshed - before < 10
+    settle(plain, qtbot)
+    assert plain.menus.actions["undo"].text() == "&Undo experiment record"
+
+
+def test_undo_and_redo_say_what_they_do(plain: MainWindow, copy_sample: CopySample, qtbot: QtBot):
+    plain.open_session(copy_sample("thumb_tack"))
+    plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Another")))
+    settle(plain, qtbot)
+    actions = plain.menus.actions
+    assert actions["undo"].text() == "&Undo experiment record"
+    assert not actions["redo"].isEnabled()
+    actions["undo"].trigger()
+    settle(plain, qtbot)
+    assert plain.workspace.session is not None
+    assert plain.workspace.session.record.title == "Thumb tack of §8.2"
+    assert actions["redo"].text() == "&Redo experiment record"
+    actions["redo"].trigger()
+    assert plain.workspace.session.record.title == "Another"
+    assert "Done again: experiment record" in plain.status_line.message.text()
+
+
+def test_keys_go_through_the_frames_and_the_steps(
+    plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    plain.open_session(copy_sample("blocked_rows"))
+    plain.activateWindow()
+    plain_page(plain).setFocus()
+    steps = [(Qt.Key.Key_Right, 1), (Qt.Key.Key_End, 5), (Qt.Key.Key_Left, 4), (Qt.Key.Key_Home, 0)]
+    for key, frame in steps:
+        qtbot.keyClick(plain, key)
+        assert plain.workspace.frame == frame
+    for name, frame in [
+        ("next_doubtful", 3),
+        ("next_doubtful", 4),
+        ("previous_corrected", 2),
+        ("previous_corrected", 2),
+    ]:
+        plain.menus.do(name)
+        assert plain.workspace.frame == frame
+    assert "No frame before this one is corrected by hand" in plain.status_line.message.text()
+    plain.menus.do("previous_step")
+    assert plain_page(plain).key == "capture"
+    plain.menus.do("step_setup")
+    assert plain.step_list.currentRow() == 0
+    plain.step_list.setCurrentRow(2)
+    assert plain_page(plain).key == "surface"
+
+
+def test_space_plays_and_arrows_in_a_field_stay_there(
+    plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    plain.open_session(copy_sample("gtaw"))
+    plain_page(plain).setFocus()
+    qtbot.keyClick(plain, Qt.Key.Key_Space)
+    assert plain.timeline.playing
+    qtbot.waitUntil(lambda: plain.workspace.frame > 2)
+    plain.say("The recording is gone", True)
+    assert not plain.timeline.playing
+    frame = plain.workspace.frame
+    editor = plain.timeline.number.lineEdit()
+    qtbot.keyClick(editor, Qt.Key.Key_Home)
+    qtbot.keyClick(editor, Qt.Key.Key_Right)
+    assert plain.workspace.frame == frame
+
+
+def test_a_page_that_fails_is_said_and_the_window_stays(
+    plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    plain.open_session(copy_sample("thumb_tack"))
+    plain.show_step("export")
+    assert "RuntimeError: no export today" in problems(plain)[0]
+    assert "no export today" in plain.status_line.message.text()
+    plain.show_step("surface")
+    assert plain_page(plain).key == "surface"
+    plain.status_line.read_button.click()
+    assert plain.log_panel.isVisible()
+    assert plain.status_line.unread == []
+
+
+def test_a_session_that_is_in_use_is_offered_read_only(
+    plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    path = copy_sample("thumb_tack")
+
+    def answer(accept: bool) -> None:
+        box = QApplication.activeModalWidget()
+        assert isinstance(box, QMessageBox)
+        chosen = box.defaultButton() if accept else box.button(QMessageBox.StandardButton.Cancel)
+        chosen.click()
+
+    with Session.open(path):
+        QTimer.singleShot(50, lambda: answer(False))
+        assert not plain.open_session(path)
+        assert plain.workspace.session is None
+        QTimer.singleShot(50, lambda: answer(True))
+        assert plain.open_session(path)
+        assert plain.windowTitle() == "thumb_tack (read-only) — labapp"
+        assert not plain.workspace.attempt(lambda s: s.set_record(Record()))
+        assert "read-only" in problems(plain)[0]
+        assert not plain.menus.actions["undo"].isEnabled()
+
+
+def test_what_is_no_session_is_refused_in_words(plain: MainWindow, tmp_path: Path):
+    (tmp_path / "a.labsession").write_bytes(b"nonsense")
+    assert not plain.open_session(tmp_path / "a.labsession")
+    assert not plain.open_session(tmp_path / "gone.labsession")
+    assert len(problems(plain)) == 2
+    assert plain.stack.currentWidget() is plain.welcome
+
+
+def drop(window: MainWindow, qtbot: QtBot, *paths: Path) -> None:
+    data = QMimeData()
+    data.setUrls([QUrl.fromLocalFile(str(path)) for path in paths])
+    window.dropEvent(
+        QDropEvent(
+            QPointF(50, 50),
+            Qt.DropAction.CopyAction,
+            data,
+            Qt.MouseButton.LeftButton,
+            Qt.KeyboardModifier.NoModifier,
+        )
+    )
+    qtbot.wait(20)
+
+
+def test_what_is_dropped_is_opened_or_imported(
+    plain: MainWindow,
+    copy_sample: CopySample,
+    tmp_path: Path,
+    qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    path = copy_sample("gtaw")
+    asked: list[Path] = []
+
+    def answer(_: object, proposed: Path, *__: object) -> Path:
+        asked.append(proposed)
+        return tmp_path / "made.labsession"
+
+    monkeypatch.setattr(dialogs, "ask_new_session", answer)
+    recording = path.parent / "recording.avi"
+    drop(plain, qtbot, recording)
+    assert asked == [path.parent / "recording.labsession"]
+    assert plain.workspace.session is not None
+    assert plain.workspace.session.path == tmp_path / "made.labsession"
+    assert plain_page(plain).key == "capture"
+    assert plain_page(plain).taken == [recording]
+    drop(plain, qtbot, path.parent)
+    assert plain_page(plain).taken == [recording, path.parent]
+    drop(plain, qtbot, path)
+    assert plain.workspace.session.path == path
+    drop(plain, qtbot, path, recording)
+    assert "Drop one file" in problems(plain)[0]
+    drop(plain, qtbot, tmp_path / "gone.avi")
+    assert "is not there" in problems(plain)[1]
+
+
+def test_saying_no_to_a_new_session_imports_nothing(
+    plain: MainWindow, copy_sample: CopySample, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: None)
+    plain.import_recording(copy_sample("gtaw").parent / "recording.avi")
+    assert plain.workspace.session is None
+    assert plain.page is None
+
+
+def test_a_copy_stands_elsewhere_and_finds_its_recording(
+    plain: MainWindow,
+    copy_sample: CopySample,
+    tmp_path: Path,
+    qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    plain.open_session(copy_sample("gtaw"))
+    plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Mine")))
+    there = tmp_path / "elsewhere" / "copy.labsession"
+    there.parent.mkdir()
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: there)
+    plain.menus.do("copy")
+    settle(plain, qtbot)
+    assert f"A copy is in {there}" in plain.status_line.message.text()
+    with Session.open(there) as copy:
+        assert copy.record.title == "Mine"
+        assert copy.missing_recording is None
+        assert copy.frame(3).image.shape == (640, 480)
+        assert copy.problems() == []
+    assert sorted(p.name for p in there.parent.iterdir() if "lock" not in p.name) == [there.name]
+    plain.menus.do("copy")
+    settle(plain, qtbot)
+    assert "is there already" in problems(plain)[0]
+
+
+def test_a_copy_must_have_a_name_of_its_own(copy_sample: CopySample, tmp_path: Path):
+    path = copy_sample("thumb_tack")
+    for bad in (path, tmp_path / "copy.txt", tmp_path / "no" / "folder.labsession"):
+        with pytest.raises(InputError):
+            copy_session(path, bad)
+    assert not (tmp_path / "no").exists()
+
+
+def test_the_sample_is_copied_once_and_then_the_users_own(tmp_path: Path):
+    for name in ("gtaw", "concave"):
+        path = copied_sample(name, tmp_path / name)
+        with Session.open(path) as session:
+            session.frame(0)
+            session.set_record(replace(session.record, title="Mine"))
+        assert copied_sample(name, tmp_path / name) == path
+        with Session.open(path) as session:
+            assert session.record.title == "Mine"
+            assert session.problems() == []
+
+
+def test_trying_the_sample_opens_it(
+    plain: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(Preferences, "samples_folder", tmp_path / "documents")
+    plain.welcome.buttons["sample"].click()
+    assert plain.workspace.session is not None
+    assert plain.workspace.session.path == tmp_path / "documents" / "gtaw" / "gtaw.labsession"
+    assert "copy of the sample" in plain.status_line.message.text()
+
+
+def test_the_layout_and_the_theme_are_remembered(
+    plain: MainWindow, copy_sample: CopySample, tmp_path: Path
+):
+    path = copy_sample("thumb_tack")
+    plain.open_session(path)
+    plain.resize(777, 500)
+    plain.menus.do("steps")
+    plain.menus.do("log")
+    plain.menus.do("theme_dark")
+    plain.close()
+    found, problem = read_preferences(tmp_path / "preferences.json")
+    assert problem == ""
+    assert (found.theme, found.recent) == ("dark", (str(path),))
+    again = MainWindow(found, tmp_path / "preferences.json")
+    KEPT.append(again)
+    again.show()
+    assert again.size().width() == 777
+    again.open_session(path)
+    assert not again._docks["steps"].isVisible()
+    assert again._docks["log"].isVisible()
+    again.menus.do("reset_layout")
+    assert again._docks["steps"].isVisible()
+    assert not again._docks["log"].isVisible()
+    again.close()
+
+
+def test_nonsense_for_a_layout_does_no_harm(qapp: QApplication, tmp_path: Path):
+    odd = Preferences(("/gone/x.labsession",), "dark", "ä no base64", "AAAAB3NzaC1yc2E=", "/gone")
+    window = MainWindow(odd, tmp_path / "preferences.json")
+    KEPT.append(window)
+    window.show()
+    assert window.isVisible()
+    window.close()
+
+
+def test_closing_stops_the_measuring_and_keeps_what_is_finished(
+    plain: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
+):
+    np.save(tmp_path / "dark.npy", np.zeros((2000, 48, 64), np.uint8))
+    path = tmp_path / "dark.labsession"
+    with Session.open(copy_sample("gtaw")) as sample, Session.create(path) as session:
+        session.set_setup(sample.setup_text)
+        session.import_recording(tmp_path / "dark.npy")
+    plain.open_session(path)
+    settle(plain, qtbot)
+    plain.menus.do("measure")
+    task = plain.workspace.tasks.active[0]
+    qtbot.waitUntil(lambda: task.done >= 5, timeout=30_000)
+    assert plain.status_line.bar.isVisible()
+    plain.menus.do("measure_frame")
+    assert "being measured already" in plain.status_line.message.text()
+    began = time.perf_counter()
+    plain.close()
+    assert time.perf_counter() - began < 4
+    assert not task.thread.is_alive()
+    with Session.open(path) as session:
+        assert 5 <= 2000 - len(session.stale_frames()) < 2000
+        assert session.problems() == []
+
+
+def test_a_set_up_that_is_not_complete_is_said_before_measuring(
+    plain: MainWindow, copy_sample: CopySample
+):
+    plain.open_session(copy_sample("thumb_tack"))
+    plain.workspace.attempt(lambda s: s.update_setup({"laser": {"distance_mm": None}}))
+    plain.menus.do("measure_frame")
+    assert "laser.distance_mm" in problems(plain)[0]
+    assert plain.workspace.tasks.active == []
+
+
+def test_a_missing_recording_is_said_at_once(plain: MainWindow, copy_sample: CopySample):
+    path = copy_sample("gtaw")
+    (path.parent / "recording.avi").unlink()
+    assert plain.open_session(path)
+    assert "recording.avi" in problems(plain)[0]
+
+
+def test_copying_a_picture_and_a_table(plain: MainWindow, copy_sample: CopySample):
+    from PySide6.QtWidgets import QTableWidget, QTableWidgetItem
+
+    plain.open_session(copy_sample("thumb_tack"))
+    plain.menus.do("copy_table")
+    assert plain.status_line.message.text() == "This step has no table"
+    table = QTableWidget(2, 2)
+    table.setHorizontalHeaderLabels(["Quantity", "mm"])
+    for row, cells in enumerate([("Width", "6.66"), ("Height", "0.294")]):
+        for column, text in enumerate(cells):
+            table.setItem(row, column, QTableWidgetItem(text))
+    plain_page(plain).panel_layout.addWidget(table)
+    table.show()
+    plain.menus.do("copy_table")
+    assert QApplication.clipboard().text() == "Quantity\tmm\nWidth\t6.66\nHeight\t0.294"
+    assert table_text(table) == QApplication.clipboard().text()
+    plain.menus.do("copy_picture")
+    assert QApplication.clipboard().pixmap().width() == plain_page(plain).width()
+
+
+def test_where_to_begin(copy_sample: CopySample, tmp_path: Path):
+    with Session.create(tmp_path / "new.labsession") as session:
+        assert first_step(session) == "setup"
+        assert title(session) == "new — labapp"
+    with Session.open(copy_sample("gtaw")) as session:
+        assert first_step(session) == "surface"
+        (tmp_path / "setup.toml").write_text(session.setup_text, "utf-8")
+        with Session.create(tmp_path / "other.labsession") as other:
+            other.set_setup(session.setup_text)
+            assert first_step(other) == "capture"
+
+
+def test_every_step_tells_its_mark_in_words_and_in_a_shape(
+    qapp: QApplication, copy_sample: CopySample, qtbot: QtBot
+):
+    listed = StepList(STEPS)
+    qtbot.addWidget(listed)
+    with Session.open(copy_sample("blocked_rows")) as session:
+        found = states(session)
+        listed.show_states(found)
+    for row, step in enumerate(STEPS):
+        item = listed.item(row)
+        assert found[step.key].why in item.toolTip()
+        assert found[step.key].mark.value in item.data(Qt.ItemDataRole.AccessibleTextRole)
+    shapes = set()
+    for mark in Mark:
+        image = mark_icon(mark, False).pixmap(54, 54).toImage()
+        alpha = [image.pixelColor(x, y).alpha() > 99 for x in range(54) for y in range(54)]
+        shapes.add(tuple(alpha))
+    assert len(shapes) == len(Mark)
+
+
+def test_looking_at_sessions_changes_none(copy_sample: CopySample, tmp_path: Path):
+    path = copy_sample("concave")
+    content = path.read_bytes()
+    found = look_at(path)
+    assert found.title == "A concave pool"
+    assert "6 frames, all measured" in found.about
+    assert found.thumbnail is not None
+    assert np.ptp(found.thumbnail) == 255
+    assert path.read_bytes() == content
+    shutil.rmtree(path.parent / "recording")
+    without = look_at(path)
+    assert without.there
+    assert without.thumbnail is None
+    path.write_bytes(content[:5000])
+    assert not look_at(path).there
+    assert not look_at(tmp_path / "gone.labsession").there
+    with Session.create(tmp_path / "new.labsession"):
+        pass
+    assert "no recording yet" in look_at(tmp_path / "new.labsession").about
+
+
+def test_a_fault_goes_to_the_log_and_is_said(plain: MainWindow, qtbot: QtBot):
+    faults = app.Faults(plain.say, plain)
+    try:
+        raise ZeroDivisionError("in a slot")
+    except ZeroDivisionError as error:
+        faults.take(type(error), error, error.__traceback__)
+    assert "ZeroDivisionError: in a slot" in problems(plain)[0]
+
+    def elsewhere() -> None:
+        try:
+            raise ValueError("in a thread")
+        except ValueError as error:
+            faults.take(type(error), error, error.__traceback__)
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    qtbot.waitUntil(lambda: len(problems(plain)) == 2)
+    log = log_file().read_text("utf-8")
+    assert "Traceback" in log
+    assert "in a thread" in log
+    assert plain.isVisible()
+
+
+def test_without_a_display_or_a_file_it_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: Path
+):
+    with pytest.raises(InputError, match="is not there"):
+        app.main([str(tmp_path / "gone.avi")])
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match="display"):
+        app.main([])
+
+
+def test_the_app_starts_opens_a_session_and_ends(
+    qapp: QApplication,
+    copy_sample: CopySample,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    state: Path,
+):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    (tmp_path / "config" / "labapp").mkdir(parents=True)
+    (tmp_path / "config" / "labapp" / "preferences.json").write_text("{broken")
+    path = copy_sample("thumb_tack")
+    seen: dict[str, object] = {}
+
+    before = set(QApplication.topLevelWidgets())
+
+    def look() -> None:
+        for window in set(QApplication.topLevelWidgets()) - before:
+            if isinstance(window, MainWindow):
+                KEPT.append(window)
+                seen["title"] = window.windowTitle()
+                seen["problems"] = problems(window)
+                window.close()
+        QApplication.quit()
+
+    QTimer.singleShot(500, look)
+    assert app.main([str(path)]) == 0
+    assert seen["title"] == "thumb_tack — labapp"
+    assert "preferences file is damaged" in str(seen["problems"])
