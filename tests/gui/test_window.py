@@ -585,7 +585,6 @@ def test_the_app_starts_opens_a_session_and_ends(
                 seen["title"] = window.windowTitle()
                 seen["problems"] = problems(window)
                 window.close()
-        QApplication.quit()
 
     QTimer.singleShot(500, look)
     assert app.main([str(path)]) == 0
