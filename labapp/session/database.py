@@ -352,7 +352,8 @@ def _lock(path: Path) -> FileLock:
             path,
             "folder",
             getattr(error, "strerror", None) or error,
-            "a folder that can be written; the session can be opened read-only",
+            "a folder that can be written"
+            + ("; the session can be opened read-only" if path.exists() else ""),
         ) from error
     return lock
 

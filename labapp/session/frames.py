@@ -31,6 +31,8 @@ from labapp.session.run import select_frames
 Progress = Callable[[int, int], None]
 """Called with how much is done and of how much; may raise to stop."""
 
+THE_RECORDING = "the recording; `labapp session relink` says where it is now"
+
 READ_BYTES = 1 << 20
 PAIRED = frozenset({".cih", ".cihx", ".mraw"})
 
@@ -306,9 +308,7 @@ class Frames:
         if self._source is None:
             recording, place = self._imported(), self._place()
             if not place.exists():
-                raise InputError(
-                    place, "recording", "is not there", "the recording; say where it is now"
-                )
+                raise InputError(place, "recording", "is not there", THE_RECORDING)
             source = open_source(place, recording.index)
             if (len(source), source.shape) != (
                 recording.frames,

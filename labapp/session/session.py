@@ -30,7 +30,7 @@ from labapp.session.blobs import fingerprint
 from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Change, Documents, Key
 from labapp.session.export import ExportChoice, ExportedFile
-from labapp.session.frames import Frames, Progress
+from labapp.session.frames import THE_RECORDING, Frames, Progress
 from labapp.session.kept_pictures import KeptPictures
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
@@ -367,7 +367,7 @@ class Session:
         chosen = self.stale_frames() if frames is None else frames
         basis = Basis(self.setup, self.settings)
         if (missing := self.missing_recording) is not None:
-            raise InputError(missing, "recording", "is not there", "say where it is now (relink)")
+            raise InputError(missing, "recording", "is not there", THE_RECORDING)
         corrections: dict[int, Correction | None] = {}
 
         def correction(number: int) -> Correction | None:

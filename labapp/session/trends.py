@@ -9,7 +9,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import detrend
 from scipy.signal.windows import hann
 
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.session.measured import Overview
 
 NEIGHBOURS = 15
@@ -246,14 +246,13 @@ def spectrum(course: Trend) -> Spectrum:
 
     Raises
     ------
-    CannotMeasure
-        ``too-few-frames`` if that part is too short.
+    ValueError
+        If that part is too short.
     """
     members = _even_part(course)
     count = len(members)
     if count < FEWEST:
-        raise CannotMeasure(
-            "too-few-frames",
+        raise ValueError(
             f"a spectrum needs {FEWEST} frames in a row, evenly spaced in time; "
             f"there are {count} at most",
         )

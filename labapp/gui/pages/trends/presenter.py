@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.values import CannotMeasure, IntArray
+from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
 from labapp.session.measured import Overview
@@ -153,7 +153,7 @@ def _spectrum(seen: Overview, wish: Wish, timed: bool) -> tuple[tuple[Curve, ...
     course = trend(seen, wish.spectrum_of, wish.without_doubtful)
     try:
         found = spectrum(course)
-    except CannotMeasure as error:
+    except ValueError as error:
         return (), axis, error.reason[0].upper() + error.reason[1:]
     quantity = course.quantity
     curve = Curve(
