@@ -19,7 +19,7 @@ from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.session.log import NAME
 
-POLL_MS = 30
+POLL_MS = 10
 
 
 class Cancelled(Exception):

@@ -154,7 +154,9 @@ def test_a_spoiled_frame_is_put_right_in_fifteen_actions(
 
     assert actions <= 15
     assert len(session.history) == steps + 4
-    qtbot.waitUntil(lambda: not presenter.needs_fit(session, 0), timeout=60_000)
+    qtbot.waitUntil(
+        lambda: not presenter.needs_fit(presenter.shown(session, 0, None)), timeout=60_000
+    )
     result = session.result(0)
     assert result is not None
     assert not result.stale
@@ -367,13 +369,13 @@ def test_what_is_shown_without_a_window(copy_sample: CopySample) -> None:
         assert [line.row for line in lines if line.row] == list(range(9, 0, -1))
         assert sum(line.dots for line in lines) == 99
         assert [line.note for line in lines if line.row == 6] == ["reference 8"]
-        assert not presenter.needs_fit(session, 0)
+        assert not presenter.needs_fit(presenter.shown(session, 0, None))
         session.correct({0: shift_row(seen.correction, 4, 1)})
-        assert presenter.needs_fit(session, 0)
+        assert presenter.needs_fit(presenter.shown(session, 0, None))
         assert presenter.shown(session, 0, None).origin == "corrected"
         session.correct({0: None})
         assert presenter.shown(session, 0, None).origin == "measured"
-        assert not presenter.needs_fit(session, 0)
+        assert not presenter.needs_fit(presenter.shown(session, 0, None))
 
 
 def test_figures_before_and_after() -> None:
@@ -404,12 +406,12 @@ def test_four_hundred_dots_follow_the_hand_at_sixty_hertz(page: DotsPage) -> Non
     took = []
     for step in range(20):
         page.editor.shift_px[:] = step, -step
-        start = time.perf_counter()
+        start = time.thread_time()
         page.draw()
         page.view.canvas.grab()
-        took.append(time.perf_counter() - start)
-    # The machine may be busy with other work: its best is what the page costs.
-    assert min(took) < 1 / 60
+        took.append(time.thread_time() - start)
+    # The thread's own time: the machine may be busy with other work.
+    assert np.median(took) < 1 / 60
 
 
 def test_frames_that_rush_by_show_their_own_dots(

@@ -6,11 +6,10 @@ from PySide6.QtCore import QObject, QTimer, Signal
 
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.presenter import Carried, Found, Shown, Wanted
+from labapp.gui.pages.dots.presenter import Carried, Found, Shown
 from labapp.gui.tasks import Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
-from labapp.session.session import Session
 
 REST_MS = 120
 """Dots are looked for where the frame stays in view so long: not while frames rush by."""
@@ -59,32 +58,13 @@ class Looking(QObject):
         self.found: Found | None = None
         self._rest.stop()
 
-    def want(self, frame: int) -> None:
-        """See to it that a frame, and dots in it, are there to show."""
+    def read(self, frame: int) -> None:
+        """Read a frame."""
         session = self._space.session
         if session is None or self._busy:
             return
-        if frame != self.frame:
-            self._rest.stop()
-            self._read(session, frame)
-        elif self._missing(session) and self.image is not None:
-            self._rest.start()
-
-    def stop(self) -> None:
-        """Look for nothing more."""
         self._rest.stop()
 
-    @property
-    def _busy(self) -> bool:
-        return self._task is not None and self._task in self._space.tasks.active
-
-    def _missing(self, session: Session) -> Wanted | None:
-        """What has to be looked for in the frame that was read."""
-        by = None if self.frame is None else presenter.wanted(session, self.frame)
-        known = self.found is not None and by == (self.found.frame, *self.found.by)
-        return None if known else by
-
-    def _read(self, session: Session, frame: int) -> None:
         def work(_: Control) -> tuple[int, GreyImage | None, str]:
             try:
                 return frame, session.frame(frame).image, ""
@@ -97,10 +77,25 @@ class Looking(QObject):
 
         self._task = self._space.tasks.start(f"Reading frame {frame}", work, done)
 
+    def look(self) -> None:
+        """Look for dots in the frame that was read, if it stays in view."""
+        if not self._busy and not self._rest.isActive():
+            self._rest.start()
+
+    def stop(self) -> None:
+        """Look for nothing more."""
+        self._rest.stop()
+
+    @property
+    def _busy(self) -> bool:
+        return self._task is not None and self._task in self._space.tasks.active
+
     def _look(self) -> None:
         session, image = self._space.session, self.image
-        missing = None if session is None or self._busy else self._missing(session)
-        if missing is None or image is None:
+        if session is None or image is None or self.frame is None or self._busy:
+            return
+        missing = presenter.wanted(session, self.frame)
+        if missing is None:
             return
         frame, dots, lattice = missing
 
@@ -134,17 +129,17 @@ class Refit:
         """Whether a fit is under way."""
         return self._task is not None and self._task in self._space.tasks.active
 
-    def want(self, frame: int) -> None:
+    def want(self, seen: Shown) -> None:
         """Fit a frame if what it was measured from has been changed."""
         session = self._space.session
-        if session is None or self.pending or not presenter.needs_fit(session, frame):
+        if session is None or self.pending or not presenter.needs_fit(seen):
             return
         # A fit that was refused or cancelled is not begun again until something else is tried.
-        state = (frame, session.history)
+        state = (seen.frame, session.history)
         if state == self._failed or presenter.why_no_fit(session):
             return
         self._failed = state
-        self._task = self._space.measure([frame])
+        self._task = self._space.measure([seen.frame])
 
 
 def carry_on(workspace: Workspace, seen: Shown, most: int | None) -> None:

@@ -175,12 +175,11 @@ def computed_px(result: Result | None) -> FloatArray:
     return parse_setup(result.setup, "setup").calibration.to_image(plane)
 
 
-def needs_fit(session: Session, frame: int) -> bool:
+def needs_fit(seen: Shown) -> bool:
     """Whether a frame's fit has to be redone because its dots or rows were changed by hand."""
-    result = session.result(frame)
-    if result is None:
-        return session.correction(frame) is not None
-    return CORRECTION_CHANGED in result.stale
+    if seen.result is None:
+        return seen.origin == "corrected"
+    return CORRECTION_CHANGED in seen.result.stale
 
 
 def why_no_fit(session: Session) -> str:

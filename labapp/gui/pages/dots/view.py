@@ -88,12 +88,14 @@ class DotsPage(Page):
         if not len(session.frames):
             self.view.show_picture(None, "Import a recording first")
             return
-        self.looking.want(frame)
         if self.looking.frame != frame:
+            self.looking.read(frame)
             return  # the frame before it, with its own dots, stays until this one is read
         same = self.seen is not None and self.seen.frame == frame
-        self.refit.want(frame)
         self.seen = presenter.shown(session, frame, self.looking.found)
+        if self.seen.correction is None:
+            self.looking.look()
+        self.refit.want(self.seen)
         if self.looking.image is None or self.view.picture is not self.looking.image:
             self.view.show_picture(self.looking.image, self.looking.why)
         self.editor.show(self.seen.correction, same)
