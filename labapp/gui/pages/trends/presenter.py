@@ -154,7 +154,7 @@ def _spectrum(seen: Overview, wish: Wish, timed: bool) -> tuple[tuple[Curve, ...
     try:
         found = spectrum(course)
     except ValueError as error:
-        return (), axis, error.reason[0].upper() + error.reason[1:]
+        return (), axis, str(error)[:1].upper() + str(error)[1:]
     quantity = course.quantity
     curve = Curve(
         f"Amplitude, {quantity.label.lower()}" if quantity.label != "ARE" else "Amplitude, ARE",
