@@ -18,7 +18,7 @@ import numpy as np
 from labapp import cli
 from labapp.cli.info import _facts, _text
 from labapp.core.correction import Correction
-from labapp.core.pipeline import Measurement
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.media import open_source
@@ -27,6 +27,7 @@ from labapp.session.corrections_csv import read_correction
 from labapp.session.export import verify_export
 from labapp.session.record import Record
 from labapp.session.results import surface_files
+from labapp.session.schema import MEASURES
 from labapp.session.session import Session
 from labapp.session.setup import read_setup, update_setup
 from labapp.session.tables import csv_rows, frame_tables
@@ -140,7 +141,8 @@ def _fingerprint_of(session: Session, name: str) -> str:
     return fingerprint(getattr(session, name))
 
 
-NOTHING = {fingerprint(None), fingerprint(""), fingerprint(Record())}
+UNMEASURED = repr(dict.fromkeys(MEASURES, float("nan")))
+NOTHING = {fingerprint(None), fingerprint(""), fingerprint(Record()), fingerprint(Settings())}
 
 
 def untold(before: dict[Any, Any], after: dict[Any, Any], *, forged: bool) -> list[str]:
@@ -149,11 +151,11 @@ def untold(before: dict[Any, Any], after: dict[Any, Any], *, forged: bool) -> li
     for key, value in after.items():
         known = before.get(key)
         kind = key[0]
-        if kind in ("frames", "settings") or value is None or value in NOTHING or value == known:
+        if kind == "frames" or value is None or value in NOTHING or value == known:
             continue
         if kind == "glance" and value[0] == "":
             continue
-        if kind == "measures" and "nan" in value and after["glance", *key[1:]][0] == "":
+        if kind == "measures" and value == UNMEASURED:
             continue
         if forged and kind == "result" and known is not None and value[:2] == known[:2]:
             continue
@@ -256,19 +258,16 @@ def try_session(folder: Path, known: dict[Any, Any], rng: random.Random) -> Tall
         problems = tally.attempt(session.problems)
         change(session, tally, rng)
         if problems == [] and tally.attempt(session.problems) == []:
-            after = facts(session)
-            kept = {key: of for key, of in after.items() if key[0] in ("measures", "frame")}
-            known = {**known, ("measures", 4, "fit"): kept.get(("measures", 4, "fit"))}
-            kept = {key: of for key, of in kept.items() if key[:2] != ("frame", 4)}
-            _hold_untold(known, kept | _glances(after), forged=True)
+            # What it calls stale follows from the changes; the numbers and the frames stand.
+            after = {
+                k: v for k, v in facts(session).items() if k[0] in ("measures", "frame", "time")
+            }
+            after.pop(("measures", 4, "fit"), None)  # measured in `change`
+            _hold_untold(known, after, forged=forged)
     strange = [name for name in _contents(folder) if name not in before]
     if [name for name in strange if not name.endswith("-journal")]:
         raise Broken(f"left beside it: {strange}")
     return tally
-
-
-def _glances(values: dict[Any, Any]) -> dict[Any, Any]:
-    return {key: of for key, of in values.items() if key[0] == "glance"}
 
 
 def _hold_untold(known: dict[Any, Any], now: dict[Any, Any], *, forged: bool) -> None:
