@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from labapp.gui.pages.capture import CapturePage
 from labapp.gui.pages.dots import DotsPage
+from labapp.gui.pages.export import ExportPage
 from labapp.gui.pages.page import Page
+from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.pages.trends import TrendsPage
 
 PAGES: tuple[type[Page], ...] = (
     CapturePage,
     DotsPage,
+    SurfacePage,
     TrendsPage,
+    ExportPage,
 )
 """In the order of `steps.STEPS`; a step without a page is not shown."""

@@ -1,0 +1,306 @@
+"""The export page: ticks, frames, folder; what would be written, what was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from PySide6.QtCore import Qt, QUrl
+from PySide6.QtGui import QDesktopServices
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QFileDialog,
+    QFrame,
+    QGridLayout,
+    QHBoxLayout,
+    QLabel,
+    QPushButton,
+    QScrollArea,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.pages.export.presenter import (
+    GROUPS,
+    USUAL,
+    Plan,
+    Wish,
+    Written,
+    folder_within,
+    plan,
+    proposed_folder,
+    schemes,
+    write,
+)
+from labapp.gui.pages.page import Page
+from labapp.gui.tasks import Control, Task
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, TextField
+from labapp.gui.workspace import Workspace
+from labapp.session.meshes import SMALLEST_SPACING_MM
+from labapp.session.session import Session
+
+WHICH = (
+    ("all", "all that are measured"),
+    ("view", "the frame in view"),
+    ("part", "a part"),
+)
+
+
+class ExportPage(Page):
+    """What leaves the session."""
+
+    key = "export"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.wish = Wish()
+        self.plan: Plan | None = None
+        self.written: Written | None = None
+        self._writing: Task | None = None
+        self._boxes: dict[str, QCheckBox] = {}
+        self._make_canvas()
+        self._make_panel()
+        workspace.opened.connect(self._session_opened)
+        workspace.tasks.changed.connect(self._show_state)
+
+    # --- what it shows ------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Show what would be written of what the session holds now."""
+        session = self.workspace.session
+        if session is None:
+            return
+        if not self.folder.value():
+            self.folder.set_value(str(proposed_folder(session)))
+        self.scheme.set_choices(schemes(session))
+        self.wish = replace(self.wish, scheme=self.scheme.value())
+        if len(session.frames) and not self.wish.last:
+            first, last = int(session.frames[0]), int(session.frames[-1])
+            self.wish = replace(self.wish, first=first, last=last)
+            self.first.set_value(first)
+            self.last.set_value(last)
+        self._show_plan(session)
+
+    def _show_plan(self, session: Session) -> None:
+        self.plan = made = plan(session, self.wish, self.workspace.frame)
+        self.files.setText("\n".join(made.files) or "Nothing.")
+        self.notes.setText("\n".join(made.notes))
+        self.notes.setVisible(bool(made.notes))
+        self._boxes["solid"].setEnabled(self.wish.has_mesh)
+        for field in (self.first, self.last, self.every):
+            for widget in (field, field.label):
+                widget.setVisible(self.wish.which == "part")
+        self._show_state()
+
+    def _show_state(self) -> None:
+        made = self.plan
+        if made is None or self.workspace.session is None:
+            return
+        active = self.workspace.tasks.active
+        writing = self._writing in active
+        measuring = any(task.title == "Measuring" for task in active)
+        why_not = "It is being written." if writing else made.why_not
+        self.export_button.setEnabled(not why_not)
+        self.export_button.setToolTip(
+            why_not or "Write all of it: the folder is whole or not there"
+        )
+        count = len(made.frames)
+        ready = f"{count} frame{'s' * (count != 1)} will be written."
+        self.why_not.setText(f"▲ {why_not}" if why_not and not writing else why_not or ready)
+        again = len(made.again) > 0 and not self.workspace.session.read_only
+        self.again_button.setVisible(again)
+        self.again_button.setEnabled(again and not measuring)
+        self.again_button.setText(
+            "Being measured …" if measuring else f"Measure {len(made.again)} now"
+        )
+        self.result.setText("" if self.written is None else self.written.words)
+        self.result_group.setVisible(self.written is not None)
+
+    def _session_opened(self) -> None:
+        self.written = self.plan = None
+        self.folder.set_value("")
+        self.wish = replace(self.wish, scheme="", first=0, last=0)
+
+    # --- what the operator does ---------------------------------------------------------------
+
+    def _wish(self, **values: object) -> None:
+        self.wish = replace(self.wish, **values)  # type: ignore[arg-type]
+        if self.workspace.session is not None:
+            self._show_plan(self.workspace.session)
+
+    def _ticked(self) -> None:
+        self._wish(ticked=frozenset(key for key, box in self._boxes.items() if box.isChecked()))
+
+    def choose_folder(self) -> None:
+        """Ask for a folder; where it holds something else, a new one in it is taken."""
+        session = self.workspace.session
+        if session is None:
+            return
+        here = Path(self.folder.value() or proposed_folder(session))
+        name = QFileDialog.getExistingDirectory(self, "Where to", str(here.parent))
+        if name:
+            self.folder.set_value(str(folder_within(Path(name), session)))
+
+    def measure_again(self) -> None:
+        """Measure what is missing or no longer stands of the frames chosen."""
+        if self.plan is not None:
+            self.workspace.measure(self.plan.again.tolist())
+
+    def export(self) -> None:
+        """Write what is ticked, in the background."""
+        session, made, wish = self.workspace.session, self.plan, self.wish
+        if session is None or made is None or made.why_not:
+            return
+        folder = Path(self.folder.value() or proposed_folder(session)).expanduser()
+        if not folder.is_absolute():
+            folder = session.path.parent / folder
+        frames = made.frames.tolist()
+
+        def work(control: Control) -> Written:
+            return write(session, wish, frames, folder, control.progress)
+
+        def done(written: Written) -> None:
+            if self.workspace.session is session:
+                self.written = written
+                self.workspace.said.emit(written.words, bool(written.problems))
+                self._show_state()
+
+        self.written = None
+        self._writing = self.workspace.tasks.start(f"Exporting to {folder.name}", work, done)
+        self._show_state()
+
+    def open_folder(self) -> None:
+        """Show the folder in the desktop's file manager."""
+        if self.written is not None:
+            folder = self.written.folder
+            if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(folder))):
+                self.workspace.said.emit(f"The files are in {folder}", False)
+
+    # --- the widgets --------------------------------------------------------------------------
+
+    def _make_canvas(self) -> None:
+        inner = QWidget()
+        grid = QGridLayout(inner)
+        grid.setContentsMargins(16, 12, 16, 12)
+        grid.setHorizontalSpacing(32)
+        grid.setVerticalSpacing(18)
+        for number, (title, items) in enumerate(GROUPS):
+            column = QVBoxLayout()
+            column.addWidget(_heading(title))
+            for item in items:
+                box = QCheckBox(item.name)
+                box.setToolTip(item.tip)
+                box.setAccessibleDescription(item.tip)
+                box.setChecked(item.key in USUAL)
+                box.toggled.connect(lambda _: self._ticked())
+                self._boxes[item.key] = box
+                column.addWidget(box)
+            column.addStretch(1)
+            grid.addLayout(column, number // 2, number % 2)
+        will = QVBoxLayout()
+        will.addWidget(_heading("In the folder there will be"))
+        self.files = _words()
+        will.addWidget(self.files)
+        grid.addLayout(will, 2, 0, 1, 2)
+        grid.addWidget(self._make_result(), 3, 0, 1, 2)
+        grid.setRowStretch(4, 1)
+        grid.setColumnStretch(0, 1)
+        grid.setColumnStretch(1, 1)
+        area = QScrollArea()
+        area.setWidget(inner)
+        area.setWidgetResizable(True)
+        area.setFrameShape(QFrame.Shape.NoFrame)
+        self.canvas_layout.addWidget(area)
+
+    def _make_result(self) -> QWidget:
+        self.result_group = QWidget()
+        layout = QVBoxLayout(self.result_group)
+        layout.setContentsMargins(0, 8, 0, 0)
+        layout.addWidget(_heading("Written"))
+        self.result = _words()
+        layout.addWidget(self.result)
+        row = QHBoxLayout()
+        row.addWidget(_button("Open the folder", "Show it in the file manager", self.open_folder))
+        row.addStretch(1)
+        layout.addLayout(row)
+        self.result_group.hide()
+        return self.result_group
+
+    def _make_panel(self) -> None:
+        form = FieldForm()
+        self.which = ChoiceField("Frames", WHICH, tooltip="Which frames to write")
+        self.which.edited.connect(lambda key: self._wish(which=key))
+        self.first = _whole("From frame", 0, "The first frame to write", "first", self._wish)
+        self.last = _whole("To frame", 0, "The last frame to write", "last", self._wish)
+        self.every = _whole("Every n-th", 1, "1: every frame; 2: every second", "every", self._wish)
+        self.every.set_value(1)
+        self.scheme = ChoiceField(
+            "Results of", tooltip="The scheme whose results are written; others must be measured"
+        )
+        self.scheme.edited.connect(lambda key: self._wish(scheme=key))
+        self.spacing = NumberField(
+            "Grid of surfaces",
+            "mm",
+            lowest=SMALLEST_SPACING_MM,
+            highest=1.0,
+            step=0.01,
+            decimals=2,
+            tooltip="Distance of the surfaces' points: finer makes larger files",
+        )
+        self.spacing.set_value(self.wish.spacing_mm)
+        self.spacing.edited.connect(
+            lambda value: self._wish(spacing_mm=value) if value is not None else None
+        )
+        for field in (self.which, self.first, self.last, self.every, self.scheme, self.spacing):
+            form.add(field)
+        self.panel_layout.addWidget(form)
+        self.folder = TextField(
+            "Folder",
+            tooltip="Where to: a new or empty folder, or an earlier export, which is replaced",
+        )
+        self.panel_layout.addWidget(self.folder.label)
+        self.panel_layout.addWidget(self.folder)
+        self.panel_layout.addWidget(
+            _button("Choose a folder …", "Choose where to write", self.choose_folder)
+        )
+        self.notes = _words()
+        self.why_not = _words()
+        self.again_button = _button(
+            "Measure now",
+            "Measure the chosen frames that are not measured, or no longer stand",
+            self.measure_again,
+        )
+        self.export_button = _button("Export", "", self.export)
+        for widget in (self.notes, self.why_not, self.again_button, self.export_button):
+            self.panel_layout.addWidget(widget)
+        self.panel_layout.addStretch(1)
+
+
+def _whole(label: str, lowest: int, tip: str, name: str, wish: Callable[..., None]) -> NumberField:
+    field = NumberField(label, lowest=lowest, highest=10**9, decimals=0, tooltip=tip)
+    field.edited.connect(lambda value: wish(**{name: value}) if value is not None else None)
+    return field
+
+
+def _heading(words: str) -> QLabel:
+    label = QLabel(words)
+    font = label.font()
+    font.setBold(True)
+    label.setFont(font)
+    return label
+
+
+def _words() -> QLabel:
+    label = QLabel()
+    label.setWordWrap(True)
+    label.setTextFormat(Qt.TextFormat.PlainText)
+    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+    return label
+
+
+def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
+    button = QPushButton(words)
+    button.setToolTip(tip)
+    button.clicked.connect(lambda _: work())
+    return button

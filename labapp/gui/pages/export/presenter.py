@@ -1,0 +1,340 @@
+"""What an export would write, whether it can be written, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from labapp.core.values import IntArray
+from labapp.gui.pages.capture.presenter import size_in_words
+from labapp.session.export import (
+    HDF5_FILE,
+    MANIFEST,
+    TREND_FILE,
+    ExportChoice,
+    ExportedFile,
+    verify_export,
+)
+from labapp.session.measured import SETUP_CHANGED, scheme_name
+from labapp.session.meshes import FORMATS, SPACING_MM
+from labapp.session.session import Session
+
+REPORT_FILE = "report.pdf"
+
+SCHEMES = {
+    "fit": "fit",
+    "ers": "ERS",
+    "irs-opa": "IRS, OPA",
+    "irs-epa-r": "IRS, EPA-R",
+    "irs-epa-c": "IRS, EPA-C",
+    "irs-epa-rc": "IRS, EPA-RC",
+}
+
+SHOWN_PROBLEMS = 5
+
+
+@dataclass(frozen=True)
+class Item:
+    """Something that can be ticked.
+
+    Parameters
+    ----------
+    key
+        ``tables:dots``, ``surfaces:stl``, ``solid``, ``hdf5``, ``pictures:frames``, ``report``.
+    name
+        Its words.
+    tip
+        What it is.
+    """
+
+    key: str
+    name: str
+    tip: str
+
+
+GROUPS: tuple[tuple[str, tuple[Item, ...]], ...] = (
+    (
+        "Tables (CSV)",
+        (
+            Item("tables:measures", "Measures", "A row a frame: width, length, height, ARE …"),
+            Item("tables:dots", "Dots", "A row a dot: its place, row, column and ray"),
+            Item("tables:points", "Points", "A row a reflection point, with its residual"),
+            Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
+        ),
+    ),
+    (
+        "Surfaces, a file a frame",
+        (
+            Item("surfaces:csv", "CSV", "x, y, z of a grid within the boundary, mm"),
+            Item("surfaces:stl", "STL", "Triangles, binary, mm"),
+            Item("surfaces:stl-ascii", "STL as text", "Triangles as text, for old programs, mm"),
+            Item("surfaces:ply", "PLY", "Triangles for mesh programs, mm"),
+            Item("surfaces:vtp", "VTP", "Triangles for ParaView, mm"),
+            Item("solid", "also as solids", "Each surface as a watertight body, mesh formats only"),
+        ),
+    ),
+    (
+        "Pictures (PNG)",
+        (
+            Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
+            Item("pictures:surfaces", "Surfaces", "Each surface in 3-D; takes a second each"),
+            Item("pictures:trends", "Trends", "Width, length and height over time"),
+        ),
+    ),
+    (
+        "Everything together",
+        (
+            Item("hdf5", "HDF5", "All tables and surfaces with units and their source in one file"),
+            Item("report", "Report (PDF)", "Set-up, calibration, results, error budget, versions"),
+        ),
+    ),
+)
+
+USUAL = frozenset(
+    "tables:measures tables:dots tables:points tables:boundary surfaces:csv surfaces:stl".split()
+)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the operator wants to take along.
+
+    Parameters
+    ----------
+    ticked
+        Keys of the `Item` that are ticked.
+    which
+        ``all``, ``view`` (the frame in view) or ``part``.
+    first, last, every
+        The part: frames ``first``, ``first + every`` … up to ``last``.
+    scheme
+        Whose results; empty: that of the settings.
+    spacing_mm
+        Distance of the surfaces' nodes.
+    """
+
+    ticked: frozenset[str] = USUAL
+    which: str = "all"
+    first: int = 0
+    last: int = 0
+    every: int = 1
+    scheme: str = ""
+    spacing_mm: float = SPACING_MM
+
+    def some(self, kind: str) -> frozenset[str]:
+        """What is ticked of a kind."""
+        return frozenset(key.partition(":")[2] for key in self.ticked if key.startswith(f"{kind}:"))
+
+    @property
+    def has_mesh(self) -> bool:
+        """Whether surfaces are written as triangles, which solids need."""
+        return bool(self.some("surfaces") & FORMATS.keys())
+
+    def choice(self) -> ExportChoice:
+        """As the session takes it."""
+        return ExportChoice(
+            tables=self.some("tables"),
+            surfaces=self.some("surfaces"),
+            solid="solid" in self.ticked and self.has_mesh,
+            hdf5="hdf5" in self.ticked,
+            pictures=self.some("pictures"),
+            spacing_mm=self.spacing_mm,
+        )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What would be written.
+
+    Parameters
+    ----------
+    scheme
+        Whose results.
+    frames
+        Numbers of the frames that are measured and chosen, shape (n,).
+    again
+        Frames to be measured for the choice to be whole: stale or unmeasured ones, shape (k,).
+    why_not
+        Why nothing can be written; empty if it can.
+    notes
+        What to know otherwise, a sentence each.
+    files
+        What would be in the folder, a line each.
+    """
+
+    scheme: str
+    frames: IntArray
+    again: IntArray
+    why_not: str
+    notes: tuple[str, ...]
+    files: tuple[str, ...]
+
+
+def plan(session: Session, wish: Wish, frame: int) -> Plan:
+    """What would be written, and whether it can be.
+
+    Parameters
+    ----------
+    session, wish
+        Of what, and what of it.
+    frame
+        The frame in view.
+    """
+    own = scheme_name(session.settings)
+    scheme = wish.scheme or own
+    seen = session.overview(scheme)
+    chosen = _chosen(seen.frame, wish, frame)
+    status = np.array(seen.status, dtype=object)
+    measured = chosen & (status != "")
+    stale = seen.frame[measured & seen.stale]
+    unmeasured = seen.frame[chosen & (status == "")]
+    surfaces = int((measured & (status == "ok")).sum())
+    notes = []
+    if len(unmeasured):
+        notes.append(f"{_frames(len(unmeasured))} not measured by {_named(scheme)}: left out.")
+    if measured.any() and surfaces < measured.sum():
+        without = int(measured.sum()) - surfaces
+        notes.append(f"{_frames(without)} without a surface: in the tables with the reason.")
+    frames = seen.frame[measured]
+    again = np.union1d(stale, unmeasured) if scheme == own else np.zeros(0, np.int64)
+    return Plan(
+        scheme=scheme,
+        frames=frames,
+        again=np.asarray(again, np.int64),
+        why_not=_why_not(session, wish, scheme, frames, stale),
+        notes=tuple(notes),
+        files=_files(wish, len(frames), surfaces),
+    )
+
+
+def _chosen(frames: IntArray, wish: Wish, frame: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    if wish.which == "view":
+        return np.asarray(frames == frame)
+    if wish.which == "part":
+        step = (frames - wish.first) % max(1, wish.every) == 0
+        return np.asarray((frames >= wish.first) & (frames <= wish.last) & step)
+    return np.ones(len(frames), bool)
+
+
+def _why_not(session: Session, wish: Wish, scheme: str, frames: IntArray, stale: IntArray) -> str:
+    if not len(frames):
+        return f"None of these frames is measured by {_named(scheme)}: measure them first."
+    if len(stale):
+        result = session.result(int(stale[0]), scheme)
+        why = " and ".join(result.stale) if result is not None else SETUP_CHANGED
+        return (
+            f"{_frames(len(stale))} no longer stand{'s' * (len(stale) == 1)}, because {why}. "
+            "Measure again, or undo the change."
+        )
+    if not wish.ticked - {"solid"}:
+        return "Tick what you want to take along."
+    missing = session.missing_recording
+    if "frames" in wish.some("pictures") and missing is not None:
+        return f"Pictures of frames need the recording, and {missing.name} is not where it was."
+    return ""
+
+
+def _files(wish: Wish, count: int, surfaces: int) -> tuple[str, ...]:
+    if not count:
+        return ()
+    lines = [f"{name}.csv" for name in ("measures", "dots", "points", "boundary")]
+    lines = [line for line in lines if line.removesuffix(".csv") in wish.some("tables")]
+    many = [".csv"] if "csv" in wish.some("surfaces") else []
+    many += [FORMATS[name][0] for name in FORMATS if name in wish.some("surfaces")]
+    if "surfaces" in wish.some("pictures"):
+        many.append(".png")
+    lines += [f"surface_NNNNNN{end}, {surfaces} of them" for end in many if surfaces]
+    if wish.choice().solid and surfaces:
+        lines.append(f"the same as solids, {surfaces} of each format")
+    if "frames" in wish.some("pictures"):
+        lines.append(f"frame_NNNNNN.png, {count} of them")
+    if "trends" in wish.some("pictures"):
+        lines.append(TREND_FILE)
+    lines += [HDF5_FILE] * ("hdf5" in wish.ticked) + [REPORT_FILE] * ("report" in wish.ticked)
+    return (*lines, f"{MANIFEST}: source, set-up, versions, every file with its SHA-256")
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'s' * (count != 1)}"
+
+
+def _named(scheme: str) -> str:
+    return SCHEMES.get(scheme, scheme)
+
+
+def schemes(session: Session) -> tuple[tuple[str, str], ...]:
+    """Schemes to choose from, (key, words): the settings' first, then others with results."""
+    own = scheme_name(session.settings)
+    others = sorted({scheme for scheme, _ in session.measured_by} - {own})
+    return (
+        ("", f"{_named(own)} (as in the settings)"),
+        *((scheme, _named(scheme)) for scheme in others),
+    )
+
+
+def proposed_folder(session: Session) -> Path:
+    """Where to write if nobody says otherwise."""
+    return session.path.parent / f"{session.path.stem}-results"
+
+
+def folder_within(folder: Path, session: Session) -> Path:
+    """The folder itself where an export can be; one in it where it holds something else."""
+    try:
+        own = not any(folder.iterdir()) or (folder / MANIFEST).is_file()
+    except OSError:
+        own = True  # the export tells what is wrong with it
+    return folder if own else folder / proposed_folder(session).name
+
+
+@dataclass(frozen=True)
+class Written:
+    """What came of an export.
+
+    Parameters
+    ----------
+    folder
+        Where it is.
+    files
+        What is in it.
+    problems
+        What in it differs from its manifest; empty if nothing does.
+    """
+
+    folder: Path
+    files: tuple[ExportedFile, ...]
+    problems: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        """For the operator."""
+        size = size_in_words(sum(file.size for file in self.files))
+        told = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
+        if not self.problems:
+            return f"✓ {told} Read again and compared with the manifest: all as written."
+        shown = "; ".join(self.problems[:SHOWN_PROBLEMS])
+        return f"▲ {told} But not all is as it was written: {shown}."
+
+
+def write(
+    session: Session,
+    wish: Wish,
+    frames: Sequence[int],
+    folder: Path,
+    progress: Callable[[int, int], None],
+) -> Written:
+    """Export, then read everything again and compare it with the manifest."""
+    # The report's matrices are small: more threads than one get in each other's way.
+    with threadpool_limits(limits=1, user_api="blas"):
+        files = session.export(
+            folder,
+            wish.choice(),
+            frames=frames,
+            scheme=wish.scheme or None,
+            report="report" in wish.ticked,
+            progress=lambda done: progress(done, len(frames)),
+        )
+    return Written(folder, files, tuple(verify_export(folder)))

@@ -1,0 +1,212 @@
+"""Export: what would be written, why not, and that what is written is the session's export."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PySide6.QtWidgets import QAbstractButton
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.export.page import ExportPage
+from labapp.gui.pages.export.presenter import (
+    GROUPS,
+    USUAL,
+    Wish,
+    Written,
+    folder_within,
+    plan,
+    proposed_folder,
+    schemes,
+)
+from labapp.gui.workspace import Workspace
+from labapp.session.export import ExportChoice, verify_export
+from labapp.session.session import Session
+
+KEPT: list[object] = []
+
+
+@pytest.fixture
+def gtaw(copy_sample) -> Path:
+    return copy_sample("gtaw")
+
+
+def test_the_usual_ticks_are_the_usual_export() -> None:
+    assert Wish().choice() == ExportChoice()
+    keys = {item.key for _, items in GROUPS for item in items}
+    everything = Wish(ticked=frozenset(keys)).choice()
+    assert everything.solid
+    assert everything.hdf5
+    assert len(everything.surfaces) == 5
+    assert everything.pictures == {"frames", "surfaces", "trends"}
+    assert keys > USUAL
+    assert not Wish(ticked=frozenset({"solid", "surfaces:csv"})).choice().solid
+
+
+def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
+    with Session.open(gtaw) as session:
+        every = plan(session, Wish(), 3)
+        assert len(every.frames) == 30
+        assert every.why_not == ""
+        assert every.files[:5] == (
+            "measures.csv",
+            "dots.csv",
+            "points.csv",
+            "boundary.csv",
+            "surface_NNNNNN.csv, 30 of them",
+        )
+        assert every.files[-1].startswith("manifest.json")
+        assert plan(session, Wish(which="view"), 3).frames.tolist() == [3]
+        part = plan(session, Wish(which="part", first=4, last=11, every=3), 0)
+        assert part.frames.tolist() == [4, 7, 10]
+        assert plan(session, Wish(ticked=frozenset()), 0).why_not.startswith("Tick what")
+        assert "measure them first" in plan(session, Wish(scheme="ers"), 0).why_not
+        assert schemes(session) == (("", "fit (as in the settings)"),)
+
+
+def test_frames_without_a_surface_are_told_and_the_recording_missed(copy_sample) -> None:
+    path = copy_sample("blocked_rows")
+    with Session.open(path) as session:
+        made = plan(session, Wish(), 0)
+        assert made.notes == ("3 frames without a surface: in the tables with the reason.",)
+        assert "surface_NNNNNN.stl, 3 of them" in made.files
+    (path.parent / "recording.mkv").unlink()
+    with Session.open(path) as session:
+        assert plan(session, Wish(), 0).why_not == ""
+        pictures = Wish(ticked=frozenset({"pictures:frames"}))
+        assert "recording.mkv is not where it was" in plan(session, pictures, 0).why_not
+
+
+def test_what_no_longer_stands_is_explained_and_can_be_measured(gtaw: Path) -> None:
+    with Session.open(gtaw) as session:
+        session.update_setup({"laser": {"distance_mm": 32.0}})
+        made = plan(session, Wish(which="part", first=0, last=4), 0)
+        assert made.why_not == (
+            "5 frames no longer stand, because the rig or a calibration was changed. "
+            "Measure again, or undo the change."
+        )
+        assert made.again.tolist() == [0, 1, 2, 3, 4]
+        session.undo()
+        session.set_settings(replace(session.settings, scheme="ers"))
+        made = plan(session, Wish(which="view"), 7)
+        assert made.again.tolist() == [7]
+        assert schemes(session) == (("", "ERS (as in the settings)"), ("fit", "fit"))
+        other = plan(session, Wish(scheme="fit"), 0)
+        assert (len(other.frames), other.why_not) == (30, "")
+        assert len(other.again) == 0
+
+
+def test_somebody_s_own_folder_is_not_proposed(gtaw: Path, tmp_path: Path) -> None:
+    with Session.open(gtaw, read_only=True) as session:
+        assert proposed_folder(session) == gtaw.parent / "gtaw-results"
+        empty = tmp_path / "empty"
+        empty.mkdir()
+        assert folder_within(empty, session) == empty
+        assert folder_within(gtaw.parent, session) == gtaw.parent / "gtaw-results"
+    bad = Written(tmp_path, (), ("a.csv was changed",))
+    assert bad.words.startswith("▲")
+    assert "a.csv was changed" in bad.words
+
+
+@pytest.fixture
+def page(qtbot: QtBot, gtaw: Path) -> ExportPage:
+    workspace = Workspace()
+    workspace.open(gtaw)
+    page = ExportPage(workspace)
+    KEPT.extend((workspace, page))
+    workspace.changed.connect(page.refresh)
+    workspace.frame_changed.connect(page.refresh)
+    page.refresh()
+    for widget in (page, page.panel):
+        widget.resize(800, 600)
+        widget.show()
+    yield page
+    workspace.close()
+
+
+def session_of(page: ExportPage) -> Session:
+    assert page.workspace.session is not None
+    return page.workspace.session
+
+
+def test_the_button_writes_what_a_script_would(
+    page: ExportPage, qtbot: QtBot, tmp_path: Path
+) -> None:
+    page.workspace.show_frame(6)
+    page.which.edited.emit("view")
+    page.folder.set_value(str(tmp_path / "out"))
+    page.export_button.click()
+    assert not page.export_button.isEnabled()
+    qtbot.waitUntil(lambda: page.written is not None, timeout=20_000)
+    assert page.result.text().startswith("✓ 6 files and the manifest")
+    assert page.export_button.isEnabled()
+    script = tmp_path / "script"
+    session_of(page).export(script, frames=[6])
+    names = sorted(path.name for path in script.iterdir())
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
+    for name in names:
+        if name != "manifest.json":
+            assert (tmp_path / "out" / name).read_bytes() == (script / name).read_bytes()
+    assert verify_export(tmp_path / "out") == []
+
+
+def test_a_cancelled_export_leaves_nothing(
+    page: ExportPage, qtbot: QtBot, tmp_path: Path, monkeypatch
+) -> None:
+    folder = tmp_path / "out"
+    page.folder.set_value(str(folder))
+    original = Session.export
+
+    def cancelled_midway(session: Session, *given, progress, **named):
+        def on(done: int) -> None:
+            if done == 2 and page._writing is not None:
+                page._writing.cancel()
+            progress(done)
+
+        return original(session, *given, progress=on, **named)
+
+    monkeypatch.setattr(Session, "export", cancelled_midway)
+    page.export()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active, timeout=20_000)
+    assert page.written is None
+    assert not folder.exists()
+    assert list(tmp_path.glob(".out*")) == []
+    assert page.export_button.isEnabled()
+
+
+def test_a_folder_of_somebody_s_is_refused_in_words(
+    page: ExportPage, qtbot: QtBot, tmp_path: Path
+) -> None:
+    said: list[tuple[str, bool]] = []
+    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    page.folder.set_value(str(tmp_path / "mine"))
+    page.export()
+    qtbot.waitUntil(lambda: bool(said), timeout=20_000)
+    assert said[0][1]
+    assert "mine" in said[0][0]
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+
+
+def test_the_button_is_greyed_out_with_the_reason(page: ExportPage) -> None:
+    page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": 32.0}}))
+    assert not page.export_button.isEnabled()
+    assert "no longer stand" in page.why_not.text()
+    assert page.again_button.isVisibleTo(page.panel)
+    assert page.again_button.text() == "Measure 30 now"
+    page.workspace.undo()
+    assert page.export_button.isEnabled()
+    assert not page.again_button.isVisibleTo(page.panel)
+    for box in page._boxes.values():
+        box.setChecked(False)
+    assert "Tick what" in page.why_not.text()
+    assert not page._boxes["solid"].isEnabled()
+
+
+def test_every_control_says_what_it_does(page: ExportPage) -> None:
+    for widget in (page, page.panel):
+        for button in widget.findChildren(QAbstractButton):
+            if button.text():
+                assert button.toolTip(), button.text()
