@@ -386,7 +386,7 @@ class InteractiveView(View3d):
         if self._draw():
             assert self._drawing is not None
             self._drawing.plotter.setVisible(True)
-            self._drawing.plotter.render()
+            QWidget.update(self._drawing.plotter)  # which renders, once
         elif self._drawing is not None:
             self._drawing.plotter.setVisible(False)
 

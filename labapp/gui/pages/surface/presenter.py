@@ -16,7 +16,7 @@ from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.session.heights import Profile
-from labapp.session.measured import Result, scheme_name
+from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.scene import Scene, rays_of, scene_of
 from labapp.session.session import Session
 from labapp.session.setup import parse_setup
@@ -235,10 +235,9 @@ def rig_of(result: Result) -> Rig:
     return parse_setup(result.setup, "setup").rig
 
 
-def height_limits(session: Session) -> tuple[float, float] | None:
+def height_limits(seen: Overview) -> tuple[float, float] | None:
     """Lowest and highest height of all frames, mm; None without any."""
-    measures = session.overview().measures
-    low, high = measures["depth_mm"], measures["height_mm"]
+    low, high = seen.measures["depth_mm"], seen.measures["height_mm"]
     known = np.isfinite(low) & np.isfinite(high)
     if not known.any() or high[known].max() <= low[known].min():
         return None

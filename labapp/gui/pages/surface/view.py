@@ -227,14 +227,14 @@ class SurfacePage(Page):
         self.workspace.said.emit(words, not written)
 
     def _show_surface(self) -> None:
-        result, session = self.told.result, self.workspace.session
+        result, seen = self.told.result, self.workspace.overview()
         reconstruction = self.told.reconstruction
         drawn, cut, dots = None, None, None
         if reconstruction is not None and self.options.section is not None:
             cut = profile(reconstruction, *self.options.section)
-        if result is not None and session is not None:
+        if result is not None and seen is not None:
             measurement = result.measurement
-            limits = height_limits(session) if self.options.same_colours else None
+            limits = height_limits(seen) if self.options.same_colours else None
             drawn = scene(measurement, rig_of(result), self.options, limits, cut)
             dots = reflected_dots(measurement)
         self.view.set_words(self.told.words)

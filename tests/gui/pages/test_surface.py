@@ -1,0 +1,219 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPointF, Qt
+from PySide6.QtGui import QGuiApplication, QImage
+from PySide6.QtWidgets import QAbstractButton, QApplication, QScrollArea, QSplitter, QWidget
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.surface import SurfacePage
+from labapp.gui.workspace import Workspace
+from labapp.session.heights import profile
+from labapp.session.scene import can_draw
+from tests.gui.conftest import KEPT, CopySample
+
+
+class OneThread(ThreadPoolExecutor):
+    """Measures in place of processes, which take seconds to start."""
+
+    _processes: ClassVar[dict[int, object]] = {}
+
+
+@pytest.fixture
+def page(qapp: QApplication, copy_sample: CopySample) -> SurfacePage:
+    """The page beside its panel, as in the window, with the GTAW sample."""
+    workspace = Workspace()
+    workspace._pool = OneThread(1)
+    made = SurfacePage(workspace)
+    whole, panel = QSplitter(), QScrollArea()
+    panel.setWidgetResizable(True)
+    panel.setWidget(made.panel)
+    for widget in (made, panel):
+        whole.addWidget(widget)
+    whole.resize(1180, 560)
+    whole.setSizes([880, 300])
+    KEPT.append(whole)
+    workspace.changed.connect(made.refresh)
+    workspace.frame_changed.connect(lambda _: made.refresh())
+    assert workspace.open(copy_sample("gtaw"))
+    whole.show()
+    yield made
+    made.leave()
+    whole.close()
+    workspace.close()
+
+
+def told(page: SurfacePage) -> list[tuple[str, bool]]:
+    said: list[tuple[str, bool]] = []
+    page.workspace.said.connect(lambda words, bad: said.append((words, bad)))
+    return said
+
+
+def test_it_shows_the_frame_in_view(page: SurfacePage) -> None:
+    first = page.side.sizes.item(0, 1).text()
+    assert page.side.status.text() == "✓ Measured."
+    page.workspace.show_frame(7)
+    assert page.side.sizes.item(0, 1).text() != first
+    assert page.side.provenance.text().startswith("Frame 7 · Fit")
+    boundary = page.workspace.session.result(7).measurement.reconstruction.boundary
+    x, _ = page.plan._outline.getData()
+    np.testing.assert_array_equal(x[:-1], boundary.points_mm[:, 0])
+
+
+def test_choosing_a_scheme_is_a_step_that_can_be_undone(page: SurfacePage) -> None:
+    session = page.workspace.session
+    page.side.scheme.edited.emit("irs-epa-r")
+    assert (session.settings.scheme, session.settings.algorithm) == ("irs", "epa-r")
+    assert session.history[-1].label == "scheme IRS, edge points, rows (EPA-R)"
+    assert page.side.scheme.value() == "irs-epa-r"
+    assert page.side.status.text().startswith("○ Frame 0 is not measured by IRS")
+    assert page.view.scene is None
+    assert page.side.sizes.isHidden()
+    page.workspace.undo()
+    assert page.side.scheme.value() == "fit"
+    assert page.view.scene is not None
+
+
+def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) -> None:
+    assert page.side.again.isHidden()
+    page.side.correspondence.edited.emit("S/S")
+    assert page.side.status.text().startswith("⟳ These figures no longer stand")
+    assert not page.side.again.isHidden()
+    page.side.again.click()
+    assert not page.side.one.isEnabled()
+    assert "under way" in page.side.one.toolTip()
+    assert not page.side.progress.isHidden()
+    with qtbot.waitSignal(page.workspace.said, timeout=30_000):
+        pass
+    assert page.side.status.text() == "✓ Measured."
+    assert page.side.one.isEnabled()
+    assert page.side.progress.isHidden()
+    assert page.workspace.session.result(0).settings.correspondence == "S/S"
+    assert page.workspace.session.result(1).stale
+
+
+def test_measuring_can_be_cancelled(page: SurfacePage, qtbot: QtBot) -> None:
+    page.side.one.click()
+    page.side.cancel.click()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active, timeout=30_000)
+    assert page.side.progress.isHidden()
+    assert page.side.all.isEnabled()
+
+
+def test_buttons_say_why_they_are_off(page: SurfacePage) -> None:
+    page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": None}}))
+    assert not page.side.one.isEnabled()
+    assert "The set-up is not complete: laser.distance_mm" in page.side.one.toolTip()
+    page.workspace.undo()
+    assert page.side.one.isEnabled()
+
+
+def test_the_section_line_is_dragged(page: SurfacePage) -> None:
+    line = page.plan._line
+    a, b = line.getHandles()
+    line.movePoint(a, QPointF(-3.0, 1.0), coords="parent")
+    line.movePoint(b, QPointF(3.0, 1.0), coords="parent")
+    assert page.options.section == (0.0, 1.0)
+    assert (page.angle.value(), page.offset.value()) == (0.0, 1.0)
+    cut = profile(page.told.reconstruction, 0.0, 1.0)
+    along, height = page.profile._height.getData()
+    known = np.isfinite(cut.height_mm)
+    np.testing.assert_array_equal(along, cut.along_mm[known])
+    np.testing.assert_array_equal(height, cut.height_mm[known])
+    # The ends stay where the hand has put them.
+    ends = [line.mapToParent(handle.pos()) for handle in line.getHandles()]
+    assert [(end.x(), end.y()) for end in ends] == [(-3.0, 1.0), (3.0, 1.0)]
+
+
+def test_the_section_is_typed(page: SurfacePage) -> None:
+    page.angle.edited.emit(page.angle.set_value(30.0))
+    assert page.options.section == (30.0, 0.0)
+    a, b = (page.plan._line.mapToParent(handle.pos()) for handle in page.plan._line.getHandles())
+    assert np.degrees(np.arctan2(b.y() - a.y(), b.x() - a.x())) == pytest.approx(30.0)
+    page.offset.edited.emit(page.offset.set_value(20.0))
+    assert page.profile.title.text() == "The section line misses the pool"
+    button(page, "Along X").click()
+    assert page.options.section == (0.0, 0.0)
+    assert "◆ boundary; band: ±" in page.profile.title.text()
+
+
+def button(page: QWidget, words: str) -> QAbstractButton:
+    (found,) = [each for each in page.findChildren(QAbstractButton) if each.text() == words]
+    return found
+
+
+def test_what_the_view_shows_is_ticked(page: SurfacePage) -> None:
+    assert page.view.scene.rays_mm == {}
+    page.parts["rays"].trigger()
+    assert len(page.view.scene.rays_mm["reflected"]) == len(page.view.scene.points_mm)
+    page.parts["points"].trigger()
+    assert len(page.view.scene.points_mm) == 0
+    own = page.view.scene.limits
+    page.parts["same_colours"].trigger()
+    assert page.view.scene.limits[1] > own[1]
+    page.colour.edited.emit("sigma")
+    assert page.view.scene.label == "± height (mm)"
+    page.high.edited.emit(5.0)
+    assert page.view.scene.exaggeration == 5.0
+    page.workspace.show_frame(3)
+    assert page.view.scene.exaggeration == 5.0
+
+
+@pytest.mark.skipif(not can_draw(), reason="nothing can be drawn in 3-D here")
+def test_the_picture_is_copied_and_written(page: SurfacePage, tmp_path: Path) -> None:
+    said = told(page)
+    page.grab()
+    button(page, "Top").click()
+    button(page, "Copy").click()
+    copied = QGuiApplication.clipboard().image()
+    assert copied.size() == page.view.size()
+    page.write_picture(tmp_path / "pool")
+    assert QImage(str(tmp_path / "pool.png")).size() == page.view.size()
+    page.write_picture(tmp_path / "nowhere" / "pool.png")
+    assert [bad for _, bad in said] == [False, False, True]
+
+
+@pytest.mark.skipif(not can_draw(), reason="nothing can be drawn in 3-D here")
+def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None:
+    page.comparing.click()
+    compare = page.compare
+    assert (compare.first.choice.value(), compare.second.choice.value()) == ("fit", "ers")
+    qtbot.waitUntil(lambda: compare.table.rowCount() == 10, timeout=20_000)
+    page.grab()
+    first, second, difference = compare.views
+    assert difference.scene.diverging
+    assert first.scene.limits == second.scene.limits
+    first.turn(40, 10)
+    assert second.camera == first.camera
+    second.look("side")
+    assert first.camera == second.camera
+    before = compare.words.text()
+    compare.second.choice.set_value("irs-opa")
+    compare.second.choice.edited.emit("irs-opa")
+    qtbot.waitUntil(lambda: "IRS" in compare.words.text(), timeout=20_000)
+    assert compare.words.text() != before
+    page.workspace.show_frame(5)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active, timeout=20_000)
+    assert "IRS" in compare.words.text()
+    page.comparing.click()
+    assert page.view.scene is not None
+
+
+def test_every_control_can_be_named_and_reached(page: SurfacePage) -> None:
+    for each in (*page.findChildren(QAbstractButton), *page.panel.findChildren(QAbstractButton)):
+        if each.isVisibleTo(page) or each.isVisibleTo(page.panel):
+            if not each.text():
+                continue  # of a spin box or a header
+            assert each.toolTip(), each.text()
+            assert each.accessibleName(), each.text()
+            assert each.focusPolicy() & Qt.FocusPolicy.TabFocus, each.text()
+
+
+def test_the_panel_fits_its_place(page: SurfacePage) -> None:
+    page.side.again.show()
+    assert page.panel.minimumSizeHint().width() <= 300

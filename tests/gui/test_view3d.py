@@ -1,0 +1,278 @@
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
+from PySide6.QtGui import QColor, QMouseEvent, QPalette, QWheelEvent
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.views import view3d
+from labapp.gui.views.view3d import NOTHING_HERE, OffscreenView, View3d, make_view3d
+from labapp.session.scene import Scene, can_draw
+from tests.gui.conftest import KEPT
+
+pytestmark = pytest.mark.skipif(not can_draw(), reason="nothing can be drawn in 3-D here")
+
+
+def hill(height_mm: float = 0.3) -> Scene:
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(-3.0, 4.0), np.arange(-3.0, 4.0)))
+    z = height_mm * (1 - (x**2 + y**2) / 18)
+    a = (np.arange(6)[:, None] * 7 + np.arange(6)).ravel()
+    triangles = np.vstack([np.column_stack([a, a + 1, a + 8]), np.column_stack([a, a + 8, a + 7])])
+    return Scene(np.column_stack([x, y, z]), triangles, z, "height (mm)", (0.0, height_mm))
+
+
+@pytest.fixture
+def view(qtbot: QtBot) -> View3d:
+    made = make_view3d("A hill")
+    KEPT.append(made)
+    made.resize(320, 240)
+    made.show()
+    made.show_scene(hill())
+    made.grab()  # which paints it
+    yield made
+    made.close_view()
+    made.close()
+
+
+def colours(view: View3d) -> int:
+    """How many colours are to be seen: a surface has many, words have few."""
+    image = view.grab().toImage()
+    return len({image.pixel(x, y) for x in range(0, 320, 4) for y in range(0, 240, 4)})
+
+
+def test_without_a_display_it_draws_off_screen(view: View3d) -> None:
+    assert isinstance(view, OffscreenView)
+    assert colours(view) > 60
+
+
+def test_nothing_is_drawn_before_it_is_shown(qtbot: QtBot) -> None:
+    hidden = make_view3d()
+    KEPT.append(hidden)
+    hidden.show_scene(hill())
+    assert hidden.camera is None
+    assert hidden.image() is None
+
+
+def test_the_mouse_turns_moves_and_zooms_it(view: View3d, qtbot: QtBot) -> None:
+    def distance() -> float:
+        return float(np.linalg.norm(np.subtract(view.camera[0], view.camera[1])))
+
+    first, far = view.camera, distance()
+    centre = QPoint(160, 120)
+    with qtbot.waitSignal(view.camera_changed):
+        drag(view, centre, centre + QPoint(50, 0))
+    turned = view.camera
+    assert turned[0] != first[0]
+    assert turned[1] == first[1]
+    assert distance() == pytest.approx(far)
+    drag(view, centre, centre + QPoint(30, 10), Qt.KeyboardModifier.ShiftModifier)
+    moved = view.camera
+    np.testing.assert_allclose(
+        np.subtract(moved[0], turned[0]), np.subtract(moved[1], turned[1]), atol=1e-9
+    )
+    assert np.linalg.norm(np.subtract(moved[1], turned[1])) > 0.1
+    before = view.grab().toImage()
+    wheel = QWheelEvent(
+        *(QPointF(centre), QPointF(centre), QPoint(), QPoint(0, 120)),
+        *(Qt.MouseButton.NoButton, Qt.KeyboardModifier.NoModifier),
+        *(Qt.ScrollPhase.NoScrollPhase, False),
+    )
+    QApplication.sendEvent(view, wheel)
+    assert view.grab().toImage() != before
+
+
+def drag(
+    view: View3d,
+    start: QPoint,
+    end: QPoint,
+    keys: Qt.KeyboardModifier = Qt.KeyboardModifier.NoModifier,
+) -> None:
+    left, none = Qt.MouseButton.LeftButton, Qt.MouseButton.NoButton
+    for kind, at, button, buttons in (
+        (QEvent.Type.MouseButtonPress, start, left, left),
+        (QEvent.Type.MouseMove, end, none, left),
+        (QEvent.Type.MouseButtonRelease, end, left, none),
+    ):
+        event = QMouseEvent(kind, QPointF(at), QPointF(at), button, buttons, keys)
+        QApplication.sendEvent(view, event)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [Qt.Key.Key_Left, Qt.Key.Key_Right, Qt.Key.Key_Up, Qt.Key.Key_Down, Qt.Key.Key_Plus],
+)
+def test_keys_turn_and_zoom_it(view: View3d, key: Qt.Key) -> None:
+    before = view.grab().toImage()
+    QTest.keyClick(view, key)
+    assert view.grab().toImage() != before
+
+
+@pytest.mark.parametrize(
+    ("key", "axis", "sign"),
+    [(Qt.Key.Key_1, 2, 1), (Qt.Key.Key_2, 0, 1), (Qt.Key.Key_3, 1, -1)],
+)
+def test_keys_look_from_the_top_the_side_and_the_front(
+    view: View3d, key: Qt.Key, axis: int, sign: int
+) -> None:
+    QTest.keyClick(view, key)
+    way = np.subtract(view.camera[0], view.camera[1])
+    assert np.argmax(np.abs(way)) == axis
+    assert way[axis] * sign > 0
+    assert np.abs(np.delete(way, axis)).max() < 1e-6 * abs(way[axis])
+    assert view.camera[4]  # without perspective
+
+
+def test_a_view_looks_from_where_another_does(view: View3d, qtbot: QtBot) -> None:
+    other = make_view3d("Another")
+    KEPT.append(other)
+    other.set_camera(view.camera)  # before it is drawn
+    other.resize(320, 240)
+    other.show()
+    other.show_scene(hill())
+    other.grab()
+    assert other.camera == view.camera
+    told = []
+    other.camera_changed.connect(told.append)
+    view.turn(30, 10)
+    other.set_camera(view.camera)
+    assert other.camera == view.camera
+    assert not told  # or two linked views would go round in circles
+    other.close_view()
+
+
+def test_another_frame_leaves_the_camera(view: View3d) -> None:
+    view.turn(30, 10)
+    camera, before = view.camera, view.grab().toImage()
+    view.show_scene(hill(0.2))
+    assert view.grab().toImage() != before
+    assert view.camera == camera
+
+
+def test_it_follows_the_window_to_dark(view: View3d) -> None:
+    dark = QPalette()
+    dark.setColor(QPalette.ColorRole.Base, QColor("#101418"))
+    dark.setColor(QPalette.ColorRole.Text, QColor("#e0e0e0"))
+    view.setPalette(dark)
+    image = view.grab().toImage()
+    assert QColor(image.pixel(20, 200)).lightness() < 40
+
+
+def test_its_picture_is_what_is_seen(view: View3d) -> None:
+    image = view.image()
+    assert (image.width(), image.height()) == (320, 240)
+    picture = view.picture()
+    assert picture is not None
+    at = QColor(image.pixel(160, 120))
+    assert (at.red(), at.green(), at.blue()) == tuple(picture[120, 160])
+
+
+def test_words_stand_where_there_is_no_scene(view: View3d) -> None:
+    view.show_scene(None)
+    blank = view.grab().toImage()
+    view.set_words("Frame 3 is not measured yet.")
+    assert view.grab().toImage() != blank
+    assert view.accessibleDescription() == "Frame 3 is not measured yet."
+    assert view.image() is None
+    view.show_scene(hill())
+    assert colours(view) > 60
+
+
+def test_words_stand_where_nothing_can_be_drawn(
+    qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    painted = []
+    monkeypatch.setattr(view3d, "can_draw", lambda: False)
+    without = make_view3d()
+    KEPT.append(without)
+    monkeypatch.setattr(without, "_paint_words", lambda _, words: painted.append(words))
+    without.show()
+    without.show_scene(hill())
+    without.grab()
+    assert painted[-1] == NOTHING_HERE
+    without.look("top")
+    QTest.keyClick(without, Qt.Key.Key_Left)
+    assert without.camera is None
+
+
+def test_a_closed_view_is_taken_up_again(view: View3d) -> None:
+    view.look("side")
+    camera = view.camera
+    view.close_view()
+    view.close_view()
+    assert view.camera is None
+    view.update()
+    view.show_scene(hill())
+    assert colours(view) > 60
+    assert view.camera == camera
+
+
+REAL = """
+import sys
+import numpy as np
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication
+from labapp.gui.views.view3d import InteractiveView, make_view3d
+from tests.gui.test_view3d import hill
+app = QApplication([])
+view, told = make_view3d(), []
+assert isinstance(view, InteractiveView), type(view)
+view.resize(400, 300)
+view.camera_changed.connect(told.append)
+view.show_scene(hill())
+assert view.camera is None
+view.show()
+QTest.qWait(300)
+picture = view.picture()
+assert picture.std() > 20, picture.std()
+camera = view.camera
+plotter = view._drawing.plotter
+QTest.mousePress(plotter, Qt.MouseButton.LeftButton, pos=view.rect().center())
+QTest.mouseMove(plotter, view.rect().center() / 2)
+QTest.mouseRelease(plotter, Qt.MouseButton.LeftButton, pos=view.rect().center() / 2)
+QTest.qWait(100)
+assert view.camera != camera and told
+for key in (Qt.Key.Key_Q, Qt.Key.Key_1, Qt.Key.Key_Left):
+    QTest.keyClick(view, key)
+QTest.qWait(50)
+assert (view.picture() != picture).any()
+view.show_scene(None)
+QTest.qWait(50)
+view.show_scene(hill(0.1))
+QTest.qWait(50)
+assert view.picture().std() > 20
+view.close()
+assert view.camera is None
+view.show()
+QTest.qWait(100)
+assert view.camera is not None
+view.close()
+print("well")
+"""
+
+
+@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="Xvfb is not installed")
+def test_with_a_display_it_draws_in_the_window() -> None:
+    """The real thing, under Xvfb: a process of its own, since Qt has one platform per process."""
+    environment = {**os.environ, "QT_QPA_PLATFORM": "xcb"}
+    environment.pop("VTK_DEFAULT_OPENGL_WINDOW", None)
+    screen = ["xvfb-run", "-a", "-s", "-screen 0 1000x800x24 -nolisten tcp"]
+    done = subprocess.run(
+        [*screen, sys.executable, "-c", REAL],
+        cwd=Path(__file__).parents[2],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.strip()[-4:]) == (0, "well"), done.stderr[-3000:]
