@@ -58,6 +58,7 @@ class ExportPage(Page):
         self.plan: Plan | None = None
         self.written: Written | None = None
         self._writing: Task | None = None
+        self._in_view: int | None = None
         self._boxes: dict[str, QCheckBox] = {}
         self._make_canvas()
         self._make_panel()
@@ -68,8 +69,14 @@ class ExportPage(Page):
 
     def refresh(self) -> None:
         """Show what would be written of what the session holds now."""
-        session = self.workspace.session
+        session, frame = self.workspace.session, self.workspace.frame
         if session is None:
+            return
+        moved = self._in_view not in (None, frame)
+        self._in_view = frame
+        if moved:  # the frame in view is another one, and nothing else
+            if self.wish.which == "view":
+                self._show_plan(session)
             return
         if not self.folder.value():
             self.folder.set_value(str(proposed_folder(session)))
@@ -81,6 +88,10 @@ class ExportPage(Page):
             self.first.set_value(first)
             self.last.set_value(last)
         self._show_plan(session)
+
+    def leave(self) -> None:
+        """Show everything anew when it comes back."""
+        self._in_view = None
 
     def _show_plan(self, session: Session) -> None:
         self.plan = made = plan(session, self.wish, self.workspace.frame)
@@ -118,7 +129,7 @@ class ExportPage(Page):
         self.result_group.setVisible(self.written is not None)
 
     def _session_opened(self) -> None:
-        self.written = self.plan = None
+        self.written = self.plan = self._in_view = None
         self.folder.set_value("")
         self.wish = replace(self.wish, scheme="", first=0, last=0)
 

@@ -40,9 +40,11 @@ class TrendsPage(Page):
         self.wish = Wish()
         self.shown: Shown | None = None
         self._boxes: dict[str, QCheckBox] = {}
+        self._in_view: int | None = None
         self._last_folder = Path()
         self.plots = PlotStack("Trends over the recording")
         self.plots.chosen.connect(workspace.show_frame)
+        workspace.opened.connect(self.leave)
         self.spectrum = PlotStack("Spectrum")
         self.spectrum.hide()
         splitter = QSplitter(Qt.Orientation.Vertical)
@@ -58,12 +60,18 @@ class TrendsPage(Page):
 
     def refresh(self) -> None:
         """Show the session's results."""
-        session = self.workspace.session
+        session, frame = self.workspace.session, self.workspace.frame
         if session is None:
             return
+        if self._in_view not in (None, frame):
+            # The frame in view is another one, and nothing else: stepping must be quick.
+            self._in_view = frame
+            self.plots.set_current(frame)
+            return
+        self._in_view = frame
         self.shown = shown = show(session, self.wish)
         self.plots.show_curves(shown.curves, shown.axis)
-        self.plots.set_current(self.workspace.frame)
+        self.plots.set_current(frame)
         self.plots.setVisible(bool(shown.curves))
         self.nothing.setVisible(not shown.curves)
         self.counted.setText(shown.words)
@@ -74,6 +82,10 @@ class TrendsPage(Page):
         self.spectrum_words.setVisible(bool(shown.spectrum_words))
         self.signals_words.setText(shown.signals_words)
         self._show_signals(session.signals, session.read_only)
+
+    def leave(self) -> None:
+        """Show everything anew when it comes back."""
+        self._in_view = None
 
     def picture(self) -> QPixmap:
         """Return the plots without what is round them."""
@@ -94,6 +106,7 @@ class TrendsPage(Page):
 
     def _wish(self, **values: object) -> None:
         self.wish = replace(self.wish, **values)  # type: ignore[arg-type]
+        self._in_view = None
         self.refresh()
 
     def _chosen(self) -> None:
