@@ -53,13 +53,15 @@ def keys() -> str:
     parts = []
     for menu in MENUS:
         rows = "".join(
-            f"<tr><td>{escape(_shown(action.key))}&nbsp;&nbsp;</td>"
-            f"<td><b>{escape(action.text.replace('&', ''))}</b></td>"
-            f"<td>&nbsp;&nbsp;{escape(action.tip)}</td></tr>"
+            f"<tr><td width='110'>{escape(_shown(action.key))}</td>"
+            f"<td width='190'><b>{escape(action.text.replace('&', ''))}</b></td>"
+            f"<td>{escape(action.tip)}</td></tr>"
             for action in ACTIONS
             if action.menu == menu and action.key
         )
-        parts.append(f"<h3>{escape(menu.replace('&', ''))}</h3><table>{rows}</table>")
+        parts.append(
+            f"<h3>{escape(menu.replace('&', ''))}</h3><table cellpadding='2'>{rows}</table>"
+        )
     return f"<h2>Keys</h2>{''.join(parts)}"
 
 

@@ -75,6 +75,10 @@ class LogPanel(QListWidget):
         self.setTextElideMode(Qt.TextElideMode.ElideNone)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
 
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Some lines; the operator may drag it higher."""
+        return QSize(400, self.fontMetrics().height() * 6)
+
     def add(self, text: str, problem: bool) -> None:
         """Add what was said."""
         now = datetime.datetime.now().strftime("%H:%M:%S")

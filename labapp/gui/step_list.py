@@ -37,15 +37,23 @@ ARROW = ((0.32, 0.2), (0.8, 0.5), (0.32, 0.8))
 WARNING = ((0.5, 0.1), (0.93, 0.88), (0.07, 0.88))
 
 
-def mark_icon(mark: Mark, dark: bool) -> QIcon:
-    """The mark's shape in its colour."""
+def mark_icon(mark: Mark, dark: bool, selected: QColor | None = None) -> QIcon:
+    """The mark's shape in its colour, and in another where its step is selected."""
+    colour = QColor(COLOURS[mark][dark])
+    icon = QIcon(_drawn(mark, colour, QColor("#22262a" if dark else "#ffffff")))
+    if selected is not None:
+        ground = QColor("#000000" if selected.lightness() > 128 else "#ffffff")
+        icon.addPixmap(_drawn(mark, selected, ground), QIcon.Mode.Selected)
+    return icon
+
+
+def _drawn(mark: Mark, colour: QColor, ground: QColor) -> QPixmap:
     scale = 3  # sharp on a screen of any scaling
     pixmap = QPixmap(ICON_PX * scale, ICON_PX * scale)
     pixmap.fill(Qt.GlobalColor.transparent)
     painter = QPainter(pixmap)
     painter.setRenderHint(QPainter.RenderHint.Antialiasing)
     painter.scale(ICON_PX * scale, ICON_PX * scale)
-    colour = QColor(COLOURS[mark][dark])
     pen = QPen(colour, 0.1)
     pen.setCapStyle(Qt.PenCapStyle.RoundCap)
     pen.setJoinStyle(Qt.PenJoinStyle.RoundJoin)
@@ -60,11 +68,11 @@ def mark_icon(mark: Mark, dark: bool) -> QIcon:
         corners = ARROW if mark is Mark.READY else WARNING
         painter.drawPolygon(QPolygonF([QPointF(*point) for point in corners]))
         if mark is Mark.ATTENTION:
-            painter.setPen(QPen(QColor("#22262a" if dark else "#ffffff"), 0.1))
+            painter.setPen(QPen(ground, 0.1))
             painter.drawLine(QPointF(0.5, 0.38), QPointF(0.5, 0.6))
             painter.drawPoint(QPointF(0.5, 0.76))
     painter.end()
-    return QIcon(pixmap)
+    return pixmap
 
 
 class StepList(QListWidget):
@@ -95,24 +103,17 @@ class StepList(QListWidget):
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """As wide as the longest title needs."""
-        width = (
-            max(
-                (self.sizeHintForIndex(self.indexFromItem(self.item(row))).width())
-                for row in range(self.count())
-            )
-            if self.count()
-            else 0
-        )
         metrics = self.fontMetrics()
         texts = [metrics.horizontalAdvance(self.item(row).text()) for row in range(self.count())]
-        return QSize(max([width, *texts]) + ICON_PX + 32, 200)
+        return QSize(max([60, *texts]) + ICON_PX + 36, 200)
 
     def show_states(self, states: Mapping[str, State]) -> None:
         """Show how far every step is."""
         dark = is_dark(self.palette())
+        selected = self.palette().color(QPalette.ColorRole.HighlightedText)
         for row, step in enumerate(self._steps):
             state, item = states[step.key], self.item(row)
-            item.setIcon(mark_icon(state.mark, dark))
+            item.setIcon(mark_icon(state.mark, dark, selected))
             item.setToolTip(f"{state.mark.value.capitalize()}: {state.why}")
             told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
             item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
@@ -156,11 +157,11 @@ class SidePanel(QWidget):
         line.setForegroundRole(QPalette.ColorRole.Mid)
         layout.addWidget(line)
         layout.addWidget(self.stack, 1)
-        self.setMinimumWidth(260)
+        self.setMinimumWidth(320)
 
     def sizeHint(self) -> QSize:  # noqa: N802
         """Room for two columns of numbers."""
-        return QSize(340, 500)
+        return QSize(350, 500)
 
     def show_panel(self, panel: QWidget, step: Step) -> None:
         """Show a page's panel."""

@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 
 from labapp.errors import InputError
+from labapp.session.measured import Overview
 from labapp.session.session import Session
 
 
@@ -91,8 +92,8 @@ class State:
     why: str
 
 
-def states(session: Session | None) -> dict[str, State]:
-    """State of every step, by its key."""
+def states(session: Session | None, seen: Overview | None = None) -> dict[str, State]:
+    """State of every step, by its key; ``seen`` is the session's overview, if it is at hand."""
     if session is None:
         return {step.key: State(Mark.TODO, "Open or make a session first") for step in STEPS}
     try:
@@ -104,7 +105,7 @@ def states(session: Session | None) -> dict[str, State]:
         "setup": State(Mark.DONE, "Complete") if not missing else State(Mark.READY, missing),
         "laser": _calibrated(session.laser_calibration is not None, "laser." in missing),
         "plane": _calibrated(session.plane_calibration is not None, "image_calibration" in missing),
-        **_frame_states(session, missing),
+        **_frame_states(session, missing, seen),
     }
 
 
@@ -116,7 +117,7 @@ def _calibrated(done: bool, needed: bool) -> State:
     return State(Mark.READY, "Not calibrated here: the values were entered")
 
 
-def _frame_states(session: Session, missing: str) -> dict[str, State]:
+def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict[str, State]:
     recording, gone = session.recording, session.missing_recording
     if recording is None:
         first = State(Mark.TODO, "Import a recording first")
@@ -124,7 +125,7 @@ def _frame_states(session: Session, missing: str) -> dict[str, State]:
             "capture": State(Mark.READY, "No recording yet"),
             **dict.fromkeys(("dots", "surface", "trends", "export"), first),
         }
-    seen = session.overview()
+    seen = seen or session.overview()
     status = np.array(seen.status, dtype=object)
     measured = int((status != "").sum())
     without = int(((status != "") & (status != "ok")).sum())

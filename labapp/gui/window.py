@@ -102,6 +102,7 @@ class MainWindow(QMainWindow):
         self._kinds = {kind.key: kind for kind in PAGES}
         self._steps = tuple(step for step in STEPS if step.key in self._kinds)
         self.pages: dict[str, Page] = {}
+        self._states = states(None)
         self._changes_due = False
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)
@@ -198,7 +199,8 @@ class MainWindow(QMainWindow):
             step = next(step for step in STEPS if step.key == key)
             self.side_panel.show_panel(page.panel, step)
         self.step_list.show_step(key)
-        self._show_session()
+        self._show_page()
+        self.menus.refresh()
 
     def go_step(self, by: int) -> None:
         """Go some steps on, or back."""
@@ -215,7 +217,8 @@ class MainWindow(QMainWindow):
         if kind == "doubtful":
             wanted, words = np.isin(self.standings, DOUBTFUL), "in doubt"
         else:
-            wanted, words = np.isin(session.frames, session.corrected_frames()), "corrected by hand"
+            corrected = session.corrected_frames()
+            wanted, words = np.isin(session.frames, corrected), "corrected by hand"
         found = next_frame(session.frames, wanted, self.workspace.frame, forward)
         if found is None:
             self.say(f"No frame {'after' if forward else 'before'} this one is {words}")
@@ -232,10 +235,11 @@ class MainWindow(QMainWindow):
         session = self.workspace.session
         self.timeline.set_playing(False)
         self._leave()
+        self._show_session()
         if session is None:
             self.stack.setCurrentWidget(self.welcome)
+            self.step_list.show_step("")
             self._list_recent()
-            self._show_session()
         elif self._steps:
             keys = [step.key for step in self._steps]
             first = self.workspace.tried(lambda: first_step(session)) or "setup"
@@ -257,7 +261,7 @@ class MainWindow(QMainWindow):
         began = time.perf_counter()
         self._changes_due = False
         session = self.workspace.session
-        seen = None if session is None else self.workspace.tried(session.overview)
+        seen = self.workspace.tried(self.workspace.overview)
         if seen is None:
             self.standings = np.zeros(0, np.int64)
             self.timeline.set_frames(self.standings, np.zeros(0), self.standings)
@@ -265,20 +269,22 @@ class MainWindow(QMainWindow):
             self.standings = standings(seen)
             self.timeline.set_frames(seen.frame, seen.time_s, self.standings)
         self.timeline.set_frame(self.workspace.frame)
-        found = self.workspace.tried(lambda: states(session)) or states(None)
-        self.step_list.show_states(found)
-        if self.page is not None and session is not None:
-            self.side_panel.show_state(found[self.page.key])
-            self.workspace.tried(self.page.refresh)
+        self._states = self.workspace.tried(lambda: states(session, seen)) or states(None)
+        self.step_list.show_states(self._states)
+        self._show_page()
         self.menus.refresh()
         self.setWindowTitle(title(session))
         took_ms = (time.perf_counter() - began) * 1000
         self._rest.start(min(LONGEST_REST_MS, round(REST * took_ms)))
 
+    def _show_page(self) -> None:
+        if self.page is not None and self.workspace.session is not None:
+            self.side_panel.show_state(self._states[self.page.key])
+            self.workspace.tried(self.page.refresh)
+
     def _frame_changed(self, frame: int) -> None:
         self.timeline.set_frame(frame)
-        if self.page is not None:
-            self.workspace.tried(self.page.refresh)
+        self._show_page()
 
     # --- files ------------------------------------------------------------------------------
 

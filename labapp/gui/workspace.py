@@ -11,6 +11,7 @@ from typing import TypeVar
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui.tasks import Control, Task, Tasks, in_words
+from labapp.session.measured import Overview
 from labapp.session.run import measuring_pool
 from labapp.session.session import Session
 
@@ -45,6 +46,10 @@ class Workspace(QObject):
         self.session: Session | None = None
         self.frame = 0
         self._pool: ProcessPoolExecutor | None = None
+        self._overview: Overview | None = None
+        # Connected before anybody else: whoever hears of a change sees the frames as they are.
+        self.opened.connect(self._forget)
+        self.changed.connect(self._forget)
         self.tasks = Tasks(self)
         self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
 
@@ -124,6 +129,21 @@ class Workspace(QObject):
             if frames and self.frame not in frames:
                 self.show_frame(frames[0])
             self.changed.emit()
+
+    def overview(self) -> Overview | None:
+        """All frames at a glance, looked up once after each change; None without a session.
+
+        Raises
+        ------
+        InputError
+            If the session is damaged.
+        """
+        if self._overview is None and self.session is not None:
+            self._overview = self.session.overview()
+        return self._overview
+
+    def _forget(self) -> None:
+        self._overview = None
 
     def show_frame(self, number: int) -> None:
         """Bring a frame of the session into view."""

@@ -101,7 +101,7 @@ def test_clicking_typing_and_keys_go_to_frames(qtbot: QtBot):
     timeline.moved.connect(went.append)
     timeline.moved.connect(timeline.set_frame)
     scrubber = timeline.scrubber
-    middle = QPoint(scrubber.width() // 2, 15)
+    middle = QPoint(int(scrubber.width() * 0.505), 15)
     qtbot.mouseClick(scrubber, Qt.MouseButton.LeftButton, pos=middle)
     assert went[-1] == 60
     qtbot.keyClick(scrubber, Qt.Key.Key_PageUp)

@@ -125,6 +125,11 @@ class Scrubber(QWidget):
             self.update()
 
     @property
+    def kinds(self) -> npt.NDArray[np.int64]:
+        """Of the frames, indices into the ticks, shape (n,)."""
+        return self._kinds
+
+    @property
     def position(self) -> int:
         """Of the frame in view."""
         return self._position
@@ -280,6 +285,7 @@ class Timeline(QWidget):
         self._timer = QTimer(self)
         self._timer.timeout.connect(self._play_on)
         self.number = QSpinBox()
+        self.number.setPrefix("Frame ")
         self.number.setAccessibleName("Frame number")
         self.number.setToolTip("The frame in view, counted from 0: type a number to go there")
         self.number.setKeyboardTracking(False)
@@ -289,6 +295,10 @@ class Timeline(QWidget):
         self.told.setMinimumWidth(self.fontMetrics().horizontalAdvance("of 10000 · 0000.0000 s  "))
         self.counts = QLabel()
         self.counts.setTextFormat(Qt.TextFormat.RichText)
+        self.counts.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+        self.counts.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+        self.counts.setMinimumWidth(self.fontMetrics().horizontalAdvance("■ 0000   ") * 3)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self._lay_out()
 
     def _lay_out(self) -> None:
@@ -313,24 +323,24 @@ class Timeline(QWidget):
             row.addWidget(button)
         row.addWidget(self.number)
         row.addWidget(self.told)
-        for kind, text in (("doubtful", "in doubt"), ("corrected", "corrected")):
-            for forward, sign in ((False, "◂"), (True, "▸")):
-                button = QToolButton()
-                button.setText(f"{sign} {text}" if not forward else f"{text} {sign}")
-                key = ("F8" if kind == "doubtful" else "F7") if forward else ""
-                key = key or ("Shift+F8" if kind == "doubtful" else "Shift+F7")
-                where = "next" if forward else "previous"
-                button.setAccessibleName(f"{where.capitalize()} frame {text}")
-                button.setToolTip(f"Go to the {where} frame {text} ({key})")
-                button.clicked.connect(lambda *_, k=kind, f=forward: self.jumped.emit(k, f))
-                row.addWidget(button)
-        row.addStretch(1)
-        row.addWidget(self.counts)
+        for kind, words, key in (("doubtful", "in doubt", "F8"), ("corrected", "corrected", "F7")):
+            row.addSpacing(8)
+            row.addWidget(self._jump(kind, f"previous frame {words}", "◂", f"Shift+{key}", False))
+            row.addWidget(QLabel(words))
+            row.addWidget(self._jump(kind, f"next frame {words}", "▸", key, True))
+        row.addSpacing(8)
+        row.addWidget(self.counts, 1)
         column = QVBoxLayout(self)
         column.setContentsMargins(6, 4, 6, 4)
         column.setSpacing(4)
         column.addWidget(self.scrubber)
         column.addLayout(row)
+
+    def _jump(self, kind: str, where: str, sign: str, key: str, forward: bool) -> QToolButton:
+        button = self._button(where.capitalize(), f"Go to the {where} ({key})", None)
+        button.setText(sign)
+        button.clicked.connect(lambda: self.jumped.emit(kind, forward))
+        return button
 
     def _button(
         self, name: str, tip: str | None, icon: QStyle.StandardPixmap | None
@@ -367,7 +377,7 @@ class Timeline(QWidget):
         self.number.blockSignals(True)
         self.number.setRange(*((int(frames[0]), int(frames[-1])) if len(frames) else (0, 0)))
         self.number.blockSignals(False)
-        self._show_counts(kinds)
+        self._show_counts()
 
     def set_frame(self, frame: int) -> None:
         """Mark the frame in view."""
@@ -389,17 +399,31 @@ class Timeline(QWidget):
         when = "" if np.isnan(time_s) else f", {time_s:.4f} s"
         return f"Frame {self._frames[position]}{when}"
 
-    def _show_counts(self, kinds: npt.NDArray[np.int64]) -> None:
-        """A legend that counts: only kinds that occur, so that it stays short."""
+    def _show_counts(self) -> None:
+        """A legend that counts the kinds that occur; without its words where there is no room."""
         dark = self.palette().color(QPalette.ColorRole.Window).lightness() < 128
+        kinds = self.scrubber.kinds
         found = np.bincount(kinds, minlength=len(self._ticks)) if len(kinds) else ()
-        parts = []
+        long, short, told = [], [], []
         for tick, count in zip(self._ticks, found, strict=False):
             if count:
-                colour = (tick.dark if dark else tick.light) or "gray"
+                square = (
+                    f'<span style="color:{(tick.dark if dark else tick.light) or "gray"}">■</span>'
+                )
                 words = tick.words.split(":")[0]
-                parts.append(f'<span style="color:{colour}">■</span>&nbsp;{count}&nbsp;{words}')
-        self.counts.setText(" &nbsp; ".join(parts))
+                long.append(f"{square}&nbsp;{count}&nbsp;{words.replace(' ', '&nbsp;')}")
+                short.append(f"{square}&nbsp;{count}")
+                told.append(f"{count} {tick.words}")
+        self.counts.setToolTip("\n".join(told))
+        self.counts.setAccessibleName(", ".join(told))
+        self.counts.setText(" &nbsp; ".join(long))
+        if self.counts.sizeHint().width() > self.counts.width():
+            self.counts.setText(" &nbsp; ".join(short))
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+        """Give the legend its words where there is room for them."""
+        super().resizeEvent(event)
+        self._show_counts()
 
     # --- going ------------------------------------------------------------------------------
 
