@@ -67,7 +67,7 @@ FILE = (
         "&New session …",
         "Ctrl+N",
         "Make a file for a new experiment",
-        lambda window: window.new_session(),
+        lambda window: window.files.new(),
     ),
     Action(
         "open",
@@ -75,7 +75,7 @@ FILE = (
         "&Open …",
         "Ctrl+O",
         "Open a session",
-        lambda window: window.choose_session(),
+        lambda window: window.files.choose(),
     ),
     Action(
         "sample",
@@ -83,7 +83,7 @@ FILE = (
         "Try the &sample",
         "",
         "Open a copy of a recorded run that is measured already",
-        lambda window: window.try_sample(),
+        lambda window: window.files.try_sample(),
     ),
     Action(
         "copy",
@@ -91,7 +91,7 @@ FILE = (
         "Save a &copy …",
         "Ctrl+Shift+S",
         "Save the session as it is now under another name; you go on in this one",
-        lambda window: window.save_copy(),
+        lambda window: window.files.save_copy(),
         needs="session",
         begins=True,
     ),
@@ -101,7 +101,7 @@ FILE = (
         "&Import a recording …",
         "Ctrl+I",
         "Take frames from a video, an image or a stack into the session",
-        lambda window: window.choose_recording(),
+        lambda window: window.files.choose_recording(),
     ),
     Action(
         "export",
@@ -118,7 +118,7 @@ FILE = (
         "C&lose the session",
         "Ctrl+W",
         "Close the session and go back to the welcome page; everything is saved",
-        lambda window: window.close_session(),
+        lambda window: window.files.close(),
         needs="session",
         begins=True,
     ),

@@ -79,7 +79,7 @@ def main(arguments: Sequence[str]) -> int:
         window.say(problem, True)
     window.show()
     if path is not None:
-        QTimer.singleShot(0, window, lambda: window.open_path(path))
+        QTimer.singleShot(0, window, lambda: window.files.open_path(path))
     try:
         return app.exec()
     finally:

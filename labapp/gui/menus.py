@@ -108,7 +108,7 @@ class Menus:
             text = f"{path.stem} — {path.parent}".replace("&", "&&")
             made = self.recent.addAction(f"&{number} {text}" if number < 10 else text)
             made.setToolTip(name)
-            made.triggered.connect(lambda *_, chosen=path: self._window.open_session(chosen))
+            made.triggered.connect(lambda *_, chosen=path: self._window.files.open(chosen))
 
 
 BY_NAME = {action.name: action for action in ACTIONS}

@@ -27,8 +27,8 @@ from PySide6.QtWidgets import (
 
 from labapp.core.values import IntArray
 from labapp.errors import InputError
-from labapp.gui import dialogs
 from labapp.gui.actions import ACTIONS
+from labapp.gui.files import Files
 from labapp.gui.help import HelpDialog
 from labapp.gui.menus import Menus
 from labapp.gui.messages import LogPanel, StatusLine
@@ -42,8 +42,6 @@ from labapp.gui.steps import STEPS, states
 from labapp.gui.theme import apply_theme
 from labapp.gui.views.timeline import Tick, Timeline
 from labapp.gui.workspace import Workspace
-from labapp.session.copies import copy_sample, copy_session
-from labapp.session.database import SUFFIX, SessionInUse
 from labapp.session.log import log_file
 from labapp.session.session import Session
 
@@ -88,6 +86,7 @@ class MainWindow(QMainWindow):
 
     preferences: Preferences
     workspace: Workspace
+    files: Files
     timeline: Timeline
     status_line: StatusLine
 
@@ -97,6 +96,7 @@ class MainWindow(QMainWindow):
         self.preferences = preferences
         self._preferences_file = preferences_file
         self.workspace = Workspace(self)
+        self.files = Files(self)
         self.standings: IntArray = np.zeros(0, np.int64)
         self.page: Page | None = None
         self._kinds = {kind.key: kind for kind in PAGES}
@@ -160,8 +160,8 @@ class MainWindow(QMainWindow):
         self.timeline.jumped.connect(self.jump)
         self.status_line.read.connect(self.read_messages)
         self.welcome.asked.connect(self.menus.do)
-        self.welcome.chosen.connect(self.open_session)
-        self.welcome.forgotten.connect(self.forget)
+        self.welcome.chosen.connect(self.files.open)
+        self.welcome.forgotten.connect(self.files.forget)
 
     # --- what is in view --------------------------------------------------------------------
 
@@ -239,7 +239,7 @@ class MainWindow(QMainWindow):
         if session is None:
             self.stack.setCurrentWidget(self.welcome)
             self.step_list.show_step("")
-            self._list_recent()
+            self.files.list_recent()
         elif self._steps:
             keys = [step.key for step in self._steps]
             first = self.workspace.tried(lambda: first_step(session)) or "setup"
@@ -285,113 +285,6 @@ class MainWindow(QMainWindow):
     def _frame_changed(self, frame: int) -> None:
         self.timeline.set_frame(frame)
         self._show_page()
-
-    # --- files ------------------------------------------------------------------------------
-
-    def new_session(self) -> bool:
-        """Ask for a file and make a session in it."""
-        return self._create(dialogs.new_path(self.preferences.folder, "experiment"))
-
-    def choose_session(self) -> None:
-        """Ask for a session and open it."""
-        path = dialogs.ask_session(self, self.preferences.folder)
-        if path is not None:
-            self.open_session(path)
-
-    def choose_recording(self) -> None:
-        """Ask for a recording and import it."""
-        path = dialogs.ask_recording(self, self.preferences.folder)
-        if path is not None:
-            self.import_recording(path)
-
-    def open_path(self, path: Path) -> None:
-        """Open a session, or import anything else."""
-        if path.suffix.lower() == SUFFIX:
-            self.open_session(path)
-        else:
-            self.import_recording(path)
-
-    def open_session(self, path: Path) -> bool:
-        """Open a session file, read-only if it is in use elsewhere and the operator agrees."""
-        present = self.workspace.session
-        if present is not None and path.absolute() == present.path:
-            return True
-        session = self.workspace.tried(lambda: self._opened(path))
-        if session is None:
-            return False
-        self._show(session)
-        return True
-
-    def import_recording(self, path: Path) -> None:
-        """Take a recording to the capture page, in a new session where none is open."""
-        if not path.exists():
-            self.say(f"{path} is not there", True)
-        elif self.workspace.session is not None or self._create(
-            dialogs.new_path(path.parent, path.stem)
-        ):
-            self._remember(replace(self.preferences, last_folder=str(path.parent)))
-            self.show_step("capture")
-            if self.page is not None:
-                self.page.take(path)
-
-    def save_copy(self) -> None:
-        """Ask for a file and save the session in it as it is now."""
-        session = self.workspace.session
-        if session is None:
-            return
-        proposed = dialogs.new_path(session.path.parent, f"{session.path.stem} copy")
-        path = dialogs.ask_new_session(self, proposed, "Save a copy")
-        if path is not None:
-            source = session.path
-            self.workspace.tasks.start(
-                "Saving a copy",
-                lambda _: copy_session(source, path),
-                lambda copied: self.say(f"A copy is in {copied}"),
-            )
-
-    def try_sample(self) -> None:
-        """Open a copy of the sample run, in a folder of the user's."""
-        folder = self.preferences.samples_folder / "gtaw"
-        path = self.workspace.tried(lambda: copy_sample("gtaw", folder))
-        if path is not None and self.open_session(path):
-            self.say(f"This is a copy of the sample, in {path.parent}: change what you like")
-
-    def close_session(self) -> None:
-        """Close the session and go back to the welcome page."""
-        self.workspace.show(None)
-
-    def forget(self, path: Path) -> None:
-        """Take a session off the list of recent ones; the file stays."""
-        self._remember(self.preferences.without_recent(path))
-        self._list_recent()
-
-    def _create(self, proposed: Path) -> bool:
-        path = dialogs.ask_new_session(self, proposed)
-        session = None if path is None else self.workspace.tried(lambda: Session.create(path))
-        if session is None:
-            return False
-        self._show(session)
-        return True
-
-    def _opened(self, path: Path) -> Session | None:
-        try:
-            return Session.open(path)
-        except SessionInUse:
-            if not dialogs.ask_read_only(self, path):
-                return None
-            return Session.open(path, read_only=True)
-
-    def _show(self, session: Session) -> None:
-        self._remember(self.preferences.with_recent(session.path))
-        self.workspace.show(session)
-        missing = self.workspace.tried(lambda: session.missing_recording)
-        if missing is not None:
-            self.say(f"The recording is not where it was: {missing}", True)
-
-    def _list_recent(self) -> None:
-        self.menus.show_recent(self.preferences.recent)
-        if self.workspace.session is None:
-            self.welcome.show_recent([Path(name) for name in self.preferences.recent])
 
     # --- measuring, copying -----------------------------------------------------------------
 
@@ -441,7 +334,7 @@ class MainWindow(QMainWindow):
 
     def set_theme(self, theme: str) -> None:
         """Show the app light, dark or as the desktop is."""
-        self._remember(replace(self.preferences, theme=theme))
+        self.remember(replace(self.preferences, theme=theme))
         self.apply_theme()
 
     def apply_theme(self) -> None:
@@ -502,7 +395,8 @@ class MainWindow(QMainWindow):
         if self.preferences.layout:
             self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
 
-    def _remember(self, preferences: Preferences) -> None:
+    def remember(self, preferences: Preferences) -> None:
+        """Keep preferences for the next start."""
         self.preferences = preferences
         problem = write_preferences(self._preferences_file, preferences)
         if problem:
@@ -528,13 +422,13 @@ class MainWindow(QMainWindow):
         if len(paths) > 1:
             self.say("Drop one file, or the folder that holds the images", True)
         elif paths:
-            QTimer.singleShot(0, self, lambda: self.open_path(paths[0]))
+            QTimer.singleShot(0, self, lambda: self.files.open_path(paths[0]))
 
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802
         """Stop all work, remember the layout and close the session."""
         self.timeline.set_playing(False)
         self._show_docks(everywhere=True)
-        self._remember(
+        self.remember(
             replace(
                 self.preferences,
                 geometry=_text(self.saveGeometry()),

@@ -110,7 +110,7 @@ def test_opening_shows_the_results_and_closing_the_welcome_page(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     path = copy_sample("gtaw")
-    assert plain.open_session(path)
+    assert plain.files.open(path)
     page = plain_page(plain)
     assert page.key == "surface"
     assert page.refreshed >= 1
@@ -130,7 +130,7 @@ def test_opening_shows_the_results_and_closing_the_welcome_page(
 def test_the_page_in_view_is_refreshed_and_no_other(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
-    plain.open_session(copy_sample("thumb_tack"))
+    plain.files.open(copy_sample("thumb_tack"))
     surface = plain_page(plain)
     plain.show_step("setup")
     settle(plain, qtbot)
@@ -148,7 +148,7 @@ def test_the_page_in_view_is_refreshed_and_no_other(
 def test_many_changes_in_a_row_are_shown_together_and_the_last_is_seen(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
-    plain.open_session(copy_sample("thumb_tack"))
+    plain.files.open(copy_sample("thumb_tack"))
     settle(plain, qtbot)
     page = plain_page(plain)
     page.refresh = lambda: (time.sleep(0.01), setattr(page, "refreshed", page.refreshed + 1))  # type: ignore[method-assign]
@@ -161,7 +161,7 @@ def test_many_changes_in_a_row_are_shown_together_and_the_last_is_seen(
 
 
 def test_undo_and_redo_say_what_they_do(plain: MainWindow, copy_sample: CopySample, qtbot: QtBot):
-    plain.open_session(copy_sample("thumb_tack"))
+    plain.files.open(copy_sample("thumb_tack"))
     plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Another")))
     settle(plain, qtbot)
     actions = plain.menus.actions
@@ -180,7 +180,7 @@ def test_undo_and_redo_say_what_they_do(plain: MainWindow, copy_sample: CopySamp
 def test_keys_go_through_the_frames_and_the_steps(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
-    plain.open_session(copy_sample("blocked_rows"))
+    plain.files.open(copy_sample("blocked_rows"))
     plain.activateWindow()
     plain_page(plain).setFocus()
     steps = [(Qt.Key.Key_Right, 1), (Qt.Key.Key_End, 5), (Qt.Key.Key_Left, 4), (Qt.Key.Key_Home, 0)]
@@ -207,7 +207,7 @@ def test_keys_go_through_the_frames_and_the_steps(
 def test_space_plays_and_arrows_in_a_field_stay_there(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
-    plain.open_session(copy_sample("gtaw"))
+    plain.files.open(copy_sample("gtaw"))
     plain_page(plain).setFocus()
     qtbot.keyClick(plain, Qt.Key.Key_Space)
     assert plain.timeline.playing
@@ -224,7 +224,7 @@ def test_space_plays_and_arrows_in_a_field_stay_there(
 def test_a_page_that_fails_is_said_and_the_window_stays(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
-    plain.open_session(copy_sample("thumb_tack"))
+    plain.files.open(copy_sample("thumb_tack"))
     plain.show_step("export")
     assert "RuntimeError: no export today" in problems(plain)[0]
     assert "no export today" in plain.status_line.message.text()
@@ -248,10 +248,10 @@ def test_a_session_that_is_in_use_is_offered_read_only(
 
     with Session.open(path):
         QTimer.singleShot(50, lambda: answer(False))
-        assert not plain.open_session(path)
+        assert not plain.files.open(path)
         assert plain.workspace.session is None
         QTimer.singleShot(50, lambda: answer(True))
-        assert plain.open_session(path)
+        assert plain.files.open(path)
         assert plain.windowTitle() == "thumb_tack (read-only) — labapp"
         assert not plain.workspace.attempt(lambda s: s.set_record(Record()))
         assert "read-only" in problems(plain)[0]
@@ -260,8 +260,8 @@ def test_a_session_that_is_in_use_is_offered_read_only(
 
 def test_what_is_no_session_is_refused_in_words(plain: MainWindow, tmp_path: Path):
     (tmp_path / "a.labsession").write_bytes(b"nonsense")
-    assert not plain.open_session(tmp_path / "a.labsession")
-    assert not plain.open_session(tmp_path / "gone.labsession")
+    assert not plain.files.open(tmp_path / "a.labsession")
+    assert not plain.files.open(tmp_path / "gone.labsession")
     assert len(problems(plain)) == 2
     assert plain.stack.currentWidget() is plain.welcome
 
@@ -317,7 +317,7 @@ def test_saying_no_to_a_new_session_imports_nothing(
     plain: MainWindow, copy_sample: CopySample, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: None)
-    plain.import_recording(copy_sample("gtaw").parent / "recording.avi")
+    plain.files.take(copy_sample("gtaw").parent / "recording.avi")
     assert plain.workspace.session is None
     assert plain.page is None
 
@@ -329,7 +329,7 @@ def test_a_copy_stands_elsewhere_and_finds_its_recording(
     qtbot: QtBot,
     monkeypatch: pytest.MonkeyPatch,
 ):
-    plain.open_session(copy_sample("gtaw"))
+    plain.files.open(copy_sample("gtaw"))
     plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Mine")))
     there = tmp_path / "elsewhere" / "copy.labsession"
     there.parent.mkdir()
@@ -382,7 +382,7 @@ def test_the_layout_and_the_theme_are_remembered(
     plain: MainWindow, copy_sample: CopySample, tmp_path: Path
 ):
     path = copy_sample("thumb_tack")
-    plain.open_session(path)
+    plain.files.open(path)
     plain.resize(798, 555)
     plain.menus.do("steps")
     plain.menus.do("log")
@@ -395,7 +395,7 @@ def test_the_layout_and_the_theme_are_remembered(
     KEPT.append(again)
     again.show()
     assert again.size().height() == 555
-    again.open_session(path)
+    again.files.open(path)
     assert not again._docks["steps"].isVisible()
     assert again._docks["log"].isVisible()
     again.menus.do("reset_layout")
@@ -421,7 +421,7 @@ def test_closing_stops_the_measuring_and_keeps_what_is_finished(
     with Session.open(copy_sample("gtaw")) as sample, Session.create(path) as session:
         session.set_setup(sample.setup_text)
         session.import_recording(tmp_path / "dark.npy")
-    plain.open_session(path)
+    plain.files.open(path)
     settle(plain, qtbot)
     plain.menus.do("measure")
     task = plain.workspace.tasks.active[0]
@@ -441,7 +441,7 @@ def test_closing_stops_the_measuring_and_keeps_what_is_finished(
 def test_a_set_up_that_is_not_complete_is_said_before_measuring(
     plain: MainWindow, copy_sample: CopySample
 ):
-    plain.open_session(copy_sample("thumb_tack"))
+    plain.files.open(copy_sample("thumb_tack"))
     plain.workspace.attempt(lambda s: s.update_setup({"laser": {"distance_mm": None}}))
     plain.menus.do("measure_frame")
     assert "laser.distance_mm" in problems(plain)[0]
@@ -451,14 +451,14 @@ def test_a_set_up_that_is_not_complete_is_said_before_measuring(
 def test_a_missing_recording_is_said_at_once(plain: MainWindow, copy_sample: CopySample):
     path = copy_sample("gtaw")
     (path.parent / "recording.avi").unlink()
-    assert plain.open_session(path)
+    assert plain.files.open(path)
     assert "recording.avi" in problems(plain)[0]
 
 
 def test_copying_a_picture_and_a_table(plain: MainWindow, copy_sample: CopySample):
     from PySide6.QtWidgets import QTableWidget, QTableWidgetItem
 
-    plain.open_session(copy_sample("thumb_tack"))
+    plain.files.open(copy_sample("thumb_tack"))
     plain.menus.do("copy_table")
     assert plain.status_line.message.text() == "This step has no table"
     table = QTableWidget(2, 2)
