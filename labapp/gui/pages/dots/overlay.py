@@ -29,8 +29,11 @@ COMPUTED = "#ff5c5c"
 BLOCKED = "⊘"
 """Beside the number of a row that the torch blocks."""
 
-SIZE, CHOSEN_SIZE, REFERENCE_SIZE = 13, 16, 26
-"""Points of the screen."""
+LEAST, MOST, CHOSEN_MORE = 13.0, 60.0, 4.0
+"""Diameters of rings, points of the screen: never less, never more, and more for chosen dots."""
+
+DOT_WIDTHS = 6.0
+"""A ring is so many σ of a dot's light wide at a near zoom: round the dot, not on it."""
 
 
 class DotsOverlay:
@@ -51,9 +54,7 @@ class DotsOverlay:
         self._blocked = _line("#ffffff", 200, Qt.PenStyle.DashLine)
         self._dots = _Marks(pxMode=True)
         self._computed = _Marks(pxMode=True, symbol="+", size=9, pen=None, brush=QColor(COMPUTED))
-        self._reference = _Marks(
-            pxMode=True, size=REFERENCE_SIZE, pen=pg.mkPen(CHOSEN, width=2), brush=None
-        )
+        self._reference = _Marks(pxMode=True, pen=pg.mkPen(CHOSEN, width=2), brush=None)
         self._box = pg.QtWidgets.QGraphicsRectItem()
         self._box.setPen(_pen(CHOSEN, 1, Qt.PenStyle.DashLine))
         self._box.hide()
@@ -62,6 +63,9 @@ class DotsOverlay:
             view.add(item)
         for item in (self._dots, self._reference, self._box):
             view.add(item)
+        self._drawn: tuple[FloatArray, IntArray] = (np.zeros((0, 2)), np.zeros(0, np.int64))
+        self._size = LEAST
+        view.box.sigXRangeChanged.connect(lambda *_: self._rescale())
 
     def show(
         self,
@@ -74,18 +78,37 @@ class DotsOverlay:
         if correction is not self._correction:
             self._correction = correction
             self._joints = _joints(correction)
+        self._drawn = dots_px, selection
+        self._size = self._ring()
         self._draw_lines(dots_px)
         self._draw_dots(correction, dots_px, selection)
         self._computed.setData(*computed_px.T)
         self._draw_labels(correction, dots_px)
         self._draw_reference(correction)
 
+    def _ring(self) -> float:
+        """Diameter of a ring at the present zoom, points of the screen."""
+        if self._correction is None or not len(self._correction.dots):
+            return LEAST
+        width = DOT_WIDTHS * float(np.median(self._correction.dots.size_px))
+        return float(np.clip(width / self._view.px_per_point, LEAST, MOST))
+
+    def _rescale(self) -> None:
+        """Draw rings round the dots at another zoom."""
+        correction, (dots_px, selection) = self._correction, self._drawn
+        if self._ring() != self._size:
+            self._size = self._ring()
+            self._draw_dots(correction, dots_px, selection)
+            self._draw_reference(correction)
+        self._draw_labels(correction, dots_px)
+
     def toggle(self) -> None:
         """Hide all marks, or show them again."""
         visible = not self._dots.isVisible()
         marks = (self._columns, self._rows, self._blocked, self._dots, self._computed)
-        for item in (*marks, self._reference, *self._labels):
+        for item in (*marks, self._reference):
             item.setVisible(visible)
+        self._draw_labels(self._correction, self._drawn[0])
 
     def show_box(self, one: tuple[float, float], other: tuple[float, float]) -> None:
         """Show the box that the pointer draws."""
@@ -123,7 +146,7 @@ class DotsOverlay:
         self._dots.setData(
             *dots_px.T,
             symbol=["s" if hand else "o" for hand in correction.manual.tolist()],
-            size=np.where(chosen, CHOSEN_SIZE, SIZE),
+            size=np.where(chosen, self._size + CHOSEN_MORE, self._size),
             pen=[pen for pen, _ in looks],
             brush=[brush for _, brush in looks],
         )
@@ -131,17 +154,17 @@ class DotsOverlay:
     def _draw_labels(self, correction: Correction | None, dots_px: FloatArray) -> None:
         ends = () if correction is None else picking.row_ends(correction.lattice.row, dots_px)
         while len(self._labels) < len(ends):
-            label = pg.TextItem(anchor=(1.4, 0.5), fill=(0, 0, 0, 60))
-            label.setVisible(self._dots.isVisible())
+            label = pg.TextItem(anchor=(1, 0.5), fill=(0, 0, 0, 60))
             self._labels.append(label)
             self._view.add(label)
+        beside = (0.6 * self._size + 2) * self._view.px_per_point
         blocked = frozenset() if correction is None else correction.lattice.blocked_rows
         for label, end in zip(self._labels, ends, strict=False):
             row, dot = end
             label.setText(f"{row} {BLOCKED}" if row in blocked else str(row), row_color(row))
-            label.setPos(*dots_px[dot])
-        for label in self._labels[len(ends) :]:
-            label.setText("")
+            label.setPos(dots_px[dot, 0] - beside, dots_px[dot, 1])
+        for n, label in enumerate(self._labels):
+            label.setVisible(n < len(ends) and self._dots.isVisible())
 
     def _draw_reference(self, correction: Correction | None) -> None:
         site = None if correction is None else correction.lattice.reference

@@ -83,14 +83,15 @@ class DotsPanel(QWidget):
         layout.addStretch(1)
 
     def show_frame(
-        self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine]
+        self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine] | None
     ) -> None:
-        """Show what the session says of the frame in view."""
+        """Show what the session says of the frame in view; None leaves the list of rows."""
         self.seen.setText(seen)
         self.why.setText(f"⚠ {why}" if why else "")
         self.why.setVisible(bool(why))
         self.fit.set_rows(fit)
-        self.rows.show_lines(rows)
+        if rows is not None:
+            self.rows.show_lines(rows)
 
     def show_chosen(self, words: str, rows: Sequence[int], site: tuple[int, int]) -> None:
         """Show what is chosen: in words, its rows, and the site of a single dot (0: none)."""
@@ -191,6 +192,7 @@ class _RowList(QTableWidget):
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
         header.setSectionResizeMode(3, QHeaderView.ResizeMode.Stretch)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.show_lines(())
 
     def show_lines(self, lines: Sequence[RowLine]) -> None:
         """Show rows; what is chosen stays with its row."""

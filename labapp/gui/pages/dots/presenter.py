@@ -83,7 +83,19 @@ class Shown:
 
 @dataclass(frozen=True)
 class Figures:
-    """What tells whether an edit made the fit better; lengths in mm, NaN where there are none."""
+    """What tells whether an edit made the fit better; lengths in mm, NaN where there are none.
+
+    Parameters
+    ----------
+    status
+        Of the measurement.
+    matched
+        Number of dots whose ray is known.
+    are_mm, mre_mm
+        Reflection errors.
+    height_mm, height_sigma_mm
+        Largest height, or the depth of a pool that is deeper than high, and its σ.
+    """
 
     status: str
     matched: int
@@ -108,10 +120,11 @@ class RowLine:
 
 def shown(session: Session, frame: int, found: Found | None) -> Shown:
     """What a frame shows: its correction, else what was measured, else what was found."""
-    correction, result = session.correction(frame), session.result(frame)
+    correction = session.correction(frame)
+    result, damage = _result(session, frame)
     computed = computed_px(result)
     if correction is not None:
-        why = "" if result is None or result.stale else result.measurement.reason
+        why = damage if result is None or result.stale else result.measurement.reason
         return Shown(frame, "corrected", correction, computed, result, why)
     by = _by(session)
     if result is not None and _automatic(result, by):
@@ -119,16 +132,24 @@ def shown(session: Session, frame: int, found: Found | None) -> Shown:
         start = start_correction(measurement)
         return Shown(frame, "measured", start, computed, result, measurement.reason)
     if found is not None and (found.frame, found.by) == (frame, by):
-        return Shown(frame, "found", found.correction, computed, result, found.why)
-    return Shown(frame, "looked for", None, NO_PLACES, result, "")
+        return Shown(frame, "found", found.correction, computed, result, damage or found.why)
+    return Shown(frame, "looked for", None, NO_PLACES, result, damage)
 
 
 def wanted(session: Session, frame: int) -> Wanted | None:
     """What has to be looked for in a frame, and how; None if the session knows its dots."""
     if session.correction(frame) is not None:
         return None
-    by, result = _by(session), session.result(frame)
+    by, result = _by(session), _result(session, frame)[0]
     return None if result is not None and _automatic(result, by) else (frame, *by)
+
+
+def _result(session: Session, frame: int) -> tuple[Result | None, str]:
+    """What a frame gave; a damaged result is none, and why."""
+    try:
+        return session.result(frame), ""
+    except InputError as error:
+        return None, f"{error}; measure the frame again"
 
 
 def _by(session: Session) -> tuple[DotSettings, LatticeSettings]:
@@ -221,10 +242,8 @@ def sentence(seen: Shown) -> str:
     return f"{words}."
 
 
-def row_lines(correction: Correction | None) -> tuple[RowLine, ...]:
+def row_lines(correction: Correction) -> tuple[RowLine, ...]:
     """The list of rows, from the top of the picture down as they are seen, doubtful dots last."""
-    if correction is None:
-        return ()
     lattice = correction.lattice
     reference = lattice.reference or (0, 0)
     numbers = {int(k) for k in lattice.row} | set(lattice.blocked_rows) | {reference[0]}
@@ -262,7 +281,9 @@ def figures(result: Result | None) -> Figures | None:
     measurement = result.measurement
     size = measurement.measures
     matched = 0 if measurement.match is None else len(measurement.match.dot)
-    names = ("are_mm", "mre_mm", "height_mm", "height_sigma_mm")
+    deep = size is not None and size.depth_mm < -size.height_mm
+    most = ("depth_mm", "depth_sigma_mm") if deep else ("height_mm", "height_sigma_mm")
+    names = ("are_mm", "mre_mm", *most)
     values = (math.nan if size is None else float(getattr(size, name)) for name in names)
     return Figures(measurement.status, matched, *values)
 
@@ -287,7 +308,7 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
         ResultRow("Dots matched", pair([t[1] for t in told])),
         ResultRow("ARE", length("are_mm"), unit="mm", note="Average reflection error (Eq. 6-3)"),
         ResultRow("MRE", length("mre_mm"), unit="mm", note="Largest reflection error (Eq. 6-4)"),
-        ResultRow("Height", height, unit="mm", note="Largest height of the pool, with its ±"),
+        ResultRow("Height", height, unit="mm", note="Largest height, or depth (below 0), with ±"),
     ]
 
 

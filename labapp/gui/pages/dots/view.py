@@ -92,12 +92,12 @@ class DotsPage(Page):
             self.looking.read(frame)
             return  # the frame before it, with its own dots, stays until this one is read
         same = self.seen is not None and self.seen.frame == frame
+        if self.looking.image is None or self.view.picture is not self.looking.image:
+            self.view.show_picture(self.looking.image, self.looking.why)
         self.seen = presenter.shown(session, frame, self.looking.found)
         if self.seen.correction is None:
             self.looking.look()
         self.refit.want(self.seen)
-        if self.looking.image is None or self.view.picture is not self.looking.image:
-            self.view.show_picture(self.looking.image, self.looking.why)
         self.editor.show(self.seen.correction, same)
         correction = self.seen.correction
         self.dots_panel.show_reference(None if correction is None else correction.lattice.reference)
@@ -121,7 +121,8 @@ class DotsPage(Page):
                 figures,
                 pending,
             ),
-            presenter.row_lines(seen.correction),
+            # The list keeps its size while dots are looked for: nothing jumps.
+            None if seen.correction is None else presenter.row_lines(seen.correction),
         )
 
     def draw(self) -> None:
@@ -165,7 +166,7 @@ class DotsPage(Page):
 
     def _again(self) -> None:
         if self._in_view:
-            self.refresh()
+            self.workspace.tried(self.refresh)
 
     def _forget(self) -> None:
         self.seen = self._before = None
