@@ -278,7 +278,7 @@ class Frames:
             noted = self._database.value("SELECT max(coalesce(time_s, checksum)) FROM frame")
             return [] if noted is None else ["there are frames, and not what they were taken from"]
         found = []
-        if recording.frames_sha256 not in (None, self._fingerprint()):
+        if recording.frames_sha256 != self._fingerprint():
             found.append("the frames' numbers, times or checksums are not those of the import")
         if not recording.embedded:
             try:

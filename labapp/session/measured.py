@@ -327,11 +327,8 @@ def _unsealed(content: object, kept_with: tuple[object, ...]) -> Measurement:
     Damaged
         If it is, or if frame, scheme, version, set-up, settings, correction or time are others.
     """
-    held = unpack(content, Measurement | tuple[Measurement, str])
-    if isinstance(held, Measurement):  # without a seal, as labapp first kept them
-        return held
     measurement: Measurement
-    measurement, seal = held
+    measurement, seal = unpack(content, tuple[Measurement, str])
     if seal != fingerprint(kept_with):
         raise Damaged("it is of another frame, or was measured from something else")
     return measurement

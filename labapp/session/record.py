@@ -136,4 +136,4 @@ class Recording:
     warnings: tuple[str, ...]
     index: bytes | None
     imported: str
-    frames_sha256: str | None = None
+    frames_sha256: str = ""

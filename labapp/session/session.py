@@ -58,6 +58,7 @@ class Session:
         self._frames = Frames(database)
         self._pictures = KeptPictures(database)
         self._results = Results(database)
+        self._signals: tuple[str | None, Signals | None] = (None, None)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], record: Record | None = None) -> Session:
@@ -284,8 +285,10 @@ class Session:
     @property
     def signals(self) -> Signals | None:
         """Current and voltage of the weld; None where none were read."""
-        found: Signals | None = self._documents.get("signals")
-        return found
+        sha256 = self._documents.fingerprint("signals")
+        if sha256 != self._signals[0]:  # they may be half a million
+            self._signals = sha256, self._documents.get("signals")
+        return self._signals[1]
 
     def set_signals(self, signals: Signals | None) -> None:
         """Keep current and voltage (`read_signals`); None lets go of them."""

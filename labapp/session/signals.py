@@ -22,7 +22,7 @@ A_TABLE = "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), a cur
 
 LARGEST_FILE = 1 << 28
 LONGEST_LINE = 1 << 14
-MOST_ROWS = 1_000_000
+MOST_ROWS = 500_000
 HEAD_BYTES = 1 << 16
 LINES_ABOVE = 60
 """Loggers tell of themselves in so many lines before the names at most."""

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.signal import detrend
-from scipy.signal.windows import hann
 
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.session.measured import Overview
@@ -256,6 +254,9 @@ def spectrum(course: Trend) -> Spectrum:
             f"a spectrum needs {FEWEST} frames in a row, evenly spaced in time; "
             f"there are {count} at most",
         )
+    from scipy.signal import detrend  # a second, of which the app's start has no use
+    from scipy.signal.windows import hann
+
     window = hann(count, sym=False)
     step = float(course.at[members[-1]] - course.at[members[0]]) / (count - 1)
     value = detrend(course.value[members]) * window
