@@ -19,8 +19,10 @@ from labapp.core.correction import Correction, add_dot, delete_dots, shift_row
 from labapp.core.dots import Dots
 from labapp.core.lattice import Lattice
 from labapp.core.pipeline import start_correction
+from labapp.errors import InputError
 from labapp.gui.pages.dots import DotsPage, presenter
 from labapp.gui.tasks import Control
+from labapp.gui.window import MainWindow
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 
@@ -433,3 +435,49 @@ def test_frames_that_rush_by_show_their_own_dots(
     qtbot.waitUntil(lambda: origin(page) == "found")
     assert page.looking.found is not None
     assert page.looking.found.frame == numbers[-1]
+
+
+def test_a_damaged_result_is_told_and_the_dots_are_looked_for(
+    page: DotsPage,
+    qtbot: QtBot,
+    copy_sample: CopySample,
+    monkeypatch: pytest.MonkeyPatch,
+    unfitted: list[list[int]],
+) -> None:
+    path = copy_sample("blocked_rows")
+
+    def damaged(self: Session, frame: int, scheme: str | None = None) -> None:
+        raise InputError(self.path, f"result of frame {frame}", "damaged", "what was written")
+
+    monkeypatch.setattr(Session, "result", damaged)
+    session = show(page, qtbot, path, 1)
+    assert origin(page) == "found"
+    assert "result of frame 1: damaged" in page.dots_panel.why.text()
+    assert page.editor.correction is not None
+    session.correct({1: page.editor.correction})
+    page.refresh()
+    assert unfitted == [[1]]
+
+
+def test_arrow_keys_go_through_frames_until_a_dot_is_chosen(
+    window: MainWindow, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    assert window.workspace.open(copy_sample("gtaw"))
+    window.show_step("dots")
+    page = window.page
+    assert isinstance(page, DotsPage)
+    qtbot.waitUntil(lambda: page.editor.correction is not None)
+    key(page, Qt.Key.Key_Right)
+    assert window.workspace.frame == 1
+    qtbot.waitUntil(lambda: page.seen is not None and page.seen.frame == 1)
+    before = page.editor.dots_px.copy()
+    page.choose(page.editor.choose_next, 1)
+    chosen = page.editor.selection
+    key(page, Qt.Key.Key_Right)
+    assert window.workspace.frame == 1
+    moved = page.editor.dots_px - before
+    assert moved[chosen] == pytest.approx(np.array([[0.1, 0.0]]))
+    assert np.count_nonzero(moved) == 1
+    key(page, Qt.Key.Key_Escape)
+    key(page, Qt.Key.Key_Left)
+    assert window.workspace.frame == 0
