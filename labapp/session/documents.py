@@ -226,6 +226,27 @@ class Documents:
         return found
 
 
+class KeptSignals:
+    """The session's current and voltage: unpacking takes long, and is done once for each table.
+
+    Parameters
+    ----------
+    documents
+        Where they are.
+    """
+
+    def __init__(self, documents: Documents) -> None:
+        self._documents = documents
+        self._held: tuple[str | None, Signals | None] = (None, None)
+
+    def get(self) -> Signals | None:
+        """The signals; None where there are none. See `Documents.get`."""
+        sha256 = self._documents.fingerprint("signals")
+        if sha256 != self._held[0]:
+            self._held = sha256, self._documents.get("signals")
+        return self._held[1]
+
+
 def _named(kind: str, frame: int) -> str:
     return kind if frame == WHOLE else f"{kind} of frame {frame}"
 

@@ -28,7 +28,7 @@ from labapp.errors import InputError
 from labapp.media import Frame, GreyImage, open_source
 from labapp.session.blobs import fingerprint
 from labapp.session.database import Database
-from labapp.session.documents import WHOLE, Change, Documents, Key
+from labapp.session.documents import WHOLE, Change, Documents, KeptSignals, Key
 from labapp.session.export import ExportChoice, ExportedFile
 from labapp.session.frames import THE_RECORDING, Frames, Progress
 from labapp.session.kept_pictures import KeptPictures
@@ -58,7 +58,7 @@ class Session:
         self._frames = Frames(database)
         self._pictures = KeptPictures(database)
         self._results = Results(database)
-        self._signals: tuple[str | None, Signals | None] = (None, None)
+        self._signals = KeptSignals(self._documents)
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], record: Record | None = None) -> Session:
@@ -285,10 +285,7 @@ class Session:
     @property
     def signals(self) -> Signals | None:
         """Current and voltage of the weld; None where none were read."""
-        sha256 = self._documents.fingerprint("signals")
-        if sha256 != self._signals[0]:  # they may be half a million
-            self._signals = sha256, self._documents.get("signals")
-        return self._signals[1]
+        return self._signals.get()
 
     def set_signals(self, signals: Signals | None) -> None:
         """Keep current and voltage (`read_signals`); None lets go of them."""

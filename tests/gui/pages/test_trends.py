@@ -150,9 +150,9 @@ def test_a_table_is_read_kept_moved_and_undone(
     page.start.edited.emit(0.1)
     session = page.workspace.session
     assert session is not None
+    qtbot.waitUntil(lambda: page.start.value() == 0.1)
     assert session.signals is not None
     assert session.signals.start_s == 0.1
-    assert page.start.value() == 0.1
     page.workspace.undo()
     page.workspace.undo()
     assert session.signals is None

@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
+from labapp.gui.tasks import Control
 from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.workspace import Workspace
@@ -130,22 +131,32 @@ class TrendsPage(Page):
 
     def read_signals(self, path: Path) -> None:
         """Read a table with current and voltage, and keep it in the session."""
-        session = self.workspace.session
-
-        def keep(signals: Signals) -> None:
-            if self.workspace.session is session and self.workspace.attempt(
-                lambda s: s.set_signals(signals)
-            ):
-                self.workspace.said.emit(f"{path.name}: {len(signals.time_s)} samples", False)
-
-        self.workspace.tasks.start(f"Reading {path.name}", lambda _: read_signals(path), keep)
+        self._keep(f"Reading {path.name}", lambda: read_signals(path))
 
     def _start_at(self, start_s: object) -> None:
         session = self.workspace.session
         signals = None if session is None else session.signals
         if signals is not None and isinstance(start_s, int | float):
             moved = replace(signals, start_s=float(start_s))
-            self.workspace.attempt(lambda s: s.set_signals(moved))
+            self._keep("Moving current and voltage", lambda: moved)
+
+    def _keep(self, title: str, signals: Callable[[], Signals]) -> None:
+        """Keep signals in the session, in the background: they may be half a million."""
+        session = self.workspace.session
+        if session is None:
+            return
+
+        def work(_: Control) -> Signals:
+            found = signals()
+            session.set_signals(found)
+            return found
+
+        def done(kept: Signals) -> None:
+            self.workspace.said.emit(f"{kept.file}: {len(kept.time_s)} samples", False)
+            if self.workspace.session is session:
+                self.workspace.changed.emit()
+
+        self.workspace.tasks.start(title, work, done)
 
     # --- the panel ----------------------------------------------------------------------------
 

@@ -127,7 +127,7 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
     unknown = None if not found.count else " … ".join(ends).replace("-", "−")
     return (
         ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
-        ResultRow("    range", unknown, unit=quantity.unit, note=f"Least and greatest of {frames}"),
+        ResultRow("range", unknown, unit=quantity.unit, note=f"Least and greatest of {frames}"),
     )
 
 
