@@ -8,6 +8,7 @@ import numpy as np
 
 from labapp.core.values import BoolArray, IntArray
 from labapp.session.measured import Overview
+from labapp.session.trends import doubtful_frames
 
 
 class Standing(IntEnum):
@@ -16,7 +17,7 @@ class Standing(IntEnum):
     NOT_MEASURED = 0
     MEASURED = 1
     CORRECTED = 2
-    STALE = 3
+    DOUBTFUL = 3
     NOT_MEASURABLE = 4
 
     @property
@@ -29,11 +30,11 @@ WORDS = {
     Standing.NOT_MEASURED: "not measured",
     Standing.MEASURED: "measured",
     Standing.CORRECTED: "corrected by hand",
-    Standing.STALE: "in doubt: changed since it was measured",
+    Standing.DOUBTFUL: "in doubt: stands out, or changed since it was measured",
     Standing.NOT_MEASURABLE: "could not be measured",
 }
 
-DOUBTFUL = (Standing.STALE, Standing.NOT_MEASURABLE)
+DOUBTFUL = (Standing.DOUBTFUL, Standing.NOT_MEASURABLE)
 """What an operator has to look at."""
 
 
@@ -44,7 +45,8 @@ def standings(seen: Overview) -> IntArray:
     found = np.where(measured, Standing.MEASURED, Standing.NOT_MEASURED)
     found = np.where(seen.corrected & (fine | ~measured), Standing.CORRECTED, found)
     found = np.where(measured & ~fine, Standing.NOT_MEASURABLE, found)
-    return np.asarray(np.where(measured & seen.stale, Standing.STALE, found), np.int64)
+    doubtful = (measured & seen.stale) | (fine & doubtful_frames(seen))
+    return np.asarray(np.where(doubtful, Standing.DOUBTFUL, found), np.int64)
 
 
 def next_frame(

@@ -12,13 +12,14 @@ from labapp.gui.standing import Standing, next_frame, standings
 from labapp.gui.views.timeline import Timeline, aggregated
 from labapp.gui.window import TICKS
 from labapp.session.measured import Overview
+from labapp.session.schema import MEASURES
 
 
 def overview(status: list[str], corrected: list[bool], stale: list[bool]) -> Overview:
     count = len(status)
     return Overview(
         np.arange(count), np.arange(count) / 60, tuple(status), np.array(corrected),
-        np.array(stale), {},
+        np.array(stale), dict.fromkeys(MEASURES, np.full(count, np.nan)),
     )  # fmt: skip
 
 
@@ -39,9 +40,18 @@ def test_how_frames_stand():
         [False, False, False, True, False, False, False],
     )
     assert [Standing(kind).name for kind in standings(seen)] == [
-        "NOT_MEASURED", "MEASURED", "CORRECTED", "STALE", "NOT_MEASURABLE", "CORRECTED",
+        "NOT_MEASURED", "MEASURED", "CORRECTED", "DOUBTFUL", "NOT_MEASURABLE", "CORRECTED",
         "NOT_MEASURABLE",
     ]  # fmt: skip
+
+
+def test_a_frame_that_stands_out_is_in_doubt():
+    width = np.full(40, 6.6)
+    width[17] = 9.0
+    none = np.zeros(40, bool)
+    measures = dict.fromkeys(MEASURES, np.full(40, 1.0)) | {"width_mm": width}
+    seen = Overview(np.arange(40), np.arange(40) / 60, ("ok",) * 40, none, none, measures)
+    assert np.flatnonzero(standings(seen) == Standing.DOUBTFUL).tolist() == [17]
 
 
 def test_the_next_frame_that_is_wanted():
