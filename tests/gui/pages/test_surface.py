@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import ClassVar
@@ -54,15 +56,16 @@ def told(page: SurfacePage) -> list[tuple[str, bool]]:
     return said
 
 
-def test_it_shows_the_frame_in_view(page: SurfacePage) -> None:
+def test_it_shows_the_frame_in_view(page: SurfacePage, qtbot: QtBot) -> None:
     first = page.side.sizes.item(0, 1).text()
     assert page.side.status.text() == "✓ Measured."
     page.workspace.show_frame(7)
     assert page.side.sizes.item(0, 1).text() != first
     assert page.side.provenance.text().startswith("Frame 7 · Fit")
     boundary = page.workspace.session.result(7).measurement.reconstruction.boundary
-    x, _ = page.plan._outline.getData()
-    np.testing.assert_array_equal(x[:-1], boundary.points_mm[:, 0])
+    # Charts follow when frames no longer rush by.
+    x = boundary.points_mm[:, 0]
+    qtbot.waitUntil(lambda: np.array_equal(page.plan._outline.getData()[0][:-1], x))
 
 
 def test_choosing_a_scheme_is_a_step_that_can_be_undone(page: SurfacePage) -> None:
@@ -97,10 +100,22 @@ def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) ->
     assert page.workspace.session.result(1).stale
 
 
-def test_measuring_can_be_cancelled(page: SurfacePage, qtbot: QtBot) -> None:
-    page.side.one.click()
+def test_measuring_can_be_watched_and_cancelled(
+    page: SurfacePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slowly(numbers: list[int], pool: object) -> Iterator[tuple[int, None]]:
+        assert numbers == list(range(30))
+        for number in numbers:
+            time.sleep(0.02)
+            yield number, None
+
+    monkeypatch.setattr(page.workspace.session, "measure", slowly)
+    page.side.all.click()
+    qtbot.waitUntil(lambda: page.side.progress.value() >= 2)
+    assert page.side.progress.text().endswith(" of 30 frames")
     page.side.cancel.click()
-    qtbot.waitUntil(lambda: not page.workspace.tasks.active, timeout=30_000)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.side.progress.value() < 30
     assert page.side.progress.isHidden()
     assert page.side.all.isEnabled()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -232,7 +233,12 @@ def verdict(match: Match | None) -> str:
 
 def rig_of(result: Result) -> Rig:
     """The rig that a result was measured with."""
-    return parse_setup(result.setup, "setup").rig
+    return _rig(result.setup)
+
+
+@functools.lru_cache(maxsize=8)
+def _rig(setup: str) -> Rig:
+    return parse_setup(setup, "setup").rig
 
 
 def height_limits(seen: Overview) -> tuple[float, float] | None:

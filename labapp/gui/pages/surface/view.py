@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QAction, QGuiApplication, QPixmap
 from PySide6.QtWidgets import (
     QFileDialog,
@@ -48,6 +48,9 @@ LOOKS: dict[Direction, tuple[str, str]] = {
     "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
 }
 
+CHARTS_REST_MS = 250
+"""Charts are drawn no more often: they cost more than the 3-D view does."""
+
 SHOWN_PARTS = {
     "points": ("Reflection &points", "White dots: where the rays meet the surface"),
     "boundary": ("&Boundary", "The line where the pool meets unmelted metal"),
@@ -71,6 +74,11 @@ class SurfacePage(Page):
         self.plan.dragged.connect(self._set_section)
         self.compare = CompareView(workspace)
         self.side = SurfacePanel(workspace, self.panel_layout)
+        self._charts_due: Callable[[], None] | None = None
+        self._rest = QTimer(self)
+        self._rest.setSingleShot(True)
+        self._rest.setInterval(CHARTS_REST_MS)
+        self._rest.timeout.connect(self._show_charts)
         self.stack = QStackedWidget()
         self.stack.addWidget(self._single())
         self.stack.addWidget(self.compare)
@@ -199,7 +207,8 @@ class SurfacePage(Page):
             self._show_surface()
 
     def leave(self) -> None:
-        """Stop comparing; the measurement goes on."""
+        """Stop comparing and drawing; the measurement goes on."""
+        self._rest.stop()
         self.compare.leave()
 
     def picture(self) -> QPixmap:
@@ -239,10 +248,23 @@ class SurfacePage(Page):
             dots = reflected_dots(measurement)
         self.view.set_words(self.told.words)
         self.view.show_scene(drawn)
-        self.dots.show_dots(dots)
         boundary = None if reconstruction is None else reconstruction.boundary
-        self.plan.show_pool(boundary, self.options.section)
-        self.profile.show_profile(cut)
+
+        def show_charts() -> None:
+            self.dots.show_dots(dots)
+            self.plan.show_pool(boundary, self.options.section)
+            self.profile.show_profile(cut)
+
+        self._charts_due = show_charts
+        if not self._rest.isActive():
+            self._show_charts()
+
+    def _show_charts(self) -> None:
+        """Bring the charts up to date; when frames rush by, every so often and at last."""
+        if self._charts_due is not None:
+            self._charts_due()
+            self._charts_due = None
+            self._rest.start()
 
     def _show_options(self) -> None:
         self.colour.set_value(self.options.colour)
@@ -259,6 +281,7 @@ class SurfacePage(Page):
 
     def _set(self, **changed: object) -> None:
         self.options = replace(self.options, **changed)  # type: ignore[arg-type]
+        self._rest.stop()  # what the hand does is seen at once
         self._show_options()
         if self.stack.currentWidget() is self.compare:
             self.compare.refresh(self.options)
