@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import logging
 import os
 import signal
@@ -29,6 +31,9 @@ from labapp.session.log import NAME, start_log
 WITHOUT = "labapp --help tells what can be done on the command line"
 
 BAD_INPUT = 2
+
+LOAD_AFTER_MS = 300
+"""The window is there first; then what it will need for 3-D is loaded behind it."""
 
 HEARTBEAT_MS = 300
 """So often Python gets a turn to notice Ctrl-C in the terminal."""
@@ -80,11 +85,21 @@ def main(arguments: Sequence[str]) -> int:
     window.show()
     if path is not None:
         QTimer.singleShot(0, window, lambda: window.files.open_path(path))
+    loading = threading.Thread(target=_load_what_draws_in_3d, name="loading", daemon=True)
+    QTimer.singleShot(LOAD_AFTER_MS, window, loading.start)
     try:
         return app.exec()
     finally:
+        if loading.is_alive():
+            loading.join()
         signal.signal(signal.SIGINT, former)
         faults.uninstall()
+
+
+def _load_what_draws_in_3d() -> None:
+    """Load it while the operator looks at the first page: it takes a second or two."""
+    with contextlib.suppress(ImportError):
+        importlib.import_module("pyvistaqt")
 
 
 def start_app() -> QApplication:

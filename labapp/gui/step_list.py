@@ -99,6 +99,7 @@ class StepList(QListWidget):
             item = QListWidgetItem(f"{number}  {step.title}")
             item.setSizeHint(QSize(0, self.fontMetrics().height() + 14))
             self.addItem(item)
+        self.setMinimumWidth(self.sizeHint().width())
         self.currentRowChanged.connect(self._told)
 
     def sizeHint(self) -> QSize:  # noqa: N802

@@ -32,13 +32,13 @@ LIGHT = {
     Role.Shadow: "#5d656f",
 }
 DARK = {
-    Role.Window: "#22262a",
+    Role.Window: "#1f2326",
     Role.WindowText: "#e4e7ea",
-    Role.Base: "#191c1f",
-    Role.AlternateBase: "#202428",
+    Role.Base: "#2a3036",
+    Role.AlternateBase: "#30373e",
     Role.Text: "#e4e7ea",
     Role.PlaceholderText: "#929ba6",
-    Role.Button: "#31363c",
+    Role.Button: "#383f46",
     Role.ButtonText: "#e4e7ea",
     Role.BrightText: "#ffffff",
     Role.ToolTipBase: "#31363c",
