@@ -481,3 +481,25 @@ def test_arrow_keys_go_through_frames_until_a_dot_is_chosen(
     key(page, Qt.Key.Key_Escape)
     key(page, Qt.Key.Key_Left)
     assert window.workspace.frame == 0
+
+
+def test_rings_grow_with_the_dots_and_the_reference_is_ringed(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    show(page, qtbot, copy_sample("gtaw"), 0)
+    marks, ring = page.overlay._dots, page.overlay._reference
+    size = marks.data["size"].max()
+    assert ring.data["size"].tolist() == [2 * size]
+    # Row 6 is dark at column 8: the ring is amid its neighbours there.
+    assert page.editor.correction is not None
+    lattice, place = page.editor.correction.lattice, page.editor.dots_px
+    beside = place[(lattice.row == 6) & np.isin(lattice.column, [7, 9])]
+    assert ring.data["x"][0] == pytest.approx(beside[:, 0].mean(), abs=1)
+    page.view.zoom(3)
+    QTest.qWait(20)
+    assert marks.data["size"].max() > 1.5 * size
+    assert ring.data["size"].tolist() == [2 * marks.data["size"].max()]
+    key(page, Qt.Key.Key_H)
+    assert not marks.isVisible()
+    key(page, Qt.Key.Key_H)
+    assert marks.isVisible()

@@ -169,9 +169,8 @@ class DotsOverlay:
     def _draw_reference(self, correction: Correction | None) -> None:
         site = None if correction is None else correction.lattice.reference
         place = None if correction is None or site is None else picking.site_px(correction, site)
-        self._reference.setData(
-            [] if place is None else place[:1], [] if place is None else place[1:]
-        )
+        at = np.zeros((0, 2)) if place is None else place[None]
+        self._reference.setData(*at.T, size=np.full(len(at), 2 * self._size))
 
 
 class _Marks(pg.ScatterPlotItem):  # type: ignore[misc]

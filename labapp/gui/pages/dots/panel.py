@@ -61,7 +61,7 @@ class DotsPanel(QWidget):
         layout.addWidget(self.seen)
         layout.addWidget(self.why)
         layout.addWidget(self.fit)
-        layout.addWidget(_heading("Chosen"))
+        layout.addWidget(_heading("Put right"))
         layout.addWidget(self.chosen)
         layout.addLayout(self._sites())
         layout.addLayout(_buttons(edits))
@@ -121,26 +121,28 @@ class DotsPanel(QWidget):
             made = NumberField(
                 label, lowest=-99, highest=999, decimals=0, optional=True, tooltip=tip
             )
+            made.editor.setMinimumWidth(made.fontMetrics().horizontalAdvance("0000") + 34)
             return made
 
-        self.row = field("Row", "Row of the chosen dots, counted from the bottom up (T)")
-        self.column = field("Column", "Column of the chosen dots, counted from the left")
-        self.reference_row = field("Reference: row", "Row of the dark centre of the pattern")
-        self.reference_column = field("column", "Column of the dark centre of the pattern")
+        self.row = field("Row of the chosen dots", "Their row, counted from the bottom up (T)")
+        self.column = field("Column of the chosen dots", "Their column, counted from the left")
+        self.reference_row = field("Row of the reference", "Row of the pattern's dark centre")
+        self.reference_column = field("Column of the reference", "Column of that dark centre")
         self.row.edited.connect(lambda value: _told(self.row_given, value))
         self.column.edited.connect(lambda value: _told(self.column_given, value))
         for part in (self.reference_row, self.reference_column):
             part.edited.connect(lambda _: self._tell_reference())
         grid = QGridLayout()
-        for line, pair in enumerate(
-            ((self.row, self.column), (self.reference_row, self.reference_column))
-        ):
-            for k, one in enumerate(pair):
-                one.label.setWordWrap(False)
-                one.editor.setMinimumWidth(one.fontMetrics().horizontalAdvance("0000") + 34)
-                one.editor.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
-                grid.addWidget(one.label, line, 2 * k)
-                grid.addWidget(one, line, 2 * k + 1)
+        for k, words in enumerate(("", "Row", "Column")):
+            grid.addWidget(QLabel(words), 0, k)
+        lines = (
+            ("Chosen dots", self.row, self.column),
+            ("Reference", self.reference_row, self.reference_column),
+        )
+        for line, (words, *pair) in enumerate(lines, 1):
+            grid.addWidget(QLabel(words), line, 0)
+            for k, one in enumerate(pair, 1):
+                grid.addWidget(one, line, k)
         return grid
 
     def _tell_reference(self) -> None:
