@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 from collections.abc import Collection, Sequence
@@ -42,7 +43,7 @@ def open_app(arguments: Sequence[str]) -> int:
 def show_in_app(session: Path) -> None:
     """Open a session in the app where there is a display; elsewhere tell how to."""
     if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
-        typer.echo(f"To see it in the app: labapp {session}")
+        typer.echo(f"To see it in the app: labapp {shlex.quote(os.fspath(session))}")
         return
     typer.echo("The app opens with it; close its window to end.")
     # A process of its own: whatever comes over the window, the results are there.

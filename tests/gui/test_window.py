@@ -29,8 +29,7 @@ from labapp.session.copies import copy_session
 from labapp.session.log import log_file
 from labapp.session.record import Record
 from labapp.session.session import Session
-
-from .conftest import KEPT, CopySample
+from tests.gui.conftest import KEPT, CopySample
 
 
 class Plain(Page):
