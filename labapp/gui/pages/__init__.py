@@ -6,10 +6,12 @@ from labapp.gui.pages.capture import CapturePage
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.export import ExportPage
 from labapp.gui.pages.page import Page
+from labapp.gui.pages.setup import SetupPage
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.pages.trends import TrendsPage
 
 PAGES: tuple[type[Page], ...] = (
+    SetupPage,
     CapturePage,
     DotsPage,
     SurfacePage,

@@ -50,6 +50,10 @@ class BenchView(QWidget):
         former, self._view = self._view, view
         self.words.setText(words)
         self.setAccessibleDescription(words)
+        for plot in (self.whole, self.near):
+            plot.setVisible(view is not None)
+        center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft
+        self.words.setAlignment(center if view is None else left)
         self._draw()
         if view is not None and (former is None or _extent(view) != _extent(former)):
             self.fit()

@@ -1,0 +1,421 @@
+"""What the set-up page shows of a session: without Qt."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from labapp.core.rig import Rig
+from labapp.errors import InputError
+from labapp.gui.digits import ResultRow
+from labapp.session.files import write_whole
+from labapp.session.record import Record
+from labapp.session.session import Session
+from labapp.session.setup import parse_setup, read_setup, updated_setup
+from labapp.session.setup_keys import SECTIONS
+from labapp.simulation.positioning import (
+    USUAL_LENGTH_MM,
+    USUAL_WIDTH_MM,
+    Fate,
+    SideView,
+    side_view,
+)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A field of the page.
+
+    Parameters
+    ----------
+    key
+        ``section.key`` of the setup, or the name in `Record`.
+    label, unit, tooltip
+        What it is; its unit; more about it.
+    lowest, highest, step, decimals
+        Of its number; lowest = highest: it takes words.
+    usual
+        What the text has for it (Appendix II); None: nothing.
+    """
+
+    key: str
+    label: str
+    unit: str = ""
+    tooltip: str = ""
+    lowest: float = 0.0
+    highest: float = 0.0
+    step: float = 1.0
+    decimals: int = 1
+    usual: float | None = None
+
+
+RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
+    (
+        "Dot pattern",
+        (
+            Entry("pattern.rows", "Rows", "", "Rows of the dot matrix, odd", 3, 99, 2, 0, 19),
+            Entry("pattern.columns", "Columns", "", "Columns of it, odd", 3, 99, 2, 0, 19),
+            Entry(
+                "pattern.inter_beam_angle_deg",
+                "Inter-beam angle",
+                "°",
+                "Angle between neighbouring rays at the centre",
+                0,
+                45,
+                0.01,
+                2,
+                0.77,
+            ),
+        ),
+    ),
+    (
+        "Laser",
+        (
+            Entry(
+                "laser.projection_angle_deg",
+                "Projection angle",
+                "°",
+                "Elevation of the beam above the work piece; step 2 measures it",
+                0,
+                90,
+                0.5,
+                2,
+                30,
+            ),
+            Entry(
+                "laser.distance_mm",
+                "Distance",
+                "mm",
+                "From the diode to the work piece under the electrode; step 2 measures it",
+                0,
+                10_000,
+                0.5,
+                2,
+                35,
+            ),
+        ),
+    ),
+    (
+        "Torch",
+        (
+            Entry(
+                "electrode.height_mm",
+                "Electrode height",
+                "mm",
+                "From the work piece up to the electrode's tip",
+                0,
+                10_000,
+                0.5,
+                2,
+                4,
+            ),
+        ),
+    ),
+    (
+        "Imaging plane",
+        (
+            Entry(
+                "imaging_plane.distance_mm",
+                "Distance",
+                "mm",
+                "From the electrode's axis back to O′, along −Y",
+                0,
+                10_000,
+                1,
+                2,
+                50,
+            ),
+            Entry(
+                "imaging_plane.s_mm",
+                "s",
+                "mm",
+                "How far O′ lies to the left of the electrode, as the camera sees it",
+                -10_000,
+                10_000,
+                1,
+                2,
+            ),
+            Entry(
+                "imaging_plane.h_mm",
+                "h",
+                "mm",
+                "How high O′ lies above the work piece",
+                -10_000,
+                10_000,
+                0.5,
+                2,
+            ),
+            Entry(
+                "imaging_plane.width_mm",
+                "Width",
+                "mm",
+                "Size along O′X′, from O′",
+                0,
+                10_000,
+                1,
+                1,
+                101.6,
+            ),
+            Entry(
+                "imaging_plane.height_mm",
+                "Height",
+                "mm",
+                "Size along O′Z′, from O′",
+                0,
+                10_000,
+                1,
+                1,
+                101.6,
+            ),
+            Entry(
+                "imaging_plane.pitch_deg",
+                "Pitch",
+                "°",
+                "How far its upper edge leans away from the torch; empty: upright",
+                -90,
+                90,
+                0.5,
+                2,
+            ),
+            Entry(
+                "imaging_plane.yaw_deg",
+                "Yaw",
+                "°",
+                "How far it is turned about the upright; empty: square to the welding direction",
+                -90,
+                90,
+                0.5,
+                2,
+            ),
+        ),
+    ),
+)
+"""Of the rig, by headings."""
+
+POOL = (
+    Entry("expected_width_mm", "Width", "mm", "Of the pool that is expected", 0.1, 100, 0.5, 2),
+    Entry("expected_length_mm", "Length", "mm", "Of the pool that is expected", 0.1, 100, 0.5, 2),
+    Entry(
+        "expected_height_mm",
+        "Height",
+        "mm",
+        "Of the pool that is expected; negative for a concave one",
+        -50,
+        50,
+        0.05,
+        2,
+    ),
+)
+
+EXPERIMENT = (
+    Entry("title", "Title", tooltip="What this experiment is called"),
+    Entry("operator", "Operator", tooltip="Who does it"),
+    Entry("material", "Material", tooltip="Of the work piece"),
+    Entry("thickness_mm", "Thickness", "mm", "Of the work piece", 0, 1000, 0.5, 2),
+    Entry("current_a", "Current", "A", "Weld current", 0, 2000, 1, 1),
+    Entry("voltage_v", "Voltage", "V", "Arc voltage", 0, 1000, 0.5, 1),
+    Entry("travel_speed_mm_s", "Travel speed", "mm/s", "Of the torch", 0, 1000, 0.1, 2),
+    Entry("gas", "Shielding gas", tooltip="Which gas"),
+    Entry("gas_flow_l_min", "Gas flow", "l/min", "Of the shielding gas", 0, 1000, 0.5, 1),
+    Entry("notes", "Notes", tooltip="Anything else worth keeping; Ctrl+Enter keeps it"),
+)
+
+SAFETY: tuple[tuple[str, str], ...] = (
+    (
+        "Laser points at nobody's eyes",
+        "It is of class IIIb: never into the beam, nor into its reflection on metal.",
+    ),
+    ("Laser goggles are worn", "By everybody in the room, for 685 nm."),
+    ("Welding goggles are worn", "The arc is bright enough to hurt the eyes."),
+    ("Welding clothes are worn", "Metal splatters."),
+    ("Hands stay off the arc", "Arc, torch and work piece are very hot."),
+    ("Water cooling is on", "Before the welding machine is switched on."),
+    ("Shielding gas is on", "Before the welding machine is switched on."),
+)
+"""Title and what it means, from Appendix II."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the page shows.
+
+    Parameters
+    ----------
+    values
+        By the keys of `RIG`; None where there is none.
+    problems
+        What is wrong, in words, by the same keys.
+    others
+        What is wrong elsewhere in the setup, a sentence each.
+    record
+        The experiment record.
+    """
+
+    values: dict[str, float | None]
+    problems: dict[str, str]
+    others: tuple[str, ...]
+    record: Record
+
+
+def shown(session: Session) -> Shown:
+    """What the page shows of a session."""
+    sections: dict[str, Any] = tomllib.loads(session.setup_text)
+    keys = [entry.key for _, entries in RIG for entry in entries]
+    values = {key: _number(sections, key) for key in keys}
+    problems: dict[str, str] = {}
+    others = []
+    for problem in _problems(session):
+        words = "missing"
+        if problem.value != words:
+            words = f"{problem.value}; expected {problem.expected}"
+        if problem.field in values:
+            problems[problem.field] = words
+        elif problem.value == "missing" and f"{problem.field}." in " ".join(keys):
+            rules = SECTIONS[problem.field]
+            problems |= {f"{problem.field}.{key}": words for key in rules if rules[key].required}
+        elif problem.field.startswith("image_calibration") and problem.value == "missing":
+            others.append("The imaging plane is not calibrated: that is step 3.")
+        else:
+            others.append(f"{problem.field}: {words}")
+    return Shown(values, problems, tuple(dict.fromkeys(others)), session.record)
+
+
+def _problems(session: Session) -> tuple[InputError, ...]:
+    try:
+        _ = session.setup
+    except InputError as error:
+        return error.problems
+    return ()
+
+
+def _number(sections: dict[str, Any], key: str) -> float | None:
+    section, _, name = key.partition(".")
+    table = sections.get(section)
+    value = table.get(name) if isinstance(table, dict) else None
+    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def rig(session: Session) -> Rig | None:
+    """The rig, as soon as it is complete; the image calibration may still be missing."""
+    anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
+    points = dict.fromkeys(SECTIONS["image_calibration"])
+    try:
+        text = updated_setup(
+            session.setup_text, session.path, {"image_calibration": points | anything}
+        )
+        return parse_setup(text, session.path).rig
+    except InputError:
+        return None
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The bench from the side.
+
+    Parameters
+    ----------
+    view
+        What is drawn; None without a rig, or a pool that cannot be.
+    words
+        The same in words, or why it is not drawn.
+    rows
+        Its numbers.
+    """
+
+    view: SideView | None
+    words: str
+    rows: tuple[ResultRow, ...] = ()
+
+
+def bench(session: Session) -> Bench:
+    """The bench as it is set up, with the pool that is expected."""
+    found, record = rig(session), session.record
+    if found is None:
+        return Bench(None, "The drawing appears when laser, pattern, torch and plane are entered.")
+    size = (
+        record.expected_width_mm or USUAL_WIDTH_MM,
+        record.expected_length_mm or USUAL_LENGTH_MM,
+        record.expected_height_mm or 0.0,
+    )
+    try:
+        view = side_view(found, *size)
+    except ValueError as error:
+        return Bench(None, f"There is no such pool: {error}.")
+    tally, room = view.tally, view.clearance
+    width, length, height = size
+    given = None not in (record.expected_width_mm, record.expected_length_mm)
+    words = (
+        f"{tally[Fate.CAUGHT]} of {sum(tally.values())} rays come back to the imaging plane "
+        f"(solid). {tally[Fate.BLOCKED]} are blocked by the torch (dashed red), "
+        f"{tally[Fate.PAST]} miss the plane (dotted grey), {tally[Fate.UNUSED]} do not meet the "
+        f"pool (thin grey). {'Expected' if given else 'Usual'} pool: {width:g} × {length:g} mm, "
+        f"{height:g} mm high. Drawn: the central column of the pattern."
+    )
+    rows = (
+        ResultRow("Rays that come back", str(tally[Fate.CAUGHT])),
+        ResultRow("Blocked by the torch", str(tally[Fate.BLOCKED])),
+        ResultRow("Miss the plane", str(tally[Fate.PAST])),
+        ResultRow("L1", room.l1_mm, unit="mm", decimals=1, note="Longest tail (Eq. 4-14)"),
+        ResultRow("L2", room.l2_mm, unit="mm", decimals=1, note="Longest head (Eq. 4-15 … 4-18)"),
+        ResultRow("Least plane distance", room.least_plane_mm, unit="mm", decimals=1, note=REACH),
+        ResultRow("Most plane distance", room.most_plane_mm, unit="mm", decimals=1, note=REACH),
+    )
+    return Bench(view, words, rows)
+
+
+REACH = "The plane catches the steepest ray that passes the torch between these two (Eq. 4-16)"
+
+
+# --- changes ----------------------------------------------------------------------------------
+
+
+def put(session: Session, key: str, value: float | None) -> None:
+    """Put one value of the rig into the setup; None takes it out."""
+    section, _, name = key.partition(".")
+    label = next(e.label for _, entries in RIG for e in entries if e.key == key)
+    session.update_setup({section: {name: value}}, f"set-up, {label}")
+
+
+def put_usual(session: Session) -> None:
+    """Put the usual values in where something is missing; what is there stays."""
+    values = shown(session).values
+    missing: dict[str, dict[str, object]] = {}
+    for _, entries in RIG:
+        for entry in entries:
+            if values[entry.key] is None and entry.usual is not None:
+                section, _, name = entry.key.partition(".")
+                missing.setdefault(section, {})[name] = entry.usual
+    session.update_setup(missing, "usual values")
+
+
+def note(session: Session, name: str, value: str | float | None) -> None:
+    """Note one item of the experiment record."""
+    session.set_record(replace(session.record, **{name: value}))  # type: ignore[arg-type]
+
+
+def tick(session: Session, item: str, ticked: bool, now: str) -> None:
+    """Tick an item of the safety list at a time (ISO 8601), or take its tick away."""
+    kept = tuple(pair for pair in session.record.safety if pair[0] != item)
+    safety = (*kept, (item, now)) if ticked else kept
+    session.set_record(replace(session.record, safety=safety))
+
+
+def load_setup(session: Session, path: Path) -> None:
+    """Take the whole setup from a setup file; refused in words that name the file."""
+    session.set_setup(read_setup(path).text, f"set-up from {path.name}")
+
+
+def save_setup(session: Session, path: Path) -> None:
+    """Write the setup, as far as it goes, to a setup file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    try:
+        write_whole(path, session.setup_text.encode())
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "a file that can be written") from error

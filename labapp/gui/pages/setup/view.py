@@ -1,0 +1,242 @@
+"""The set-up page: three tabs beside the drawing of the bench."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+from PySide6.QtWidgets import (
+    QCheckBox,
+    QFileDialog,
+    QHBoxLayout,
+    QLabel,
+    QPushButton,
+    QTabWidget,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.pages.page import Page
+from labapp.gui.pages.setup import presenter
+from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
+from labapp.gui.views.bench import BenchView
+from labapp.gui.views.fields import FieldForm, NumberField, ResultTable, TextField
+from labapp.gui.workspace import Workspace
+
+SETUP_FILES = "Set-up files (*.toml)"
+
+EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB = range(3)
+
+
+class SetupPage(Page):
+    """Experiment, safety list and bench; the bench is drawn as it is entered."""
+
+    key = "setup"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.bench = BenchView()
+        self.canvas_layout.addWidget(self.bench)
+        self.rig_fields: dict[str, NumberField] = {}
+        self.record_fields: dict[str, NumberField | TextField] = {}
+        self.ticks: dict[str, QCheckBox] = {}
+        self._times: dict[str, QLabel] = {}
+        self._drawn: object = None
+        self.tabs = QTabWidget()
+        self.tabs.setAccessibleName("Parts of the set-up")
+        self.tabs.addTab(self._experiment(), "Experiment")
+        self.tabs.addTab(self._safety(), "Safety")
+        self.tabs.addTab(self._bench(), "Bench")
+        self.panel_layout.addWidget(self.tabs)
+        self.panel_layout.setContentsMargins(0, 0, 0, 0)
+
+    def refresh(self) -> None:
+        """Show record, safety list and setup as the session holds them."""
+        session = self.workspace.session
+        assert session is not None
+        shown = presenter.shown(session)
+        for key, field in self.rig_fields.items():
+            field.set_value(shown.values[key])
+            if shown.problems.get(key):
+                field.set_problem(shown.problems[key])
+        for name, noted in self.record_fields.items():
+            noted.set_value(getattr(shown.record, name))
+        ticked = dict(shown.record.safety)
+        for item, box in self.ticks.items():
+            box.setChecked(item in ticked)
+            self._times[item].setText(f"ticked {_clock(ticked[item])}" if item in ticked else "")
+            self._times[item].setVisible(item in ticked)
+        self.tabs.setTabText(SAFETY_TAB, f"Safety {len(ticked.keys() & self.ticks)}/{len(SAFETY)}")
+        self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems else "Bench")
+        self.others.setText("\n".join(shown.others))
+        self.others.setVisible(bool(shown.others))
+        basis = (session.setup_text, shown.record)
+        if basis != self._drawn:
+            self._drawn = basis
+            bench = presenter.bench(session)
+            self.bench.show_bench(bench.view, bench.words)
+            self.table.set_rows(bench.rows)
+            self.table.setVisible(bool(bench.rows))
+
+    def leave(self) -> None:
+        """Finish the edit under way."""
+        for field in (*self.rig_fields.values(), *self.record_fields.values()):
+            field.flush()
+
+    def load(self, path: Path) -> None:
+        """Take the setup from a file."""
+        if self.workspace.attempt(lambda session: presenter.load_setup(session, path)):
+            self.workspace.said.emit(f"Set-up loaded from {path.name}", False)
+
+    def save(self, path: Path) -> None:
+        """Write the setup to a file."""
+        session = self.workspace.session
+        if session is None:
+            return
+
+        def saved() -> bool:
+            presenter.save_setup(session, path)
+            return True
+
+        if self.workspace.tried(saved):
+            self.workspace.said.emit(f"Set-up saved as {path.name}", False)
+
+    # --- within -----------------------------------------------------------------------------
+
+    def _experiment(self) -> QWidget:
+        form = FieldForm()
+        for entry in EXPERIMENT:
+            self._add_noted(form, entry)
+        return _top(form)
+
+    def _add_noted(self, form: FieldForm, entry: Entry) -> None:
+        field: NumberField | TextField
+        if entry.lowest < entry.highest:
+            field = _number(entry)
+        else:
+            lines = 4 if entry.key == "notes" else 1
+            field = TextField(entry.label, tooltip=entry.tooltip, lines=lines)
+        field.edited.connect(
+            lambda value: self.workspace.attempt(
+                lambda session: presenter.note(session, entry.key, value)
+            )
+        )
+        self.record_fields[entry.key] = field
+        form.add(field)
+
+    def _safety(self) -> QWidget:
+        page = QWidget()
+        layout = QVBoxLayout(page)
+        for item, meaning in SAFETY:
+            box = QCheckBox(item)
+            box.setToolTip(f"{meaning} The time of the tick is kept.")
+            box.setAccessibleDescription(meaning)
+            box.clicked.connect(lambda on, item=item: self._tick(item, on))
+            layout.addWidget(box)
+            time = QLabel()
+            for label in (QLabel(meaning), time):
+                label.setWordWrap(True)
+                label.setIndent(24)
+                layout.addWidget(label)
+            layout.addSpacing(4)
+            self.ticks[item], self._times[item] = box, time
+        layout.addStretch(1)
+        return page
+
+    def _tick(self, item: str, ticked: bool) -> None:
+        now = datetime.now().astimezone().isoformat(timespec="seconds")
+        if not self.workspace.attempt(lambda session: presenter.tick(session, item, ticked, now)):
+            self.ticks[item].setChecked(not ticked)
+
+    def _bench(self) -> QWidget:
+        form = FieldForm()
+        form.add_wide(
+            _buttons(
+                ("Load…", "Take the whole set-up from a setup file (TOML)", self._choose_load),
+                ("Save…", "Write the set-up to a file, for another session", self._choose_save),
+                (
+                    "Usual values",
+                    "Put the usual values in where something is missing; check each of them",
+                    lambda: self.workspace.attempt(presenter.put_usual),
+                ),
+            )
+        )
+        self.others = QLabel()
+        self.others.setWordWrap(True)
+        form.add_wide(self.others)
+        for heading, entries in RIG:
+            form.add_heading(heading)
+            for entry in entries:
+                self._add_rig(form, entry)
+        form.add_heading("Expected pool")
+        for entry in POOL:
+            self._add_noted(form, entry)
+        self.table = ResultTable("What the bench lets through")
+        form.add_wide(self.table)
+        return _top(form)
+
+    def _add_rig(self, form: FieldForm, entry: Entry) -> None:
+        field = _number(entry)
+        field.edited.connect(
+            lambda value: self.workspace.attempt(
+                lambda session: presenter.put(session, entry.key, value)
+            )
+        )
+        self.rig_fields[entry.key] = field
+        form.add(field)
+
+    def _choose_load(self) -> None:
+        path, _ = QFileDialog.getOpenFileName(
+            self, "Load set-up", str(self._folder()), f"{SETUP_FILES};;All files (*)"
+        )
+        if path:
+            self.load(Path(path))
+
+    def _choose_save(self) -> None:
+        path, _ = QFileDialog.getSaveFileName(
+            self, "Save set-up", str(self._folder() / "setup.toml"), SETUP_FILES
+        )
+        if path:
+            self.save(Path(path))
+
+    def _folder(self) -> Path:
+        session = self.workspace.session
+        return Path.home() if session is None else Path(session.path).parent
+
+
+def _number(entry: Entry) -> NumberField:
+    return NumberField(
+        entry.label,
+        entry.unit,
+        lowest=entry.lowest,
+        highest=entry.highest,
+        step=entry.step,
+        decimals=entry.decimals,
+        tooltip=entry.tooltip,
+        optional=True,
+    )
+
+
+def _buttons(*wanted: tuple[str, str, Callable[[], object]]) -> QWidget:
+    row = QWidget()
+    layout = QHBoxLayout(row)
+    layout.setContentsMargins(0, 0, 0, 0)
+    for words, tooltip, work in wanted:
+        button = QPushButton(words)
+        button.setToolTip(tooltip)
+        button.clicked.connect(lambda _, work=work: work())
+        layout.addWidget(button)
+    return row
+
+
+def _top(form: FieldForm) -> QWidget:
+    page = QWidget()
+    layout = QVBoxLayout(page)
+    layout.addWidget(form)
+    layout.addStretch(1)
+    return page
+
+
+def _clock(iso: str) -> str:
+    return iso.partition("+")[0].replace("T", " ")

@@ -1,0 +1,190 @@
+"""Set-up: what is missing is said at its field, every edit is one step, the drawing follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from labapp.errors import InputError
+from labapp.gui.pages.setup import SetupPage, presenter
+from labapp.gui.pages.setup.presenter import RIG, SAFETY
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+from labapp.session.setup import read_setup
+from labapp.simulation.positioning import Fate
+
+KEPT: list[object] = []
+
+SAMPLES = Path(__file__).parents[3] / "sample_sessions"
+
+KEYS = [entry.key for _, entries in RIG for entry in entries]
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Iterator[Session]:
+    with Session.create(tmp_path / "new.labsession") as session:
+        yield session
+
+
+def test_everything_is_missing_in_a_new_session(empty: Session) -> None:
+    shown = presenter.shown(empty)
+    needed = [key for key in KEYS if not key.endswith(("pitch_deg", "yaw_deg"))]
+    assert shown.problems == dict.fromkeys(needed, "missing")
+    assert set(shown.values.values()) == {None}
+    assert shown.others == ("The imaging plane is not calibrated: that is step 3.",)
+    bench = presenter.bench(empty)
+    assert bench.view is None
+    assert "appears when" in bench.words
+
+
+def test_usual_values_fill_only_what_is_missing(empty: Session) -> None:
+    presenter.put(empty, "laser.distance_mm", 42.0)
+    presenter.put_usual(empty)
+    shown = presenter.shown(empty)
+    assert shown.values["laser.distance_mm"] == 42.0
+    assert shown.values["pattern.rows"] == 19
+    assert set(shown.problems) == {"imaging_plane.s_mm", "imaging_plane.h_mm"}
+    for key in shown.problems:
+        presenter.put(empty, key, 3.0)
+    rig = presenter.rig(empty)
+    assert rig is not None
+    assert rig.laser.distance_mm == 42.0
+
+
+def test_what_cannot_be_is_said_at_its_field(empty: Session) -> None:
+    presenter.load_setup(empty, SAMPLES / "gtaw" / "setup.toml")
+    presenter.put(empty, "laser.projection_angle_deg", 90)
+    shown = presenter.shown(empty)
+    assert "below 90" in shown.problems["laser.projection_angle_deg"]
+    presenter.put(empty, "laser.projection_angle_deg", 2.0)
+    assert "half the fan" in presenter.shown(empty).problems["laser.projection_angle_deg"]
+
+
+def test_the_bench_counts_what_comes_back(empty: Session) -> None:
+    presenter.load_setup(empty, SAMPLES / "gtaw" / "setup.toml")
+    usual = presenter.bench(empty)
+    assert "Usual pool: 5 × 6 mm, 0 mm high" in usual.words
+    for name, value in (("width", 6.0), ("length", 8.0), ("height", 0.8)):
+        presenter.note(empty, f"expected_{name}_mm", value)
+    bench = presenter.bench(empty)
+    assert bench.view is not None
+    assert bench.view.tally[Fate.BLOCKED] > 0
+    values = {row.name: row.value for row in bench.rows}
+    assert values["Blocked by the torch"] == str(bench.view.tally[Fate.BLOCKED])
+    assert values["L2"] == bench.view.clearance.l2_mm
+    presenter.note(empty, "expected_height_mm", 4.0)
+    assert "overhang" in presenter.bench(empty).words
+
+
+def test_a_tick_is_kept_with_its_time(empty: Session) -> None:
+    (first, _), (second, _), *_ = SAFETY
+    presenter.tick(empty, first, True, "2026-11-21T10:00:00+01:00")
+    presenter.tick(empty, second, True, "2026-11-21T10:01:00+01:00")
+    presenter.tick(empty, first, False, "2026-11-21T10:02:00+01:00")
+    assert empty.record.safety == ((second, "2026-11-21T10:01:00+01:00"),)
+    empty.undo()
+    assert dict(empty.record.safety)[first].startswith("2026-11-21T10:00")
+
+
+def test_a_setup_file_comes_in_and_goes_out(empty: Session, tmp_path: Path) -> None:
+    presenter.load_setup(empty, SAMPLES / "gtaw" / "setup.toml")
+    presenter.put(empty, "imaging_plane.pitch_deg", 2.5)
+    out = tmp_path / "out.toml"
+    presenter.save_setup(empty, out)
+    assert read_setup(out).text == empty.setup_text
+    out.write_text("[laser]\nprojection_angle_deg = 95\n")
+    before = empty.setup_text
+    with pytest.raises(InputError, match=r"out\.toml"):
+        presenter.load_setup(empty, out)
+    assert empty.setup_text == before
+    with pytest.raises(InputError, match="can be written"):
+        presenter.save_setup(empty, tmp_path / "not there" / "out.toml")
+
+
+# --- the page ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[SetupPage]:
+    workspace = Workspace()
+    assert workspace.open(copy_sample("gtaw"))
+    made = SetupPage(workspace)
+    KEPT.extend([workspace, made, made.panel])
+    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
+    made.refresh()
+    made.show()
+    made.panel.show()
+    yield made
+    workspace.close()
+
+
+def retype(qtbot: QtBot, field, text: str) -> None:
+    field.editor.setFocus()
+    field.editor.selectAll()
+    qtbot.keyClicks(field.editor, text)
+    qtbot.keyClick(field.editor, Qt.Key.Key_Return)
+
+
+def test_an_edit_changes_the_session_and_the_drawing_and_is_undone(
+    qtbot: QtBot, page: SetupPage
+) -> None:
+    session = page.workspace.session
+    assert session is not None
+    field = page.rig_fields["electrode.height_mm"]
+    words = page.bench.words.text()
+    retype(qtbot, field, "1,5")
+    assert session.setup.rig.electrode.height_mm == 1.5
+    assert page.bench.words.text() != words
+    page.workspace.undo()
+    assert field.value() == 5.0
+    assert page.bench.words.text() == words
+
+
+def test_an_emptied_field_is_marked(qtbot: QtBot, page: SetupPage) -> None:
+    field = page.rig_fields["laser.distance_mm"]
+    field.editor.clear()
+    field.flush()
+    assert field.problem.text() == "⚠ missing"
+    assert "⚠" in page.tabs.tabText(2)
+    assert page.bench.whole.isHidden()
+    page.workspace.undo()
+    assert field.problem.isHidden()
+    assert not page.bench.whole.isHidden()
+
+
+def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:
+    session = page.workspace.session
+    assert session is not None
+    retype(qtbot, page.record_fields["operator"], "Ada")
+    retype(qtbot, page.record_fields["thickness_mm"], "3")
+    assert (session.record.operator, session.record.thickness_mm) == ("Ada", 3.0)
+    item = SAFETY[0][0]
+    page.ticks[item].click()
+    assert session.record.safety[-1][0] == item
+    assert "1/7" in page.tabs.tabText(1)
+    page.ticks[item].click()
+    assert item not in dict(session.record.safety)
+
+
+def test_a_wrong_file_is_refused_in_words(page: SetupPage, tmp_path: Path) -> None:
+    said: list[tuple[str, bool]] = []
+    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    bad = tmp_path / "bad.toml"
+    bad.write_text("no = [")
+    page.load(bad)
+    assert said[-1][1]
+    assert "bad.toml" in said[-1][0]
+    page.save(tmp_path / "good.toml")
+    assert said[-1] == ("Set-up saved as good.toml", False)
+
+
+def test_every_control_has_a_name_and_says_what_it_does(page: SetupPage) -> None:
+    for field in (*page.rig_fields.values(), *page.record_fields.values()):
+        assert field.editor.accessibleName()
+        assert field.editor.toolTip()
+    for box in page.ticks.values():
+        assert box.toolTip()
