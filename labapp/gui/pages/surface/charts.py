@@ -38,7 +38,7 @@ class Chart(QWidget):
         self.title.setWordWrap(True)
         self.plot = pg.PlotWidget()
         self.plot.setAccessibleName(name)
-        self.plot.setMinimumSize(120, 90)
+        self.plot.setMinimumSize(88, 80)
         self.plot.setMenuEnabled(False)
         self.plot.setLabel("bottom", x_label)
         self.plot.setLabel("left", y_label)

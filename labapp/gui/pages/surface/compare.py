@@ -14,6 +14,7 @@ from PySide6.QtWidgets import (
     QVBoxLayout,
     QWidget,
 )
+from threadpoolctl import threadpool_limits
 
 from labapp.gui.pages.surface.comparison import Comparison, compared, other_scheme
 from labapp.gui.pages.surface.presenter import SCHEMES, Options
@@ -96,7 +97,9 @@ class CompareView(QWidget):
             self._task.cancel()
 
         def work(_: Control) -> Comparison:
-            return compared(session, frame, schemes, options)
+            # The matrices are small: more threads than one get in the window's way.
+            with threadpool_limits(limits=1, user_api="blas"):
+                return compared(session, frame, schemes, options)
 
         def done(comparison: Comparison) -> None:
             if self._shown_for == wanted:

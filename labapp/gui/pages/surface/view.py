@@ -7,11 +7,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from PySide6.QtCore import Qt, QTimer
-from PySide6.QtGui import QAction, QGuiApplication, QPixmap
+from PySide6.QtCore import QSize, Qt, QTimer
+from PySide6.QtGui import QAction, QGuiApplication, QPixmap, QResizeEvent
 from PySide6.QtWidgets import (
+    QBoxLayout,
     QFileDialog,
     QHBoxLayout,
+    QLayout,
     QMenu,
     QSplitter,
     QStackedWidget,
@@ -82,7 +84,7 @@ class SurfacePage(Page):
         self.stack = QStackedWidget()
         self.stack.addWidget(self._single())
         self.stack.addWidget(self.compare)
-        self.canvas_layout.addLayout(self._tools())
+        self.canvas_layout.addWidget(self._tools())
         self.canvas_layout.addWidget(self.stack, 1)
 
     # --- what is where -----------------------------------------------------------------------
@@ -92,7 +94,7 @@ class SurfacePage(Page):
         below = QWidget()
         column = QVBoxLayout(below)
         column.setContentsMargins(0, 0, 0, 0)
-        column.addLayout(self._section_fields())
+        column.addWidget(self._section_fields())
         column.addWidget(self.profile, 1)
         for splitter, widgets, sizes in (
             (left, (self.view, below), (5, 3)),
@@ -112,7 +114,7 @@ class SurfacePage(Page):
         whole.setChildrenCollapsible(False)
         return whole
 
-    def _section_fields(self) -> QHBoxLayout:
+    def _section_fields(self) -> QWidget:
         self.angle = NumberField(
             *("Section at", "°"),
             lowest=-180,
@@ -129,7 +131,7 @@ class SurfacePage(Page):
             decimals=2,
             tooltip="How far to the left of the electrode the line passes",
         )
-        line = QHBoxLayout()
+        line, cuts = QHBoxLayout(), QHBoxLayout()
         for field in (self.angle, self.offset):
             field.label.setWordWrap(False)
             line.addWidget(field.label)
@@ -137,11 +139,11 @@ class SurfacePage(Page):
             field.edited.connect(self._enter_section)
         for words, angle in (("Along X", 0.0), ("Along Y", 90.0)):
             cut = partial(self._set_section, angle, 0.0)
-            line.addWidget(_tool(words, f"Cut {words.lower()}, through the electrode's axis", cut))
-        line.addStretch(1)
-        return line
+            cuts.addWidget(_tool(words, f"Cut {words.lower()}, through the electrode's axis", cut))
+        cuts.addStretch(1)
+        return _Tools(line, cuts)
 
-    def _tools(self) -> QHBoxLayout:
+    def _tools(self) -> QWidget:
         self.colour = ChoiceField(
             "Colour",
             [("height", "by height"), ("sigma", "by ±")],
@@ -157,11 +159,12 @@ class SurfacePage(Page):
             tooltip="Heights are drawn so many times as high; the axes tell true ones",
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
-        line = QHBoxLayout()
+        first, line = QHBoxLayout(), QHBoxLayout()
         for field in (self.colour, self.high):
-            line.addWidget(field.label)
-            line.addWidget(field)
-        line.addWidget(self._parts_button())
+            field.label.setWordWrap(False)
+            first.addWidget(field.label)
+            first.addWidget(field)
+        first.addWidget(self._parts_button())
         for direction, (words, what) in LOOKS.items():
             line.addWidget(_tool(words, what, partial(self._look, direction)))
         line.addStretch(1)
@@ -171,7 +174,7 @@ class SurfacePage(Page):
         self.comparing.setCheckable(True)
         for button in (self.copy, self.save, self.comparing):
             line.addWidget(button)
-        return line
+        return _Tools(first, line)
 
     def _parts_button(self) -> QToolButton:
         menu = QMenu(self)
@@ -310,6 +313,30 @@ class SurfacePage(Page):
             self.compare.leave()
         self.stack.setCurrentIndex(int(wanted))
         self.refresh()
+
+
+class _Tools(QWidget):
+    """Two lines of tools: side by side where there is room, else under each other."""
+
+    def __init__(self, *lines: QHBoxLayout) -> None:
+        super().__init__()
+        self._lines = lines
+        self._box = QBoxLayout(QBoxLayout.Direction.LeftToRight, self)
+        self._box.setContentsMargins(0, 0, 0, 0)
+        self._box.setSizeConstraint(QLayout.SizeConstraint.SetNoConstraint)
+        for line in lines:
+            self._box.addLayout(line)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+        super().resizeEvent(event)
+        wanted = sum(line.sizeHint().width() for line in self._lines) + 12
+        way = QBoxLayout.Direction
+        self._box.setDirection(way.LeftToRight if self.width() >= wanted else way.TopToBottom)
+        self.setFixedHeight(self._box.sizeHint().height())
+
+    def minimumSizeHint(self) -> QSize:  # noqa: N802
+        widest = max(line.minimumSize().width() for line in self._lines)
+        return QSize(widest, self._box.sizeHint().height())
 
 
 def _tool(words: str, what: str, work: Callable[[], None]) -> QToolButton:
