@@ -503,3 +503,25 @@ def test_rings_grow_with_the_dots_and_the_reference_is_ringed(
     assert not marks.isVisible()
     key(page, Qt.Key.Key_H)
     assert marks.isVisible()
+
+
+def test_edits_that_follow_each_other_at_once_all_stand(
+    window: MainWindow, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    assert window.workspace.open(copy_sample("gtaw"))
+    window.show_step("dots")
+    page, session = window.page, window.workspace.session
+    assert isinstance(page, DotsPage)
+    assert session is not None
+    qtbot.waitUntil(lambda: page.editor.correction is not None)
+    before = page.editor.correction
+    assert before is not None
+    for row in (2, 4, 7):
+        page.editor.choose_rows([row])
+        assert page.editor.block()
+    window.workspace.undo()
+    page.editor.choose_rows([5])
+    assert page.editor.block()
+    kept = session.correction(0)
+    assert kept is not None
+    assert kept.lattice.blocked_rows == before.lattice.blocked_rows | {2, 4, 5}

@@ -74,6 +74,8 @@ class DotsPage(Page):
         self.view.pointed.connect(self._point)
         self.view.canvas.installEventFilter(self)
         self.looking.ready.connect(self._again)
+        # The window may show a change a little later; the next edit must begin with it.
+        self.workspace.changed.connect(self._again)
         self.workspace.opened.connect(self._forget)
 
     # --- what is shown ------------------------------------------------------------------------
