@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PySide6.QtCore import QByteArray, Qt, QTimer, QUrl
+from PySide6.QtCore import QByteArray, QSize, Qt, QTimer, QUrl
 from PySide6.QtGui import (
     QCloseEvent,
     QDesktopServices,
@@ -61,7 +61,9 @@ TICKS = (
 
 LAYOUT_VERSION = 1
 
-SIZE_PX = (1280, 760)
+SIZE_PX = (1600, 1000)
+PART_OF_SCREEN = 0.92
+"""Size at the first start, and the most of the screen that it takes."""
 
 
 class MainWindow(QMainWindow):
@@ -385,7 +387,8 @@ class MainWindow(QMainWindow):
             self.say(f"The log is in {folder}")
 
     def _restore(self) -> None:
-        self.resize(*SIZE_PX)
+        room = self.screen().availableSize()
+        self.resize(QSize(*SIZE_PX).boundedTo(room * PART_OF_SCREEN))
         restored = (
             (self.restoreGeometry, self.preferences.geometry),
             (lambda held: self.restoreState(held, LAYOUT_VERSION), self.preferences.layout),
