@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -79,7 +80,7 @@ def test_a_table_for_a_spreadsheet() -> None:
 
 
 @pytest.fixture
-def view(qtbot: QtBot) -> PlotStack:
+def view(qtbot: QtBot) -> Iterator[PlotStack]:
     view = PlotStack("Trends")
     KEPT.append(view)
     view.resize(800, 600)
@@ -87,7 +88,8 @@ def view(qtbot: QtBot) -> PlotStack:
     view.show()
     qtbot.waitExposed(view)
     QTest.qWait(40)
-    return view
+    yield view
+    view.hide()
 
 
 def at(view: PlotStack, plot: int, x: float, y: float) -> QPoint:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -103,6 +104,15 @@ def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
         seen = look(session, 0)
         assert seen.image is None
         assert "is not there" in seen.words
+
+
+@pytest.fixture(autouse=True)
+def hidden_at_the_end() -> Iterator[None]:
+    yield
+    for kept in KEPT:
+        if isinstance(kept, CapturePage):
+            kept.hide()
+            kept.panel.hide()
 
 
 def made(workspace: Workspace) -> CapturePage:

@@ -122,6 +122,8 @@ def page(qtbot: QtBot, gtaw: Path) -> ExportPage:
         widget.resize(800, 600)
         widget.show()
     yield page
+    for widget in (page, page.panel):
+        widget.hide()
     workspace.close()
 
 

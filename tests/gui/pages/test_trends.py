@@ -105,6 +105,8 @@ def page(qtbot: QtBot, gtaw: Path) -> TrendsPage:
     page.refresh()
     QTest.qWait(30)
     yield page
+    for widget in (page, page.panel):
+        widget.hide()
     workspace.close()
 
 
