@@ -64,6 +64,9 @@ def main(arguments: Sequence[str]) -> int:
     if not has_display(os.environ):
         value = "none: neither DISPLAY nor WAYLAND_DISPLAY is set"
         raise InputError("the app", "display", value, f"a desktop; {WITHOUT}")
+    # Before numpy is loaded: the matrices are small, and waiting threads keep the window from it.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app = start_app()
 
     from labapp.gui.preferences import preferences_file, read_preferences

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TypeVar
 
@@ -55,6 +56,8 @@ class Workspace(QObject):
 
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""
+        if self.tasks.active:
+            self._stop_measuring()
         self.tasks.cancel_all()
         if self.session is not None:
             self.session.close()
@@ -80,13 +83,15 @@ class Workspace(QObject):
 
     def close(self) -> None:
         """Stop all work and close the session: the window goes."""
+        self._stop_measuring()
+        self.show(None)
+
+    def _stop_measuring(self) -> None:
+        """End the processes: what they are at is not kept, and can take seconds of a hard frame."""
         pool, self._pool = self._pool, None
         if pool is not None:
-            # What they are at is not kept anyway, and can take many seconds of a hard frame.
             for process in list((pool._processes or {}).values()):
                 process.terminate()
-        self.show(None)
-        if pool is not None:
             pool.shutdown(cancel_futures=True)
 
     def tried(self, work: Callable[[], T]) -> T | None:
@@ -167,9 +172,16 @@ class Workspace(QObject):
 
         def work(control: Control) -> int:
             done = 0
-            for done, _ in enumerate(session.measure(numbers, pool), 1):
-                control.progress(done, len(numbers))
-                control.part(None)
+            try:
+                for done, _ in enumerate(session.measure(numbers, pool), 1):
+                    control.progress(done, len(numbers))
+                    control.part(None)
+            except BrokenProcessPool as error:
+                control.check()  # ended on purpose
+                self._pool = None
+                raise ValueError(
+                    "a process that measures has ended; what was measured is kept: measure again"
+                ) from error
             return done
 
         def finished(count: int) -> None:
