@@ -5,6 +5,7 @@ from __future__ import annotations
 from labapp.gui.pages.capture import CapturePage
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.export import ExportPage
+from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.pages.surface import SurfacePage
@@ -12,6 +13,7 @@ from labapp.gui.pages.trends import TrendsPage
 
 PAGES: tuple[type[Page], ...] = (
     SetupPage,
+    LaserPage,
     CapturePage,
     DotsPage,
     SurfacePage,

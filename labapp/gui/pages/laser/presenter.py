@@ -1,0 +1,214 @@
+"""What the laser page shows: lengths of the cross, the laser that follows, what is in use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from labapp.core.laser_calibration import LaserCalibration, calibrate_laser
+from labapp.core.values import FloatArray
+from labapp.gui.digits import ResultRow, parsed
+from labapp.gui.pages.setup.presenter import shown as setup_shown
+from labapp.media import GreyImage, open_source
+from labapp.session.session import Session
+
+NAMES = ("l₁", "l₂", "l₃")
+
+MEANINGS = (
+    "Half of the cross along the beam, on the laser's side",
+    "Half of the cross along the beam, away from the laser",
+    "Half of the cross across the beam",
+)
+
+FAN_ANGLE_DEG = 10.0
+
+Place = tuple[float, float]
+
+ENDS = ("laser's side", "far side", "left", "right")
+"""The ends of the cross in a picture, by the names of their points."""
+
+SCALE = ("scale 1", "scale 2")
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Lengths as they were typed.
+
+    Parameters
+    ----------
+    lengths_mm
+        Readings of l₁, l₂, l₃, mm; any number of each.
+    fan_angle_deg
+        Of the cross-hair lens.
+    wrong
+        What was typed and is no length, a sentence each.
+    """
+
+    lengths_mm: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] = ((), (), ())
+    fan_angle_deg: float = FAN_ANGLE_DEG
+    wrong: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Result:
+    """What follows from readings.
+
+    Parameters
+    ----------
+    found
+        The laser; None where none follows.
+    why_not
+        Then why, in words.
+    rows
+        Means of the lengths, and the laser.
+    """
+
+    found: LaserCalibration | None
+    why_not: str
+    rows: tuple[ResultRow, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the operator should know of the readings."""
+        return () if self.found is None else tuple(map(_spoken, self.found.warnings))
+
+
+def typed(cells: Mapping[tuple[int, int], str], fan_angle_deg: float) -> Readings:
+    """Readings from the cells of the table, (row, column) → text."""
+    lengths: list[list[float]] = [[], [], []]
+    wrong = []
+    for (row, column), text in sorted(cells.items()):
+        if not text.strip():
+            continue
+        value = parsed(text)
+        if value is None or value <= 0:
+            wrong.append(f"{NAMES[column]}, reading {row + 1}: “{text.strip()}” is not a length")
+        else:
+            lengths[column].append(value)
+    l1, l2, l3 = map(tuple, lengths)
+    return Readings((l1, l2, l3), fan_angle_deg, tuple(wrong))
+
+
+def kept(session: Session) -> Readings | None:
+    """The readings of the calibration in use; None before one."""
+    calibration = session.laser_calibration
+    if calibration is None:
+        return None
+    lengths = (calibration.l1_mm, calibration.l2_mm, calibration.l3_mm)
+    return Readings(lengths, calibration.fan_angle_deg)
+
+
+def result(readings: Readings) -> Result:
+    """The laser that follows from readings, or why none does."""
+    spread = tuple(
+        _mean_row(name, meaning, np.array(lengths, float))
+        for name, meaning, lengths in zip(NAMES, MEANINGS, readings.lengths_mm, strict=True)
+    )
+    missing = [name for name, found in zip(NAMES, readings.lengths_mm, strict=True) if not found]
+    if readings.wrong:
+        return Result(None, "; ".join(readings.wrong), spread)
+    if missing:
+        return Result(None, f"Enter at least one reading of {', '.join(missing)}", spread)
+    try:
+        found = calibrate_laser(*readings.lengths_mm, readings.fan_angle_deg)
+    except ValueError as error:
+        return Result(None, _spoken(str(error)), spread)
+    check = ResultRow(
+        "l₁ that follows", found.expected_l1_mm, unit="mm", note="From l₂, l₃ and the fan angle"
+    )
+    rows = (
+        ResultRow("Projection angle", found.angle_deg, found.angle_sigma_deg, "°"),
+        ResultRow("Distance", found.distance_mm, found.distance_sigma_mm, "mm"),
+        ResultRow("Height", found.height_mm, found.height_sigma_mm, "mm"),
+        ResultRow("Horizontal distance", found.horizontal_mm, found.horizontal_sigma_mm, "mm"),
+    )
+    return Result(found, "", (*spread, check, *rows))
+
+
+def in_use(session: Session) -> tuple[ResultRow, ...]:
+    """The laser as the set-up has it."""
+    values = setup_shown(session).values
+    note = "From this session's calibration" if session.laser_calibration else "As entered"
+    return (
+        ResultRow("Projection angle", values["laser.projection_angle_deg"], None, "°", 3, note),
+        ResultRow("Distance", values["laser.distance_mm"], None, "mm", 3, note),
+    )
+
+
+def use(session: Session, readings: Readings, picture: GreyImage | None = None) -> None:
+    """Put the laser that follows from the readings into the rig."""
+    session.calibrate_laser(*readings.lengths_mm, readings.fan_angle_deg, picture)
+
+
+# --- a picture of the cross -------------------------------------------------------------------
+
+
+def read_picture(path: Path) -> GreyImage:
+    """Read a picture, or the first frame of a recording; an `InputError` says why not."""
+    with open_source(path) as source:
+        return source.frame(0).image
+
+
+def first_places(shape: tuple[int, int]) -> dict[str, Place]:
+    """Where the points lie before they are dragged, in a picture of shape (rows, columns)."""
+    rows, columns = shape
+    at = {
+        SCALE[0]: (0.25, 0.9),
+        SCALE[1]: (0.75, 0.9),
+        ENDS[0]: (0.5, 0.25),
+        ENDS[1]: (0.5, 0.75),
+        ENDS[2]: (0.3, 0.5),
+        ENDS[3]: (0.7, 0.5),
+    }
+    return {name: (x * columns, y * rows) for name, (x, y) in at.items()}
+
+
+def cross_lengths(places: Mapping[str, Place], scale_mm: float) -> tuple[float, float, float]:
+    """l₁, l₂, l₃ of a cross in a picture taken square to the work piece, mm.
+
+    The centre is where the line between the two ends along the beam cuts the one across.
+
+    Parameters
+    ----------
+    places
+        (u, v) of `ENDS` and `SCALE`, px.
+    scale_mm
+        Distance between the two points of the scale.
+
+    Raises
+    ------
+    ValueError
+        If the points make no cross or no scale.
+    """
+    near, far, left, right = (np.array(places[name]) for name in ENDS)
+    scale_px = float(np.hypot(*np.subtract(places[SCALE[1]], places[SCALE[0]])))
+    if scale_px < 1:
+        raise ValueError("The two points of the scale lie on each other: drag them apart")
+    system = np.stack([far - near, left - right], axis=-1)
+    if abs(np.linalg.det(system)) < 1:
+        raise ValueError("The two lines of the cross do not cut each other")
+    along, across = np.linalg.solve(system, left - near)
+    if not (0 < along < 1 and 0 < across < 1):
+        raise ValueError("The two lines of the cross do not cut each other between their ends")
+    center = near + along * (far - near)
+    mm = scale_mm / scale_px
+    l1, l2 = (mm * float(np.hypot(*(end - center))) for end in (near, far))
+    return l1, l2, mm * float(np.hypot(*(right - left))) / 2
+
+
+def _mean_row(name: str, meaning: str, lengths: FloatArray) -> ResultRow:
+    count = len(lengths)
+    mean = float(lengths.mean()) if count else None
+    spread = float(lengths.std(ddof=1)) if count > 1 else None
+    note = f"{meaning}; mean and standard deviation of {count} readings"
+    return ResultRow(f"{name}, {count} reading{'s' * (count != 1)}", mean, spread, "mm", 2, note)
+
+
+def _spoken(words: str) -> str:
+    """The core's names of the lengths as the page has them."""
+    for number, name in enumerate(NAMES, 1):
+        words = words.replace(f"l{number}_mm", name).replace(f"l{number} ", f"{name} ")
+    return words

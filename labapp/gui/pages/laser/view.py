@@ -1,0 +1,324 @@
+"""The laser page: readings of the cross, or a picture of it, and the laser that follows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PySide6.QtCore import QEvent, QObject, Qt
+from PySide6.QtGui import QKeyEvent
+from PySide6.QtWidgets import (
+    QFileDialog,
+    QHeaderView,
+    QLabel,
+    QPushButton,
+    QStackedWidget,
+    QTableWidget,
+    QTableWidgetItem,
+    QWidget,
+)
+
+from labapp.gui.pages.laser import presenter
+from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place, Readings
+from labapp.gui.pages.page import Page
+from labapp.gui.views.cross_hair import CrossHairView
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
+from labapp.gui.views.picture import DragPoint, PictureView
+from labapp.gui.workspace import Workspace
+from labapp.media import GreyImage
+
+WAYS = (("callipers", "measured with callipers"), ("picture", "from a picture of the cross"))
+
+NO_PICTURE = "Take a picture of the cross beside a scale, square from above, and load it here."
+
+LEAST_ROWS = 4
+
+
+class LaserPage(Page):
+    """Lengths of the cross in a table, typed or taken from a picture; the laser follows."""
+
+    key = "laser"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.drawing = CrossHairView()
+        self.picture_view = PictureView("Picture of the cross hair")
+        self.picture_view.show_picture(None, NO_PICTURE)
+        self.canvas = QStackedWidget()
+        self.canvas.addWidget(self.drawing)
+        self.canvas.addWidget(self.picture_view)
+        self.canvas_layout.addWidget(self.canvas)
+        self._points: dict[str, DragPoint] = {}
+        self._from_picture: GreyImage | None = None
+        self._loaded: object = None
+        self._make_panel()
+        self._show_way("callipers")
+
+    def refresh(self) -> None:
+        """Show the readings in use when they changed, and the values in use."""
+        session = self.workspace.session
+        assert session is not None
+        kept = presenter.kept(session)
+        loaded = (session.path, kept)
+        if loaded != self._loaded:
+            self._loaded = loaded
+            self._from_picture = None
+            self._fill(kept or Readings())
+        self.in_use.set_rows(presenter.in_use(session))
+        self._follow()
+
+    def readings(self) -> Readings:
+        """What the table holds."""
+        cells = {
+            (row, column): item.text()
+            for row in range(self.table.rowCount())
+            for column in range(3)
+            if (item := self.table.item(row, column)) is not None
+        }
+        return presenter.typed(cells, self.fan.value() or presenter.FAN_ANGLE_DEG)
+
+    def load_picture(self, path: Path) -> None:
+        """Show a picture of the cross, with the points to drag."""
+        self.workspace.tasks.start(
+            "Loading the picture", lambda _: presenter.read_picture(path), self._show_picture
+        )
+
+    def add_reading(self) -> None:
+        """Put the lengths from the picture into the table, as one more reading."""
+        lengths = self._cross()
+        if lengths is None:
+            return
+        rows = range(self.table.rowCount())
+        row = next(r for r in rows if all(not self._text(r, c) for c in range(3)))
+        self._put(row, [f"{length:.2f}" for length in lengths])
+        self._from_picture = self.picture_view.picture
+        self._follow()
+
+    def use(self) -> None:
+        """Put the laser that follows into the rig."""
+        readings = self.readings()
+        picture = self._from_picture
+        if self.workspace.attempt(lambda session: presenter.use(session, readings, picture)):
+            self.workspace.said.emit("The laser is in the rig; undo brings the former back", False)
+
+    # --- the panel --------------------------------------------------------------------------
+
+    def _make_panel(self) -> None:
+        form = FieldForm()
+        self.way = ChoiceField("Lengths", WAYS, tooltip="Where the lengths of the cross come from")
+        self.way.edited.connect(self._show_way)
+        form.add(self.way)
+        self.fan = NumberField(
+            "Fan angle",
+            "°",
+            lowest=0.1,
+            highest=89.9,
+            step=0.5,
+            decimals=2,
+            tooltip="Fan angle of the cross-hair lens, as its maker says",
+        )
+        self.fan.set_value(presenter.FAN_ANGLE_DEG)
+        self.fan.edited.connect(lambda _: self._follow())
+        form.add(self.fan)
+        self.panel_layout.addWidget(form)
+        self.panel_layout.addWidget(self._picture_part())
+        self.table = _ReadingsTable()
+        self.table.itemChanged.connect(self._cell_changed)
+        self.panel_layout.addWidget(QLabel("Readings, mm: a line each, as often as you like"))
+        self.panel_layout.addWidget(self.table)
+        self.result = ResultTable("The laser that follows")
+        self.panel_layout.addWidget(self.result)
+        self.words = QLabel()
+        self.words.setWordWrap(True)
+        self.panel_layout.addWidget(self.words)
+        self.use_button = QPushButton("Use these")
+        self.use_button.clicked.connect(self.use)
+        self.panel_layout.addWidget(self.use_button)
+        self.panel_layout.addWidget(QLabel("In the rig now"))
+        self.in_use = ResultTable("Laser in use")
+        self.panel_layout.addWidget(self.in_use)
+        self.panel_layout.addStretch(1)
+
+    def _picture_part(self) -> QWidget:
+        self.picture_part = FieldForm()
+        load = QPushButton("Load picture…")
+        load.setToolTip("A picture of the cross hair beside a scale")
+        load.clicked.connect(self._choose_picture)
+        self.picture_part.add_wide(load)
+        self.scale = NumberField(
+            "Scale length",
+            "mm",
+            lowest=0.1,
+            highest=10_000,
+            step=1,
+            decimals=2,
+            tooltip="Distance between the two points marked on the scale",
+        )
+        self.scale.set_value(10.0)
+        self.scale.edited.connect(lambda _: self._dragged())
+        self.picture_part.add(self.scale)
+        self.lengths = QLabel()
+        self.lengths.setWordWrap(True)
+        self.picture_part.add_wide(self.lengths)
+        self.add_button = QPushButton("Add as a reading")
+        self.add_button.setToolTip("Put these lengths into the table, as one more reading")
+        self.add_button.clicked.connect(self.add_reading)
+        self.picture_part.add_wide(self.add_button)
+        return self.picture_part
+
+    def _show_way(self, way: str) -> None:
+        picture = way == "picture"
+        self.picture_part.setVisible(picture)
+        self.canvas.setCurrentIndex(int(picture))
+        self._dragged()
+
+    # --- the readings -----------------------------------------------------------------------
+
+    def _fill(self, readings: Readings) -> None:
+        count = max(map(len, readings.lengths_mm))
+        self.table.blockSignals(True)
+        self.table.setRowCount(0)
+        self.table.setRowCount(max(LEAST_ROWS, count + 1))
+        for column, lengths in enumerate(readings.lengths_mm):
+            for row, length in enumerate(lengths):
+                self.table.setItem(row, column, _cell(f"{length:g}"))
+        self.table.blockSignals(False)
+        self.table.fit()
+        self.fan.set_value(readings.fan_angle_deg)
+
+    def _put(self, row: int, texts: list[str]) -> None:
+        self.table.blockSignals(True)
+        for column, text in enumerate(texts):
+            self.table.setItem(row, column, _cell(text))
+        self.table.blockSignals(False)
+        self._grow()
+
+    def _cell_changed(self, item: QTableWidgetItem) -> None:
+        self.table.blockSignals(True)
+        item.setTextAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+        self.table.blockSignals(False)
+        self._from_picture = None
+        self._grow()
+        self._follow()
+
+    def _grow(self) -> None:
+        """Keep an empty line below."""
+        last = self.table.rowCount() - 1
+        if any(self._text(last, column) for column in range(3)):
+            self.table.setRowCount(last + 2)
+            self.table.fit()
+
+    def _text(self, row: int, column: int) -> str:
+        item = self.table.item(row, column)
+        return "" if item is None else item.text().strip()
+
+    def _follow(self) -> None:
+        """Show what follows from the readings."""
+        readings = self.readings()
+        result = presenter.result(readings)
+        self.result.set_rows(result.rows)
+        warnings = [f"⚠ {words}" for words in result.warnings]
+        why_not = [f"⚠ {result.why_not}"] if result.why_not else []
+        self.words.setText("\n".join(why_not or warnings or ["✓ The three lengths agree."]))
+        self.use_button.setEnabled(result.found is not None)
+        tip = "Put angle and distance into the rig; undo brings the former back"
+        self.use_button.setToolTip(result.why_not or tip)
+        means = [row.value for row in result.rows[:2]]
+        l1, l2 = (value if isinstance(value, float) else 0.0 for value in means)
+        words = result.why_not or "From the side, to scale: the beam, and the edges of the fan."
+        self.drawing.show_laser(result.found, l1, l2, words)
+
+    # --- the picture ------------------------------------------------------------------------
+
+    def _choose_picture(self) -> None:
+        session = self.workspace.session
+        folder = "" if session is None else str(Path(session.path).parent)
+        path, _ = QFileDialog.getOpenFileName(self, "Picture of the cross hair", folder)
+        if path:
+            self.load_picture(Path(path))
+
+    def _show_picture(self, image: GreyImage) -> None:
+        former = self.picture_view.picture
+        self.picture_view.show_picture(image)
+        rows, columns = image.shape
+        places = presenter.first_places((rows, columns))
+        if not self._points:
+            for name in (*ENDS, *SCALE):
+                color = "#ffb000" if name in ENDS else "#40c4ff"
+                point = DragPoint(name, *places[name], color)
+                point.moved.connect(lambda *_: self._dragged())
+                self._points[name] = point
+                self.picture_view.add_point(point)
+        elif former is None or former.shape != image.shape:
+            for name, point in self._points.items():
+                point.set_place(*places[name])
+        self._dragged()
+
+    def places(self) -> dict[str, Place]:
+        """(u, v) of the points, by name, px."""
+        return {name: point.place for name, point in self._points.items()}
+
+    def move_point(self, name: str, u: float, v: float) -> None:
+        """Put a point somewhere, as a drag does."""
+        self._points[name].set_place(u, v)
+        self._dragged()
+
+    def _cross(self) -> tuple[float, float, float] | None:
+        if not self._points:
+            self.lengths.setText("")
+            return None
+        try:
+            lengths = presenter.cross_lengths(self.places(), self.scale.value() or 0.0)
+        except ValueError as error:
+            self.lengths.setText(f"⚠ {error}")
+            return None
+        told = (f"{name} {length:.2f} mm" for name, length in zip(NAMES, lengths, strict=True))
+        self.lengths.setText(",  ".join(told))
+        return lengths
+
+    def _dragged(self) -> None:
+        self.add_button.setEnabled(self._cross() is not None)
+
+
+class _ReadingsTable(QTableWidget):
+    """Three columns of readings; Delete empties the selected ones."""
+
+    def __init__(self) -> None:
+        super().__init__(LEAST_ROWS, 3)
+        self.setHorizontalHeaderLabels(NAMES)
+        for column, (name, meaning) in enumerate(zip(NAMES, MEANINGS, strict=True)):
+            header = self.horizontalHeaderItem(column)
+            assert header is not None, name
+            header.setToolTip(meaning)
+        self.setAccessibleName("Readings of l₁, l₂ and l₃ in mm")
+        self.setToolTip("; ".join(f"{n}: {m}" for n, m in zip(NAMES, MEANINGS, strict=True)))
+        self.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.Stretch)
+        self.setTabKeyNavigation(True)
+        self.installEventFilter(self)
+        self.fit()
+
+    def fit(self) -> None:
+        """As high as its lines, up to eight."""
+        header = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
+        self.setFixedHeight(header + min(self.rowCount(), 8) * self.rowHeight(0))
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802
+        """Tab beyond the last cell leaves the table."""
+        if isinstance(event, QKeyEvent) and event.type() == QEvent.Type.KeyPress:
+            last = self.currentRow() == self.rowCount() - 1 and self.currentColumn() == 2
+            if event.key() == Qt.Key.Key_Tab and last:
+                return self.focusNextChild()
+        return super().eventFilter(watched, event)
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+        """Delete empties the selected cells."""
+        if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
+            for item in self.selectedItems():
+                item.setText("")
+        else:
+            super().keyPressEvent(event)
+
+
+def _cell(text: str) -> QTableWidgetItem:
+    item = QTableWidgetItem(text)
+    item.setTextAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+    return item

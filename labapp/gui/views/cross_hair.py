@@ -1,0 +1,96 @@
+"""The laser over its cross hair from the side, to scale (Fig. A-1)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import QEvent, Qt
+from PySide6.QtGui import QPalette
+from PySide6.QtWidgets import QLabel, QVBoxLayout, QWidget
+
+from labapp.core.laser_calibration import LaserCalibration
+
+
+class CrossHairView(QWidget):
+    """Diode, beam, the fan's two edges, and l₁ and l₂ on the work piece; mm."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setAccessibleName("Drawing of the laser and its cross hair")
+        self.plot = pg.PlotWidget()
+        self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        self.plot.setAspectLocked(True)
+        self.plot.setMenuEnabled(False)
+        self.plot.hideButtons()
+        self.plot.setLabel("bottom", "Y, mm")
+        self.plot.setLabel("left", "Z, mm")
+        self.words = QLabel()
+        self.words.setWordWrap(True)
+        self.words.setMargin(6)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self.plot, 1)
+        layout.addWidget(self.words)
+        self._shown: tuple[LaserCalibration | None, float, float] = (None, 0.0, 0.0)
+        self.show_laser(None, 0.0, 0.0, "")
+
+    def show_laser(
+        self, found: LaserCalibration | None, l1_mm: float, l2_mm: float, words: str
+    ) -> None:
+        """Draw a laser and the lengths that were read, or say in words why there is none."""
+        self._shown = (found, l1_mm, l2_mm)
+        self.words.setText(words)
+        self.setAccessibleDescription(words)
+        self.plot.setVisible(found is not None)
+        center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft
+        self.words.setAlignment(center if found is None else left)
+        self._draw()
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_shown"):
+            self._draw()
+
+    def _draw(self) -> None:
+        ground = self.palette().color(QPalette.ColorRole.Base)
+        ink = self.palette().color(QPalette.ColorRole.Text)
+        beam = "#ff6b5e" if ground.lightness() < 128 else "#c62828"
+        self.plot.setBackground(ground)
+        for side in ("bottom", "left"):
+            self.plot.getAxis(side).setPen(ink)
+            self.plot.getAxis(side).setTextPen(ink)
+        self.plot.clear()
+        found, l1, l2 = self._shown
+        if found is None:
+            return
+        diode = np.array([found.horizontal_mm, found.height_mm])
+        right = max(diode[0], l1) * 1.1 + 2
+        self._line([[-l2 - 4, 0], [right, 0]], pg.mkPen(ink, width=2.5))
+        for end, style in (
+            (0.0, Qt.PenStyle.SolidLine),
+            (l1, Qt.PenStyle.DashLine),
+            (-l2, Qt.PenStyle.DashLine),
+        ):
+            self._line([diode, [end, 0.0]], pg.mkPen(beam, width=1.6, style=style))
+        self._line([diode, [diode[0], 0.0]], pg.mkPen(ink, width=1, style=Qt.PenStyle.DotLine))
+        level = -0.06 * max(right + l2, diode[1])
+        for name, start, end in (("l₁", 0.0, l1), ("l₂", -l2, 0.0)):
+            self._line([[start, level], [end, level]], pg.mkPen(ink, width=1.2), symbol="|")
+            self._text(f"{name} {end - start:.2f} mm", ((start + end) / 2, level), (0.5, 0.0))
+        self.plot.plot(*diode[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=ink)
+        self._text("laser", diode, (0.5, 1.4))
+        self._text(f"height {found.height_mm:.1f} mm", (diode[0], diode[1] / 2), (-0.05, 0.5))
+        words = f"{found.distance_mm:.1f} mm at {found.angle_deg:.2f}°"
+        self._text(words, diode / 2, (1.05, 1.0))
+        self.plot.setRange(xRange=(-l2 - 4, right), yRange=(2 * level, diode[1] * 1.15))
+
+    def _line(self, points: object, pen: object, **symbol: object) -> None:
+        ends = np.array(points, float)
+        self.plot.plot(ends[:, 0], ends[:, 1], pen=pen, symbolPen=pen, **symbol)
+
+    def _text(self, words: str, place: object, anchor: tuple[float, float]) -> None:
+        item = pg.TextItem(words, color=self.palette().color(QPalette.ColorRole.Text))
+        item.setAnchor(anchor)
+        item.setPos(*np.asarray(place, float))
+        self.plot.addItem(item, ignoreBounds=True)

@@ -1,0 +1,209 @@
+"""Laser: readings typed or dragged in a picture, what follows, and what is in use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from labapp.core.laser_calibration import calibrate_laser
+from labapp.gui.pages.laser import LaserPage, presenter
+from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+
+KEPT: list[object] = []
+
+CROSS = ((13.676,), (18.561,), (7.874,))
+
+
+def test_cells_become_readings() -> None:
+    cells = {(0, 0): "13,7", (1, 0): " 13.6", (0, 1): "18.5", (1, 1): "", (0, 2): "x", (1, 2): "-1"}
+    readings = presenter.typed(cells, 10.0)
+    assert readings.lengths_mm == ((13.7, 13.6), (18.5,), ())
+    assert readings.wrong == (
+        "l₃, reading 1: “x” is not a length",
+        "l₃, reading 2: “-1” is not a length",
+    )
+    assert presenter.result(readings).why_not.startswith("l₃, reading 1")
+
+
+def test_what_is_missing_is_said() -> None:
+    result = presenter.result(Readings(((13.7,), (), ())))
+    assert result.found is None
+    assert result.why_not == "Enter at least one reading of l₂, l₃"
+    assert result.rows[0].value == 13.7
+
+
+def test_means_spreads_and_the_laser_are_shown() -> None:
+    lengths = ((13.6, 13.8), (18.5, 18.6), (7.87, 7.88))
+    result = presenter.result(Readings(lengths))
+    found = calibrate_laser(*lengths)
+    rows = {row.name: row for row in result.rows}
+    assert rows["l₁, 2 readings"].value == pytest.approx(13.7)
+    assert rows["l₁, 2 readings"].sigma == pytest.approx(np.std([13.6, 13.8], ddof=1))
+    assert rows["Projection angle"].value == found.angle_deg
+    assert rows["Distance"].sigma == found.distance_sigma_mm
+    assert rows["l₁ that follows"].value == found.expected_l1_mm
+
+
+def test_lengths_that_contradict_each_other_are_said_in_the_pages_words() -> None:
+    doubted = presenter.result(Readings(((13.95,), *CROSS[1:])))
+    assert doubted.found is not None
+    assert "l₁ = 13.95 differs" in doubted.warnings[0]
+    refused = presenter.result(Readings(((16.0,), *CROSS[1:])))
+    assert refused.found is None
+    assert "l₁ = 16 contradicts l₂ and l₃" in refused.why_not
+
+
+def cross_places(turn_deg: float, px_per_mm: float = 12.0) -> dict[str, tuple[float, float]]:
+    angle = np.radians(turn_deg)
+    along, across = (
+        np.array([np.sin(angle), -np.cos(angle)]),
+        np.array([np.cos(angle), np.sin(angle)]),
+    )
+    center = np.array([400.0, 300.0])
+    (l1,), (l2,), (l3,) = (np.array(lengths) * px_per_mm for lengths in CROSS)
+    ends = center + l1 * along, center - l2 * along, center - l3 * across, center + l3 * across
+    scale = np.array([10.0, 20.0]), np.array([10.0, 20.0]) + 25.0 * px_per_mm * across
+    places = dict(zip((*ENDS, *SCALE), (*ends, *scale), strict=True))
+    return {name: (float(u), float(v)) for name, (u, v) in places.items()}
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 33.0, -120.0])
+def test_a_picture_gives_the_lengths_whichever_way_it_is_turned(turn_deg: float) -> None:
+    lengths = presenter.cross_lengths(cross_places(turn_deg), 25.0)
+    assert lengths == pytest.approx([length for (length,) in CROSS])
+
+
+def test_points_that_make_no_cross_are_refused() -> None:
+    places = cross_places(0.0)
+    with pytest.raises(ValueError, match="scale"):
+        presenter.cross_lengths(places | {SCALE[0]: places[SCALE[1]]}, 25.0)
+    with pytest.raises(ValueError, match="between their ends"):
+        presenter.cross_lengths(places | {ENDS[0]: (400.0, 350.0)}, 25.0)
+    with pytest.raises(ValueError, match="do not cut"):
+        presenter.cross_lengths(places | {ENDS[3]: places[ENDS[2]]}, 25.0)
+
+
+def test_what_is_used_comes_back_with_its_readings(tmp_path: Path) -> None:
+    with Session.create(tmp_path / "new.labsession") as session:
+        assert presenter.kept(session) is None
+        assert [row.value for row in presenter.in_use(session)] == [None, None]
+        readings = Readings(CROSS, 10.0)
+        presenter.use(session, readings)
+        assert presenter.kept(session) == readings
+        angle, distance = (row.value for row in presenter.in_use(session))
+        assert angle == pytest.approx(30.0, abs=0.01)
+        assert distance == pytest.approx(90.0, abs=0.01)
+        session.undo()
+        assert presenter.kept(session) is None
+
+
+# --- the page ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[LaserPage]:
+    workspace = Workspace()
+    assert workspace.open(copy_sample("gtaw"))
+    made = LaserPage(workspace)
+    KEPT.extend([workspace, made, made.panel])
+    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
+    made.refresh()
+    made.show()
+    made.panel.show()
+    yield made
+    workspace.close()
+
+
+def fill(page: LaserPage, row: int, texts: tuple[str, ...]) -> None:
+    for column, text in enumerate(texts):
+        item = page.table.item(row, column)
+        if item is None:
+            page.table.setItem(row, column, presenter_cell(text))
+        else:
+            item.setText(text)
+
+
+def presenter_cell(text: str):
+    from labapp.gui.pages.laser.view import _cell
+
+    return _cell(text)
+
+
+def clear(page: LaserPage) -> None:
+    page.table.selectAll()
+    page.table.setFocus()
+    for item in page.table.selectedItems():
+        item.setText("")
+
+
+def test_typed_readings_are_used_and_undone(qtbot: QtBot, page: LaserPage) -> None:
+    session = page.workspace.session
+    assert session is not None
+    before = session.setup.rig.laser, page.readings()
+    clear(page)
+    assert not page.use_button.isEnabled()
+    assert "Enter at least one reading" in page.words.text()
+    fill(page, 0, ("13,676", "18.561", "7.874"))
+    assert page.use_button.isEnabled()
+    assert "agree" in page.words.text()
+    page.use_button.click()
+    assert session.setup.rig.laser.distance_mm == pytest.approx(90.0, abs=0.01)
+    assert page.readings().lengths_mm == CROSS
+    page.workspace.undo()
+    assert (session.setup.rig.laser, page.readings()) == before
+
+
+def test_the_table_grows_and_delete_empties(qtbot: QtBot, page: LaserPage) -> None:
+    clear(page)
+    rows = page.table.rowCount()
+    fill(page, rows - 1, ("1", "2", "3"))
+    assert page.table.rowCount() == rows + 1
+    page.table.setCurrentCell(rows - 1, 0)
+    qtbot.keyClick(page.table, Qt.Key.Key_Delete)
+    assert page.readings().lengths_mm[0] == ()
+
+
+def test_a_refresh_keeps_what_is_being_typed(page: LaserPage) -> None:
+    clear(page)
+    fill(page, 0, ("1", "", ""))
+    page.refresh()
+    assert page.readings().lengths_mm[0] == (1.0,)
+
+
+def test_lengths_from_a_picture_are_a_reading_and_the_picture_is_kept(
+    qtbot: QtBot, page: LaserPage, tmp_path: Path
+) -> None:
+    session = page.workspace.session
+    assert session is not None
+    image = np.full((600, 800), 40, np.uint8)
+    cv2.imwrite(str(tmp_path / "cross.png"), image)
+    clear(page)
+    page.load_picture(tmp_path / "cross.png")
+    qtbot.waitUntil(lambda: page.picture_view.picture is not None)
+    page.scale.set_value(25.0)
+    for name, (u, v) in cross_places(12.0).items():
+        page.move_point(name, u, v)
+    assert page.lengths.text() == "l₁ 13.68 mm,  l₂ 18.56 mm,  l₃ 7.87 mm"
+    page.add_button.click()
+    assert page.readings().lengths_mm == ((13.68,), (18.56,), (7.87,))
+    page.use_button.click()
+    calibration = session.laser_calibration
+    assert calibration is not None
+    assert calibration.picture_sha256 is not None
+    np.testing.assert_array_equal(session.picture(calibration.picture_sha256), image)
+
+
+def test_a_picture_that_cannot_be_read_is_said(qtbot: QtBot, page: LaserPage, tmp_path) -> None:
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    with qtbot.waitSignal(page.workspace.said) as said:
+        page.load_picture(tmp_path / "bad.png")
+    assert "bad.png" in said.args[0]
+    assert page.picture_view.picture is None
