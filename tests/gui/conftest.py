@@ -36,6 +36,14 @@ def copy_sample(tmp_path: Path) -> CopySample:
     return copied
 
 
+@pytest.fixture(autouse=True)
+def hide_windows() -> Iterator[None]:
+    """Leave none in view: an app that is tested ends when the last one goes."""
+    yield
+    for widget in QApplication.topLevelWidgets():
+        widget.hide()
+
+
 @pytest.fixture
 def window(qapp: QApplication, tmp_path: Path, state: Path) -> Iterator[MainWindow]:
     """The window as it is at the first start; closed, and kept, after the test."""
