@@ -7,6 +7,7 @@ from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.export import ExportPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.page import Page
+from labapp.gui.pages.plane import PlanePage
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.pages.trends import TrendsPage
@@ -14,6 +15,7 @@ from labapp.gui.pages.trends import TrendsPage
 PAGES: tuple[type[Page], ...] = (
     SetupPage,
     LaserPage,
+    PlanePage,
     CapturePage,
     DotsPage,
     SurfacePage,

@@ -82,12 +82,14 @@ class CrossHairView(QWidget):
         self._text("laser", diode, (0.5, 1.4))
         self._text(f"height {found.height_mm:.1f} mm", (diode[0], diode[1] / 2), (-0.05, 0.5))
         words = f"{found.distance_mm:.1f} mm at {found.angle_deg:.2f}°"
-        self._text(words, diode / 2, (1.05, 1.0))
+        self._text(words, (diode + np.array([-l2, 0.0])) / 2, (1.05, 1.0))
         self.plot.setRange(xRange=(-l2 - 4, right), yRange=(2 * level, diode[1] * 1.15))
 
     def _line(self, points: object, pen: object, **symbol: object) -> None:
         ends = np.array(points, float)
-        self.plot.plot(ends[:, 0], ends[:, 1], pen=pen, symbolPen=pen, **symbol)
+        if symbol:
+            symbol["symbolPen"] = pen
+        self.plot.plot(ends[:, 0], ends[:, 1], pen=pen, **symbol)
 
     def _text(self, words: str, place: object, anchor: tuple[float, float]) -> None:
         item = pg.TextItem(words, color=self.palette().color(QPalette.ColorRole.Text))

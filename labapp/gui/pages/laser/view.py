@@ -26,7 +26,9 @@ from labapp.gui.views.picture import DragPoint, PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 
-WAYS = (("callipers", "measured with callipers"), ("picture", "from a picture of the cross"))
+WAYS = (("callipers", "by callipers"), ("picture", "from a picture"))
+
+EXPLAINED = "\n".join(f"{name}: {meaning}" for name, meaning in zip(NAMES, MEANINGS, strict=True))
 
 NO_PICTURE = "Take a picture of the cross beside a scale, square from above, and load it here."
 
@@ -217,14 +219,19 @@ class LaserPage(Page):
         result = presenter.result(readings)
         self.result.set_rows(result.rows)
         warnings = [f"⚠ {words}" for words in result.warnings]
-        why_not = [f"⚠ {result.why_not}"] if result.why_not else []
-        self.words.setText("\n".join(why_not or warnings or ["✓ The three lengths agree."]))
+        refused = [f"⚠ {result.why_not}"] if result.why_not else []
+        self.words.setText("\n".join(refused or warnings or ["✓ The three lengths agree."]))
         self.use_button.setEnabled(result.found is not None)
         tip = "Put angle and distance into the rig; undo brings the former back"
         self.use_button.setToolTip(result.why_not or tip)
         means = [row.value for row in result.rows[:2]]
         l1, l2 = (value if isinstance(value, float) else 0.0 for value in means)
-        words = result.why_not or "From the side, to scale: the beam, and the edges of the fan."
+        explained = f"{EXPLAINED}\n\n{result.why_not}"
+        words = (
+            explained
+            if result.why_not
+            else "From the side, to scale: the beam, and the edges of the fan."
+        )
         self.drawing.show_laser(result.found, l1, l2, words)
 
     # --- the picture ------------------------------------------------------------------------

@@ -1,0 +1,220 @@
+"""What the imaging-plane page shows: O′ and the axes, found or placed by hand, and their ±."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.plane_calibration import (
+    PlaneCalibration,
+    PlaneCalibrationSettings,
+    calibrate_plane,
+)
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.gui.digits import ResultRow
+from labapp.media import GreyImage
+from labapp.session.files import write_whole
+from labapp.session.session import Session
+from labapp.simulation.target import Target, target_svg
+
+POINTS = ("O′", "O′X′", "O′Z′")
+"""Names of the three points: the origin, and the middles of the two bars."""
+
+HAND_SIGMA_PX = 0.5
+"""Standard uncertainty of a point that was placed by hand, px."""
+
+UNPLACED = float("inf")
+"""That of a point that nobody has placed yet."""
+
+UNIT_MM = Target().unit_mm
+
+DESIGN = PlaneCalibrationSettings()
+
+Place = tuple[float, float]
+
+
+def find(image: GreyImage, unit_mm: float) -> PlaneCalibration:
+    """O′ and the axes as they are found; `CannotMeasure` says why not."""
+    return calibrate_plane(image, PlaneCalibrationSettings(unit_mm=unit_mm))
+
+
+def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
+    """Points to begin with where nothing is found, in a picture of shape (rows, columns)."""
+    rows, columns = shape
+    side = 0.8 * min(rows, columns)
+    u, v = 0.1 * columns, 0.9 * rows
+    arms = np.array([sum(DESIGN.x_units), sum(DESIGN.z_units)]) / 2 / DESIGN.x_units[1]
+    return _of_units(
+        PlaneCalibration(
+            origin_px=(u, v),
+            x_axis_px=(u + float(arms[0]) * side, v),
+            x_axis_mm=1.0,
+            z_axis_px=(u, v - float(arms[1]) * side),
+            z_axis_mm=1.0,
+            sigma_px=(UNPLACED, UNPLACED, UNPLACED),
+            threshold=0.0,
+        ),
+        unit_mm,
+    )
+
+
+def moved(found: PlaneCalibration, point: int, place: Place) -> PlaneCalibration:
+    """The calibration with one of its points placed by hand."""
+    sigma = list(found.sigma_px)
+    sigma[point] = HAND_SIGMA_PX
+    of_point = {("origin_px", "x_axis_px", "z_axis_px")[point]: place}
+    return replace(found, sigma_px=(sigma[0], sigma[1], sigma[2]), **of_point)  # type: ignore[arg-type]
+
+
+def with_unit(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
+    """The same points on a target of another unit."""
+    return _of_units(found, unit_mm)
+
+
+def _of_units(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
+    x_mm, z_mm = (sum(units) / 2 * unit_mm for units in (DESIGN.x_units, DESIGN.z_units))
+    return replace(found, x_axis_mm=x_mm, z_axis_mm=z_mm)
+
+
+def places(found: PlaneCalibration) -> tuple[Place, Place, Place]:
+    """The three points, px."""
+    return found.origin_px, found.x_axis_px, found.z_axis_px
+
+
+@dataclass(frozen=True)
+class Result:
+    """What follows from the three points.
+
+    Parameters
+    ----------
+    rows
+        Scales and angle with ±.
+    why_not
+        Why they cannot be used; empty if they can.
+    warnings
+        What the operator should look at.
+    """
+
+    rows: tuple[ResultRow, ...] = ()
+    why_not: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+def result(found: PlaneCalibration | None) -> Result:
+    """Scales, angle and their ± of a calibration, and what is wrong with it."""
+    if found is None:
+        return Result(why_not="Load a picture of the target first")
+    try:
+        _ = found.image_calibration
+    except ValueError as error:
+        return Result(why_not=str(error))
+    waiting = [
+        name for name, sigma in zip(POINTS, found.sigma_px, strict=True) if sigma == UNPLACED
+    ]
+    if waiting:
+        return Result(why_not=f"Drag {' and '.join(waiting)} to where it is in the picture")
+    values, sigmas = _numbers(found), _sigmas(found)
+    units = (("Scale along O′X′", "px/mm"), ("Scale along O′Z′", "px/mm"), ("Angle", "°"))
+    rows = [
+        ResultRow(name, value, sigma, unit)
+        for (name, unit), value, sigma in zip(units, values, sigmas, strict=True)
+    ]
+    rows += [
+        ResultRow(name, f"{u:.1f}, {v:.1f}", unit="px", note=f"± {sigma:.2f} px each way")
+        for name, (u, v), sigma in zip(POINTS, places(found), found.sigma_px, strict=True)
+    ]
+    along_x, along_z, angle = values
+    warnings = []
+    if abs(along_x / along_z - 1) > DESIGN.scale_tolerance:
+        warnings.append("The two scales differ by more than a camera in front of the plane sees")
+    if abs(angle - 90) > DESIGN.angle_tolerance_deg:
+        warnings.append(f"The axes are {angle:.0f}° apart, which should be about 90°")
+    return Result(tuple(rows), "", tuple(warnings))
+
+
+def _numbers(found: PlaneCalibration) -> FloatArray:
+    return np.array([*found.px_per_mm, found.angle_deg])
+
+
+def _sigmas(found: PlaneCalibration) -> FloatArray:
+    """± of scales and angle: each point's ± along u and along v, carried through."""
+    base, step = _numbers(found), 1e-3
+    squares = np.zeros(3)
+    for point, (u, v) in enumerate(places(found)):
+        for place in ((u + step, v), (u, v + step)):
+            change = (_numbers(moved(found, point, place)) - base) / step
+            squares += (change * found.sigma_px[point]) ** 2
+    return np.asarray(np.sqrt(squares))
+
+
+def in_use(session: Session) -> tuple[ResultRow, ...]:
+    """Scales and angle of the image calibration that the set-up has."""
+    names = (("Scale along X′", "px/mm"), ("Scale along Z′", "px/mm"), ("Angle", "°"))
+    values = [np.nan] * 3
+    keys = tomllib.loads(session.setup_text).get("image_calibration", {})
+    try:
+        calibration = (
+            ImageCalibration(np.array(keys["homography"], float))
+            if "homography" in keys
+            else ImageCalibration.from_three_points(**keys)
+        )
+    except (TypeError, ValueError, KeyError):
+        pass  # it is not there, or not right: the set-up page says what
+    else:
+        origin, along_x, along_z = calibration.to_image(np.array([[0.0, 0], [1, 0], [0, 1]]))
+        of_one_mm = PlaneCalibration(
+            _place(origin), _place(along_x), 1.0, _place(along_z), 1.0, (0.0, 0.0, 0.0), 0.0
+        )
+        values = _numbers(of_one_mm).tolist()
+    note = "From this session's calibration" if session.plane_calibration else "As entered"
+    return tuple(
+        ResultRow(name, value, None, unit, 3 if unit == "px/mm" else 2, note)
+        for (name, unit), value in zip(names, values, strict=True)
+    )
+
+
+def axes(found: PlaneCalibration, unit_mm: float) -> tuple[FloatArray, FloatArray]:
+    """The axes and their unit marks as they should lie in the picture.
+
+    Returns
+    -------
+    tuple
+        Ends of the axes, shape (3, 2): O′X′'s end, O′, O′Z′'s end; and the unit marks, shape
+        (n, 2); px.
+    """
+    x_end, z_end = DESIGN.x_units[1], DESIGN.z_units[1]
+    line = np.array([[x_end, 0.0], [0.0, 0.0], [0.0, z_end]]) * unit_mm
+    marks = [(n, 0) for n in range(1, int(x_end) + 1)]
+    marks += [(0, n) for n in range(1, int(z_end) + 1)]
+    calibration = found.image_calibration
+    return calibration.to_image(line), calibration.to_image(np.array(marks, float) * unit_mm)
+
+
+def use(
+    session: Session, found: PlaneCalibration, unit_mm: float, image: GreyImage, name: str
+) -> None:
+    """Use the calibration and keep its picture."""
+    session.use_plane(found, unit_mm, image, name)
+
+
+def save_target(path: Path) -> None:
+    """Write the target at true size, to be printed at 100 % (SVG).
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    try:
+        write_whole(path, target_svg(Target()).encode())
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "a file that can be written") from error
+
+
+def _place(point: FloatArray) -> Place:
+    return float(point[0]), float(point[1])

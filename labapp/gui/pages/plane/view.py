@@ -1,0 +1,271 @@
+"""The imaging-plane page: the target's picture, O′ and the axes over it, found or dragged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyqtgraph as pg
+from PySide6.QtWidgets import QFileDialog, QLabel, QPushButton
+
+from labapp.core.plane_calibration import PlaneCalibration
+from labapp.gui.pages.laser.presenter import read_picture
+from labapp.gui.pages.page import Page
+from labapp.gui.pages.plane import presenter
+from labapp.gui.pages.plane.presenter import POINTS
+from labapp.gui.tasks import Control
+from labapp.gui.views.fields import FieldForm, NumberField, ResultTable
+from labapp.gui.views.picture import DragPoint, PictureView
+from labapp.gui.workspace import Workspace
+from labapp.media import GreyImage
+
+NO_PICTURE = "Load a picture of the target on the imaging plane, taken by the camera in its place."
+
+COLOR = "#ffb000"
+
+
+class PlanePage(Page):
+    """A picture with three points; scales and angle follow them."""
+
+    key = "plane"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.view = PictureView("Picture of the target")
+        self.view.show_picture(None, NO_PICTURE)
+        self.canvas_layout.addWidget(self.view)
+        self.found: PlaneCalibration | None = None
+        self._name = "picture"
+        self._loaded: object = None
+        self._axes = pg.PlotDataItem(pen=pg.mkPen(COLOR, width=1.5))
+        self._marks = pg.PlotDataItem(
+            pen=None, symbol="+", symbolSize=11, symbolPen=pg.mkPen(COLOR, width=1.5)
+        )
+        self.points: list[DragPoint] = []
+        self._make_panel()
+
+    def refresh(self) -> None:
+        """Show the picture and the points in use when they changed, and the values in use."""
+        session = self.workspace.session
+        assert session is not None
+        kept = session.plane_calibration
+        loaded = (session.path, kept)
+        if loaded != self._loaded:
+            self._loaded = loaded
+            self._clear()
+            if kept is not None:
+                self.unit.set_value(kept.unit_mm)
+                self.take_kept()
+        self.kept_button.setEnabled(kept is not None)
+        none = "The session keeps no picture yet: Use keeps it"
+        self.kept_button.setToolTip("Show what is in use again" if kept else none)
+        self.in_use.set_rows(presenter.in_use(session))
+        self._follow()
+
+    def load(self, path: Path) -> None:
+        """Show a picture of the target and look for O′ and the axes in it."""
+
+        def loaded(image: GreyImage) -> None:
+            self._name = path.name
+            self._show(image, None)
+            self.find_axes()
+
+        self.workspace.tasks.start("Loading the picture", lambda _: read_picture(path), loaded)
+
+    def take_kept(self) -> None:
+        """Show the picture that the session keeps, and the points in use."""
+        session = self.workspace.session
+        kept = None if session is None else session.plane_calibration
+        if session is None or kept is None:
+            return
+        sha256 = kept.picture_sha256
+
+        def shown(image: GreyImage) -> None:
+            if (self.workspace.session, session.plane_calibration) == (session, kept):
+                self.unit.set_value(kept.unit_mm)
+                self._show(image, kept.found)
+
+        self.workspace.tasks.start(
+            "Showing the calibration picture", lambda _: session.picture(sha256), shown
+        )
+
+    def find_axes(self) -> None:
+        """Look for O′ and the axes."""
+        image = self.view.picture
+        if image is None:
+            return
+        unit = self._unit()
+
+        def work(_: Control) -> PlaneCalibration:
+            return presenter.find(image, unit)
+
+        def found(calibration: PlaneCalibration) -> None:
+            if self.view.picture is image:
+                self._place(presenter.with_unit(calibration, self._unit()))
+
+        self.workspace.tasks.start("Looking for O′ and the axes", work, found)
+
+    def use(self) -> None:
+        """Use what is shown."""
+        image, found, unit = self.view.picture, self.found, self._unit()
+        if image is None or found is None:
+            return
+        if self.workspace.attempt(
+            lambda session: presenter.use(session, found, unit, image, self._name)
+        ):
+            self.workspace.said.emit("The imaging plane is in use; undo brings the former", False)
+
+    def leave(self) -> None:
+        """Finish the edit under way."""
+        self.unit.flush()
+
+    # --- the panel --------------------------------------------------------------------------
+
+    def _make_panel(self) -> None:
+        form = FieldForm()
+        form.add_wide(
+            self._button(
+                "Load picture…",
+                "A picture of the target, taken by the camera in its place",
+                self._choose,
+            )
+        )
+        self.kept_button = self._button("Picture in use", "", self.take_kept)
+        form.add_wide(self.kept_button)
+        self.unit = NumberField(
+            "Unit of the axes",
+            "mm",
+            lowest=0.001,
+            highest=1000,
+            step=0.05,
+            decimals=3,
+            tooltip="From one flag of a bar to the next: measure it on the printed target",
+        )
+        self.unit.set_value(presenter.UNIT_MM)
+        self.unit.edited.connect(lambda _: self._unit_changed())
+        form.add(self.unit)
+        self.find_button = self._button(
+            "Find O′ and the axes",
+            "Look for the dot and the two bars in the picture",
+            self.find_axes,
+        )
+        form.add_wide(self.find_button)
+        self.panel_layout.addWidget(form)
+        help_text = QLabel(
+            "Drag a point that is not right: O′ to the middle of the dot, the others to the "
+            "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
+        )
+        help_text.setWordWrap(True)
+        self.panel_layout.addWidget(help_text)
+        self.result = ResultTable("What follows from the three points")
+        self.panel_layout.addWidget(self.result)
+        self.words = QLabel()
+        self.words.setWordWrap(True)
+        self.panel_layout.addWidget(self.words)
+        self.use_button = self._button("Use", "", self.use)
+        self.panel_layout.addWidget(self.use_button)
+        self.panel_layout.addWidget(QLabel("In use now"))
+        self.in_use = ResultTable("Image calibration in use")
+        self.panel_layout.addWidget(self.in_use)
+        self.panel_layout.addWidget(
+            self._button(
+                "Save the target for printing…",
+                "The target at true size (SVG): print it at 100 % and measure its unit",
+                self._choose_target,
+            )
+        )
+        self.panel_layout.addStretch(1)
+
+    def _button(self, words: str, tooltip: str, work: object) -> QPushButton:
+        button = QPushButton(words)
+        button.setToolTip(tooltip)
+        button.clicked.connect(lambda _: work())  # type: ignore[operator]
+        return button
+
+    def _choose(self) -> None:
+        path, _ = QFileDialog.getOpenFileName(self, "Picture of the target", str(self._folder()))
+        if path:
+            self.load(Path(path))
+
+    def _choose_target(self) -> None:
+        proposed = self._folder() / "imaging_plane_4_inch.svg"
+        path, _ = QFileDialog.getSaveFileName(self, "Save target", str(proposed), "SVG (*.svg)")
+        if path:
+            self.save_target(Path(path))
+
+    def save_target(self, path: Path) -> None:
+        """Write the target for the printer."""
+
+        def saved() -> bool:
+            presenter.save_target(path)
+            return True
+
+        if self.workspace.tried(saved):
+            self.workspace.said.emit(f"Target saved as {path.name}: print it at 100 %", False)
+
+    def _folder(self) -> Path:
+        session = self.workspace.session
+        return Path.home() if session is None else Path(session.path).parent
+
+    # --- the picture ------------------------------------------------------------------------
+
+    def _unit(self) -> float:
+        return self.unit.value() or presenter.UNIT_MM
+
+    def _unit_changed(self) -> None:
+        if self.found is not None:
+            self._place(presenter.with_unit(self.found, self._unit()))
+
+    def _clear(self) -> None:
+        self.view.show_picture(None, NO_PICTURE)
+        self._place(None)
+
+    def _show(self, image: GreyImage, found: PlaneCalibration | None) -> None:
+        self.view.show_picture(image)
+        rows, columns = image.shape
+        self._place(found or presenter.first_points((rows, columns), self._unit()))
+
+    def _place(self, found: PlaneCalibration | None) -> None:
+        self.found = found
+        if found is not None and not self.points:
+            self.view.add(self._axes)
+            self.view.add(self._marks)
+            for k, (name, place) in enumerate(zip(POINTS, presenter.places(found), strict=True)):
+                point = DragPoint(name, *place, COLOR)
+                point.moved.connect(lambda u, v, k=k: self.drag(k, u, v))
+                self.points.append(point)
+                self.view.add_point(point)
+        for k, point in enumerate(self.points):
+            point.setVisible(found is not None)
+            if found is not None:
+                point.set_place(*presenter.places(found)[k])
+        self._follow()
+
+    def drag(self, point: int, u: float, v: float) -> None:
+        """One of the points is dragged."""
+        if self.found is not None:
+            self.found = presenter.moved(self.found, point, (u, v))
+            self._follow()
+
+    def _follow(self) -> None:
+        """Show what follows from the points."""
+        result = presenter.result(self.found)
+        self.result.set_rows(result.rows)
+        self.result.setVisible(bool(result.rows))
+        why_not = (result.why_not,) if result.why_not else ()
+        self.words.setText("\n".join(f"⚠ {words}" for words in (*why_not, *result.warnings)))
+        self.words.setVisible(bool(self.words.text()))
+        usable = not result.why_not
+        self.use_button.setEnabled(usable)
+        self.use_button.setToolTip(
+            result.why_not or "Measure with this; undo brings the former back"
+        )
+        self.find_button.setEnabled(self.view.picture is not None)
+        self._axes.setVisible(self.found is not None)
+        self._marks.setVisible(self.found is not None)
+        if self.found is not None:
+            try:
+                line, marks = presenter.axes(self.found, self._unit())
+            except ValueError:  # the three points lie on one line for now
+                return
+            self._axes.setData(line[:, 0], line[:, 1])
+            self._marks.setData(marks[:, 0], marks[:, 1])

@@ -1,0 +1,202 @@
+"""Imaging plane: found or placed by hand, what follows with its ±, and what is in use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QPushButton
+from pytestqt.qtbot import QtBot
+
+from labapp.core.plane_calibration import PlaneCalibration
+from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
+from labapp.gui.pages.plane import PlanePage, presenter
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+from labapp.simulation.target import Target, target_svg
+
+KEPT: list[object] = []
+
+GTAW = Path(__file__).parents[3] / "sample_sessions" / "gtaw"
+
+SQUARE = PlaneCalibration(
+    origin_px=(50.0, 400.0),
+    x_axis_px=(50.0 + 5.5 * 60, 400.0),
+    x_axis_mm=55.0,
+    z_axis_px=(50.0, 400.0 - 2.5 * 60),
+    z_axis_mm=25.0,
+    sigma_px=(0.1, 0.2, 0.3),
+    threshold=14.0,
+)
+"""Six px/mm, axes square, units of 10 mm."""
+
+
+def test_scales_and_angle_carry_the_points_uncertainty() -> None:
+    rows = {row.name: row for row in presenter.result(SQUARE).rows}
+    along_x, along_z, angle = (
+        rows[name] for name in ("Scale along O′X′", "Scale along O′Z′", "Angle")
+    )
+    assert (along_x.value, along_z.value, angle.value) == pytest.approx((6.0, 6.0, 90.0))
+    assert along_x.sigma == pytest.approx(np.hypot(0.1, 0.2) / 55, rel=1e-3)
+    assert along_z.sigma == pytest.approx(np.hypot(0.1, 0.3) / 25, rel=1e-3)
+    at_origin = np.hypot(0.1 / 330, 0.1 / 150)
+    sigma = np.degrees(np.sqrt((0.2 / 330) ** 2 + (0.3 / 150) ** 2 + at_origin**2))
+    assert angle.sigma == pytest.approx(sigma, rel=1e-3)
+
+
+def test_what_cannot_be_used_and_what_is_odd_is_said() -> None:
+    assert "Load a picture" in presenter.result(None).why_not
+    line = replace(SQUARE, z_axis_px=SQUARE.x_axis_px)
+    assert "one line" in presenter.result(line).why_not
+    odd = presenter.result(replace(SQUARE, z_axis_px=(250.0, 300.0)))
+    assert not odd.why_not
+    assert len(odd.warnings) == 2
+    assert not presenter.result(SQUARE).warnings
+
+
+def test_a_point_placed_by_hand_is_less_certain() -> None:
+    moved = presenter.moved(SQUARE, 1, (381.0, 401.0))
+    assert moved.x_axis_px == (381.0, 401.0)
+    assert moved.sigma_px == (0.1, presenter.HAND_SIGMA_PX, 0.3)
+    assert moved.origin_px == SQUARE.origin_px
+
+
+def test_another_unit_is_another_scale() -> None:
+    twice = presenter.with_unit(SQUARE, 20.0)
+    assert twice.px_per_mm == pytest.approx((3.0, 3.0))
+
+
+def test_unit_marks_lie_on_the_axes() -> None:
+    line, marks = presenter.axes(SQUARE, 10.0)
+    np.testing.assert_allclose(line, [[650, 400], [50, 400], [50, 160]])
+    assert len(marks) == 14
+    np.testing.assert_allclose(marks[[0, 10]], [[110, 400], [50, 340]])
+
+
+def test_points_to_begin_with_are_a_target_in_the_picture() -> None:
+    begun = presenter.first_points((480, 640), 6.35)
+    assert "Drag O′ and O′X′ and O′Z′" in presenter.result(begun).why_not
+    for point, place in enumerate(presenter.places(begun)):
+        begun = presenter.moved(begun, point, place)
+    assert not presenter.result(begun).why_not
+    assert begun.px_per_mm[0] == pytest.approx(begun.px_per_mm[1])
+    line, _ = presenter.axes(begun, 6.35)
+    assert (line >= 0).all()
+    assert (line < [640, 480]).all()
+
+
+def test_what_is_in_use_is_told_whichever_form_it_has(tmp_path: Path) -> None:
+    with Session.create(tmp_path / "new.labsession") as session:
+        assert all(np.isnan(row.value) for row in presenter.in_use(session))
+        image = cv2.imread(str(GTAW / "calibration.png"), cv2.IMREAD_UNCHANGED)
+        presenter.use(session, SQUARE, 10.0, image, "by hand")
+        assert [row.value for row in presenter.in_use(session)] == pytest.approx([6, 6, 90])
+        homography = SQUARE.image_calibration.matrix.tolist()
+        points = dict.fromkeys(
+            ("origin_px", "x_axis_px", "x_axis_mm", "z_axis_px", "z_axis_mm"), None
+        )
+        session.update_setup({"image_calibration": {**points, "homography": homography}})
+        assert [row.value for row in presenter.in_use(session)] == pytest.approx([6, 6, 90])
+
+
+def test_the_target_is_written_for_the_printer(tmp_path: Path) -> None:
+    presenter.save_target(tmp_path / "target.svg")
+    assert (tmp_path / "target.svg").read_text("utf-8") == target_svg(Target())
+    with pytest.raises(InputError, match="can be written"):
+        presenter.save_target(tmp_path / "not there" / "target.svg")
+
+
+def test_a_picture_without_a_target_is_refused_in_words() -> None:
+    with pytest.raises(CannotMeasure, match="no dark marks"):
+        presenter.find(np.full((200, 300), 90, np.uint8), 6.35)
+
+
+# --- the page ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage]:
+    workspace = Workspace()
+    assert workspace.open(copy_sample("gtaw"))
+    made = PlanePage(workspace)
+    KEPT.extend([workspace, made, made.panel])
+    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
+    made.refresh()
+    made.show()
+    made.panel.show()
+    qtbot.waitUntil(lambda: not workspace.tasks.active)
+    yield made
+    workspace.close()
+    made.hide()
+    made.panel.hide()
+
+
+def test_a_picture_is_loaded_found_used_and_undone(qtbot: QtBot, page: PlanePage) -> None:
+    session = page.workspace.session
+    assert session is not None
+    before = session.setup_text
+    page.load(GTAW / "calibration.png")
+    qtbot.waitUntil(lambda: page.found is not None and page.found.threshold > 0)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.found is not None
+    page.drag(0, page.found.origin_px[0] + 3.0, page.found.origin_px[1])
+    placed = page.found
+    page.use_button.click()
+    assert session.setup_text != before
+    kept = session.plane_calibration
+    assert kept is not None
+    assert (kept.found, kept.unit_mm) == (placed, 6.35)
+    page.workspace.undo()
+    assert session.setup_text == before
+
+
+def test_an_arrow_key_moves_the_chosen_point(qtbot: QtBot, page: PlanePage) -> None:
+    page.load(GTAW / "calibration.png")
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.found is not None
+    u, v = page.found.x_axis_px
+    scale = page.result.rows[0].value
+    qtbot.keyClick(page.view, Qt.Key.Key_P)
+    qtbot.keyClick(page.view, Qt.Key.Key_Right, Qt.KeyboardModifier.ShiftModifier)
+    qtbot.keyClick(page.view, Qt.Key.Key_Up)
+    assert page.found.x_axis_px == pytest.approx((u + 1.0, v - 0.1))
+    assert page.result.rows[0].value != scale
+
+
+def test_a_picture_without_a_target_is_said_and_points_can_be_placed(
+    qtbot: QtBot, page: PlanePage, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(tmp_path / "bare.png"), np.full((200, 300), 90, np.uint8))
+    said: list[str] = []
+    page.workspace.said.connect(lambda words, _: said.append(words))
+    page.load(tmp_path / "bare.png")
+    qtbot.waitUntil(lambda: len(said) == 1)
+    assert "no-target" in said[0]
+    assert [point.isVisible() for point in page.points] == [True] * 3
+    for k, place in enumerate([(30.0, 180.0), (120.0, 181.0), (31.0, 120.0)]):
+        assert not page.use_button.isEnabled()
+        page.drag(k, *place)
+    assert page.use_button.isEnabled()
+
+
+def test_a_new_unit_is_followed_at_once(qtbot: QtBot, page: PlanePage) -> None:
+    page.load(GTAW / "calibration.png")
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    scale = page.result.rows[0].value
+    page.unit.editor.setFocus()
+    page.unit.editor.selectAll()
+    qtbot.keyClicks(page.unit.editor, "12.7")
+    qtbot.keyClick(page.unit.editor, Qt.Key.Key_Return)
+    assert page.result.rows[0].value == pytest.approx(scale / 2)
+
+
+def test_every_button_says_what_it_does(page: PlanePage) -> None:
+    buttons = page.panel.findChildren(QPushButton)
+    assert len(buttons) == 5
+    assert all(button.toolTip() for button in buttons)
