@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import time
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -103,10 +103,13 @@ def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) ->
 def test_measuring_can_be_watched_and_cancelled(
     page: SurfacePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    cancelled = threading.Event()
+
     def slowly(numbers: list[int], pool: object) -> Iterator[tuple[int, None]]:
         assert numbers == list(range(30))
         for number in numbers:
-            time.sleep(0.02)
+            if number == 3:
+                cancelled.wait(60)
             yield number, None
 
     monkeypatch.setattr(page.workspace.session, "measure", slowly)
@@ -114,6 +117,7 @@ def test_measuring_can_be_watched_and_cancelled(
     qtbot.waitUntil(lambda: page.side.progress.value() >= 2)
     assert page.side.progress.text().endswith(" of 30 frames")
     page.side.cancel.click()
+    cancelled.set()
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     assert page.side.progress.value() < 30
     assert page.side.progress.isHidden()
