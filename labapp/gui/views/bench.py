@@ -143,7 +143,8 @@ class BenchView(QWidget):
         torch = view.tip_mm + np.array([0.0, TORCH_MM])
         self._text(self.whole, "torch", torch, (0.5, 1.0))
         self._text(self.whole, "laser", view.laser_mm, (0.5, 1.5))
-        self._text(self.whole, "imaging plane", view.plane_mm[1], (-0.1, 0.0))
+        top = np.minimum(view.plane_mm[1], [np.inf, _extent(view)[2]])
+        self._text(self.whole, "imaging plane", top, (-0.1, 0.0))
         lengths = ("L1", -view.clearance.l1_mm), ("L2", view.clearance.l2_mm)
         reach = _reach(view)
         level = -0.15 * reach
