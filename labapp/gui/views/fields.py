@@ -382,7 +382,9 @@ class FieldForm(QWidget):
         row = self._grid.rowCount()
         self._grid.addWidget(field.label, row, 0, Qt.AlignmentFlag.AlignTop)
         self._grid.addWidget(field, row, 1)
-        field.label.setMinimumHeight(field.editor.sizeHint().height())
+        # Level with the editor's first line.
+        height = field.editor.fontMetrics().lineSpacing() + 12
+        field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))
         self._fields.append(field)
         units = [other.unit for other in self._fields if other.unit.text()]
         width = max((unit.sizeHint().width() for unit in units), default=0)
