@@ -10,7 +10,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from labapp.errors import InputError
-from labapp.session.database import SUFFIX
+from labapp.session.database import SUFFIX, new_session_path
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 
@@ -35,11 +35,7 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
     InputError
         If there is a file of that name, or it cannot be written.
     """
-    path = Path(path).absolute()
-    if path.suffix.lower() != SUFFIX:
-        raise InputError(path, "name", path.name, f"a name that ends in {SUFFIX}")
-    if path.exists():
-        raise InputError(path, "file", "is there already", "a new name")
+    path = new_session_path(path)
     beside = path.with_name(f".{path.name}.part")
     try:
         beside.unlink(missing_ok=True)

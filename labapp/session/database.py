@@ -75,11 +75,7 @@ class Database:
         InputError
             If there is a file of that name, or it cannot be written.
         """
-        path = Path(path).absolute()
-        if path.suffix.lower() != SUFFIX:
-            raise InputError(path, "name", path.name, f"a name that ends in {SUFFIX}")
-        if path.exists():
-            raise InputError(path, "file", "is there already", "a new name, or open it")
+        path = new_session_path(path)
         lock = _lock(path)
         # Made beside its place: a crash on the way leaves no session that is none.
         beside = path.with_name(f".{path.name}.part")
@@ -240,6 +236,22 @@ class Database:
             self.close()
             raise
         return self
+
+
+def new_session_path(path: str | os.PathLike[str]) -> Path:
+    """Where a session is to be made, absolute.
+
+    Raises
+    ------
+    InputError
+        If that is no name of a session, or there is a file of that name.
+    """
+    path = Path(path).absolute()
+    if path.suffix.lower() != SUFFIX:
+        raise InputError(path, "name", path.name, f"a name that ends in {SUFFIX}")
+    if path.exists():
+        raise InputError(path, "file", "is there already", "a new name, or open it")
+    return path
 
 
 def _check_header(path: Path) -> int:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.survey import Survey, frame_checksum, survey
@@ -65,12 +65,6 @@ class Frames:
         """Numbers of the session's frames in the recording, from 0, ascending, shape (n,)."""
         rows = self._database.rows("SELECT number FROM frame")
         return self._database.array([number for (number,) in rows], np.int64)
-
-    @property
-    def times_s(self) -> FloatArray:
-        """Time of each since the recording's first frame, shape (n,), s; NaN where unknown."""
-        rows = self._database.rows("SELECT time_s FROM frame ORDER BY number")
-        return self._database.array([time_s for (time_s,) in rows], np.float64)
 
     def time_s(self, number: int) -> float | None:
         """Time of one frame, s; None where unknown.

@@ -226,13 +226,6 @@ class Results:
             stale=(*outdated, *((CORRECTION_CHANGED,) if corrected != correction else ())),
         )
 
-    def schemes(self, frame: int) -> tuple[str, ...]:
-        """Names of the schemes that a frame was measured by."""
-        rows = self._database.rows(
-            "SELECT scheme FROM result WHERE frame = ? ORDER BY scheme", frame
-        )
-        return tuple(scheme for (scheme,) in rows)
-
     def counts(self) -> dict[tuple[str, str], int]:
         """How many results there are: (scheme, version of labapp) → count."""
         rows = self._database.rows(

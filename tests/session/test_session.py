@@ -178,7 +178,10 @@ def test_each_scheme_keeps_its_own_results(session: Session):
     session._results.put(0, replace(one.measurement, scheme="ers"), basis, None)
     assert session.overview().status == ("ok", "", "", "")
     assert session.overview("fit").stale.tolist() == [False] * 4
-    assert session._results.schemes(0) == ("ers", "fit")
+    assert session.measured_by == {
+        ("ers", labapp.__version__): 1,
+        ("fit", labapp.__version__): 2,
+    }
     one = session.result(0, "fit")
     assert one is not None
     assert one.stale == ()
