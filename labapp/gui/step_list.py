@@ -102,7 +102,7 @@ class StepList(QListWidget):
         self.setMinimumWidth(self.sizeHint().width())
         self.currentRowChanged.connect(self._told)
 
-    def sizeHint(self) -> QSize:  # noqa: N802
+    def sizeHint(self) -> QSize:
         """As wide as the longest title needs."""
         metrics = self.fontMetrics()
         texts = [metrics.horizontalAdvance(self.item(row).text()) for row in range(self.count())]
@@ -160,7 +160,7 @@ class SidePanel(QWidget):
         layout.addWidget(self.stack, 1)
         self.setMinimumWidth(320)
 
-    def sizeHint(self) -> QSize:  # noqa: N802
+    def sizeHint(self) -> QSize:
         """Room for two columns of numbers."""
         return QSize(350, 500)
 

@@ -408,17 +408,17 @@ class MainWindow(QMainWindow):
 
     # --- events -----------------------------------------------------------------------------
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         """Do what a plain key means that nothing else has taken."""
         if not self.menus.key(event):
             super().keyPressEvent(event)
 
-    def dragEnterEvent(self, event: QDragEnterEvent) -> None:  # noqa: N802
+    def dragEnterEvent(self, event: QDragEnterEvent) -> None:
         """Take files."""
         if any(url.isLocalFile() for url in event.mimeData().urls()):
             event.acceptProposedAction()
 
-    def dropEvent(self, event: QDropEvent) -> None:  # noqa: N802
+    def dropEvent(self, event: QDropEvent) -> None:
         """Open what was dropped, once the other program has its pointer back."""
         paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
         event.acceptProposedAction()
@@ -427,7 +427,7 @@ class MainWindow(QMainWindow):
         elif paths:
             QTimer.singleShot(0, self, lambda: self.files.open_path(paths[0]))
 
-    def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802
+    def closeEvent(self, event: QCloseEvent) -> None:
         """Stop all work, remember the layout and close the session."""
         self.timeline.set_playing(False)
         self._show_docks(everywhere=True)

@@ -128,7 +128,7 @@ class Welcome(QWidget):
 
             self._workspace.tasks.start("Looking at recent sessions", look, on_part=self._show)
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         """Take a session off the list."""
         if event.key() == Qt.Key.Key_Delete and self.list.hasFocus():
             for item in self.list.selectedItems():

@@ -66,7 +66,7 @@ class BenchView(QWidget):
             reach = _reach(self._view)
             self.near.setRange(xRange=(-reach, reach), yRange=(-0.4 * reach, reach), padding=0)
 
-    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+    def changeEvent(self, event: QEvent) -> None:
         """Follow a change of theme."""
         super().changeEvent(event)
         if event.type() == QEvent.Type.PaletteChange and hasattr(self, "near"):

@@ -225,14 +225,14 @@ class _NumberBox(QAbstractSpinBox):
     def validate(self, text: str, position: int) -> Any:
         return QValidator.State.Acceptable, text, position
 
-    def stepEnabled(self) -> QAbstractSpinBox.StepEnabledFlag:  # noqa: N802
+    def stepEnabled(self) -> QAbstractSpinBox.StepEnabledFlag:
         flags = QAbstractSpinBox.StepEnabledFlag
         return flags.StepUpEnabled | flags.StepDownEnabled
 
-    def stepBy(self, steps: int) -> None:  # noqa: N802
+    def stepBy(self, steps: int) -> None:
         self.stepped.emit(steps)
 
-    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+    def wheelEvent(self, event: QWheelEvent) -> None:
         # Scrolling a panel must not change the numbers that pass under the pointer.
         if self.hasFocus():
             super().wheelEvent(event)
@@ -298,11 +298,11 @@ class _Paragraphs(QPlainTextEdit):
         self.setTabChangesFocus(True)
         self.setFixedHeight(self.fontMetrics().lineSpacing() * lines + 14)
 
-    def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802
+    def focusOutEvent(self, event: QFocusEvent) -> None:
         super().focusOutEvent(event)
         self.finished.emit()
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         enter = event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter)
         if enter and event.modifiers() & Qt.KeyboardModifier.ControlModifier:
             self.finished.emit()
@@ -353,7 +353,7 @@ class ChoiceField(Field):
             self._combo.setItemData(self._combo.count() - 1, words, Qt.ItemDataRole.ToolTipRole)
         self.set_value(present or (choices[0][0] if choices else ""))
 
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         """Keep the wheel from changing a choice that does not have the focus."""
         if event.type() == QEvent.Type.Wheel and not self._combo.hasFocus():
             event.ignore()

@@ -281,7 +281,7 @@ class PictureView(QWidget):
     def _paint(self) -> None:
         self.canvas.setBackground(self.palette().color(QPalette.ColorRole.Window).darker(120))
 
-    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+    def changeEvent(self, event: QEvent) -> None:
         """Follow a change of theme."""
         super().changeEvent(event)
         if event.type() == QEvent.Type.PaletteChange and hasattr(self, "canvas"):
@@ -296,7 +296,7 @@ class PictureView(QWidget):
                 return True
         return super().event(event)
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         """Give a key to the tool, to the point chosen, or to zoom and contrast."""
         step, key = self._step(event), event.key()
         simple: dict[int, Callable[[], object]] = {
@@ -321,13 +321,13 @@ class PictureView(QWidget):
         else:
             super().keyPressEvent(event)
 
-    def keyReleaseEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyReleaseEvent(self, event: QKeyEvent) -> None:
         """Tell the tool."""
         if not event.isAutoRepeat():
             self.tool.release()
         super().keyReleaseEvent(event)
 
-    def focusOutEvent(self, event: QFocusEvent) -> None:  # noqa: N802
+    def focusOutEvent(self, event: QFocusEvent) -> None:
         """Tell the tool: the key may be let go elsewhere."""
         self.tool.release()
         super().focusOutEvent(event)
@@ -429,7 +429,7 @@ class _Box(pg.ViewBox):  # type: ignore[misc]
         self._view = view
         self._tool_drags = False
 
-    def mouseClickEvent(self, event: Any) -> None:  # noqa: N802
+    def mouseClickEvent(self, event: Any) -> None:
         if event.button() != Qt.MouseButton.LeftButton:
             return
         event.accept()
@@ -440,7 +440,7 @@ class _Box(pg.ViewBox):  # type: ignore[misc]
         else:
             self._view.tool.click(place.x(), place.y(), event.modifiers())
 
-    def mouseDragEvent(self, event: Any, axis: int | None = None) -> None:  # noqa: N802
+    def mouseDragEvent(self, event: Any, axis: int | None = None) -> None:
         tool = self._view.tool
         if event.isStart():
             self._view.setFocus(Qt.FocusReason.MouseFocusReason)

@@ -236,7 +236,7 @@ class PlotStack(QWidget):
         if len(distance) and np.nanmin(distance) <= NEAR:
             self.chosen.emit(int(curve.key[int(np.nanargmin(distance))]))
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         """Step through the points, or zoom."""
         steps = {Qt.Key.Key_Left: -1, Qt.Key.Key_Right: 1, Qt.Key.Key_Home: -(10**9)}
         steps[Qt.Key.Key_End] = 10**9
@@ -255,7 +255,7 @@ class PlotStack(QWidget):
         else:
             super().keyPressEvent(event)
 
-    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+    def changeEvent(self, event: QEvent) -> None:
         """Follow a change of theme."""
         super().changeEvent(event)
         if event.type() == QEvent.Type.PaletteChange and hasattr(self, "canvas"):

@@ -106,7 +106,7 @@ class Scrubber(QWidget):
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.setAccessibleName("Frames")
 
-    def sizeHint(self) -> QSize:  # noqa: N802
+    def sizeHint(self) -> QSize:
         """As wide as there is room, and high enough for the shapes to be told apart."""
         return QSize(400, self.fontMetrics().height() * 2 + RAIL_PX)
 
@@ -147,7 +147,7 @@ class Scrubber(QWidget):
 
     # --- drawing ----------------------------------------------------------------------------
 
-    def paintEvent(self, _event: QPaintEvent) -> None:  # noqa: N802
+    def paintEvent(self, _event: QPaintEvent) -> None:
         """Draw the ticks, made once for a width and kinds, and the marker over them."""
         painter = QPainter(self)
         if not len(self._kinds):
@@ -209,12 +209,12 @@ class Scrubber(QWidget):
             masks.append(np.any(fills, axis=0))
         return np.array(colours, np.uint32), np.array(masks, bool)
 
-    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+    def resizeEvent(self, event: QResizeEvent) -> None:
         """Draw the ticks anew for another width."""
         self._picture = None
         super().resizeEvent(event)
 
-    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+    def changeEvent(self, event: QEvent) -> None:
         """Draw the ticks anew for another palette."""
         if event.type() in (QEvent.Type.PaletteChange, QEvent.Type.StyleChange):
             self._picture = None
@@ -222,22 +222,22 @@ class Scrubber(QWidget):
 
     # --- going ------------------------------------------------------------------------------
 
-    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+    def mousePressEvent(self, event: QMouseEvent) -> None:
         """Go to the frame under the pointer."""
         if event.button() == Qt.MouseButton.LeftButton:
             self.go_to(self.position_at(event.position().x()))
 
-    def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:
         """Scrub."""
         if event.buttons() & Qt.MouseButton.LeftButton:
             self.go_to(self.position_at(event.position().x()))
 
-    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+    def wheelEvent(self, event: QWheelEvent) -> None:
         """Step through the frames."""
         steps = event.angleDelta().y() or event.angleDelta().x()
         self.go_to(self._position - (steps > 0) + (steps < 0))
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         """Go a tenth of all frames with Page Up and Down; the other keys are the window's."""
         page = max(1, len(self._kinds) // 10)
         if event.key() == Qt.Key.Key_PageUp:
@@ -420,7 +420,7 @@ class Timeline(QWidget):
         if self.counts.sizeHint().width() > self.counts.width():
             self.counts.setText(" &nbsp; ".join(short))
 
-    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+    def resizeEvent(self, event: QResizeEvent) -> None:
         """Give the legend its words where there is room for them."""
         super().resizeEvent(event)
         self._show_counts()

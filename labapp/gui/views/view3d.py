@@ -157,7 +157,7 @@ class View3d(QWidget):
         picture = self.picture()
         return None if picture is None else as_image(picture)
 
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         """Let go of OpenGL before the window goes."""
         if event.type() == QEvent.Type.Close:
             self.close_view()
@@ -236,7 +236,7 @@ class View3d(QWidget):
                 event.accept()
         return super().event(event)
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         """Turn, zoom, or look from one of four sides."""
         key = Qt.Key(event.key())
         if key in TURNS:
@@ -250,7 +250,7 @@ class View3d(QWidget):
         else:
             super().keyPressEvent(event)
 
-    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+    def changeEvent(self, event: QEvent) -> None:
         """Follow the window from light to dark."""
         super().changeEvent(event)
         if event.type() == QEvent.Type.PaletteChange and self._scene is not None:
@@ -293,12 +293,12 @@ class OffscreenView(View3d):
         if self._picture is not None:
             self._picture.setDevicePixelRatio(self.devicePixelRatioF())
 
-    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+    def resizeEvent(self, event: QResizeEvent) -> None:
         """Draw anew, as large as the view is now."""
         super().resizeEvent(event)
         self._refresh()
 
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802
+    def paintEvent(self, event: QPaintEvent) -> None:
         """Show the scene, or say why there is none."""
         if self._picture is None and self._scene is not None:
             self._render()
@@ -312,11 +312,11 @@ class OffscreenView(View3d):
             painter.setPen(QColor(self.palette().color(QPalette.ColorRole.Highlight)))
             painter.drawRect(self.rect().adjusted(0, 0, -1, -1))
 
-    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+    def mousePressEvent(self, event: QMouseEvent) -> None:
         """Begin to turn or to move."""
         self._at = event.position()
 
-    def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:
         """Turn with the left button; move with Shift or the middle one."""
         way, self._at = event.position() - self._at, event.position()
         shift = event.modifiers() & Qt.KeyboardModifier.ShiftModifier
@@ -325,7 +325,7 @@ class OffscreenView(View3d):
         elif event.buttons() & Qt.MouseButton.LeftButton:
             self.turn(way.x() * DEGREES_A_PIXEL, way.y() * DEGREES_A_PIXEL)
 
-    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+    def wheelEvent(self, event: QWheelEvent) -> None:
         """Zoom."""
         self.zoom(ZOOM ** (event.angleDelta().y() / 120))
 
@@ -390,12 +390,12 @@ class InteractiveView(View3d):
         elif self._drawing is not None:
             self._drawing.plotter.setVisible(False)
 
-    def showEvent(self, event: QShowEvent) -> None:  # noqa: N802
+    def showEvent(self, event: QShowEvent) -> None:
         """Draw what there is by now."""
         super().showEvent(event)
         self._refresh()
 
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: N802
+    def paintEvent(self, event: QPaintEvent) -> None:
         """Show the scene, or say why there is none."""
         painter = QPainter(self)
         painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))

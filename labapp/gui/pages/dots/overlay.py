@@ -176,7 +176,7 @@ class DotsOverlay:
 class _Marks(pg.ScatterPlotItem):  # type: ignore[misc]
     """Marks that leave clicks to the picture's tool."""
 
-    def mouseClickEvent(self, event: Any) -> None:  # noqa: N802
+    def mouseClickEvent(self, event: Any) -> None:
         """Leave it."""
         event.ignore()
 

@@ -157,7 +157,7 @@ class DotsPage(Page):
         """The frame with its marks."""
         return QPixmap.fromImage(self.view.grab_picture())
 
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         """Note when the pointer leaves the picture."""
         if event.type() == QEvent.Type.Leave:
             self._pointer = None

@@ -308,7 +308,7 @@ class _ReadingsTable(QTableWidget):
         header = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
         self.setFixedHeight(header + min(self.rowCount(), 8) * self.rowHeight(0))
 
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         """Tab beyond the last cell leaves the table."""
         if isinstance(event, QKeyEvent) and event.type() == QEvent.Type.KeyPress:
             last = self.currentRow() == self.rowCount() - 1 and self.currentColumn() == 2
@@ -316,7 +316,7 @@ class _ReadingsTable(QTableWidget):
                 return self.focusNextChild()
         return super().eventFilter(watched, event)
 
-    def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
+    def keyPressEvent(self, event: QKeyEvent) -> None:
         """Delete empties the selected cells."""
         if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
             for item in self.selectedItems():

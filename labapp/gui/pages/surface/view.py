@@ -327,14 +327,14 @@ class _Tools(QWidget):
         for line in lines:
             self._box.addLayout(line)
 
-    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+    def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
         wanted = sum(line.sizeHint().width() for line in self._lines) + 12
         way = QBoxLayout.Direction
         self._box.setDirection(way.LeftToRight if self.width() >= wanted else way.TopToBottom)
         self.setFixedHeight(self._box.sizeHint().height())
 
-    def minimumSizeHint(self) -> QSize:  # noqa: N802
+    def minimumSizeHint(self) -> QSize:
         widest = max(line.minimumSize().width() for line in self._lines)
         return QSize(widest, self._box.sizeHint().height())
 
