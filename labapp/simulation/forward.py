@@ -16,12 +16,16 @@ from labapp.core.orientation import Orientation
 from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.simulation.pools import PoolSize
+from labapp.simulation.torch import Torch, YozTorch
 
 SAMPLES = 256
 """Steps along a ray between the highest and the lowest point of the pool."""
 
 SLACK_MM = 0.05
 """How far above and below the pool the walk along a ray begins and ends."""
+
+CLEAR_MM = 1e-6
+"""A ray that is no deeper than this under the surface leaves it: rounding, on a flat pool."""
 
 HALVINGS = 52
 """Halvings of a step: as far as double precision goes."""
@@ -56,6 +60,9 @@ class Reflections:
         The ray meets the pool, shape (rows, columns). An absent ray is traced like any other.
     incident_blocked, reflected_blocked
         The torch is in the way of the incident or of the reflected ray, shape (rows, columns).
+    hits_again
+        The reflected ray meets the pool a second time, shape (rows, columns). It is not followed
+        any further: what else it does lights no dot where one is looked for.
     on_plane
         The reflected ray meets the imaging plane within its edges, shape (rows, columns).
     point_mm
@@ -71,6 +78,7 @@ class Reflections:
     hit: BoolArray
     incident_blocked: BoolArray
     reflected_blocked: BoolArray
+    hits_again: BoolArray
     on_plane: BoolArray
     point_mm: FloatArray
     incident: FloatArray
@@ -93,14 +101,21 @@ class Reflections:
     @property
     def visible(self) -> BoolArray:
         """A dot shows on the imaging plane."""
-        return np.asarray(self.lit & ~self.blocked & self.on_plane)
+        return np.asarray(self.lit & ~self.blocked & ~self.hits_again & self.on_plane)
 
 
-def trace(pool: PoolSurface, rig: Rig) -> Reflections:
+def trace(pool: PoolSurface, rig: Rig, torch: Torch | None = None) -> Reflections:
     """Follow every ray from the laser by way of the pool to the imaging plane.
 
     Outside the pool's boundary is the work piece at z = 0, which scatters: a ray that meets it
     first is not lit.
+
+    Parameters
+    ----------
+    pool, rig
+        What reflects, and what is around it.
+    torch
+        What hides rays; None: all that passes above the rig's electrode (`YozTorch`).
     """
     source, incident = _rays(rig)
     point, hit = _first_hit(pool, source, incident)
@@ -110,16 +125,17 @@ def trace(pool: PoolSurface, rig: Rig) -> Reflections:
     reflected = incident - 2 * np.sum(incident * normal, axis=-1, keepdims=True) * normal
     plane = _on_imaging_plane(point, reflected, rig)
     limit = (rig.imaging_plane.width_mm, rig.imaging_plane.height_mm)
-    tip = rig.electrode.height_mm
-    y = point[..., 1]
+    torch = torch or YozTorch(rig.electrode.height_mm)
+    incident_blocked, reflected_blocked = torch.hides(point, incident, reflected)
     absent = np.zeros(hit.shape, bool)
     for i, j in rig.pattern.absent_rays:
         absent[i - 1, j - 1] = True
     return Reflections(
         absent=absent,
         hit=hit,
-        incident_blocked=(y < 0) & (_height_over_origin(point, -incident) > tip),
-        reflected_blocked=(y > 0) & (_height_over_origin(point, reflected) > tip),
+        incident_blocked=incident_blocked,
+        reflected_blocked=reflected_blocked,
+        hits_again=_hits_again(pool, point, reflected),
         on_plane=np.asarray(((plane >= 0) & (plane <= limit)).all(axis=-1)),
         point_mm=point,
         incident=incident,
@@ -242,6 +258,22 @@ def _first_hit(
     return np.where(hit[..., None], point, np.nan), np.asarray(hit)
 
 
+def _hits_again(pool: PoolSurface, point: FloatArray, direction: FloatArray) -> BoolArray:
+    """Whether rays that leave the pool at points along unit vectors meet it once more.
+
+    They are walked to where they are above its highest point or beyond its extent.
+    """
+    size = pool.size
+    rise, run = direction[..., 2], np.hypot(direction[..., 0], direction[..., 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        up = np.where(rise > 0, (size.height_mm - point[..., 2]) / rise, np.inf)
+        away = np.hypot(size.width_mm, size.length_mm) / run
+    # From the first step on: at its own point the ray is on the surface, to rounding.
+    t = np.minimum(up, away) * np.linspace(0, 1, SAMPLES + 1)[1:, None, None]
+    x, y, z = (point[..., n] + t * direction[..., n] for n in range(3))
+    return np.asarray((pool.height(x, y) - z > CLEAR_MM).any(axis=0))
+
+
 def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> FloatArray:
     """Where the reflected rays meet the plane, (X′, Z′), shape (…, 2), mm; NaN where never.
 
@@ -258,13 +290,6 @@ def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> Flo
     offset = point - np.asarray(plane.origin_mm)
     solution[meets] = np.linalg.solve(system[meets], offset[meets][..., None])[..., 0]
     return np.where(solution[..., 2:] > 0, solution[..., :2], np.nan)
-
-
-def _height_over_origin(point: FloatArray, direction: FloatArray) -> FloatArray:
-    """Z at which the rays cross y = 0 (the YOZ rule of §4.2.1.1), shape (…); NaN where never."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = -point[..., 1] / direction[..., 1]
-        return np.asarray(np.where(along > 0, point[..., 2] + along * direction[..., 2], np.nan))
 
 
 def _reflected_numbers(ray: IntArray, orientation: Orientation) -> IntArray:

@@ -6,10 +6,14 @@ gradients up to the boundary. The boundary lies at z = 0 unless a `LowRear` is p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
+from scipy import special
 
 from labapp.core.values import BoolArray, FloatArray
 
@@ -195,6 +199,80 @@ class Oscillation:
 
 
 @dataclass(frozen=True)
+class Wave:
+    """A mode of a round membrane, laid on the footprint: zero at the boundary; stands or turns.
+
+    ``amplitude · J_m(j_mn·ρ) · cos(m(φ − φ₀)) · cos(ωt)`` stands, ``… cos(m(φ − φ₀) − ωt)`` travels
+    round; ρ and φ are polar in (p, q), j_mn is the n-th zero of the Bessel function J_m.
+
+    Parameters
+    ----------
+    mode
+        (m, n): nodal diameters, nodal circles with the boundary's counted; (0, 1), (1, 1), (2, 1)
+        and (0, 2) are what weld pools show.
+    amplitude_mm
+        Largest height that it adds.
+    frequency_hz, time_s
+        ω/2π, and the moment that is looked at.
+    travelling
+        Whether it turns, counter-clockwise seen from above, rather than stands.
+    turned_deg
+        φ₀, from +X counter-clockwise.
+    phase_deg
+        Added to ωt.
+
+    Raises
+    ------
+    ValueError
+        If there is no such mode, or it has no direction to travel in.
+    """
+
+    mode: tuple[int, int]
+    amplitude_mm: float
+    frequency_hz: float = 0.0
+    time_s: float = 0.0
+    travelling: bool = False
+    turned_deg: float = 0.0
+    phase_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.mode[0] < 0 or self.mode[1] < 1:
+            raise ValueError("a mode (m, n) has m from 0 and n from 1")
+        if self.travelling and self.mode[0] == 0:
+            raise ValueError("a mode (0, n) is round: it can stand, but not travel")
+
+    @cached_property
+    def _wave_number(self) -> float:
+        return float(special.jn_zeros(self.mode[0], self.mode[1])[-1])
+
+    @cached_property
+    def _weight(self) -> complex:
+        """What the mode as a complex field is multiplied by, mm; its real part is the height."""
+        m = self.mode[0]
+        largest = special.jv(m, special.jnp_zeros(m, 1)[0]) if m else 1.0
+        swing = 2 * np.pi * self.frequency_hz * self.time_s + np.radians(self.phase_deg)
+        run = np.exp(-1j * swing) if self.travelling else np.cos(swing)
+        turn = np.exp(-1j * m * np.radians(self.turned_deg))
+        return complex(self.amplitude_mm / largest * turn * run)
+
+    def _field(self, place: Place, m: int) -> npt.NDArray[np.complex128]:
+        """J_m(k·ρ)·exp(imφ), also beside the mode's own m."""
+        angle = np.arctan2(place.q, place.p)
+        radius = self._wave_number * np.sqrt(place.rho2)
+        return np.asarray(special.jv(m, radius) * np.exp(1j * m * angle))
+
+    def height(self, place: Place) -> FloatArray:
+        """Height that it adds, mm."""
+        return (self._weight * self._field(place, self.mode[0])).real
+
+    def gradient(self, place: Place) -> FloatArray:
+        """Gradient that it adds, shape (…, 2)."""
+        below, beyond = (self._field(place, self.mode[0] + step) for step in (-1, 1))
+        half = self._weight * self._wave_number / 2
+        return place.gradient((half * (below - beyond)).real, (1j * half * (below + beyond)).real)
+
+
+@dataclass(frozen=True)
 class Pool:
     """A cap of an egg-shaped (or elliptic, or round) footprint, with disturbances on it.
 
@@ -267,13 +345,25 @@ class Pool:
             gradient = gradient + term.gradient(place)
         return np.where((place.rho2 <= 1)[..., None], gradient, np.nan)
 
-    @property
+    @cached_property
     def size(self) -> PoolSize:
         """True size; the peak is found by ever finer grids, to about 1e-6 mm."""
         foot = self.footprint
-        high, peak = self._largest(1.0)
-        low, bottom = self._largest(-1.0)
-        return PoolSize(foot.width_mm, foot.head_mm + foot.tail_mm, high, -low, peak, bottom)
+        middle = np.array([0.0, (foot.head_mm - foot.tail_mm) / 2]) + foot.center_mm
+        extent = np.array([foot.width_mm, foot.head_mm + foot.tail_mm])
+        return size_of(self.height, self.boundary_mm(), middle, extent)
+
+    def after(self, seconds: float) -> Pool:
+        """The same pool ``seconds`` later; itself when nothing on it swings."""
+        if not any(isinstance(term, Oscillation | Wave) for term in self.terms):
+            return self
+        terms = tuple(
+            replace(term, time_s=term.time_s + seconds)
+            if isinstance(term, Oscillation | Wave)
+            else term
+            for term in self.terms
+        )
+        return replace(self, terms=terms)
 
     def boundary_mm(self, count: int = 720) -> FloatArray:
         """Points of the boundary at even steps of angle in (p, q), shape (count, 3), mm."""
@@ -287,22 +377,48 @@ class Pool:
         y = foot.center_mm[1] + q / (slope - skew * q)
         return np.stack([x, y, self.height(x, y)], axis=-1)
 
-    def _largest(self, sign: float) -> tuple[float, tuple[float, float]]:
-        """Largest of sign × z, the boundary included, and where."""
-        foot = self.footprint
-        rim = self.boundary_mm()
-        best = int(np.argmax(sign * rim[:, 2]))
-        value, at = float(sign * rim[best, 2]), (float(rim[best, 0]), float(rim[best, 1]))
-        middle = np.array([0.0, (foot.head_mm - foot.tail_mm) / 2]) + foot.center_mm
-        reach = np.array([foot.width_mm, foot.head_mm + foot.tail_mm]) / 2
-        for _ in range(6):
-            x, y = np.meshgrid(*(middle[:, None] + reach[:, None] * np.linspace(-1, 1, 61)))
-            z = np.nan_to_num(sign * self.height(x, y), nan=-np.inf)
-            index = np.unravel_index(np.argmax(z), z.shape)
-            middle, reach = np.array([x[index], y[index]]), reach / 12
-            if z[index] > value + 1e-12:
-                value, at = float(z[index]), (float(x[index]), float(y[index]))
-        return value, at
+
+def size_of(
+    height: Callable[[FloatArray, FloatArray], FloatArray],
+    rim_mm: FloatArray,
+    middle_mm: FloatArray,
+    extent_mm: FloatArray,
+) -> PoolSize:
+    """Find the size of a pool.
+
+    Parameters
+    ----------
+    height
+        Gives z at (x, y), mm; NaN outside the boundary.
+    rim_mm
+        Points of the boundary, shape (n, 3), mm.
+    middle_mm, extent_mm
+        Of the boundary's box: (x, y) of its middle, its sides along X and along Y.
+    """
+    high, peak = _largest(height, rim_mm, middle_mm, extent_mm / 2, 1.0)
+    low, bottom = _largest(height, rim_mm, middle_mm, extent_mm / 2, -1.0)
+    width, length = map(float, extent_mm)
+    return PoolSize(width, length, high, -low, peak, bottom)
+
+
+def _largest(
+    height: Callable[[FloatArray, FloatArray], FloatArray],
+    rim: FloatArray,
+    middle: FloatArray,
+    reach: FloatArray,
+    sign: float,
+) -> tuple[float, tuple[float, float]]:
+    """Largest of sign × z, the boundary included, and where."""
+    best = int(np.argmax(sign * rim[:, 2]))
+    value, at = float(sign * rim[best, 2]), (float(rim[best, 0]), float(rim[best, 1]))
+    for _ in range(6):
+        x, y = np.meshgrid(*(middle[:, None] + reach[:, None] * np.linspace(-1, 1, 61)))
+        z = np.nan_to_num(sign * height(x, y), nan=-np.inf)
+        index = np.unravel_index(np.argmax(z), z.shape)
+        middle, reach = np.array([x[index], y[index]]), reach / 12
+        if z[index] > value + 1e-12:
+            value, at = float(z[index]), (float(x[index]), float(y[index]))
+    return value, at
 
 
 def spherical_cap(

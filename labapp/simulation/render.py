@@ -1,11 +1,13 @@
 """Render what the camera sees: reflected dots on the imaging plane, arc glow and noise (§3.2).
 
-Grey, 8 bit, portrait like the dissertation's pictures, of low contrast. The pictures are made to
-be measured, not to be admired: every dot's true centre is known to rounding.
+Grey and of low contrast, like the dissertation's pictures. They are made to be measured, not to be
+admired: every dot's true centre is known to rounding. Light is in grey levels of an 8-bit camera,
+whatever depth the picture is written in.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,77 +15,11 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
 from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import Reflections
 
 GreyImage = npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class CameraView:
-    """Where the camera sees the imaging plane: O′ and one point on each axis, and the picture.
-
-    The points are those of the set-up file's ``image_calibration``, so that it can be filled in
-    from here. The camera stands far off and square to the plane: the map is affine.
-
-    Parameters
-    ----------
-    origin_px, x_axis_px, z_axis_px
-        (u, v) of O′, of a point on O′X′ and of a point on O′Z′, px.
-    x_axis_mm, z_axis_mm
-        X′ of the former, Z′ of the latter, mm.
-    width_px, height_px
-        Size of the picture.
-    """
-
-    origin_px: tuple[float, float]
-    x_axis_px: tuple[float, float]
-    x_axis_mm: float
-    z_axis_px: tuple[float, float]
-    z_axis_mm: float
-    width_px: int = 480
-    height_px: int = 640
-
-    @classmethod
-    def rolled(
-        cls,
-        origin_px: tuple[float, float] = (44.0, 590.0),
-        px_per_mm: float = 5.67,
-        roll_deg: float = 0.0,
-        x_axis_mm: float = 69.85,
-        z_axis_mm: float = 31.75,
-    ) -> CameraView:
-        """Build the view of a camera that is turned about its axis, counter-clockwise."""
-        roll = np.radians(roll_deg)
-        x_step = px_per_mm * x_axis_mm * np.array([np.cos(roll), -np.sin(roll)])
-        z_step = px_per_mm * z_axis_mm * np.array([-np.sin(roll), -np.cos(roll)])
-        u, v = origin_px
-        return cls(
-            origin_px=origin_px,
-            x_axis_px=(u + float(x_step[0]), v + float(x_step[1])),
-            x_axis_mm=x_axis_mm,
-            z_axis_px=(u + float(z_step[0]), v + float(z_step[1])),
-            z_axis_mm=z_axis_mm,
-        )
-
-    @property
-    def px_per_mm(self) -> FloatArray:
-        """∂(u, v)/∂(X′, Z′), shape (2, 2), px/mm."""
-        origin = np.array(self.origin_px)
-        return np.stack(
-            [
-                (np.array(self.x_axis_px) - origin) / self.x_axis_mm,
-                (np.array(self.z_axis_px) - origin) / self.z_axis_mm,
-            ],
-            axis=-1,
-        )
-
-    def to_image(self, plane_mm: FloatArray) -> FloatArray:
-        """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
-        return np.asarray(plane_mm @ self.px_per_mm.T + np.array(self.origin_px))
-
-    def to_plane(self, image_px: FloatArray) -> FloatArray:
-        """(u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
-        return np.asarray((image_px - np.array(self.origin_px)) @ np.linalg.inv(self.px_per_mm).T)
+Picture = npt.NDArray[np.uint8 | np.uint16]
 
 
 @dataclass(frozen=True)
@@ -114,6 +50,10 @@ class Look:
         How many there are.
     missing
         Probability that a dot which should show does not.
+    full_scale
+        Light at which a pixel is full: what is brighter is cut off there.
+    bits
+        Depth of the picture: 255 becomes the largest number that it holds.
     """
 
     dot_peak: float = 55.0
@@ -130,6 +70,8 @@ class Look:
     hot_pixels: int = 0
     false_dots: int = 0
     missing: float = 0.0
+    full_scale: float = 255.0
+    bits: int = 8
 
 
 @dataclass(frozen=True)
@@ -139,15 +81,16 @@ class Frame:
     Parameters
     ----------
     image
-        Grey levels, shape (height, width).
+        Shape (height, width), 8 bit, or 16 where the look has more bits than 8.
     dot_px
-        (u, v) of each ray's dot, in the picture or not, shape (rows, columns, 2), px; NaN where
-        the ray makes none.
+        (u, v) of each ray's dot, in the picture or not, shape (rows, columns, 2), px: the middle
+        of its light where it moves while it is exposed; NaN where the ray makes none.
     shown
-        Rays whose dot was drawn with its centre in the picture, shape (rows, columns).
+        Rays whose dot was drawn with its centre in the picture for at least half of the exposure,
+        shape (rows, columns).
     """
 
-    image: GreyImage
+    image: Picture
     dot_px: FloatArray
     shown: BoolArray
 
@@ -163,7 +106,7 @@ def ray_brightness(
 
 
 def render(
-    reflections: Reflections,
+    reflections: Reflections | Sequence[Reflections],
     view: CameraView,
     look: Look,
     rng: np.random.Generator,
@@ -174,7 +117,7 @@ def render(
     Parameters
     ----------
     reflections
-        What the forward model gave.
+        What the forward model gave; of a pool that moves, at moments evenly over the exposure.
     view, look
         Where the camera sees the plane, and what the frame looks like.
     rng
@@ -183,14 +126,16 @@ def render(
         Brightness of every ray, shape (rows, columns), from `ray_brightness`; None draws it
         anew. A video passes the same to every frame.
     """
-    dot_px = view.to_image(reflections.plane_mm)
-    inside = ((dot_px >= -0.5) & (dot_px < (view.width_px - 0.5, view.height_px - 0.5))).all(-1)
-    shown = reflections.visible & inside & (rng.random(inside.shape) >= look.missing)
+    moments = [reflections] if isinstance(reflections, Reflections) else list(reflections)
+    places = np.stack([view.to_image(moment.plane_mm) for moment in moments])
+    inside = ((places >= -0.5) & (places < (view.width_px - 0.5, view.height_px - 0.5))).all(-1)
+    drawn = np.stack([moment.visible for moment in moments]) & inside
+    drawn &= rng.random(inside.shape[1:]) >= look.missing
     if brightness is None:
-        brightness = ray_brightness(inside.shape, look.unevenness, rng)
-    centers = [dot_px[shown]]
-    spreads = [_dot_covariance_px(reflections, view, look)[shown]]
-    peaks = [look.dot_peak * brightness[shown]]
+        brightness = ray_brightness(inside.shape[1:], look.unevenness, rng)
+    spread = np.stack([_dot_covariance_px(moment, view, look) for moment in moments])
+    centers, spreads = [places[drawn]], [spread[drawn]]
+    peaks = [np.broadcast_to(look.dot_peak * brightness / len(moments), drawn.shape)[drawn]]
     if look.false_dots:
         size = np.array([view.width_px, view.height_px])
         round_px = (look.dot_floor_mm * np.sqrt(abs(np.linalg.det(view.px_per_mm)))) ** 2
@@ -200,7 +145,16 @@ def render(
     shape = (view.height_px, view.width_px)
     dots = _draw(shape, *(np.concatenate(part) for part in (centers, spreads, peaks)))
     light = gaussian_filter(dots * _speckle(shape, look.speckle, rng), look.blur_px)
-    return Frame(_expose(light + _glow(shape, look), look, rng), dot_px, shown)
+    image = _expose(light + _glow(shape, look), look, rng)
+    return Frame(image, _middle(places, drawn), np.asarray(drawn.mean(axis=0) >= 1 / 2))
+
+
+def _middle(places: FloatArray, drawn: BoolArray) -> FloatArray:
+    """Mean of each dot's places, (moments, …, 2): of those drawn, or of all if none is."""
+    counted = np.where(drawn.any(axis=0), drawn, np.isfinite(places[..., 0]))
+    total = np.where(counted[..., None], places, 0.0).sum(axis=0)
+    count = counted.sum(axis=0)[..., None]
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
 def _dot_covariance_px(reflections: Reflections, view: CameraView, look: Look) -> FloatArray:
@@ -260,10 +214,12 @@ def _glow(shape: tuple[int, int], look: Look) -> FloatArray:
     return np.asarray(look.background + look.glow * np.exp(-(across**2 + upward**2) / 2))
 
 
-def _expose(light: FloatArray, look: Look, rng: np.random.Generator) -> GreyImage:
-    """Add photon and read noise and hot pixels, and round to grey levels."""
+def _expose(light: FloatArray, look: Look, rng: np.random.Generator) -> Picture:
+    """Add photon and read noise and hot pixels, cut off what is too bright, and round."""
     variance = look.read_noise**2 + look.photon_noise * np.maximum(light, 0)
     seen = light + np.sqrt(variance) * rng.normal(size=light.shape)
     hot = rng.integers(0, light.size, look.hot_pixels)
     seen.flat[hot] += rng.uniform(40, 200, look.hot_pixels)
-    return np.clip(np.rint(seen), 0, 255).astype(np.uint8)
+    white = 2**look.bits - 1
+    levels = np.rint(np.clip(seen, 0, min(look.full_scale, 255)) * (white / 255))
+    return np.asarray(levels, np.uint8 if look.bits == 8 else np.uint16)

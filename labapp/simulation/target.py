@@ -13,7 +13,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from labapp.core.values import BoolArray, FloatArray
-from labapp.simulation.render import CameraView, GreyImage
+from labapp.simulation.camera import CameraView
+from labapp.simulation.render import GreyImage
 
 
 @dataclass(frozen=True)

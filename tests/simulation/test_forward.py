@@ -203,6 +203,31 @@ def test_rays_obey_the_law_of_reflection_on_a_disturbed_pool():
     )
 
 
+def walked_again(pool, seen, steps=20000):
+    """Rays whose reflection comes under the pool, each followed by itself in tiny steps."""
+    again = np.zeros(seen.hit.shape, bool)
+    for ray in np.argwhere(seen.hit):
+        t = np.linspace(0, 12, steps)[1:, None]
+        way = seen.point_mm[tuple(ray)] + t * seen.reflected[tuple(ray)]
+        again[tuple(ray)] = (pool.height(way[:, 0], way[:, 1]) > way[:, 2] + 1e-6).any()
+    return again
+
+
+def test_second_reflections_in_a_deep_hollow_are_told_and_make_no_dot():
+    wide = DotPattern(inter_beam_angle_deg=1.0)
+    for depth, some in ((-0.3, False), (-2.6, True)):
+        pool = spherical_cap(6.0, depth)
+        seen = trace(pool, rig_with(angle=50.0, pattern=wide))
+        np.testing.assert_array_equal(seen.hits_again, walked_again(pool, seen))
+        assert seen.hits_again.any() == some
+        assert not (seen.visible & seen.hits_again).any()
+
+
+def test_rays_leave_a_convex_pool_and_a_mirror_for_good():
+    for pool in (mirror(), spherical_cap(8.0, 0.9), egg(7, 3, 4.4, 0.3)):
+        assert not trace(pool, rig_with()).hits_again.any()
+
+
 def test_the_first_of_several_meetings_counts():
     """A steep hill in front hides what lies behind it."""
     hill = Pool(Foot(8, 4, 4, (0, 0)), 2.5)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import jn_zeros, jv
 
 from labapp.simulation.pools import (
     Dent,
@@ -11,18 +12,32 @@ from labapp.simulation.pools import (
     LowRear,
     Oscillation,
     Pool,
+    Wave,
     caps_8_3_1,
     egg,
     ellipsoidal_cap,
     spherical_cap,
 )
 
+MODES = ((0, 1), (1, 1), (2, 1), (0, 2))
+
 lengths = st.floats(2.0, 6.0)
+waves = st.builds(
+    lambda mode, amplitude, time, travelling, turned: Wave(
+        mode, amplitude, 30.0, time, travelling and mode[0] > 0, turned, 20.0
+    ),
+    st.sampled_from(MODES),
+    st.floats(0, 0.1),
+    st.floats(0, 1),
+    st.booleans(),
+    st.floats(0, 90),
+)
 terms = st.lists(
     st.one_of(
         st.builds(Dent, st.floats(0, 0.2), st.floats(0.5, 2), st.just((0.3, 0.4))),
         st.builds(LowRear, st.floats(0, 0.2)),
         st.builds(Oscillation, st.floats(0, 0.1), st.just(30.0), st.floats(0, 1)),
+        waves,
     ),
     max_size=3,
 ).map(tuple)
@@ -148,6 +163,79 @@ def test_oscillation_comes_back_after_a_period():
     np.testing.assert_allclose(whole.height(x, y), start.height(x, y), atol=1e-12)
     np.testing.assert_allclose(half.height(x, y) - still, still - start.height(x, y), atol=1e-12)
     assert np.abs(start.height(x, y) - still).max() > 0.005
+
+
+def flat(*waves, width=7.0):
+    """A round pool that is flat but for its waves: what they add alone."""
+    return Pool(Footprint(width, width / 2, width / 2, (0.2, -0.3)), 0.0, waves, fullness=0.5)
+
+
+def polar(radius, angle, width=7.0):
+    return 0.2 + radius * width / 2 * np.cos(angle), -0.3 + radius * width / 2 * np.sin(angle)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_waves_are_the_modes_of_a_membrane(mode):
+    m, n = mode
+    radius, angle = np.random.default_rng(3).uniform([[0], [-3]], [[0.999], [3]], (2, 100))
+    own = jv(m, jn_zeros(m, n)[-1] * radius) * np.cos(m * (angle - np.radians(25)))
+    seen = flat(Wave(mode, 0.02, turned_deg=25.0)).height(*polar(radius, angle))
+    ratio = seen[np.abs(own) > 1e-3] / own[np.abs(own) > 1e-3]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-9)
+    size = flat(Wave(mode, 0.02)).size
+    assert max(size.height_mm, -size.depth_mm) == pytest.approx(0.02, rel=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_waves_obey_the_wave_equation(mode):
+    """∇²z = (1/c²)·∂²z/∂t², with one c over the whole pool, which the mode's zero gives."""
+    step, hertz = 1e-3, 30.0
+    wave = Wave(mode, 0.02, hertz, travelling=mode[0] > 0, phase_deg=40.0)
+    x, y = polar(*np.random.default_rng(4).uniform([[0], [-3]], [[0.95], [3]], (2, 60)))
+
+    def height(dx=0.0, dy=0.0, seconds=0.0):
+        return flat(wave).after(seconds).height(x + dx, y + dy)
+
+    still = height()
+    laplacian = (height(step) + height(-step) + height(0, step) + height(0, -step) - 4 * still) / (
+        step**2
+    )
+    later = 1e-5
+    faster = (height(seconds=later) + height(seconds=-later) - 2 * still) / later**2
+    speed = 2 * np.pi * hertz * 3.5 / jn_zeros(*mode)[-1]
+    np.testing.assert_allclose(laplacian, faster / speed**2, atol=2e-6)
+
+
+def test_a_travelling_wave_turns_and_a_standing_one_does_not():
+    angle = np.linspace(-3, 3, 50)
+    quarter = 1 / 4 / 30.0
+    for mode in ((1, 1), (2, 1)):
+        turning = flat(Wave(mode, 0.02, 30.0, travelling=True))
+        turned = polar(0.5, angle + np.pi / 2 / mode[0])
+        np.testing.assert_allclose(
+            turning.after(quarter).height(*turned),
+            turning.height(*polar(0.5, angle)),
+            atol=1e-12,
+        )
+        standing = flat(Wave(mode, 0.02, 30.0))
+        assert np.abs(standing.after(quarter).height(*turned)).max() < 1e-15
+        assert np.abs(standing.height(*turned)).max() > 0.01
+
+
+def test_what_stands_still_is_the_same_pool_later():
+    still = egg(7, 3, 4, 0.3, terms=(Dent(0.1, 0.7), LowRear(0.1)))
+    assert still.after(0.1) is still
+    moved = egg(7, 3, 4, 0.3, terms=(Dent(0.1, 0.7), Oscillation(0.03, 40.0))).after(0.005)
+    assert moved.terms == (Dent(0.1, 0.7), Oscillation(0.03, 40.0, 0.005))
+
+
+@pytest.mark.parametrize(
+    ("mode", "travelling", "words"),
+    [((-1, 1), False, "from 0"), ((1, 0), False, "from 1"), ((0, 2), True, "round")],
+)
+def test_waves_that_cannot_be_are_refused(mode, travelling, words):
+    with pytest.raises(ValueError, match=words):
+        Wave(mode, 0.1, travelling=travelling)
 
 
 def test_caps_of_8_3_1_are_28_of_the_sizes_the_text_names():

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.simulation.camera import CameraView, Lens
 from labapp.simulation.forward import trace
-from labapp.simulation.pools import egg
-from labapp.simulation.render import CameraView, Look, render
+from labapp.simulation.pools import Wave, egg
+from labapp.simulation.render import Look, render
 
 RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0))
 VIEW = CameraView.rolled(roll_deg=1.2)
@@ -147,3 +151,90 @@ def test_the_same_seed_gives_the_same_frame():
     assert (first.image != other.image).mean() > 0.5
     assert first.image.dtype == np.uint8
     assert first.image.shape == (640, 480)
+
+
+# --- the lens -----------------------------------------------------------------------------------
+
+BARREL = Lens(900.0, k1=-0.21, k2=0.06, p1=0.002, p2=-0.003, k3=-0.01)
+
+
+def test_lens_bends_as_opencv_has_it():
+    straight = np.random.default_rng(1).uniform(-400, 400, (50, 2))
+    points = np.column_stack([straight / BARREL.focal_px, np.ones(50)])
+    camera = np.diag([BARREL.focal_px, BARREL.focal_px, 1.0])
+    bend = np.array([BARREL.k1, BARREL.k2, BARREL.p1, BARREL.p2, BARREL.k3])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera, bend)
+    np.testing.assert_allclose(BARREL.distort(straight), expected.reshape(-1, 2), atol=1e-9)
+
+
+def test_distortion_goes_there_and_back():
+    view = replace(VIEW, lens=BARREL)
+    place = np.random.default_rng(2).uniform(0, 90, (100, 2))
+    seen = view.to_image(place)
+    np.testing.assert_allclose(view.to_plane(seen), place, atol=1e-8)
+    assert np.abs(seen - VIEW.to_image(place)).max() > 5
+
+
+def test_a_lens_that_folds_the_picture_is_refused():
+    with pytest.raises(ValueError, match="folds"):
+        replace(VIEW, lens=Lens(400.0, k1=-1.5))
+
+
+def test_what_lies_far_outside_is_not_folded_into_the_picture():
+    lens = Lens(600.0, k1=-0.3)
+    view = replace(VIEW, lens=lens)
+    far = np.array([[2000.0, 40.0], [40.0, -3000.0]])
+    assert np.isnan(view.to_image(far)).all()
+    # Bent coefficients alone would bring them back among the dots.
+    assert lens.distort(np.array([[100.0, 0.0]]))[0, 0] < 100
+
+
+def test_dots_are_drawn_where_the_lens_puts_them():
+    frame, image = dots_alone(STILL, view=replace(VIEW, lens=BARREL))
+    plain, _ = dots_alone(STILL)
+    assert np.nanmax(np.abs(frame.dot_px - plain.dot_px)[frame.shown]) > 2
+    for dot in lonely(frame):
+        window, du, dv = around(image, dot)
+        assert abs((window * du).sum() / window.sum()) < 0.05
+        assert abs((window * dv).sum() / window.sum()) < 0.05
+
+
+# --- the sensor ---------------------------------------------------------------------------------
+
+
+def test_light_beyond_the_full_scale_is_cut_off():
+    bright = replace(STILL, dot_peak=200.0)
+    _, whole = dots_alone(bright)
+    _, cut = dots_alone(replace(bright, full_scale=90.0))
+    assert whole.max() > 100
+    np.testing.assert_array_equal(cut, np.minimum(whole, 70.0))
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_more_bits_tell_the_same_light_more_finely(bits):
+    fine = render(SEEN, VIEW, replace(STILL, bits=bits), np.random.default_rng(0)).image
+    coarse = render(SEEN, VIEW, STILL, np.random.default_rng(0)).image
+    assert fine.dtype == (np.uint8 if bits == 8 else np.uint16)
+    step = 255 / (2**bits - 1)
+    np.testing.assert_allclose(fine * step, coarse, rtol=0, atol=0.5 + step / 2)
+    assert (len(np.unique(fine)) > 4 * len(np.unique(coarse))) == (bits > 8)
+
+
+# --- a pool that moves --------------------------------------------------------------------------
+
+
+def test_dots_of_a_moving_pool_are_smeared_over_their_places():
+    pool = egg(6.6, 3.0, 4.4, 0.3, (0.0, -0.6), (Wave((1, 1), 0.02, 30.0, 1 / 120.0),))
+    moments = [trace(pool.after(t), RIG) for t in np.linspace(-0.004, 0.004, 9)]
+    look = replace(STILL, dot_peak=200.0)
+    frame, still = (render(seen, VIEW, look, np.random.default_rng(0)) for seen in (moments, SEEN))
+    light, still_light = (
+        one.image.astype(float).sum() - 20.0 * one.image.size for one in (frame, still)
+    )
+    assert light == pytest.approx(still_light, rel=0.05)
+    assert frame.image.max() < still.image.max()
+    first, last = (VIEW.to_image(seen.plane_mm) for seen in (moments[0], moments[-1]))
+    moved = np.linalg.norm(last - first, axis=-1)[frame.shown]
+    assert np.median(moved) > 4
+    in_between = np.linalg.norm(frame.dot_px - (first + last) / 2, axis=-1)[frame.shown]
+    assert np.nanmax(in_between) < 0.2 * moved.max()

@@ -13,10 +13,10 @@ from labapp.core.correction import block_row, set_reference
 from labapp.core.pipeline import Settings, measure, start_correction
 from labapp.media import open_source
 from labapp.session.setup import read_setup
+from labapp.simulation.recording import TARGET
 from labapp.simulation.samples.__main__ import main
-from labapp.simulation.samples.recording import TARGET
 from labapp.simulation.samples.runs import blocked_rows, concave, gtaw, samples, thumb_tack
-from labapp.simulation.samples.torch import Torch
+from labapp.simulation.torch import ConeTorch
 
 FOLDER = Path(__file__).parents[2] / "sample_sessions"
 
@@ -214,15 +214,17 @@ def test_thumb_tack_is_measured():
 
 
 def test_torch_hides_what_it_stands_in_the_way_of():
-    torch = Torch((1.0, 2.0, 3.0), tip_radius_mm=0.3, radius_mm=1.0, half_angle_deg=45.0)
+    torch = ConeTorch((1.0, 2.0, 3.0), tip_radius_mm=0.3, radius_mm=1.0, half_angle_deg=45.0)
     below = np.array([[1.0, 2.0, 0.0], [1.29, 2.0, 0.0], [1.9, 2.0, 0.0], [2.1, 2.0, 0.0]])
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
-    assert torch.hides(below, up).tolist() == [True, True, True, False]
-    assert not torch.hides(below, -up).any()
+    incident, reflected = torch.hides(below, up, up)
+    assert reflected.tolist() == [True, True, True, False]
+    assert not incident.any()
+    assert torch.hides(below, -up, up)[0].tolist() == [True, True, True, False]
     # Level rays, past the flat end and under it.
     beside = np.array([[-4.0, 2.0, 3.1], [-4.0, 2.0, 2.9], [-4.0, 2.45, 3.1], [-4.0, 2.45, 3.3]])
     along = np.tile([1.0, 0.0, 0.0], (4, 1))
-    assert torch.hides(beside, along).tolist() == [True, False, False, True]
+    assert torch.hides(beside, along, along)[1].tolist() == [True, False, False, True]
 
 
 def test_lowered_torch_hides_the_references_neighbourhood():

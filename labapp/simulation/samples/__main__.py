@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from labapp.simulation.samples.recording import TARGET
+from labapp.simulation.recording import TARGET
 from labapp.simulation.samples.runs import samples
 from labapp.simulation.target import target_svg
 

@@ -9,10 +9,12 @@ from scipy.ndimage import gaussian_filter1d
 
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import FloatArray
+from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Footprint, Oscillation, Pool, egg, spherical_cap
-from labapp.simulation.render import CameraView, Look
-from labapp.simulation.samples.recording import TARGET, Sample
-from labapp.simulation.samples.torch import Torch
+from labapp.simulation.recording import TARGET
+from labapp.simulation.render import Look
+from labapp.simulation.samples.recording import Sample
+from labapp.simulation.torch import ConeTorch
 
 WIDTH_MM, WIDTH_SIGMA_MM = 6.66, 0.15
 LENGTH_MM, LENGTH_SIGMA_MM = 7.45, 0.46
@@ -135,7 +137,7 @@ def blocked_rows() -> Sample:
         pools=_swinging(seed, count, Footprint(6.7, 3.0, 4.4, (0.05, -0.6)), 0.225),
         seed=seed,
         frame_rate_hz=1.0,
-        torches=tuple(Torch((*BENT_MM, height)) for height in TIP_MM),
+        torches=tuple(ConeTorch((*BENT_MM, height)) for height in TIP_MM),
     )
 
 

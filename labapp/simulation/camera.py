@@ -1,0 +1,172 @@
+"""The camera: where it sees the imaging plane, and how its lens bends what it sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.values import FloatArray
+
+ROUNDS = 200
+"""Of the fixed point that takes a distortion back; it ends before, once nothing moves."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Brown and Conrady's distortion, radial and tangential, with OpenCV's signs and order.
+
+    With x, y from the middle of the picture over the focal length and r² = x² + y²:
+    ``x′ = x·(1 + k₁r² + k₂r⁴ + k₃r⁶) + 2p₁xy + p₂(r² + 2x²)``, and
+    ``y′ = y·(1 + k₁r² + k₂r⁴ + k₃r⁶) + p₁(r² + 2y²) + 2p₂xy``.
+
+    Parameters
+    ----------
+    focal_px
+        Focal length over the size of a pixel.
+    k1, k2, p1, p2, k3
+        Coefficients; k₁ < 0 makes a barrel.
+    """
+
+    focal_px: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def _radial(self, r2: FloatArray) -> FloatArray:
+        return np.asarray(1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3)))
+
+    def _tangential(self, x: FloatArray, y: FloatArray, r2: FloatArray) -> FloatArray:
+        return np.stack(
+            [
+                2 * self.p1 * x * y + self.p2 * (r2 + 2 * x**2),
+                self.p1 * (r2 + 2 * y**2) + 2 * self.p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+    @property
+    def _reach2(self) -> float:
+        """Largest r² up to which a dot farther out is seen farther out."""
+        turns = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
+        return min((float(t.real) for t in turns if t.real > 0 and t.imag == 0), default=np.inf)
+
+    def distort(self, straight_px: FloatArray) -> FloatArray:
+        """From a picture without distortion, from its middle, shape (…, 2), px.
+
+        NaN so far out that the coefficients would fold it back into the picture.
+        """
+        xy = straight_px / self.focal_px
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x**2 + y**2
+        seen = xy * self._radial(r2)[..., None] + self._tangential(x, y, r2)
+        return np.asarray(np.where((r2 < self._reach2)[..., None], seen * self.focal_px, np.nan))
+
+    def straighten(self, seen_px: FloatArray) -> FloatArray:
+        """Take the distortion back: inverse of `distort`."""
+        seen = seen_px / self.focal_px
+        xy = seen
+        with np.errstate(all="ignore"):
+            for _ in range(ROUNDS):
+                x, y = xy[..., 0], xy[..., 1]
+                r2 = x**2 + y**2
+                former = xy
+                xy = (seen - self._tangential(x, y, r2)) / self._radial(r2)[..., None]
+                if not np.nanmax(np.abs(xy - former), initial=0.0) > 1e-13:
+                    break
+        return np.asarray(xy * self.focal_px)
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """Where the camera sees the imaging plane: O′ and one point on each axis, and the picture.
+
+    The points are those of the set-up file's ``image_calibration``, so that it can be filled in
+    from here. The camera stands far off and square to the plane: the map is affine, but for what
+    its lens does.
+
+    Parameters
+    ----------
+    origin_px, x_axis_px, z_axis_px
+        (u, v) of O′, of a point on O′X′ and of a point on O′Z′, px.
+    x_axis_mm, z_axis_mm
+        X′ of the former, Z′ of the latter, mm.
+    width_px, height_px
+        Size of the picture.
+    lens
+        What bends the picture; the three points are those of the picture without it. None: nothing.
+
+    Raises
+    ------
+    ValueError
+        If the lens would fold the picture.
+    """
+
+    origin_px: tuple[float, float]
+    x_axis_px: tuple[float, float]
+    x_axis_mm: float
+    z_axis_px: tuple[float, float]
+    z_axis_mm: float
+    width_px: int = 480
+    height_px: int = 640
+    lens: Lens | None = None
+
+    def __post_init__(self) -> None:
+        if self.lens is None:
+            return
+        corners = np.array([[u, v] for u in (0, self.width_px) for v in (0, self.height_px)], float)
+        if not np.allclose(self.to_image(self.to_plane(corners)), corners, rtol=0, atol=1e-3):
+            raise ValueError("a distortion that folds the picture")
+
+    @classmethod
+    def rolled(
+        cls,
+        origin_px: tuple[float, float] = (44.0, 590.0),
+        px_per_mm: float = 5.67,
+        roll_deg: float = 0.0,
+        x_axis_mm: float = 69.85,
+        z_axis_mm: float = 31.75,
+    ) -> CameraView:
+        """Build the view of a camera that is turned about its axis, counter-clockwise."""
+        roll = np.radians(roll_deg)
+        x_step = px_per_mm * x_axis_mm * np.array([np.cos(roll), -np.sin(roll)])
+        z_step = px_per_mm * z_axis_mm * np.array([-np.sin(roll), -np.cos(roll)])
+        u, v = origin_px
+        return cls(
+            origin_px=origin_px,
+            x_axis_px=(u + float(x_step[0]), v + float(x_step[1])),
+            x_axis_mm=x_axis_mm,
+            z_axis_px=(u + float(z_step[0]), v + float(z_step[1])),
+            z_axis_mm=z_axis_mm,
+        )
+
+    @property
+    def px_per_mm(self) -> FloatArray:
+        """∂(u, v)/∂(X′, Z′), shape (2, 2), px/mm."""
+        origin = np.array(self.origin_px)
+        return np.stack(
+            [
+                (np.array(self.x_axis_px) - origin) / self.x_axis_mm,
+                (np.array(self.z_axis_px) - origin) / self.z_axis_mm,
+            ],
+            axis=-1,
+        )
+
+    @property
+    def _middle_px(self) -> FloatArray:
+        return np.array([self.width_px - 1, self.height_px - 1]) / 2
+
+    def to_image(self, plane_mm: FloatArray) -> FloatArray:
+        """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px; NaN if never seen."""
+        straight = np.asarray(plane_mm @ self.px_per_mm.T + np.array(self.origin_px))
+        if self.lens is None:
+            return straight
+        return self._middle_px + self.lens.distort(straight - self._middle_px)
+
+    def to_plane(self, image_px: FloatArray) -> FloatArray:
+        """(u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
+        if self.lens is not None:
+            image_px = self._middle_px + self.lens.straighten(image_px - self._middle_px)
+        return np.asarray((image_px - np.array(self.origin_px)) @ np.linalg.inv(self.px_per_mm).T)

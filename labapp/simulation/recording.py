@@ -1,0 +1,369 @@
+"""A simulated recording, its truth, and the folder that holds both."""
+
+from __future__ import annotations
+
+import csv
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import ClassVar, Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import tifffile
+
+from labapp.core.rig import Rig
+from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import PoolSurface, Reflections, trace
+from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
+from labapp.simulation.target import Target, TargetLook, render_target
+from labapp.simulation.torch import Torch
+
+TARGET = Target()
+
+MOMENTS = 15
+"""At so many moments over its exposure a pool that moves is drawn; odd: one is the middle."""
+
+AHEAD = 4
+"""So many frames are rendered ahead of the one being written."""
+
+TRUTH_COLUMNS = (
+    "frame", "time_s", "width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3",
+    "peak_x_mm", "peak_y_mm", "dots", "second_reflections",
+)  # fmt: skip
+DOT_COLUMNS = (
+    "frame", "ray_row", "ray_column", "u_px", "v_px", "visible", "x_mm", "y_mm", "z_mm",
+    "blocked", "hits_again",
+)  # fmt: skip
+
+
+class TruePool(PoolSurface, Protocol):
+    """What the truth needs to know of a pool besides."""
+
+    def inside(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+        """Whether (x, y) is within the boundary."""
+        ...
+
+    def boundary_mm(self) -> FloatArray:
+        """Points of the boundary, shape (n, 3), mm."""
+        ...
+
+    def after(self, seconds: float) -> TruePool:
+        """The same pool ``seconds`` later; itself when nothing moves."""
+        ...
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """A frame with what it was rendered from.
+
+    Parameters
+    ----------
+    pool, reflections
+        The truth, in the middle of the exposure.
+    image
+        Grey levels, shape (height, width), 8 bit; 16 bit where exposures were added up or the
+        look has more bits.
+    dot_px
+        (u, v) of each ray's dot, shape (rows, columns, 2), px; NaN where the ray makes none.
+    shown
+        Rays whose dot is in the picture, shape (rows, columns).
+    """
+
+    pool: TruePool
+    reflections: Reflections
+    image: Picture
+    dot_px: FloatArray
+    shown: BoolArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A recording to be simulated; everything random in it follows from its seed.
+
+    Parameters
+    ----------
+    file
+        Its name: a video (``.avi``, ``.mkv``), a TIFF stack (``.tif``), or a folder of PNG files
+        (no suffix).
+    rig, view, look
+        The bench, where the camera sees the imaging plane, and what the frames look like.
+    pools
+        The pool of each frame, in the middle of its exposure.
+    seed
+        Source of the noise.
+    frame_rate_hz
+        None where the recording has no time base.
+    exposure_s
+        How long a frame takes; dots of a pool that moves are smeared over it.
+    torches
+        The torch in each frame; empty: all that passes above the rig's electrode is hidden.
+    exposures
+        How many exposures a frame is the sum of.
+    first_number
+        Number in the first PNG file's name.
+    """
+
+    file: str
+    rig: Rig
+    view: CameraView
+    look: Look
+    pools: tuple[TruePool, ...]
+    seed: int
+    frame_rate_hz: float | None = None
+    exposure_s: float = 0.0
+    torches: tuple[Torch, ...] = ()
+    exposures: int = 1
+    first_number: int = 0
+
+    truth_columns: ClassVar[tuple[str, ...]] = TRUTH_COLUMNS
+    dot_columns: ClassVar[tuple[str, ...]] = DOT_COLUMNS
+
+    def frame(self, index: int) -> RecordedFrame:
+        """Render frame ``index``, counted from 0, by itself."""
+        torch = self.torches[index] if self.torches else None
+        pools = _over_exposure(self.pools[index], self.exposure_s)
+        moments = [trace(pool, self.rig, torch) for pool in pools]
+        middle = moments[len(moments) // 2]
+        brightness = ray_brightness(
+            middle.absent.shape, self.look.unevenness, np.random.default_rng([self.seed, 0])
+        )
+        rng = np.random.default_rng([self.seed, 1, index])
+        exposed = [
+            render(moments, self.view, self.look, rng, brightness) for _ in range(self.exposures)
+        ]
+        image = exposed[0].image
+        if self.exposures > 1:
+            image = np.sum([one.image for one in exposed], axis=0, dtype=np.uint16)
+        return RecordedFrame(self.pools[index], middle, image, exposed[0].dot_px, exposed[0].shown)
+
+    def calibration_picture(self) -> GreyImage:
+        """Render the calibration picture."""
+        rng = np.random.default_rng([self.seed, 2])
+        return render_target(TARGET, self.view, TargetLook(), rng)
+
+    def write_run(
+        self,
+        folder: Path,
+        setup: str,
+        workers: int = 1,
+        progress: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Write recording, calibration picture, setup file and truth into ``folder``.
+
+        Parameters
+        ----------
+        folder
+            Made if missing.
+        setup
+            Text of the setup file.
+        workers
+            How many processes render.
+        progress
+            Called after each frame.
+
+        Raises
+        ------
+        OSError
+            If the folder or a file in it cannot be written.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_png(folder / "calibration.png", self.calibration_picture())
+        (folder / "setup.toml").write_text(setup, encoding="utf-8")
+        with (
+            _Table(folder / "truth.csv", self.truth_columns) as truth,
+            _Table(folder / "dots_truth.csv", self.dot_columns) as dots,
+        ):
+
+            def images() -> Iterator[Picture]:
+                for told in self._told(workers):
+                    truth.write([told.truth])
+                    dots.write(told.dots)
+                    yield told.image
+                    progress()
+
+            self._write_recording(folder / self.file, images())
+
+    def _told(self, workers: int) -> Iterator[_Told]:
+        """Every frame in its order."""
+        numbers = iter(range(len(self.pools)))
+        if workers == 1:
+            yield from (_tell(self, number) for number in numbers)
+            return
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(workers, context, _become_worker, (self,)) as processes:
+            waiting: deque[Future[_Told]] = deque()
+            try:
+                waiting += (processes.submit(_work, n) for n in islice(numbers, workers + AHEAD))
+                while waiting:
+                    yield waiting.popleft().result()
+                    waiting += (processes.submit(_work, n) for n in islice(numbers, 1))
+            finally:
+                for future in waiting:
+                    future.cancel()
+
+    def _write_recording(self, path: Path, images: Iterator[Picture]) -> None:
+        if path.suffix == ".tif":
+            sixteen = self.exposures > 1 or self.look.bits != 8
+            tifffile.imwrite(
+                path,
+                images,
+                shape=(len(self.pools), self.view.height_px, self.view.width_px),
+                dtype=np.uint16 if sixteen else np.uint8,
+                photometric="minisblack",
+                compression="zlib",
+            )
+        elif path.suffix:
+            assert self.frame_rate_hz is not None
+            size = (self.view.width_px, self.view.height_px)
+            write_video(path, images, self.frame_rate_hz, size)
+        else:
+            path.mkdir(exist_ok=True)
+            for n, image in enumerate(images, self.first_number):
+                _write_png(path / f"frame_{n}.png", image)
+
+
+def _over_exposure(pool: TruePool, exposure_s: float) -> list[TruePool]:
+    """The pool at moments evenly over an exposure that it is the middle of."""
+    if exposure_s == 0 or pool.after(exposure_s) is pool:
+        return [pool]
+    steps = (np.arange(MOMENTS) - (MOMENTS - 1) / 2) / MOMENTS
+    return [pool.after(exposure_s * float(step)) for step in steps]
+
+
+# --- frames in processes of their own -----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Told:
+    """A frame as it is written: its picture and its rows of the tables."""
+
+    image: Picture
+    truth: Mapping[str, str]
+    dots: list[Mapping[str, str]]
+
+
+def _tell(recording: Recording, number: int) -> _Told:
+    frame = recording.frame(number)
+    truth = _truth_row(number, recording.frame_rate_hz, frame)
+    return _Told(frame.image, truth, list(_dot_rows(number, frame)))
+
+
+_rendered: Recording
+"""In a process that renders: what it renders."""
+
+
+def _become_worker(recording: Recording) -> None:
+    global _rendered  # noqa: PLW0603 - set once, where the process begins
+    _rendered = recording
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+
+
+def _work(number: int) -> _Told:
+    return _tell(_rendered, number)
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def write_video(
+    path: Path,
+    images: Iterable[npt.NDArray[np.uint8 | np.uint16]],
+    frame_rate_hz: float,
+    size_px: tuple[int, int],
+) -> None:
+    """Write 8-bit grey frames of (width, height) ``size_px`` as FFV1, which loses nothing.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    codec = cv2.VideoWriter.fourcc(*"FFV1")
+    writer = cv2.VideoWriter(str(path), codec, frame_rate_hz, size_px, isColor=False)
+    if not writer.isOpened():
+        raise OSError(f"cannot write {path}")
+    for image in images:
+        writer.write(image)
+    writer.release()
+
+
+def _number(value: float) -> str:
+    return f"{value:.5f}".replace("-0.00000", "0.00000")
+
+
+def _area_and_volume(pool: TruePool) -> tuple[float, float]:
+    """Area inside the boundary and volume under the surface, by a grid of 0.02 mm."""
+    rim = pool.boundary_mm()
+    step = 0.02
+    x, y = np.meshgrid(*(np.arange(rim[:, n].min(), rim[:, n].max(), step) for n in range(2)))
+    x, y = x + step / 2, y + step / 2
+    return (
+        float(pool.inside(x, y).sum()) * step**2,
+        float(np.nansum(pool.height(x, y))) * step**2,
+    )
+
+
+def _truth_row(n: int, frame_rate_hz: float | None, frame: RecordedFrame) -> Mapping[str, str]:
+    size = frame.pool.size
+    area, volume = _area_and_volume(frame.pool)
+    values = (size.width_mm, size.length_mm, size.height_mm, size.depth_mm, area, volume)
+    # As `labapp reconstruct` has it: of a hollow, the lowest point.
+    peak = size.peak_mm if size.height_mm >= -size.depth_mm else size.bottom_mm
+    again = frame.reflections.lit & ~frame.reflections.blocked & frame.reflections.hits_again
+    row = [
+        str(n),
+        "" if frame_rate_hz is None else f"{n / frame_rate_hz:.5f}",
+        *(_number(value) for value in (*values, *peak)),
+        str(int(frame.shown.sum())),
+        str(int(again.sum())),
+    ]
+    return dict(zip(TRUTH_COLUMNS, row, strict=True))
+
+
+def _dot_rows(n: int, frame: RecordedFrame) -> Iterator[Mapping[str, str]]:
+    seen = frame.reflections
+    for i, j in np.argwhere(seen.lit):
+        u, v = frame.dot_px[i, j]
+        row = [
+            *map(str, (n, i + 1, j + 1)),
+            *("" if np.isnan(value) else f"{value:.3f}" for value in (u, v)),
+            str(int(frame.shown[i, j])),
+            *(f"{value:.5f}" for value in seen.point_mm[i, j]),
+            str(int(seen.blocked[i, j])),
+            str(int(seen.hits_again[i, j])),
+        ]
+        yield dict(zip(DOT_COLUMNS, row, strict=True))
+
+
+def _write_png(path: Path, image: npt.NDArray[np.uint8 | np.uint16]) -> None:
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"cannot write {path}")
+
+
+class _Table:
+    """A CSV file that is written row by row; cells of other columns than its own are left out."""
+
+    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
+        self._file = path.open("w", encoding="utf-8", newline="")
+        self._rows = csv.DictWriter(self._file, columns, extrasaction="ignore", lineterminator="\n")
+        self._rows.writeheader()
+
+    def __enter__(self) -> _Table:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, rows: Iterable[Mapping[str, str]]) -> None:
+        self._rows.writerows(rows)
