@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from labapp.gui.focus import go_to_part
 from labapp.gui.steps import STEPS
 
 if TYPE_CHECKING:
@@ -364,6 +365,23 @@ VIEW = (
         "Show or hide what the app has said since it was started",
         lambda window: window.toggle_dock("log"),
         checked=lambda window: window.dock_is_wanted("log"),
+    ),
+    Action(
+        "next_part",
+        "&View",
+        "&Next part of the window",
+        "F6",
+        "Give the keys to the next of steps, page, parameters and timeline",
+        lambda window: go_to_part(window, 1),
+        begins=True,
+    ),
+    Action(
+        "previous_part",
+        "&View",
+        "Part of the window &before",
+        "Shift+F6",
+        "Give the keys to the part of the window before this one",
+        lambda window: go_to_part(window, -1),
     ),
     Action(
         "theme_system",

@@ -57,7 +57,8 @@ def ask_read_only(parent: QWidget, path: Path) -> bool:
     )
     look = box.addButton("Open &read-only", QMessageBox.ButtonRole.AcceptRole)
     look.setToolTip("Look at the session without changing it")
-    box.addButton(QMessageBox.StandardButton.Cancel)
+    cancel = box.addButton(QMessageBox.StandardButton.Cancel)
+    cancel.setToolTip("Leave it closed (Esc)")
     box.setDefaultButton(look)
     box.exec()
     return box.clickedButton() is look

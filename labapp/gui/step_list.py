@@ -90,6 +90,7 @@ class StepList(QListWidget):
         super().__init__(parent)
         self._steps = tuple(steps)
         self.setAccessibleName("Steps")
+        self.setToolTip("The steps from the bench to the results: ↑ and ↓ choose one")
         self.setFrameShape(QFrame.Shape.NoFrame)
         self.setIconSize(QSize(ICON_PX, ICON_PX))
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
@@ -170,6 +171,8 @@ class SidePanel(QWidget):
             area = QScrollArea()
             area.setWidgetResizable(True)
             area.setFrameShape(QFrame.Shape.NoFrame)
+            area.setAccessibleName(f"{step.title}: parameters and results")
+            area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
             area.setWidget(panel)
             self._areas[panel] = area
             self.stack.addWidget(area)

@@ -197,9 +197,13 @@ class MainWindow(QMainWindow):
         if page is not self.page:
             self._leave()
             self.page = page
+            listed = self.step_list.hasFocus()
             self.stack.setCurrentWidget(page)
             step = next(step for step in STEPS if step.key == key)
+            page.setAccessibleName(step.title)
             self.side_panel.show_panel(page.panel, step)
+            if not listed:
+                page.setFocus()  # or they stay with what is hidden now
         self.step_list.show_step(key)
         self._show_page()
         self.menus.refresh()

@@ -6,9 +6,10 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QColor, QPalette
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QVBoxLayout
 
 from labapp.core.values import FloatArray
+from labapp.gui.views.canvas import Drawn
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
@@ -18,15 +19,14 @@ TORCH_MM, SHOULDER_MM = 14.0, 3.5
 """How far up the torch is drawn, and the radius of its electrode."""
 
 
-class BenchView(QWidget):
+class BenchView(Drawn):
     """Side view of the bench along −X: Y to the right, Z up, mm.
 
     The fates of the rays differ by line as well as by colour: solid, dashed, dotted.
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self.setAccessibleName("Side view of the bench")
+        super().__init__("Side view of the bench")
         self._view: SideView | None = None
         self.words = QLabel()
         self.words.setWordWrap(True)
@@ -49,7 +49,7 @@ class BenchView(QWidget):
         """Draw a bench, or none; the words stand below and are what a screen reader says."""
         former, self._view = self._view, view
         self.words.setText(words)
-        self.setAccessibleDescription(words)
+        self.describe(words)
         for plot in (self.whole, self.near):
             plot.setVisible(view is not None)
         center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft

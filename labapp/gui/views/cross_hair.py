@@ -6,17 +6,17 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QPalette
-from PySide6.QtWidgets import QLabel, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QLabel, QVBoxLayout
 
 from labapp.core.laser_calibration import LaserCalibration
+from labapp.gui.views.canvas import Drawn
 
 
-class CrossHairView(QWidget):
+class CrossHairView(Drawn):
     """Diode, beam, the fan's two edges, and l₁ and l₂ on the work piece; mm."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self.setAccessibleName("Drawing of the laser and its cross hair")
+        super().__init__("Drawing of the laser and its cross hair")
         self.plot = pg.PlotWidget()
         self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self.plot.setAspectLocked(True)
@@ -40,7 +40,7 @@ class CrossHairView(QWidget):
         """Draw a laser and the lengths that were read, or say in words why there is none."""
         self._shown = (found, l1_mm, l2_mm)
         self.words.setText(words)
-        self.setAccessibleDescription(words)
+        self.describe(words)
         self.plot.setVisible(found is not None)
         center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft
         self.words.setAlignment(center if found is None else left)

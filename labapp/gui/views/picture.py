@@ -21,10 +21,10 @@ from PySide6.QtWidgets import (
     QSlider,
     QToolButton,
     QVBoxLayout,
-    QWidget,
 )
 
 from labapp.core.values import BoolArray
+from labapp.gui.views.canvas import Drawn
 from labapp.media import GreyImage
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -86,7 +86,7 @@ class Tool:
         """The key was let go, or the picture lost the focus."""
 
 
-class PictureView(QWidget):
+class PictureView(Drawn):
     """A grey picture; overlays are pyqtgraph items that `add` puts over it, in px.
 
     Signals
@@ -105,15 +105,12 @@ class PictureView(QWidget):
     pointed = Signal(float, float, object)
 
     def __init__(self, name: str = "Picture") -> None:
-        super().__init__()
+        super().__init__(name, KEYS)
         self.tool = Tool()
         self.points: list[DragPoint] = []
         self._image: GreyImage | None = None
         self._levels = (0.0, 1.0)
         self._current: DragPoint | None = None
-        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        self.setAccessibleName(name)
-        self.setAccessibleDescription(KEYS)
         self.canvas = pg.GraphicsView()
         self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self.canvas.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
@@ -128,8 +125,10 @@ class PictureView(QWidget):
         self._empty = QLabel("", self.canvas)
         self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self._empty.setWordWrap(True)
+        # It lies over the whole canvas, which takes the mouse.
+        self._empty.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setContentsMargins(1, 1, 1, 1)
         layout.setSpacing(0)
         over = QGridLayout(self.canvas)
         over.addWidget(self._empty)
@@ -149,6 +148,7 @@ class PictureView(QWidget):
         self._empty.setText(why_not if grey is None else "")
         self._item.setVisible(grey is not None)
         if grey is None:
+            self.describe(why_not)
             return
         same = former is not None and former.shape == grey.shape
         levels = auto_levels(grey)
@@ -156,6 +156,7 @@ class PictureView(QWidget):
             self._levels = levels
         self._item.setImage(grey, autoLevels=False, levels=self._shown_levels())
         rows, columns = grey.shape
+        self.describe(f"{columns} by {rows} px")
         self._item.setRect(QRectF(-0.5, -0.5, columns, rows))
         if not same:
             self.box.setLimits(

@@ -19,10 +19,11 @@ from PySide6.QtGui import (
     QKeySequence,
     QPalette,
 )
-from PySide6.QtWidgets import QFrame, QLabel, QScrollArea, QSizePolicy, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QFrame, QLabel, QScrollArea, QSizePolicy, QVBoxLayout
 
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in_words
+from labapp.gui.views.canvas import Plotted
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
@@ -41,7 +42,7 @@ KEYS = "← → step through the points, Home End to the first and last, + − z
 Role = QPalette.ColorRole
 
 
-class PlotStack(QWidget):
+class PlotStack(Plotted):
     """Plots under each other.
 
     Signals
@@ -58,14 +59,11 @@ class PlotStack(QWidget):
     chosen = Signal(int)
 
     def __init__(self, name: str = "Plots") -> None:
-        super().__init__()
+        super().__init__(name, KEYS)
         self.curves: tuple[Curve, ...] = ()
         self.axis = Axis("", "")
         self._plots: list[_Plot] = []
         self._current: int | None = None
-        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        self.setAccessibleName(name)
-        self.setAccessibleDescription(KEYS)
         self.setToolTip(f"Click a point to go to its frame; wheel or drag along the axis. {KEYS}")
         self.canvas = pg.GraphicsLayoutWidget()
         self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
@@ -86,7 +84,7 @@ class PlotStack(QWidget):
         self.read_out.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.read_out.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setContentsMargins(1, 1, 1, 1)
         layout.setSpacing(2)
         layout.addWidget(area, 1)
         layout.addWidget(self.legend)
@@ -198,7 +196,7 @@ class PlotStack(QWidget):
     def _tell(self, words: str) -> None:
         self.read_out.setText(words or " ")
         self.read_out.setToolTip(words)
-        self.setAccessibleDescription(f"{words}. {KEYS}" if words else KEYS)
+        self.describe(words)
 
     def _under(self, at: QPointF) -> tuple[_Plot, Curve] | None:
         for plot, curve in zip(self._plots, self.curves, strict=True):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, QPointF, QRectF, QSize, Qt, QTimer, Signal
+from PySide6.QtCore import QEvent, QPointF, QRectF, QSignalBlocker, QSize, Qt, QTimer, Signal
 from PySide6.QtGui import (
     QColor,
     QHelpEvent,
@@ -23,6 +23,7 @@ from PySide6.QtGui import (
     QWheelEvent,
 )
 from PySide6.QtWidgets import (
+    QAbstractSlider,
     QHBoxLayout,
     QLabel,
     QSizePolicy,
@@ -43,6 +44,8 @@ GAP_FROM_PX = 4
 
 RAIL_PX = 9
 """Room above the ticks for the marker of the frame in view."""
+
+KEYS = "← → step through the frames, Page Up and Down go a tenth, Home End to the first and last"
 
 Shape = Sequence[tuple[float, float]]
 
@@ -84,8 +87,10 @@ def aggregated(kinds: npt.NDArray[np.int64], columns: int) -> npt.NDArray[np.int
     return np.asarray(np.maximum.reduceat(kinds, first))
 
 
-class Scrubber(QWidget):
+class Scrubber(QAbstractSlider):
     """The ticks, and the frame in view on them; it knows positions, not what a frame is.
+
+    To a screen reader it is a slider, whose value is the position.
 
     Signals
     -------
@@ -99,12 +104,12 @@ class Scrubber(QWidget):
         super().__init__(parent)
         self._ticks = tuple(ticks)
         self._kinds: npt.NDArray[np.int64] = np.zeros(0, np.int64)
-        self._position = 0
         self._picture: QImage | None = None
         self.describe: Callable[[int], str] = lambda position: f"{position + 1}"
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.setAccessibleName("Frames")
+        self.valueChanged.connect(self.moved)  # by a screen reader
 
     def sizeHint(self) -> QSize:
         """As wide as there is room, and high enough for the shapes to be told apart."""
@@ -115,14 +120,24 @@ class Scrubber(QWidget):
         if not np.array_equal(kinds, self._kinds):
             self._kinds = np.asarray(kinds, np.int64)
             self._picture = None
+            with QSignalBlocker(self):
+                self.setRange(0, max(0, len(kinds) - 1))
+            self._tell()
             self.update()
 
     def set_position(self, position: int) -> None:
         """Mark the frame in view."""
-        if position != self._position:
-            self._position = position
-            self.setAccessibleDescription(self.describe(position) if len(self._kinds) else "")
-            self.update()
+        with QSignalBlocker(self):
+            self.setValue(position)
+        self._tell()
+
+    def _tell(self) -> None:
+        seen = self.in_words(self.value()) if len(self._kinds) else "There are no frames"
+        self.setAccessibleDescription(f"{seen}. {KEYS}")
+
+    def in_words(self, position: int) -> str:
+        """A frame and how it stands."""
+        return f"{self.describe(position)}: {self._ticks[int(self._kinds[position])].words}"
 
     @property
     def kinds(self) -> npt.NDArray[np.int64]:
@@ -132,7 +147,7 @@ class Scrubber(QWidget):
     @property
     def position(self) -> int:
         """Of the frame in view."""
-        return self._position
+        return self.value()
 
     def position_at(self, x: float) -> int:
         """Position of the frame under a place across the widget, px."""
@@ -142,7 +157,7 @@ class Scrubber(QWidget):
         """Go to the nearest position there is, as if the operator had."""
         if len(self._kinds):
             position = max(0, min(len(self._kinds) - 1, position))
-            if position != self._position:
+            if position != self.value():
                 self.moved.emit(position)
 
     # --- drawing ----------------------------------------------------------------------------
@@ -156,7 +171,7 @@ class Scrubber(QWidget):
             self._picture = self._drawn()
         painter.drawImage(QPointF(0, RAIL_PX), self._picture)
         width = self.width() / len(self._kinds)
-        left = self._position * width
+        left = self.value() * width
         middle = left + width / 2
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)
         ink = self.palette().color(QPalette.ColorRole.WindowText)
@@ -235,15 +250,15 @@ class Scrubber(QWidget):
     def wheelEvent(self, event: QWheelEvent) -> None:
         """Step through the frames."""
         steps = event.angleDelta().y() or event.angleDelta().x()
-        self.go_to(self._position - (steps > 0) + (steps < 0))
+        self.go_to(self.value() - (steps > 0) + (steps < 0))
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Go a tenth of all frames with Page Up and Down; the other keys are the window's."""
         page = max(1, len(self._kinds) // 10)
         if event.key() == Qt.Key.Key_PageUp:
-            self.go_to(self._position - page)
+            self.go_to(self.value() - page)
         elif event.key() == Qt.Key.Key_PageDown:
-            self.go_to(self._position + page)
+            self.go_to(self.value() + page)
         else:
             event.ignore()
 
@@ -251,8 +266,7 @@ class Scrubber(QWidget):
         """Tell of the frame under the pointer."""
         if isinstance(event, QHelpEvent) and len(self._kinds):
             position = self.position_at(event.pos().x())
-            told = self._ticks[int(self._kinds[position])].words
-            QToolTip.showText(event.globalPos(), f"{self.describe(position)}: {told}", self)
+            QToolTip.showText(event.globalPos(), self.in_words(position), self)
             return True
         return super().event(event)
 

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QObject, QPointF, Qt, QTimer, Signal
 from PySide6.QtGui import (
-    QColor,
     QGuiApplication,
     QImage,
     QKeyEvent,
@@ -29,6 +28,7 @@ from PySide6.QtGui import (
 )
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
+from labapp.gui.views.canvas import Drawn
 from labapp.session.scene import Direction, Drawing, Scene, build_scene, can_draw
 
 TURN_DEG = 10.0
@@ -53,13 +53,15 @@ TURNS = {
     Qt.Key.Key_Down: (0.0, TURN_DEG),
 }
 
+KEYS_TOLD = "arrow keys turn, + and − zoom, 1 to 4 look from the top, side, front and obliquely"
+
 NOTHING_HERE = "The 3-D view needs OpenGL, which cannot be used here. All figures are measured."
 
 Camera = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float, bool]
 """Position, focal point, up, parallel scale, whether it is without perspective."""
 
 
-class View3d(QWidget):
+class View3d(Drawn):
     """A scene to look at from all sides; make it with `make_view3d`.
 
     The mouse turns it, the wheel zooms, Shift or the middle button moves it. Arrow keys turn, + and
@@ -79,16 +81,13 @@ class View3d(QWidget):
     camera_changed = Signal(object)
 
     def __init__(self, name: str = "3-D view") -> None:
-        super().__init__()
-        self.setAccessibleName(name)
-        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        super().__init__(name, KEYS_TOLD)
+        self.setToolTip(f"{name}: drag to turn, wheel to zoom, Shift and drag to move; {KEYS_TOLD}")
         self.setMinimumSize(160, 120)
-        self._name = name
         self._words = ""
         self._scene: Scene | None = None
         self._drawing: Drawing | None = None
         self._wanted: Camera | Direction | None = None
-        self.set_words("")
 
     # --- what is shown -----------------------------------------------------------------------
 
@@ -110,13 +109,9 @@ class View3d(QWidget):
         self._refresh()
 
     def set_words(self, words: str) -> None:
-        """Say why there is no scene."""
+        """Say why there is no scene, or what it tells."""
         self._words = words
-        self.setToolTip(
-            f"{self._name}: drag to turn, wheel to zoom, Shift and drag to move; "
-            "arrow keys turn, + and − zoom, 1 to 4 look from the top, side, front and obliquely"
-        )
-        self.setAccessibleDescription(words or self.toolTip())
+        self.describe(words)
         self.update()
 
     def look(self, direction: Direction) -> None:
@@ -309,8 +304,7 @@ class OffscreenView(View3d):
         else:
             self._paint_words(painter, self._words if self._scene is None else NOTHING_HERE)
         if self.hasFocus():
-            painter.setPen(QColor(self.palette().color(QPalette.ColorRole.Highlight)))
-            painter.drawRect(self.rect().adjusted(0, 0, -1, -1))
+            self.paint_frame(painter)
 
     def mousePressEvent(self, event: QMouseEvent) -> None:
         """Begin to turn or to move."""
@@ -404,8 +398,7 @@ class InteractiveView(View3d):
         elif not can_draw():
             self._paint_words(painter, NOTHING_HERE)
         if self.hasFocus():
-            painter.setPen(QColor(self.palette().color(QPalette.ColorRole.Highlight)))
-            painter.drawRect(self.rect().adjusted(0, 0, -1, -1))
+            self.paint_frame(painter)
 
     def close_view(self) -> None:
         """Let go of OpenGL; it is taken up again when the view is next shown."""

@@ -112,11 +112,13 @@ class DotsPage(Page):
         assert session is not None
         assert seen is not None
         before = self._before
+        sentence = presenter.sentence(seen)
+        self.view.describe(sentence)
         figures = presenter.figures(seen.result)
         stands = seen.result is not None and not seen.result.stale
         pending = "fitting …" if self.refit.pending else "" if stands else "–"
         self.dots_panel.show_frame(
-            presenter.sentence(seen),
+            sentence,
             seen.why or (presenter.why_no_fit(session) if not stands else ""),
             presenter.compared(
                 before[1] if before is not None and before[0] == seen.frame else None,

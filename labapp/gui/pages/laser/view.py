@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from PySide6.QtCore import QEvent, QObject, Qt
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import (
     QFileDialog,
@@ -299,22 +299,13 @@ class _ReadingsTable(QTableWidget):
         self.setAccessibleName("Readings of l₁, l₂ and l₃ in mm")
         self.setToolTip("; ".join(f"{n}: {m}" for n, m in zip(NAMES, MEANINGS, strict=True)))
         self.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.Stretch)
-        self.setTabKeyNavigation(True)
-        self.installEventFilter(self)
+        self.setTabKeyNavigation(False)  # while a number is typed Tab still goes to the next cell
         self.fit()
 
     def fit(self) -> None:
         """As high as its lines, up to eight."""
         header = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
         self.setFixedHeight(header + min(self.rowCount(), 8) * self.rowHeight(0))
-
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Tab beyond the last cell leaves the table."""
-        if isinstance(event, QKeyEvent) and event.type() == QEvent.Type.KeyPress:
-            last = self.currentRow() == self.rowCount() - 1 and self.currentColumn() == 2
-            if event.key() == Qt.Key.Key_Tab and last:
-                return self.focusNextChild()
-        return super().eventFilter(watched, event)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Delete empties the selected cells."""

@@ -44,7 +44,7 @@ class SetupPage(Page):
         self._times: dict[str, QLabel] = {}
         self._drawn: object = None
         self.tabs = QTabWidget()
-        self.tabs.setAccessibleName("Parts of the set-up")
+        self.tabs.tabBar().setAccessibleName("Parts of the set-up")
         self.tabs.addTab(self._experiment(), "Experiment")
         self.tabs.addTab(self._safety(), "Safety")
         self.tabs.addTab(self._bench(), "Bench")

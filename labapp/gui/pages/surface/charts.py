@@ -7,18 +7,22 @@ from typing import Any
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QPointF, Qt, Signal
-from PySide6.QtGui import QPalette
-from PySide6.QtWidgets import QLabel, QVBoxLayout, QWidget
+from PySide6.QtGui import QKeyEvent, QPalette
+from PySide6.QtWidgets import QLabel, QVBoxLayout
 
 from labapp.core.boundary import Boundary
 from labapp.core.values import FloatArray
 from labapp.gui.pages.surface.presenter import error_scale
+from labapp.gui.views.canvas import Plotted
 from labapp.session.heights import Profile
 
 BAND_ALPHA = 70
 
+KEYS = "+ − zoom, F shows all"
+ZOOM = 1.25
 
-class Chart(QWidget):
+
+class Chart(Plotted):
     """One plot with a line of words above it, in the colours of the window.
 
     Parameters
@@ -32,12 +36,12 @@ class Chart(QWidget):
     """
 
     def __init__(self, name: str, x_label: str, y_label: str, equal: bool) -> None:
-        super().__init__()
-        self.setAccessibleName(name)
+        super().__init__(name, KEYS)
+        self.setToolTip(f"{name}: wheel to zoom, drag to move; {KEYS}")
         self.title = QLabel(name)
         self.title.setWordWrap(True)
         self.plot = pg.PlotWidget()
-        self.plot.setAccessibleName(name)
+        self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self.plot.setMinimumSize(88, 80)
         self.plot.setMenuEnabled(False)
         self.plot.setLabel("bottom", x_label)
@@ -45,7 +49,7 @@ class Chart(QWidget):
         self.plot.setAspectLocked(equal)
         self.plot.hideButtons()
         layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setContentsMargins(1, 1, 1, 1)
         layout.setSpacing(0)
         layout.addWidget(self.title)
         layout.addWidget(self.plot)
@@ -53,7 +57,7 @@ class Chart(QWidget):
     def say(self, words: str) -> None:
         """Put words above the plot."""
         self.title.setText(words)
-        self.setAccessibleDescription(words)
+        self.describe(words)
 
     def paint(self) -> None:
         """Take the window's colours."""
@@ -68,6 +72,18 @@ class Chart(QWidget):
     def colour(self, role: QPalette.ColorRole) -> Any:
         """A colour of the window."""
         return self.palette().color(role)
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:
+        """Zoom, or show all."""
+        box = self.plot.getViewBox()
+        if event.key() in (Qt.Key.Key_Plus, Qt.Key.Key_Equal):
+            box.scaleBy((1 / ZOOM, 1 / ZOOM))
+        elif event.key() == Qt.Key.Key_Minus:
+            box.scaleBy((ZOOM, ZOOM))
+        elif event.key() == Qt.Key.Key_F:
+            self.plot.autoRange()
+        else:
+            super().keyPressEvent(event)
 
     def changeEvent(self, event: QEvent) -> None:
         """Follow the window from light to dark."""

@@ -1,0 +1,330 @@
+"""Every page, and the dialogs, by keyboard alone and as a screen reader has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QAccessible
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import (
+    QAbstractButton,
+    QAbstractScrollArea,
+    QAbstractSlider,
+    QAbstractSpinBox,
+    QApplication,
+    QCheckBox,
+    QComboBox,
+    QDialog,
+    QLabel,
+    QLineEdit,
+    QListWidget,
+    QMenu,
+    QMessageBox,
+    QPlainTextEdit,
+    QTabBar,
+    QTableWidget,
+    QTextBrowser,
+    QWidget,
+)
+from pytestqt.qtbot import QtBot
+
+from labapp.gui import dialogs
+from labapp.gui.actions import ACTIONS
+from labapp.gui.help import HelpDialog
+from labapp.gui.steps import STEPS
+from labapp.gui.views.canvas import Drawn, Plotted
+from labapp.gui.window import MainWindow
+from tests.gui.conftest import CopySample
+
+Role = QAccessible.Role
+
+ROLES: tuple[tuple[type[QWidget], set[QAccessible.Role]], ...] = (
+    (QCheckBox, {Role.CheckBox}),
+    (QAbstractButton, {Role.Button, Role.ButtonMenu, Role.CheckBox}),
+    (QComboBox, {Role.ComboBox}),
+    (QAbstractSpinBox, {Role.SpinBox}),
+    (QAbstractSlider, {Role.Slider}),
+    (QLineEdit, {Role.EditableText}),
+    (QPlainTextEdit, {Role.EditableText}),
+    (QTextBrowser, {Role.EditableText, Role.StaticText, Role.Document}),
+    (QTabBar, {Role.PageTabList}),
+    (QTableWidget, {Role.Table}),
+    (QListWidget, {Role.List}),
+    (Plotted, {Role.Chart}),
+    (Drawn, {Role.Graphic}),
+    (QAbstractScrollArea, {Role.Client}),
+)
+"""What a widget may be to a screen reader, the first that it is an instance of."""
+
+CANVASES = {
+    "plane": {"Picture of the target"},
+    "capture": {"Frame of the recording"},
+    "dots": {"Frame with its dots"},
+    "surface": {"The pool in 3-D", "Reflected dots on the imaging plane", "Height profile"},
+    "trends": {"Trends over the recording"},
+}
+"""What is drawn on a page and must be reached."""
+
+MOST = 200
+"""No page has so many stops."""
+
+
+@pytest.fixture
+def opened(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> MainWindow:
+    """The window, active, with a measured session."""
+    assert window.files.open(copy_sample("gtaw"))
+    qtbot.waitUntil(window.isActiveWindow)
+    return window
+
+
+def stops(window: QWidget, key: Qt.Key) -> list[QWidget]:
+    """What a key leads to, from what has the keys now until it is come round."""
+    found: list[QWidget] = []
+    for _ in range(MOST):
+        QTest.keyClick(QApplication.focusWidget() or window, key)
+        place = QApplication.focusWidget()
+        assert place is not None, "the keys went to nothing"
+        if place in found:
+            assert place is found[0], f"caught at {spoken(place)}"
+            return found
+        found.append(place)
+    raise AssertionError(f"{key} does not come round")
+
+
+def controls(window: QWidget) -> set[QWidget]:
+    """What can be given the keys: enabled, in view, and no part of another control."""
+    tab = Qt.FocusPolicy.TabFocus
+    return {
+        each
+        for each in window.findChildren(QWidget)
+        if each.focusPolicy() & tab
+        and each.focusProxy() is None
+        and each.isEnabled()
+        and each.isVisible()
+        and each.window() is window
+    }
+
+
+def spoken(widget: QWidget) -> str:
+    """The name that is read out: the widget's own and that of the label before it."""
+    told = QAccessible.queryAccessibleInterface(widget)
+    labels = [
+        label.text(QAccessible.Text.Name)
+        for label, kind in told.relations()
+        if kind & QAccessible.RelationFlag.Label
+    ]
+    return " ".join([*labels, widget.accessibleName() or told.text(QAccessible.Text.Name)])
+
+
+def check_spoken(widget: QWidget) -> None:
+    """A name in words, a role that fits, and what it does."""
+    told = QAccessible.queryAccessibleInterface(widget)
+    name = spoken(widget).strip()
+    assert len(name) > 1 or name.isalpha(), f"{widget} has no name"
+    assert type(widget).__name__ not in name
+    assert any(letter.isalpha() for letter in name), f"{name!r} is no word"
+    if isinstance(widget, QComboBox):  # its own name would be the choice
+        assert widget.accessibleName(), widget.currentText()
+    roles = next((roles for kind, roles in ROLES if isinstance(widget, kind)), None)
+    assert roles is not None, f"{widget}: what is it to a screen reader?"
+    assert told.role() in roles, f"{name}: {told.role()}"
+    described = told.text(QAccessible.Text.Description)
+    assert described or isinstance(widget, QTabBar), f"{name} says nothing of what it does"
+    if not isinstance(widget, QTabBar | QAbstractScrollArea | Drawn | QAbstractSlider):
+        assert widget.toolTip(), f"{name} has no tip"
+
+
+def check_round(window: QWidget) -> list[QWidget]:
+    """Tab and Shift+Tab reach every control and come round; each says what it is."""
+    forward = stops(window, Qt.Key.Key_Tab)
+    missed = controls(window) - set(forward)
+    assert not missed, f"not reached: {sorted(spoken(each) for each in missed)}"
+    backward = stops(window, Qt.Key.Key_Backtab)
+    assert set(backward) == set(forward)
+    for widget in forward:
+        check_spoken(widget)
+    return forward
+
+
+@pytest.mark.parametrize("step", [step.key for step in STEPS])
+def test_a_page_by_keyboard(opened: MainWindow, step: str, qtbot: QtBot):
+    opened.menus.do(f"step_{step}")
+    page = opened.page
+    assert page is not None
+    assert page.key == step
+    qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
+    QTest.qWait(50)
+    reached = check_round(opened)
+    names = {each.accessibleName() for each in reached if page.isAncestorOf(each)}
+    assert CANVASES.get(step, set()) <= names
+    for drawn in page.findChildren(Drawn):
+        if drawn.isVisible():
+            told = QAccessible.queryAccessibleInterface(drawn)
+            assert told.role() in (Role.Graphic, Role.Chart)
+            assert drawn.accessibleName()
+            assert drawn.accessibleDescription()
+
+
+@pytest.mark.parametrize("tab", [0, 1, 2])
+def test_every_part_of_the_set_up(opened: MainWindow, tab: int):
+    opened.show_step("setup")
+    tabs = opened.page.tabs  # type: ignore[union-attr]
+    bar = tabs.tabBar()
+    bar.setFocus()
+    for _ in range(tab):
+        QTest.keyClick(bar, Qt.Key.Key_Right)
+    assert tabs.currentIndex() == tab
+    check_round(opened)
+
+
+def test_two_schemes_compared(opened: MainWindow, qtbot: QtBot):
+    opened.show_step("surface")
+    opened.page.comparing.click()  # type: ignore[union-attr]
+    qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
+    QTest.qWait(50)
+    check_round(opened)
+
+
+def test_the_welcome_page_by_keyboard(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):
+    window.files.open(copy_sample("thumb_tack"))
+    window.menus.do("close")
+    qtbot.waitUntil(lambda: window.isActiveWindow() and not window.workspace.tasks.active)
+    reached = check_round(window)
+    assert window.welcome.list in reached
+    window.welcome.list.setFocus()
+    QTest.keyClick(window.welcome.list, Qt.Key.Key_Return)
+    qtbot.waitUntil(lambda: window.workspace.session is not None)
+
+
+def test_f6_goes_through_the_parts_of_the_window(opened: MainWindow, qtbot: QtBot):
+    opened.show_step("dots")
+    opened.menus.do("log")
+    qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
+    parts = [opened.step_list, opened.page, opened.side_panel, opened.timeline, opened.log_panel]
+
+    def place() -> int:
+        focus = QApplication.focusWidget()
+        return next(k for k, part in enumerate(parts) if part is focus or part.isAncestorOf(focus))
+
+    opened.step_list.setFocus()
+    seen = []
+    for key in [Qt.KeyboardModifier.NoModifier] * 5 + [Qt.KeyboardModifier.ShiftModifier] * 5:
+        QTest.keyClick(QApplication.focusWidget(), Qt.Key.Key_F6, key)
+        seen.append(place())
+    assert seen == [1, 2, 3, 4, 0, 4, 3, 2, 1, 0]
+    opened.say("The recording is gone", True)
+    parts.append(opened.status_line)
+    QTest.keyClick(opened, Qt.Key.Key_F6, Qt.KeyboardModifier.ShiftModifier)
+    assert QApplication.focusWidget() is opened.status_line.read_button
+
+
+def test_f6_comes_back_to_where_the_keys_were(opened: MainWindow):
+    opened.show_step("trends")
+    button = opened.timeline.play_button
+    button.setFocus()
+    opened.menus.do("next_part")
+    opened.menus.do("previous_part")
+    assert QApplication.focusWidget() is button
+
+
+def test_a_step_by_its_key_takes_the_keys_along(opened: MainWindow):
+    for step in STEPS:
+        opened.side_panel.setFocus()
+        opened.menus.do(f"step_{step.key}")
+        focus = QApplication.focusWidget()
+        assert focus is opened.page or opened.page.isAncestorOf(focus)
+        assert opened.page.accessibleName() == step.title
+    opened.step_list.setFocus()
+    QTest.keyClick(opened.step_list, Qt.Key.Key_Up)
+    assert QApplication.focusWidget() is opened.step_list
+
+
+def test_a_screen_reader_moves_the_frame(opened: MainWindow):
+    scrubber = opened.timeline.scrubber
+    value = QAccessible.queryAccessibleInterface(scrubber).valueInterface()
+    assert (value.minimumValue(), value.maximumValue()) == (0, 29)
+    value.setCurrentValue(7)
+    assert opened.workspace.frame == 7
+    opened.workspace.show_frame(3)
+    assert value.currentValue() == 3
+    assert "Frame 3" in scrubber.accessibleDescription()
+
+
+def test_every_action_has_a_key_or_a_letter_of_its_own(opened: MainWindow):
+    for action in ACTIONS:
+        assert action.key or "&" in action.text, action.name
+    menus = [action.menu() for action in opened.menuBar().actions()]
+    menus += [menu for menu in opened.findChildren(QMenu) if menu not in menus]
+    check_letters([action.text() for action in opened.menuBar().actions()])
+    for menu in menus:
+        actions = [each for each in menu.actions() if not each.isSeparator()]
+        check_letters([each.text() for each in actions])
+        for each in actions:
+            assert each.menu() is not None or each.toolTip(), each.text()
+
+
+def check_letters(texts: list[str]) -> None:
+    plain = [text.replace("&&", "") for text in texts]
+    letters = [text[text.index("&") + 1].lower() for text in plain if "&" in text]
+    assert len(set(letters)) == len(letters), texts
+
+
+@pytest.mark.parametrize("kind", ["guide", "keys", "about"])
+def test_the_help_by_keyboard(window: MainWindow, kind: str, qtbot: QtBot):
+    window.menus.do(kind)
+    dialog = next(each for each in window.findChildren(HelpDialog))
+    qtbot.waitUntil(dialog.isActiveWindow)
+    check_round(dialog)
+    QTest.keyClick(dialog, Qt.Key.Key_Escape)
+    assert not dialog.isVisible()
+
+
+def test_the_question_whether_to_open_read_only(window: MainWindow, copy_sample: CopySample):
+    path, asked = copy_sample("thumb_tack"), []
+
+    def look() -> None:
+        box = QApplication.activeModalWidget()
+        assert isinstance(box, QMessageBox)
+        try:
+            asked.extend(check_round(box))
+        finally:
+            QTest.keyClick(box, Qt.Key.Key_Escape)
+
+    QTimer.singleShot(50, look)
+    assert not dialogs.ask_read_only(window, path)
+    assert len(asked) == 2
+
+
+def test_a_walk_finds_what_cannot_be_reached(qtbot: QtBot):
+    """The walk itself, on a window with every fault."""
+
+    class Greedy(QLineEdit):
+        def event(self, event):  # type: ignore[no-untyped-def]
+            if event.type() == event.Type.KeyPress and event.key() == Qt.Key.Key_Tab:
+                return True
+            return super().event(event)
+
+    def built(*widgets: QWidget) -> QDialog:
+        dialog = QDialog()
+        qtbot.addWidget(dialog)
+        for widget in widgets:
+            widget.setParent(dialog)
+        dialog.show()
+        qtbot.waitUntil(dialog.isActiveWindow)
+        return dialog
+
+    def fails(check: Callable[[], object], words: str) -> None:
+        with pytest.raises(AssertionError, match=words):
+            check()
+
+    fails(lambda: check_round(built(QLineEdit(), Greedy(), QLineEdit())), "not reached: .'', ''")
+    fails(lambda: check_round(built(QLineEdit())), "has no name")
+    named = QLineEdit()
+    named.setAccessibleName("Title")
+    fails(lambda: check_round(built(named)), "says nothing")
+    label, combo = QLabel("Way"), QComboBox()
+    combo.addItem("fit")
+    label.setBuddy(combo)
+    fails(lambda: check_round(built(label, combo)), "fit")
