@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyqtgraph as pg
 import pytest
-from PySide6.QtCore import QPoint, QPointF, Qt
+from PySide6.QtCore import QPoint, QPointF, QRectF, Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
@@ -97,6 +97,31 @@ def test_zoom_stays_for_the_next_frame_and_is_new_for_another_size(view: Picture
     assert view.box.viewRect() == seen
     view.show_picture(GREY[:60])
     assert view.box.viewRect() != seen
+
+
+def test_it_fits_again_in_another_size_until_the_hand_has_zoomed(view: PictureView) -> None:
+    def all_seen() -> bool:
+        return bool(view.box.viewRect().contains(QRectF(-0.5, -0.5, 160, 120)))
+
+    def as_large_as_can_be() -> bool:
+        seen = view.box.viewRect()
+        return bool(min(seen.width() / 160, seen.height() / 120) < 1.05)
+
+    for size in ((300, 700), (1200, 400), (700, 560)):
+        view.resize(*size)
+        QTest.qWait(20)
+        assert all_seen()
+        assert as_large_as_can_be()
+    drag(view, at(view, 80, 60), at(view, 100, 60))
+    moved = view.box.viewRect().center()
+    view.resize(600, 500)
+    QTest.qWait(20)
+    assert view.box.viewRect().center().x() == pytest.approx(moved.x(), abs=0.5)
+    view.fit()
+    view.zoom(4)
+    view.resize(700, 560)
+    QTest.qWait(20)
+    assert not all_seen()
 
 
 def test_keys_zoom_and_fit(view: PictureView) -> None:

@@ -110,6 +110,7 @@ class PictureView(Drawn):
         self.points: list[DragPoint] = []
         self._image: GreyImage | None = None
         self._levels = (0.0, 1.0)
+        self._fits = True
         self._current: DragPoint | None = None
         self.canvas = pg.GraphicsView()
         self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
@@ -135,6 +136,8 @@ class PictureView(Drawn):
         layout.addWidget(self.canvas, 1)
         layout.addLayout(self._bar())
         self.canvas.scene().sigMouseMoved.connect(self._moved)
+        self.box.sigRangeChangedManually.connect(lambda *_: self._let_go())
+        self.box.sigResized.connect(lambda *_: self._refit())
         self._paint()
 
     # --- the picture --------------------------------------------------------------------------
@@ -207,19 +210,30 @@ class PictureView(Drawn):
     # --- zoom and contrast --------------------------------------------------------------------
 
     def fit(self) -> None:
-        """Show the whole picture."""
+        """Show the whole picture, and go on to when the view gets larger or smaller."""
+        self._fits = True
         if self._image is not None:
             rows, columns = self._image.shape
             self.box.setRange(QRectF(-0.5, -0.5, columns, rows), padding=0.01)
 
     def zoom(self, factor: float) -> None:
         """Zoom about the middle; more than 1 makes it larger."""
+        self._let_go()
         self.box.scaleBy((1 / factor, 1 / factor))
 
     def pan(self, right: float, down: float) -> None:
         """Move what is seen by shares of the view."""
+        self._let_go()
         seen = self.box.viewRect()
         self.box.translateBy(x=right * seen.width(), y=down * seen.height())
+
+    def _let_go(self) -> None:
+        """Leave what is seen to the hand."""
+        self._fits = False
+
+    def _refit(self) -> None:
+        if self._fits:
+            self.fit()
 
     @property
     def px_per_point(self) -> float:
@@ -456,6 +470,7 @@ class _Box(pg.ViewBox):  # type: ignore[misc]
             return
         there, before = (self.mapSceneToView(p) for p in (event.scenePos(), event.lastScenePos()))
         self.translateBy(x=before.x() - there.x(), y=before.y() - there.y())
+        self.sigRangeChangedManually.emit(self.state["mouseEnabled"])
 
 
 def auto_levels(grey: GreyImage) -> tuple[float, float]:
