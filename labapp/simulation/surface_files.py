@@ -1,0 +1,271 @@
+"""Pools from files: height maps (CSV, NumPy) and meshes (STL, PLY), in mm."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.path import Path as Polygon
+from scipy.interpolate import CloughTocher2DInterpolator
+
+from labapp.core.values import FloatArray, IntArray
+from labapp.errors import InputError
+from labapp.simulation.outlined_pool import OutlinedPool, pool_from_heights
+
+A_SURFACE = "a height map (.csv, .npy, .npz) or a mesh (.stl, .ply)"
+
+MESH_NODES = 250
+"""Nodes at most along the longer side of the grid that a mesh is read off at."""
+
+SMALLEST_MM, LARGEST_MM = 0.5, 200.0
+"""Longer side of a pool; anything else is a slip of the unit."""
+
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+Grid = tuple[FloatArray, FloatArray, FloatArray]
+
+
+class _Unreadable(Exception):
+    """What is wrong with a file, and what would be right."""
+
+    def __init__(self, what: object, expected: str) -> None:
+        super().__init__(str(what), expected)
+        self.what, self.expected = what, expected
+
+
+def read_pool(
+    path: str | os.PathLike[str],
+    spacing_mm: float | None = None,
+    center_mm: tuple[float, float] = (0.0, 0.0),
+    outline_mm: FloatArray | None = None,
+) -> OutlinedPool:
+    """Read a pool from a file.
+
+    ============================== =======================================================
+    ``.npy``, ``.csv`` of numbers  heights; columns run along +X, rows along +Y from the
+                                   first, both ``spacing_mm`` apart, (0, 0) in the middle
+    ``.csv`` with x_mm,y_mm,z_mm   nodes of an even grid, as `labapp reconstruct` writes
+    ``.npz``                       x_mm (n), y_mm (m), z_mm (m, n)
+    ``.stl``, ``.ply``             triangles; those that look up are the pool
+    ============================== =======================================================
+
+    An empty cell or nan is outside the pool.
+
+    Parameters
+    ----------
+    path
+        The file.
+    spacing_mm
+        Of a grid that does not say where its nodes are; not used for others.
+    center_mm
+        Added to every (x, y) of the file, its outline's included.
+    outline_mm
+        Corners of the boundary, shape (k, 2), mm; None: that of the heights or of the mesh.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is no such surface.
+    """
+    path = Path(path)
+    readers: dict[str, Callable[[Path, float | None], tuple[Grid, FloatArray | None]]] = {
+        ".npy": _npy, ".npz": _npz, ".csv": _csv, ".stl": _mesh, ".ply": _mesh,
+    }  # fmt: skip
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(path, "file", path.suffix or "no suffix", A_SURFACE)
+    try:
+        (x, y, z), own_outline = reader(path, spacing_mm)
+        longest = max(np.ptp(x), np.ptp(y))
+        if not SMALLEST_MM <= longest <= LARGEST_MM:
+            expected = f"{SMALLEST_MM:g} to {LARGEST_MM:g} mm along its longer side"
+            raise _Unreadable(f"{longest:g} mm long", expected)
+        outline = own_outline if outline_mm is None else np.asarray(outline_mm, float)
+        shift = np.asarray(center_mm, float)
+        outline = None if outline is None else outline + shift
+        return pool_from_heights(x + shift[0], y + shift[1], z, outline)
+    except _Unreadable as error:
+        raise InputError(path, "surface", error.what, error.expected) from error
+    except OSError as error:
+        raise InputError(path, "file", error.strerror or error, A_SURFACE) from error
+    except (ValueError, LookupError, EOFError, BadZipFile) as error:  # all that damage can raise
+        raise InputError(path, "surface", error, A_SURFACE) from error
+
+
+# --- height maps --------------------------------------------------------------------------------
+
+
+def _npy(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
+    return _even(np.load(path, allow_pickle=False), spacing_mm), None
+
+
+def _even(heights: npt.NDArray[Any], spacing_mm: float | None) -> Grid:
+    """Heights without places: (0, 0) is in the middle."""
+    if heights.ndim != 2 or heights.dtype.kind not in "fiu" or min(heights.shape) < 4:
+        shape = f"{heights.dtype} of shape {heights.shape}"
+        raise _Unreadable(shape, "numbers in at least 4 rows and 4 columns")
+    if spacing_mm is None:
+        raise _Unreadable("heights without places", "spacing_mm with it")
+    y, x = (spacing_mm * (np.arange(count) - (count - 1) / 2) for count in heights.shape)
+    return x, y, np.asarray(heights, float)
+
+
+def _npz(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
+    del spacing_mm
+    with np.load(path, allow_pickle=False) as kept:
+        lacking = {"x_mm", "y_mm", "z_mm"} - set(kept.files)
+        if lacking:
+            raise _Unreadable(f"no {', '.join(sorted(lacking))}", "x_mm, y_mm and z_mm")
+        x, y, z = (np.asarray(kept[name], float) for name in ("x_mm", "y_mm", "z_mm"))
+    if z.ndim != 2 or z.shape != (*y.shape, *x.shape):
+        shapes = f"x_mm {x.shape}, y_mm {y.shape}, z_mm {z.shape}"
+        raise _Unreadable(shapes, "shapes (n), (m) and (m, n)")
+    return (_rising(x, "x_mm"), _rising(y, "y_mm"), z), None
+
+
+def _csv(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
+    text = path.read_text("utf-8-sig")
+    header, _, rest = text.partition("\n")
+    if header.strip().replace(" ", "") != "x_mm,y_mm,z_mm":
+        return _even(_numbers(text), spacing_mm), None
+    nodes = _numbers(rest)
+    if nodes.ndim != 2 or nodes.shape[1] != 3 or len(nodes) < 16:
+        raise _Unreadable(f"{len(nodes)} nodes", "at least 4 × 4 nodes x_mm,y_mm,z_mm")
+    # Written with a few decimals: what is closer than that is the same line of the grid.
+    (x, column), (y, row) = (
+        np.unique(np.round(nodes[:, n], 6), return_inverse=True) for n in range(2)
+    )
+    z = np.full((len(y), len(x)), np.nan)
+    z[row, column] = nodes[:, 2]
+    return (_rising(x, "x_mm"), _rising(y, "y_mm"), z), None
+
+
+def _numbers(text: str) -> FloatArray:
+    """Lines of numbers with commas between them; an empty cell is NaN."""
+    rows = [
+        [float(cell) if cell.strip() else np.nan for cell in line.split(",")]
+        for line in text.splitlines()
+        if line.strip()
+    ]
+    if len({len(row) for row in rows}) > 1:
+        raise _Unreadable("rows of different length", "a table")
+    return np.array(rows, float)
+
+
+def _rising(line: FloatArray, name: str) -> FloatArray:
+    step = np.diff(line)
+    if len(line) < 4 or not (step > 0).all() or np.ptp(step) > 0.01 * step.mean():
+        raise _Unreadable(f"{name} of {len(line)} places", "4 or more places, evenly rising")
+    return line
+
+
+# --- meshes -------------------------------------------------------------------------------------
+
+
+def _mesh(path: Path, spacing_mm: float | None) -> tuple[Grid, FloatArray]:
+    """Read a mesh off at an even grid, and its own boundary."""
+    del spacing_mm
+    data = path.read_bytes()
+    corners = _stl(data) if path.suffix.lower() == ".stl" else _ply(data)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    up = normal[:, 2] > 0.05 * np.linalg.norm(normal, axis=1)
+    if up.sum() < 16:
+        raise _Unreadable(f"{up.sum()} triangles that look up", "at least 16, the pool's surface")
+    corners = corners[up]
+    # STL has no shared corners: those that are the same to its 32 bits are one.
+    places, index = np.unique(np.round(corners.reshape(-1, 3), 5), axis=0, return_inverse=True)
+    outline = places[_boundary(index.reshape(-1, 3)), :2]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
+    spacing = max(float(np.median(edges)) / 2, float((high - low).max()) / MESH_NODES)
+    x, y = (
+        np.linspace(low[n], high[n], max(int(np.ceil((high[n] - low[n]) / spacing)) + 1, 4))
+        for n in range(2)
+    )
+    nodes = np.stack(np.meshgrid(x, y), axis=-1)
+    z = CloughTocher2DInterpolator(places[:, :2], places[:, 2])(nodes)
+    closed = Polygon(np.concatenate([outline, outline[:1]]), closed=True)
+    z[~closed.contains_points(nodes.reshape(-1, 2)).reshape(z.shape)] = np.nan
+    return (x, y, z), outline
+
+
+def _boundary(triangles: IntArray) -> IntArray:
+    """Corners along the longest loop of edges that only one triangle has."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    _, first, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    following = dict(edges[first[count == 1]].tolist())
+    loops: list[list[int]] = []
+    while following:
+        start, at = following.popitem()
+        loop = [start]
+        while at != start and at in following:
+            loop.append(at)
+            at = following.pop(at)
+        loops.append(loop)
+    longest = max(loops, key=len, default=[])
+    if len(longest) < 3:
+        raise _Unreadable("a mesh without an edge", "a surface that ends at its boundary")
+    return np.array(longest)
+
+
+def _stl(data: bytes) -> FloatArray:
+    """Corners of triangles, shape (k, 3, 3)."""
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + count * STL_TRIANGLE.itemsize and count:
+        return np.frombuffer(data, STL_TRIANGLE, count, 84)["corner"].astype(float)
+    lines = [line.split() for line in data.decode("ascii", "replace").splitlines()]
+    corners = [line[1:] for line in lines if len(line) == 4 and line[0] == "vertex"]
+    if not corners or len(corners) % 3:
+        raise _Unreadable("no triangles", "STL, binary or ASCII")
+    return np.array(corners, float).reshape(-1, 3, 3)
+
+
+def _ply(data: bytes) -> FloatArray:
+    """Corners of triangles, shape (k, 3, 3)."""
+    head, found, body = data.partition(b"end_header\n")
+    if not found:
+        head, found, body = data.partition(b"end_header\r\n")
+    words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    if not found or words[:1] != [["ply"]] or len(words) < 2 or words[1][:1] != ["format"]:
+        raise _Unreadable("no header", "PLY")
+    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1][1])
+    elements = [(line[1], int(line[2])) for line in words if line[:1] == ["element"]]
+    if order is None or [name for name, _ in elements][:2] != ["vertex", "face"]:
+        raise _Unreadable(" ".join(words[1]), "PLY with vertices, then triangles")
+    split = next(n for n, line in enumerate(words) if line[:2] == ["element", "face"])
+    plain = [line for line in words[:split] if line[:1] == ["property"]]
+    lists = [line for line in words[split:] if line[:1] == ["property"]]
+    if len(lists) != 1 or lists[0][1] != "list" or any(line[1] == "list" for line in plain):
+        raise _Unreadable("other properties", "faces that are a list of corners and nothing else")
+    names = [line[2] for line in plain]
+    (_, vertices), (_, faces) = elements[:2]
+    if order == "":
+        table = body.split(b"\n")
+        values = np.array([line.split() for line in table[:vertices]], float)
+        places = values[:, [names.index(axis) for axis in "xyz"]]
+        triangles = np.array([line.split() for line in table[vertices : vertices + faces]], int)
+    else:
+        kind = np.dtype([(line[2], order + PLY_TYPES[line[1]]) for line in plain])
+        read = np.frombuffer(body, kind, vertices)
+        places = np.stack([read[axis].astype(float) for axis in "xyz"], axis=-1)
+        face = np.dtype(
+            [("count", order + PLY_TYPES[lists[0][2]]), ("at", order + PLY_TYPES[lists[0][3]], 3)]
+        )
+        found_faces = np.frombuffer(body, face, faces, vertices * kind.itemsize)
+        triangles = np.column_stack([found_faces["count"], found_faces["at"]])
+    if triangles.ndim != 2 or triangles.shape[1] != 4 or (triangles[:, 0] != 3).any():
+        raise _Unreadable("faces of other than three corners", "PLY of triangles")
+    return np.asarray(places[triangles[:, 1:]])

@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import pickle
+
+import meshio
+import numpy as np
+import pytest
+import trimesh
+
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.errors import InputError
+from labapp.simulation.forward import trace
+from labapp.simulation.outlined_pool import OutlinedPool, pool_from_heights
+from labapp.simulation.pools import Dent, egg
+from labapp.simulation.surface_files import read_pool
+
+RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0))
+EGG = egg(6.6, 3.0, 4.4, 0.3, (0.1, -0.6), (Dent(0.05, 0.8),))
+"""What the files hold, known exactly."""
+
+
+def square(half):
+    return np.array([[-half, -half], [half, -half], [half, half], [-half, half]], float)
+
+
+def saddle(x, y):
+    return 0.05 * np.sin(x) * np.cos(1.5 * y)
+
+
+def grid_of(pool, spacing=0.1):
+    x, y = np.arange(-4, 4.05, spacing), np.arange(-6, 4.05, spacing)
+    return x, y, pool.height(*np.meshgrid(x, y))
+
+
+def inner(pool, count=200, reach=0.95):
+    """Points inside the pool."""
+    rng = np.random.default_rng(5)
+    rim = pool.boundary_mm()[rng.integers(0, len(pool.boundary_mm()), count), :2]
+    middle = rim.mean(axis=0)
+    return (middle + reach * np.sqrt(rng.random(count))[:, None] * (rim - middle)).T
+
+
+def assert_is_the_egg(pool, height_mm=2e-3, slope=0.02, size_mm=0.06):
+    x, y = inner(EGG)
+    np.testing.assert_allclose(pool.height(x, y), EGG.height(x, y), atol=height_mm)
+    np.testing.assert_allclose(pool.gradient(x, y), EGG.gradient(x, y), atol=slope)
+    for name in ("width_mm", "length_mm"):
+        assert getattr(pool.size, name) == pytest.approx(getattr(EGG.size, name), abs=size_mm)
+    assert pool.size.height_mm == pytest.approx(EGG.size.height_mm, abs=2e-3)
+
+
+# --- any function ---------------------------------------------------------------------------------
+
+
+def test_gradient_of_any_function_is_its_derivative():
+    pool = OutlinedPool(saddle, square(3))
+    x, y = np.random.default_rng(1).uniform(-2.9, 2.9, (2, 100))
+    exact = np.stack(
+        [0.05 * np.cos(x) * np.cos(1.5 * y), -0.075 * np.sin(x) * np.sin(1.5 * y)], axis=-1
+    )
+    np.testing.assert_allclose(pool.gradient(x, y), exact, atol=1e-10)
+
+
+def test_a_pool_ends_at_its_outline():
+    pool = OutlinedPool(saddle, square(3))
+    x, y = np.random.default_rng(2).uniform(-4, 4, (2, 400))
+    inside = np.maximum(abs(x), abs(y)) < 3
+    np.testing.assert_array_equal(pool.inside(x, y), inside)
+    np.testing.assert_array_equal(np.isfinite(pool.height(x, y)), inside)
+    np.testing.assert_array_equal(np.isfinite(pool.gradient(x, y)).all(axis=-1), inside)
+    np.testing.assert_allclose(pool.height(x, y)[inside], saddle(x, y)[inside])
+    assert (pool.size.width_mm, pool.size.length_mm) == (6.0, 6.0)
+    assert pool.size.height_mm == pytest.approx(0.05, abs=1e-9)
+    assert pool.after(1.0) is pool
+
+
+def test_the_same_pool_by_function_reflects_the_same():
+    whole = Dent(0.05, 0.8)
+    assert whole in EGG.terms
+    rim = EGG.boundary_mm(7200)[:, :2]
+    # The function itself knows no boundary: beyond it, the height is that of the nearest rim.
+    pool = OutlinedPool(lambda x, y: np.nan_to_num(EGG.height(x, y)), rim, EGG.gradient)
+    seen, exact = trace(pool, RIG), trace(EGG, RIG)
+    assert (seen.hit != exact.hit).sum() <= 1
+    both = seen.visible & exact.visible
+    assert both.sum() > 80
+    np.testing.assert_allclose(seen.plane_mm[both], exact.plane_mm[both], atol=1e-6)
+
+
+@pytest.mark.parametrize("outline", [square(3)[:2], np.array([[0, 0], [1, 1], [2, 2]])])
+def test_an_outline_without_area_is_refused(outline):
+    with pytest.raises(ValueError, match="area"):
+        OutlinedPool(saddle, outline)
+
+
+# --- height maps ----------------------------------------------------------------------------------
+
+
+def test_a_height_map_is_the_surface_it_was_taken_from():
+    pool = pool_from_heights(*grid_of(EGG), EGG.boundary_mm(360)[:, :2])
+    assert_is_the_egg(pool, 1e-4, 2e-3, 1e-3)
+    rim = pool.boundary_mm()
+    np.testing.assert_allclose(rim[:, 2], 0, atol=1e-3)  # continued beyond the last heights
+
+
+def test_gradient_of_a_height_map_is_the_derivative_of_its_height():
+    pool = pool_from_heights(*grid_of(EGG, 0.2))
+    x, y = inner(EGG, reach=0.9)
+    step = 1e-5
+    numeric = np.stack(
+        [
+            pool.height(x + step, y) - pool.height(x - step, y),
+            pool.height(x, y + step) - pool.height(x, y - step),
+        ],
+        axis=-1,
+    ) / (2 * step)
+    np.testing.assert_allclose(pool.gradient(x, y), numeric, atol=1e-8)
+
+
+def test_dots_of_a_height_map_are_those_of_the_surface():
+    seen, exact = trace(pool_from_heights(*grid_of(EGG)), RIG), trace(EGG, RIG)
+    both = seen.visible & exact.visible
+    assert (seen.visible ^ exact.visible).sum() <= 4
+    apart = np.linalg.norm(seen.plane_mm - exact.plane_mm, axis=-1)[both]
+    assert np.median(apart) < 0.01
+
+
+def test_a_height_map_can_go_to_another_process():
+    pool = pool_from_heights(*grid_of(EGG))
+    pool.size  # noqa: B018 - what was found already goes with it
+    again = pickle.loads(pickle.dumps(pool))
+    x, y = inner(EGG)
+    np.testing.assert_array_equal(again.height(x, y), pool.height(x, y))
+
+
+def write(path):
+    x, y, z = grid_of(EGG)
+    if path.name == "table.csv":
+        rows = (",".join("" if np.isnan(v) else f"{v:.6f}" for v in row) for row in z)
+        path.write_text("\n".join(rows) + "\n")
+    elif path.name == "nodes.csv":
+        u, v = np.meshgrid(x, y)
+        some = np.isfinite(z)
+        np.savetxt(path, np.stack([u[some], v[some], z[some]], -1), "%.6f", ",",
+                   header="x_mm,y_mm,z_mm", comments="")  # fmt: skip
+    elif path.suffix == ".npy":
+        np.save(path, z)
+    else:
+        np.savez(path, x_mm=x, y_mm=y, z_mm=z)
+
+
+@pytest.mark.parametrize("name", ["table.csv", "nodes.csv", "map.npy", "map.npz"])
+def test_height_maps_are_read_from_every_kind_of_file(tmp_path, name):
+    write(tmp_path / name)
+    bare = name in ("table.csv", "map.npy")
+    # The grid's middle is at (0, -1).
+    pool = read_pool(tmp_path / name, 0.1 if bare else None, (0.0, -1.0) if bare else (0.0, 0.0))
+    assert_is_the_egg(pool)
+
+
+# --- meshes -------------------------------------------------------------------------------------
+
+
+def triangles(rings=40, sectors=90):
+    """The egg as rings of triangles."""
+    rim = EGG.boundary_mm(sectors)[:, :2]
+    middle = np.array(EGG.footprint.center_mm)
+    places = [middle[None]]
+    places += [middle + (n / rings) * (1 - 1e-9) * (rim - middle) for n in range(1, rings + 1)]
+    xy = np.concatenate(places)
+    vertices = np.column_stack([xy, EGG.height(*xy.T)])
+    next_ = np.roll(np.arange(sectors), -1)
+    faces = [np.column_stack([np.zeros(sectors, int), 1 + np.arange(sectors), 1 + next_])]
+    for ring in range(rings - 1):
+        a, b = 1 + ring * sectors, 1 + (ring + 1) * sectors
+        at = np.arange(sectors)
+        faces += [np.column_stack([a + at, b + at, b + next_])]
+        faces += [np.column_stack([a + at, b + next_, a + next_])]
+    return vertices, np.concatenate(faces)
+
+
+def write_mesh(path, kind):
+    vertices, faces = triangles()
+    if kind in ("trimesh", "ascii"):
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        options = {"file_type": "stl_ascii"} if kind == "ascii" else {}
+        mesh.export(path, **options)
+    else:
+        meshio.write_points_cells(path, vertices, [("triangle", faces)], binary=kind == "binary")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("a.stl", "trimesh"),
+        ("a.stl", "ascii"),
+        ("a.ply", "trimesh"),
+        ("a.ply", "binary"),
+        ("a.ply", "text"),
+    ],
+)
+def test_meshes_of_other_programs_are_read(tmp_path, name, kind):
+    write_mesh(tmp_path / name, kind)
+    assert_is_the_egg(read_pool(tmp_path / name), size_mm=0.02)
+
+
+def test_the_top_of_a_body_is_the_pool(tmp_path):
+    vertices, faces = triangles()
+    sectors = 90
+    rim = len(vertices) - sectors + np.arange(sectors)
+    below = vertices[rim] - [0, 0, 1.0]
+    floor = len(vertices) + np.arange(sectors)
+    walls = [np.column_stack([rim, floor, np.roll(floor, -1)]),
+             np.column_stack([rim, np.roll(floor, -1), np.roll(rim, -1)]),
+             np.column_stack([np.full(sectors - 2, floor[0]), floor[2:], floor[1:-1]])]  # fmt: skip
+    body = trimesh.Trimesh(np.concatenate([vertices, below]), np.concatenate([faces, *walls]))
+    assert body.is_watertight
+    body.export(tmp_path / "body.stl")
+    assert_is_the_egg(read_pool(tmp_path / "body.stl"), size_mm=0.02)
+
+
+# --- what is no surface -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.obj", b"", ".obj"),
+        ("a.csv", b"1,2\n3\n", "different length"),
+        ("a.csv", b"1,2\n3,x\n", "could not convert"),
+        ("a.csv", b"x_mm,y_mm,z_mm\n1,2,3\n", "4 × 4"),
+        ("a.csv", b"\n".join([b"0.1,0.2,0.3,0.4"] * 5), "spacing_mm"),
+        ("a.npy", b"no numbers", "height map"),
+        ("a.npz", b"PK\x03\x04", "height map"),
+        ("a.stl", b"solid\nendsolid\n", "no triangles"),
+        ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", "vertices"),
+        ("a.ply", b"ply\n", "no header"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+            b"element face 1\nproperty list uchar int at\nend_header\n0 0\n1 0\n1 1\n3 0 1 2\n",
+            "mesh",
+        ),
+    ],
+)
+def test_what_is_no_surface_is_refused_with_what_would_be(tmp_path, name, content, words):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words) as refused:
+        read_pool(path)
+    assert refused.value.source == str(path)
+
+
+def test_a_missing_file_and_a_wrong_unit_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"No such file"):
+        read_pool(tmp_path / "a.csv", 0.1)
+    x, y, z = grid_of(EGG)
+    np.savez(tmp_path / "metres.npz", x_mm=x / 1000, y_mm=y / 1000, z_mm=z / 1000)
+    with pytest.raises(InputError, match="mm along its longer side"):
+        read_pool(tmp_path / "metres.npz")
