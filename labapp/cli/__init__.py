@@ -298,8 +298,8 @@ def calibrate_laser(
         setup,
         {
             "laser": {
-                "projection_angle_deg": round(found.angle_deg, 4),
-                "distance_mm": round(found.distance_mm, 4),
+                "projection_angle_deg": found.angle_deg,
+                "distance_mm": found.distance_mm,
             }
         },
     )
@@ -347,8 +347,8 @@ def calibrate_plane(
         f"scale      {x_scale:.4f} px/mm along X′, {z_scale:.4f} px/mm along Z′, "
         f"{found.angle_deg:.2f} degrees between them"
     )
-    rounded = {name: [round(u, 4), round(v, 4)] for name, (u, v) in points.items()}
-    _write_values(setup, {"image_calibration": {**rounded, **lengths, "homography": None}})
+    values = {name: list(point) for name, point in points.items()} | lengths
+    _write_values(setup, {"image_calibration": {**values, "homography": None}})
 
 
 def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]) -> None:

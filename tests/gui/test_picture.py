@@ -188,3 +188,16 @@ def test_without_a_picture_it_says_why(view: PictureView) -> None:
     assert view._empty.text() == "frame 3 cannot be read"
     view.show_picture(GREY)
     assert view._empty.text() == ""
+
+
+def test_the_mouse_reaches_the_picture_as_the_desktop_sends_it(view: PictureView, qtbot: QtBot):
+    seen: list[tuple[float, float]] = []
+    view.pointed.connect(lambda u, v, _: seen.append((u, v)))
+    view.tool = noting = Noting()
+    window, there = view.windowHandle(), view.canvas.mapTo(view, at(view, 80, 60))
+    QTest.mouseMove(window, there - QPoint(20, 20))
+    QTest.mouseMove(window, there)
+    QTest.mouseClick(window, Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier, there)
+    qtbot.waitUntil(lambda: bool(noting.seen))
+    assert seen  # pyqtgraph passes on so many moves a second, and no more
+    assert noting.seen[0] == ("click", pytest.approx(80, abs=1), pytest.approx(60, abs=1))

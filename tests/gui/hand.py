@@ -1,0 +1,189 @@
+"""A hand on the window: mouse and keyboard, and nothing else.
+
+A click goes to the window at the place where the widget is seen: what lies over it gets it. What is
+out of sight is gone to with Tab, as an operator without a mouse does.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from PySide6.QtCore import QPoint, QPointF, QRect, Qt, QTimer
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import (
+    QAbstractButton,
+    QApplication,
+    QCheckBox,
+    QFileDialog,
+    QLineEdit,
+    QTableWidget,
+    QTabWidget,
+    QWidget,
+)
+
+from labapp.gui.views.fields import ChoiceField, Field
+from labapp.gui.views.picture import PictureView
+from labapp.gui.window import MainWindow
+
+LEFT, NONE = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
+CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftModifier
+
+MOST_TABS = 120
+
+POLL_MS = 20
+
+
+class Hand:
+    """Works a window.
+
+    Parameters
+    ----------
+    window
+        In view, and active.
+    """
+
+    def __init__(self, window: MainWindow) -> None:
+        self.window = window
+
+    def press(self, key: Qt.Key, modifiers: Qt.KeyboardModifier = NONE) -> None:
+        """Press a key on whatever has the focus."""
+        if QApplication.activeWindow() is None:  # after a dialog; a desktop gives it back
+            self.window.activateWindow()
+            QApplication.processEvents()
+        QTest.keyClick(QApplication.focusWidget() or self.window, key, modifiers)
+
+    def write(self, text: str) -> None:
+        """Write over what the widget with the focus holds."""
+        self.press(Qt.Key.Key_A, CONTROL)
+        self.type(text)
+
+    def type(self, text: str) -> None:
+        """Type on whatever has the focus; a key may give it to another widget."""
+        for letter in text:
+            QTest.keyClicks(_focused(), letter)
+
+    def click(self, widget: QWidget, at: QPoint | None = None) -> None:
+        """Click a widget; one that is out of sight is gone to first, which scrolls it into view."""
+        if not _is_seen(widget, at):
+            self.go_to(widget)
+        assert _is_seen(widget, at), f"{_named(widget)} cannot be seen"
+        assert widget.isEnabled(), f"{_named(widget)} cannot be used"
+        # Through the window, as the desktop sends it.
+        window = widget.window()
+        place = widget.mapTo(window, at or _hot_spot(widget))
+        QTest.mouseClick(window.windowHandle(), LEFT, NONE, place)
+
+    def go_to(self, widget: QWidget) -> None:
+        """Press Tab until a widget has the focus."""
+        for _ in range(MOST_TABS):
+            present = QApplication.focusWidget()
+            if present is not None and (present is widget or widget.isAncestorOf(present)):
+                return
+            self.press(Qt.Key.Key_Tab)
+        raise AssertionError(f"Tab does not lead to {_named(widget)}")
+
+    def button(self, words: str) -> None:
+        """Click the button with these words on the page in view."""
+        self.click(self.find(words))
+
+    def find(self, words: str) -> QAbstractButton:
+        """The button with these words that is in view."""
+        found = [
+            button
+            for button in self.window.findChildren(QAbstractButton)
+            if button.text().replace("&", "") == words and button.isVisible()
+        ]
+        assert len(found) == 1, f"{len(found)} buttons “{words}” are in view"
+        return found[0]
+
+    def enter(self, field: Field, text: str) -> None:
+        """Go to a field, write in it, and finish with Enter."""
+        self.go_to(field.editor)
+        self.write(text)
+        self.press(Qt.Key.Key_Return)
+
+    def choose(self, field: ChoiceField, words: str) -> None:
+        """Choose from a list by the arrow keys."""
+        self.go_to(field.editor)
+        self.press(Qt.Key.Key_Home)
+        for _ in range(20):
+            if field.editor.currentText() == words:
+                return
+            self.press(Qt.Key.Key_Down)
+        raise AssertionError(f"{_named(field)} does not offer “{words}”")
+
+    def tick(self, words: str, on: bool) -> None:
+        """Tick a box, or take its tick away."""
+        box = self.find(words)
+        assert isinstance(box, QCheckBox)
+        if box.isChecked() != on:
+            self.click(box)
+
+    def tab(self, tabs: QTabWidget, words: str) -> None:
+        """Click a tab."""
+        bar = tabs.tabBar()
+        place = next(k for k in range(bar.count()) if bar.tabText(k).startswith(words))
+        self.click(bar, bar.tabRect(place).center())
+
+    def cell(self, table: QTableWidget, row: int, column: int, text: str) -> None:
+        """Write into a cell of a table."""
+        place = table.visualRect(table.model().index(row, column)).center()
+        self.click(table.viewport(), place)
+        self.type(text)
+        self.press(Qt.Key.Key_Return)
+
+    def point(self, view: PictureView, u: float, v: float) -> QPoint:
+        """Where a place in a picture is seen, (u, v) in px."""
+        place: QPoint = view.canvas.mapFromScene(view.box.mapViewToScene(QPointF(u, v)))
+        return place
+
+    def answer(self, path: Path) -> None:
+        """Write a path into the next file dialog and press Enter."""
+        timer = QTimer(self.window)
+        timer.setInterval(POLL_MS)
+        timer.timeout.connect(lambda: self._answer(timer, path))
+        timer.start()
+
+    def _answer(self, timer: QTimer, path: Path) -> None:
+        """Press Enter until it is taken: the first may go to the list of completions."""
+        dialog = QApplication.activeModalWidget()
+        if not isinstance(dialog, QFileDialog):
+            return
+        line = dialog.findChild(QLineEdit)
+        assert line is not None
+        if line.text() != str(path):
+            line.selectAll()
+            QTest.keyClicks(line, str(path))
+        dialog.finished.connect(timer.stop)
+        popup = QApplication.activePopupWidget()
+        if popup is not None:
+            QTest.keyClick(popup, Qt.Key.Key_Escape)
+        QTest.keyClick(line, Qt.Key.Key_Return)
+
+
+def _focused() -> QWidget:
+    focused = QApplication.focusWidget()
+    assert focused is not None, "nothing has the focus"
+    return focused
+
+
+def _hot_spot(widget: QWidget) -> QPoint:
+    """Where a click means it: the box of a tick, the middle of anything else."""
+    if isinstance(widget, QCheckBox):
+        return QPoint(10, widget.height() // 2)
+    return widget.rect().center()
+
+
+def _is_seen(widget: QWidget, at: QPoint | None) -> bool:
+    """Whether a click at that place meets the widget, and nothing that lies over it."""
+    place = at or _hot_spot(widget)
+    window = widget.window()
+    inside = QRect(QPoint(), window.size()).contains(widget.mapTo(window, place))
+    if not (widget.isVisible() and inside):
+        return False
+    met = window.childAt(widget.mapTo(window, place))
+    return met is not None and (met is widget or widget.isAncestorOf(met))
+
+
+def _named(widget: QWidget) -> str:
+    return widget.accessibleName() or getattr(widget, "text", lambda: "")() or repr(widget)

@@ -1,0 +1,250 @@
+"""An experiment from New to the exported files, by mouse and keyboard; the command line agrees.
+
+Every number is typed, dragged or chosen in the window, and given to the command line as text; what
+both write is compared byte for byte.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import tomllib
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+from PySide6.QtCore import QCoreApplication, Qt
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.capture import CapturePage
+from labapp.gui.pages.dots import DotsPage
+from labapp.gui.pages.export import ExportPage
+from labapp.gui.pages.laser import LaserPage
+from labapp.gui.pages.page import Page
+from labapp.gui.pages.plane import PlanePage
+from labapp.gui.pages.setup import SetupPage
+from labapp.gui.pages.surface import SurfacePage
+from labapp.gui.window import MainWindow
+from tests.conftest import Run
+from tests.gui.conftest import SAMPLES
+from tests.gui.hand import CONTROL, SHIFT, Hand
+
+SAMPLE = SAMPLES / "gtaw"
+
+P = TypeVar("P", bound=Page)
+
+RECORD = {"title": "Bead 7", "operator": "A. Weld", "current_a": "75", "gas": "Argon"}
+
+RIG = {
+    "pattern": {"rows": "19", "columns": "19", "inter_beam_angle_deg": "0.77"},
+    "electrode": {"height_mm": "5"},
+    "imaging_plane": {
+        "distance_mm": "50",
+        "s_mm": "45",
+        "h_mm": "3",
+        "width_mm": "101.6",
+        "height_mm": "101.6",
+    },
+}
+"""As it is typed: the sample's, but for the laser and the camera, which are calibrated."""
+
+CROSS = (("4.65", "4.66"), ("6.22", "6.23"), ("2.75", "2.76"))
+"""Two readings each of l₁, l₂, l₃, of a laser 31.48 mm away at 31.14 degrees."""
+
+UNIT_MM = "6.35"
+
+FRAMES = (4, 6, 2)
+"""First, last, every n-th: frames 4 and 6."""
+
+CORRECTED = 6
+
+PATIENCE_MS = 120_000
+"""For a few fits on a machine that has other things to do."""
+
+
+def place_of(ray: tuple[int, int]) -> tuple[float, float]:
+    """Where a ray's dot is in the frame to be corrected, (u, v) px, from the sample's truth."""
+    with (SAMPLE / "dots_truth.csv").open() as file:
+        for line in csv.DictReader(file):
+            if (int(line["frame"]), int(line["ray_row"]), int(line["ray_column"])) == (
+                CORRECTED,
+                *ray,
+            ):
+                assert line["visible"] == "1"
+                return float(line["u_px"]), float(line["v_px"])
+    raise AssertionError(f"ray {ray} has no dot in frame {CORRECTED}")
+
+
+MOVED, DELETED = (8, 9), (12, 11)
+"""Rays whose dots are moved, by 1 px to the right and 2 down, and taken out."""
+
+
+@pytest.fixture
+def hand(window: MainWindow, qtbot: QtBot) -> Hand:
+    """A hand on the window at its first start; dialogs are Qt's own, which keys can work."""
+    QCoreApplication.setAttribute(Qt.ApplicationAttribute.AA_DontUseNativeDialogs)
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    return Hand(window)
+
+
+def page(hand: Hand, kind: type[P]) -> P:
+    """The page in view, which is of that kind."""
+    found = hand.window.page
+    assert isinstance(found, kind), found
+    return found
+
+
+def settle(hand: Hand, qtbot: QtBot) -> None:
+    qtbot.waitUntil(lambda: not hand.window.workspace.tasks.active, timeout=PATIENCE_MS)
+    assert hand.window.status_line.unread == []
+
+
+def set_up(hand: Hand) -> None:
+    shown = page(hand, SetupPage)
+    for name, text in RECORD.items():
+        hand.enter(shown.record_fields[name], text)
+    hand.tab(shown.tabs, "Bench")
+    for section, values in RIG.items():
+        for key, text in values.items():
+            hand.enter(shown.rig_fields[f"{section}.{key}"], text)
+
+
+def calibrate(hand: Hand, qtbot: QtBot) -> None:
+    hand.press(Qt.Key.Key_2, CONTROL)
+    laser = page(hand, LaserPage)
+    for column, readings in enumerate(CROSS):
+        for row, text in enumerate(readings):
+            hand.cell(laser.table, row, column, text)
+    hand.button("Use these")
+    hand.press(Qt.Key.Key_PageDown, CONTROL)
+    plane = page(hand, PlanePage)
+    hand.enter(plane.unit, UNIT_MM)
+    hand.answer(SAMPLE / "calibration.png")
+    hand.button("Load picture…")
+    qtbot.waitUntil(plane.use_button.isEnabled)
+    settle(hand, qtbot)
+    hand.button("Use")
+
+
+def take_frames(hand: Hand, qtbot: QtBot, recording: Path) -> None:
+    hand.press(Qt.Key.Key_4, CONTROL)
+    capture = page(hand, CapturePage)
+    hand.answer(recording)
+    hand.button("Choose a file …")
+    qtbot.waitUntil(capture.choice_group.isVisible)
+    for field, number in zip((capture.first, capture.last, capture.every), FRAMES, strict=True):
+        hand.enter(field, str(number))
+    settle(hand, qtbot)
+    hand.button("Import")
+    settle(hand, qtbot)
+
+
+def correct(hand: Hand, qtbot: QtBot) -> None:
+    """Move a dot with the arrow keys and delete another; the fit follows by itself."""
+    hand.press(Qt.Key.Key_5, CONTROL)
+    dots = page(hand, DotsPage)
+    hand.click(dots.view)
+    hand.press(Qt.Key.Key_Right)
+    assert hand.window.workspace.frame == CORRECTED
+    qtbot.waitUntil(lambda: dots.looking.frame == CORRECTED and dots.editor.correction is not None)
+    port = dots.view.canvas.viewport()
+    hand.click(port, hand.point(dots.view, *place_of(MOVED)))
+    for key in (Qt.Key.Key_Right, Qt.Key.Key_Down, Qt.Key.Key_Down):
+        hand.press(key, SHIFT)
+    settle(hand, qtbot)
+    QTest.qWait(400)  # or the next click would be a double one
+    hand.click(port, hand.point(dots.view, *place_of(DELETED)))
+    hand.press(Qt.Key.Key_Delete)
+    settle(hand, qtbot)
+
+
+def export(hand: Hand, qtbot: QtBot, folder: Path, scheme: str) -> None:
+    shown = page(hand, ExportPage)
+    hand.choose(shown.scheme, scheme)
+    hand.enter(shown.folder, str(folder))
+    hand.button("Export")
+    qtbot.waitUntil(lambda: shown.written is not None, timeout=PATIENCE_MS)
+    settle(hand, qtbot)
+
+
+def by_hand(hand: Hand, qtbot: QtBot, recording: Path, folder: Path) -> None:
+    """The whole experiment in the window."""
+    hand.answer(folder / "by hand")
+    hand.press(Qt.Key.Key_N, CONTROL)
+    set_up(hand)
+    calibrate(hand, qtbot)
+    take_frames(hand, qtbot, recording)
+    hand.press(Qt.Key.Key_F5)
+    settle(hand, qtbot)
+    correct(hand, qtbot)
+    hand.press(Qt.Key.Key_6, CONTROL)
+    hand.choose(page(hand, SurfacePage).side.scheme, "ERS: extrapolation")
+    hand.press(Qt.Key.Key_F5)
+    settle(hand, qtbot)
+    hand.press(Qt.Key.Key_8, CONTROL)
+    hand.tick("PLY", True)
+    export(hand, qtbot, folder / "ers by hand", "ERS (as in the settings)")
+    export(hand, qtbot, folder / "fit by hand", "fit")
+
+
+def by_command(labapp: Run, recording: Path, folder: Path) -> None:
+    """The same on the command line."""
+
+    def done(*arguments: object) -> None:
+        code, _, err = labapp(*arguments)
+        assert code == 0, err
+
+    setup, session = folder / "setup.toml", folder / "by command.labsession"
+    lines = []
+    for section, values in RIG.items():
+        lines += [f"[{section}]", *(f"{key} = {text}" for key, text in values.items())]
+    setup.write_text("\n".join(lines))
+    readings = [(f"--l{k}", text) for k, texts in enumerate(CROSS, 1) for text in texts]
+    done("calibrate", "laser", *sum(readings, ()), "--setup", setup)
+    done("calibrate", "plane", SAMPLE / "calibration.png", "--unit-mm", UNIT_MM, "--setup", setup)
+    record = [(f"--{name.replace('_', '-')}", text) for name, text in RECORD.items()]
+    done("session", "new", session, "--setup", setup, *sum(record, ()))
+    first, last, every = FRAMES
+    done("session", "import", session, recording, "--frames", f"{first}:{last + 1}:{every}")
+    done("session", "measure", session)
+    edits = [
+        ("--move", "{:.2f},{:.2f}:1,2".format(*place_of(MOVED))),
+        ("--delete", "{:.2f},{:.2f}".format(*place_of(DELETED))),
+    ]
+    done("session", "correct", session, "--frame", CORRECTED, *sum(edits, ()))
+    done("session", "measure", session, "--scheme", "ers")
+    for scheme in ("ers", "fit"):
+        out = ("--out", folder / f"{scheme} by command", "--surfaces", "csv,stl,ply")
+        done("session", "export", session, *out, "--scheme", scheme)
+
+
+def compare(one: Path, other: Path) -> None:
+    """Every file is the same; so is the manifest, but for the session's name and the times."""
+    names = sorted(path.name for path in other.iterdir())
+    assert sorted(path.name for path in one.iterdir()) == names
+    assert {f"surface_{frame:06d}.stl" for frame in (4, 6)} < set(names)
+    for name in set(names) - {"manifest.json"}:
+        assert (one / name).read_bytes() == (other / name).read_bytes(), name
+    told, expected = (json.loads((where / "manifest.json").read_text()) for where in (one, other))
+    assert told["files"] == expected["files"]
+    told, expected = told["provenance"], expected["provenance"]
+    for each in (told, expected):
+        assert each["source"].pop("imported")
+    for key in ("record", "source", "settings", "measured_by", "corrected_frames"):
+        assert told[key] == expected[key], key
+    setup, of_command = (tomllib.loads(each["setup"]["toml"]) for each in (told, expected))
+    assert setup == of_command
+
+
+def test_a_session_by_hand_gives_the_files_that_the_command_line_gives(
+    hand: Hand, labapp: Run, qtbot: QtBot, tmp_path: Path
+) -> None:
+    recording = tmp_path / "recording.avi"
+    shutil.copyfile(SAMPLE / recording.name, recording)
+    by_hand(hand, qtbot, recording, tmp_path)
+    by_command(labapp, recording, tmp_path)
+    for scheme in ("ers", "fit"):
+        compare(tmp_path / f"{scheme} by hand", tmp_path / f"{scheme} by command")
