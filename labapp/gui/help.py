@@ -8,7 +8,7 @@ from html import escape
 import numpy
 import PySide6
 import scipy
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QKeySequence
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
 
@@ -17,6 +17,9 @@ from labapp.gui.actions import ACTIONS, MENUS
 from labapp.gui.standing import Standing
 from labapp.gui.steps import STEPS
 from labapp.session.log import log_file
+
+PART_OF_SCREEN = 0.85
+"""No text takes more of the screen; the rest is for the frame around it."""
 
 TITLES = {"guide": "Guide", "keys": "Keys", "about": "About labapp"}
 
@@ -106,7 +109,8 @@ class HelpDialog(QDialog):
         layout = QVBoxLayout(self)
         layout.addWidget(self.browser)
         layout.addWidget(buttons)
-        self.resize(*((520, 300) if kind == "about" else (720, 600)))
+        wanted = QSize(520, 300) if kind == "about" else QSize(720, 600)
+        self.resize(wanted.boundedTo(self.screen().availableSize() * PART_OF_SCREEN))
 
 
 def _shown(key: str) -> str:

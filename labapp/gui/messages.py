@@ -74,9 +74,10 @@ class LogPanel(QListWidget):
         self.setWordWrap(True)
         self.setTextElideMode(Qt.TextElideMode.ElideNone)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setMinimumHeight(self.fontMetrics().height() * 2)
 
     def sizeHint(self) -> QSize:
-        """Some lines; the operator may drag it higher."""
+        """Some lines; the operator may drag it higher, or lower."""
         return QSize(400, self.fontMetrics().height() * 6)
 
     def add(self, text: str, problem: bool) -> None:
@@ -143,6 +144,7 @@ class StatusLine(QWidget):
         for widget in (self.title, self.bar, self.cancel_button):
             layout.addWidget(widget)
         tasks.changed.connect(self.show_progress)
+        tasks.progressed.connect(self.show_progress)
         self.show_progress()
         self._show_message("")
 

@@ -23,6 +23,7 @@ from PySide6.QtWidgets import (
     QMenu,
     QMessageBox,
     QPlainTextEdit,
+    QScrollArea,
     QTabBar,
     QTableWidget,
     QTextBrowser,
@@ -185,6 +186,28 @@ def test_two_schemes_compared(opened: MainWindow, qtbot: QtBot):
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
     QTest.qWait(50)
     check_round(opened)
+
+
+def test_a_small_screen_at_150_percent_holds_every_page(opened: MainWindow, qtbot: QtBot):
+    """1366 × 768 px are 911 × 512 of the window's own then."""
+    opened.menus.do("log")
+    for step in STEPS:
+        opened.show_step(step.key)
+    opened.page.workspace.show_frame(1)  # type: ignore[union-attr]
+    for step in STEPS:
+        opened.show_step(step.key)
+        if step.key == "surface":
+            opened.page.comparing.click()  # type: ignore[union-attr]
+        qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
+        opened.resize(911, 512)
+        QTest.qWait(20)
+        assert (opened.width(), opened.height()) == (911, 512), step.key
+        for area in opened.findChildren(QScrollArea):
+            cut = area.isVisible() and area.horizontalScrollBar().maximum() > 0
+            assert not cut, area.accessibleName()
+        for button in opened.findChildren(QAbstractButton):
+            if button.isVisible() and button.text():
+                assert button.width() >= button.sizeHint().width() - 1, button.text()
 
 
 def test_the_welcome_page_by_keyboard(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):

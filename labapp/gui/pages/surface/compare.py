@@ -133,9 +133,6 @@ class CompareView(QWidget):
                 item.setToolTip(f"{row[0]}: {text} {row[4] if 0 < column < 4 else ''}".strip())
                 self.table.setItem(k, column, item)
         self.table.resizeRowsToContents()
-        rows = sum(self.table.rowHeight(k) for k in range(self.table.rowCount()))
-        head = self.table.horizontalHeader().sizeHint().height() + 2 * self.table.frameWidth()
-        self.table.setMinimumHeight(rows + head)
 
 
 class _SchemeBox(QWidget):
@@ -169,5 +166,5 @@ def _table() -> QTableWidget:
     header = table.horizontalHeader()
     header.setHighlightSections(False)
     header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-    header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+    header.setStretchLastSection(True)
     return table

@@ -131,17 +131,20 @@ class SurfacePage(Page):
             decimals=2,
             tooltip="How far to the left of the electrode the line passes",
         )
-        line, cuts = QHBoxLayout(), QHBoxLayout()
-        for field in (self.angle, self.offset):
+        lines = []
+        for field, words, angle in (
+            (self.angle, "Along X", 0.0),
+            (self.offset, "Along Y", 90.0),
+        ):
             field.label.setWordWrap(False)
-            line.addWidget(field.label)
-            line.addWidget(field)
             field.edited.connect(self._enter_section)
-        for words, angle in (("Along X", 0.0), ("Along Y", 90.0)):
             cut = partial(self._set_section, angle, 0.0)
-            cuts.addWidget(_tool(words, f"Cut {words.lower()}, through the electrode's axis", cut))
-        cuts.addStretch(1)
-        return _Tools(line, cuts)
+            line = QHBoxLayout()
+            line.addWidget(field.label)
+            line.addWidget(field, 1)
+            line.addWidget(_tool(words, f"Cut {words.lower()}, through the electrode's axis", cut))
+            lines.append(line)
+        return _Tools(*lines)
 
     def _tools(self) -> QWidget:
         self.colour = ChoiceField(
