@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-import json
+import functools
 import os
 import tomllib
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.errors import InputError
 from labapp.session.files import write_whole
 from labapp.session.setup_keys import SECTIONS, rules_for
+from labapp.session.toml_keys import check_keys, shown, unknown_key
 
 A_SETUP = "a setup file (TOML, UTF-8)"
 
@@ -59,6 +59,7 @@ def read_setup(path: str | os.PathLike[str]) -> Setup:
     return parse_setup(_text(path), path)
 
 
+@functools.lru_cache(maxsize=64)
 def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
     """Check a setup that was read from ``path``; see `read_setup`."""
     path = Path(path)
@@ -67,8 +68,14 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
     except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
         raise InputError(path, "syntax", error, A_SETUP) from error
     problems = [
-        *_unknown_sections(path, values),
-        *(problem for section in SECTIONS for problem in _check(path, section, values)),
+        *(unknown_key(path, key, SECTIONS) for key in values if key not in SECTIONS),
+        *(
+            problem
+            for section in SECTIONS
+            for problem in check_keys(
+                path, section, values.get(section), rules_for(section, values.get(section))
+            )
+        ),
     ]
     # How values fit each other can be asked once each is right by itself.
     problems = problems or _contradictions(path, values)
@@ -118,7 +125,7 @@ def updated_setup(
             document.add(section, tomlkit.table())
         table = document[section]
         if not isinstance(table, Table):
-            raise InputError(path, section, _shown(table), f"a table: [{section}]")
+            raise InputError(path, section, shown(table), f"a table: [{section}]")
         for key, value in keys.items():
             if value is not None:
                 table[key] = value
@@ -134,48 +141,6 @@ def _text(path: Path) -> str:
         raise InputError(path, "file", error.strerror, A_SETUP) from error
     except UnicodeDecodeError as error:
         raise InputError(path, "encoding", "not UTF-8", A_SETUP) from error
-
-
-def _unknown_sections(path: Path, values: dict[str, Any]) -> list[InputError]:
-    return [_unknown(path, key, key, list(SECTIONS)) for key in values if key not in SECTIONS]
-
-
-def _unknown(path: Path, full: str, key: str, known: list[str]) -> InputError:
-    near = difflib.get_close_matches(key, known, 1)
-    expected = f"{near[0]}, perhaps" if near else f"one of {', '.join(known)}"
-    return InputError(path, full, "unknown key", expected)
-
-
-def _check(path: Path, section: str, values: dict[str, Any]) -> list[InputError]:
-    """Find unknown, missing and wrong keys of one section."""
-    keys = values.get(section)
-    rules = rules_for(section, keys)
-    if not isinstance(keys, dict):
-        needed = ", ".join(key for key, rule in rules.items() if rule.required)
-        found = "missing" if keys is None else _shown(keys)
-        return [InputError(path, section, found, f"a table [{section}] with {needed}")]
-    problems = []
-    for key, value in keys.items():
-        full = f"{section}.{key}"
-        if key not in rules:
-            problems.append(_unknown(path, full, key, list(rules)))
-        elif not rules[key].accepts(value):
-            problems.append(InputError(path, full, _shown(value), rules[key].expected))
-    problems += [
-        InputError(path, f"{section}.{key}", "missing", rule.expected)
-        for key, rule in rules.items()
-        if rule.required and key not in keys
-    ]
-    return problems
-
-
-def _shown(value: object) -> str:
-    """A value as TOML writes it."""
-    try:
-        shown = json.dumps(value, default=str, ensure_ascii=False)
-    except (ValueError, RecursionError):
-        return "a number of thousands of digits, or too deep a list"
-    return shown.replace("NaN", "nan").replace("Infinity", "inf")
 
 
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:

@@ -2,62 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeGuard
-
 import numpy as np
 
-LARGEST_MM = 10_000.0
-"""Lengths above this are a slip of the unit, not of a bench."""
+from labapp.session.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number
 
-LARGEST = 1e9
-"""Numbers of any kind above this are no measurement."""
-
-
-@dataclass(frozen=True)
-class Rule:
-    """What a key may hold.
-
-    Parameters
-    ----------
-    expected
-        That in words, completing "expected …".
-    accepts
-        Whether a value as TOML gives it is right.
-    required
-        Whether the key must be there.
-    """
-
-    expected: str
-    accepts: Callable[[object], bool]
-    required: bool = True
-
-
-def is_number(value: object) -> TypeGuard[float]:
-    """Whether this is a finite number (true, false, nan and inf are not)."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
-
-
-def _between(low: float, high: float, unit: str, required: bool = True) -> Rule:
-    return Rule(
-        f"a number above {low:g} and below {high:g} ({unit})",
-        lambda value: is_number(value) and low < value < high,
-        required,
-    )
-
-
-_LENGTH = _between(0, LARGEST_MM, "mm")
-_PLACE = _between(-LARGEST_MM, LARGEST_MM, "mm")
+_LENGTH = between(0, LARGEST_MM, "mm")
+_PLACE = between(-LARGEST_MM, LARGEST_MM, "mm")
 _COUNT = Rule(
     "an odd whole number from 3 to 99, so that there is a centre",
     lambda value: type(value) is int and 3 <= value <= 99 and value % 2 == 1,
 )
-_TILT = _between(-90, 90, "degrees", required=False)
-
-
-def _is_pixel(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(is_number, value))
+_TILT = between(-90, 90, "degrees", required=False)
 
 
 def _is_rays(value: object) -> bool:
@@ -71,14 +26,12 @@ def _is_matrix(value: object) -> bool:
     return (
         isinstance(value, list)
         and len(value) == 3
-        and all(
-            isinstance(row, list) and len(row) == 3 and all(map(is_number, row)) for row in value
-        )
+        and all(are_numbers(row, 3) for row in value)
         and bool(np.linalg.cond(np.array(value, float)) < 1e12)
     )
 
 
-_PIXEL = Rule("[u, v], two numbers (px)", _is_pixel)
+_PIXEL = Rule("[u, v], two numbers (px)", lambda value: are_numbers(value, 2))
 _ON_AXIS = Rule(
     f"a number from -{LARGEST_MM:g} to {LARGEST_MM:g} (mm) that is not 0",
     lambda value: is_number(value) and 0 < abs(value) <= LARGEST_MM,
@@ -96,13 +49,13 @@ HOMOGRAPHY = {
 }
 SECTIONS = {
     "laser": {
-        "projection_angle_deg": _between(0, 90, "degrees"),
+        "projection_angle_deg": between(0, 90, "degrees"),
         "distance_mm": _LENGTH,
     },
     "pattern": {
         "rows": _COUNT,
         "columns": _COUNT,
-        "inter_beam_angle_deg": _between(0, 45, "degrees"),
+        "inter_beam_angle_deg": between(0, 45, "degrees"),
         "absent": Rule(
             "a list of rays [row, column] within the pattern, counted from 1",
             _is_rays,

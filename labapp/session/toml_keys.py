@@ -1,0 +1,110 @@
+"""Keys of TOML files that people write: what each may hold, and what is wrong with those given."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeGuard
+
+from labapp.errors import InputError
+
+LARGEST_MM = 10_000.0
+"""Lengths above this are a slip of the unit, not of a bench."""
+
+LARGEST = 1e9
+"""Numbers of any kind above this are no measurement."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a key may hold.
+
+    Parameters
+    ----------
+    expected
+        That in words, completing "expected …".
+    accepts
+        Whether a value as TOML gives it is right.
+    required
+        Whether the key must be there.
+    """
+
+    expected: str
+    accepts: Callable[[object], bool]
+    required: bool = True
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether this is a finite number (true, false, nan and inf are not)."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
+
+
+def are_numbers(value: object, count: int) -> TypeGuard[list[float]]:
+    """Whether this is a list of so many finite numbers."""
+    return isinstance(value, list) and len(value) == count and all(map(is_number, value))
+
+
+def between(low: float, high: float, unit: str, required: bool = True) -> Rule:
+    """A number above ``low`` and below ``high``."""
+    return Rule(
+        f"a number above {low:g} and below {high:g} ({unit})",
+        lambda value: is_number(value) and low < value < high,
+        required,
+    )
+
+
+def check_keys(
+    path: Path, table: str, keys: object, rules: Mapping[str, Rule], form: str = ""
+) -> list[InputError]:
+    """Find unknown, missing and wrong keys of one table.
+
+    Parameters
+    ----------
+    path
+        The file.
+    table
+        Its full name.
+    keys
+        What was found there, a table or not; None: nothing.
+    rules
+        Key → what it may hold.
+    form
+        How the table is written; ``[table]`` unless given.
+    """
+    if not isinstance(keys, dict):
+        needed = ", ".join(key for key, rule in rules.items() if rule.required)
+        found = "missing" if keys is None else shown(keys)
+        expected = f"a table {form or f'[{table}]'}{f' with {needed}' if needed else ''}"
+        return [InputError(path, table, found, expected)]
+    problems = []
+    for key, value in keys.items():
+        full = f"{table}.{key}"
+        if key not in rules:
+            problems.append(unknown_key(path, full, rules))
+        elif not rules[key].accepts(value):
+            problems.append(InputError(path, full, shown(value), rules[key].expected))
+    problems += [
+        InputError(path, f"{table}.{key}", "missing", rule.expected)
+        for key, rule in rules.items()
+        if rule.required and key not in keys
+    ]
+    return problems
+
+
+def unknown_key(path: Path, full: str, known: Mapping[str, object]) -> InputError:
+    """Say that there is no such key or table, and which was meant, perhaps."""
+    near = difflib.get_close_matches(full.rpartition(".")[2], known, 1)
+    expected = f"{near[0]}, perhaps" if near else f"one of {', '.join(known)}"
+    return InputError(path, full, "unknown key", expected)
+
+
+def shown(value: object) -> str:
+    """A value as TOML writes it."""
+    try:
+        text = json.dumps(value, default=str, ensure_ascii=False)
+    except (ValueError, RecursionError):
+        return "a number of thousands of digits, or too deep a list"
+    return text.replace("NaN", "nan").replace("Infinity", "inf")
