@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +18,27 @@ settings.register_profile("labapp", derandomize=True, deadline=None)
 settings.load_profile("labapp")
 
 Run = Callable[..., tuple[int, str, str]]
+
+
+def lacks(words: str) -> None:
+    """Skip a test that cannot be run here; where everything has to be there, fail."""
+    if os.environ.get("CI") or os.environ.get("LABAPP_SKIP_NOTHING"):
+        pytest.fail(words, pytrace=False)
+    pytest.skip(words)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("xvfb") and shutil.which("xvfb-run") is None:
+        lacks("xvfb-run is not installed")
+
+
+@pytest.fixture
+def opengl() -> None:
+    """Let only what can draw in 3-D off-screen go on."""
+    from labapp.session.scene import can_draw
+
+    if not can_draw():
+        lacks("nothing can be drawn in 3-D here")
 
 
 @pytest.fixture

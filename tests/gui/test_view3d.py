@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,10 +15,10 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui.views import view3d
 from labapp.gui.views.view3d import NOTHING_HERE, OffscreenView, View3d, make_view3d
-from labapp.session.scene import Scene, can_draw
+from labapp.session.scene import Scene
 from tests.gui.conftest import KEPT
 
-pytestmark = pytest.mark.skipif(not can_draw(), reason="nothing can be drawn in 3-D here")
+pytestmark = pytest.mark.usefixtures("opengl")
 
 
 def hill(height_mm: float = 0.3) -> Scene:
@@ -260,7 +259,7 @@ print("well")
 """
 
 
-@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="Xvfb is not installed")
+@pytest.mark.xvfb
 def test_with_a_display_it_draws_in_the_window() -> None:
     """The real thing, under Xvfb: a process of its own, since Qt has one platform per process."""
     environment = {**os.environ, "QT_QPA_PLATFORM": "xcb"}

@@ -16,7 +16,6 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.workspace import Workspace
 from labapp.session.heights import profile
-from labapp.session.scene import can_draw
 from tests.gui.conftest import KEPT, CopySample
 
 
@@ -183,7 +182,7 @@ def test_what_the_view_shows_is_ticked(page: SurfacePage) -> None:
     assert page.view.scene.exaggeration == 5.0
 
 
-@pytest.mark.skipif(not can_draw(), reason="nothing can be drawn in 3-D here")
+@pytest.mark.usefixtures("opengl")
 def test_the_picture_is_copied_and_written(page: SurfacePage, tmp_path: Path) -> None:
     said = told(page)
     page.grab()
@@ -197,7 +196,7 @@ def test_the_picture_is_copied_and_written(page: SurfacePage, tmp_path: Path) ->
     assert [bad for _, bad in said] == [False, False, True]
 
 
-@pytest.mark.skipif(not can_draw(), reason="nothing can be drawn in 3-D here")
+@pytest.mark.usefixtures("opengl")
 def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None:
     page.comparing.click()
     compare = page.compare
