@@ -50,6 +50,7 @@ class Frames:
         self._database = database
         self._turn = threading.RLock()
         self._source: FrameSource | None = None
+        self._numbers: tuple[int, IntArray] | None = None
 
     @property
     def recording(self) -> Recording | None:
@@ -63,8 +64,14 @@ class Frames:
     @property
     def numbers(self) -> IntArray:
         """Numbers of the session's frames in the recording, from 0, ascending, shape (n,)."""
-        rows = self._database.rows("SELECT number FROM frame")
-        return self._database.array([number for (number,) in rows], np.int64)
+        version = self._database.value("PRAGMA data_version")  # another program's changes
+        held = self._numbers
+        if held is None or held[0] != version:
+            rows = self._database.rows("SELECT number FROM frame")
+            held = version, self._database.array([number for (number,) in rows], np.int64)
+            held[1].flags.writeable = False
+            self._numbers = held
+        return held[1]
 
     def time_s(self, number: int) -> float | None:
         """Time of one frame, s; None where unknown.
@@ -189,6 +196,7 @@ class Frames:
                 )
             recording = replace(recording, frames_sha256=self._fingerprint())
             connection.execute("INSERT OR REPLACE INTO recording VALUES (1, ?)", (pack(recording),))
+        self._numbers = None
         self.close()
         return recording
 

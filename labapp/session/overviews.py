@@ -1,0 +1,173 @@
+"""All frames of a session at a glance, kept up to date: what did not change is not read again."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from labapp.core.values import FloatArray, IntArray
+from labapp.session.database import Database
+from labapp.session.measured import Basis, Overview, Results
+from labapp.session.schema import MEASURES
+
+MANY = 500
+"""Where more frames than this changed, all are read: it takes no longer."""
+
+ALL_FRAMES = -2
+
+WATCHING = (
+    "CREATE TEMP TABLE touched (frame INTEGER)",
+    *(
+        f"CREATE TEMP TRIGGER touched_{table}_{what.lower()} AFTER {what} ON main.{table} "
+        f"BEGIN INSERT INTO touched VALUES ({frame}); END"
+        for table, whole in (("result", None), ("document", None), ("frame", ALL_FRAMES))
+        for what, row in (("INSERT", "NEW"), ("UPDATE", "NEW"), ("DELETE", "OLD"))
+        for frame in (whole or f"{row}.frame",)
+    ),
+)
+"""Has SQLite note the frames of each change, undo and redo included, in memory."""
+
+QUERY = (
+    "SELECT number, time_s, inputs, correction, status, sha256, "
+    f"{', '.join(MEASURES)} FROM frame "
+    "LEFT JOIN result ON result.frame = number AND scheme = ? "
+    "LEFT JOIN document ON document.frame = number AND kind = 'correction'"
+)
+
+
+@dataclass
+class _Table:
+    """What a scheme gave, a row a frame, as it was read last.
+
+    Parameters
+    ----------
+    number, time_s, inputs
+        Of the frame; row of `inputs` that it was measured from, 0 where it was not; shape (n,).
+    used, held
+        SHA-256 of the correction it was measured with, and of the one there is now; None without.
+    status, sizes
+        Of the result: shape (n,) and (n, number of measures).
+    due
+        Frames that have changed since.
+    seen
+        What was made of it last, and the rows of `inputs` that did not stand then.
+    """
+
+    number: IntArray
+    time_s: FloatArray
+    inputs: IntArray
+    used: np.ndarray[tuple[int], np.dtype[np.object_]]
+    held: np.ndarray[tuple[int], np.dtype[np.object_]]
+    status: np.ndarray[tuple[int], np.dtype[np.object_]]
+    sizes: FloatArray
+    due: set[int] = field(default_factory=set)
+    seen: tuple[Collection[int], Overview] | None = None
+
+
+class Overviews:
+    """The overviews of a session, one a scheme; may be used from several threads.
+
+    Parameters
+    ----------
+    database, results
+        The session file, and its results.
+    """
+
+    def __init__(self, database: Database, results: Results) -> None:
+        self._database = database
+        self._results = results
+        self._turn = threading.Lock()
+        self._tables: dict[str, _Table] = {}
+        self._version: int | None = None
+        for statement in WATCHING:
+            database.rows(statement)
+
+    def get(self, scheme: str, basis: Basis | None) -> Overview:
+        """All frames by a scheme; the very same object while nothing has changed.
+
+        Parameters
+        ----------
+        scheme
+            Name that results are kept under.
+        basis
+            What frames would be measured from now; None where the setup is not complete.
+
+        Raises
+        ------
+        InputError
+            If the session is damaged.
+        """
+        with self._turn:
+            try:
+                self._note_changes()
+                table = self._tables.get(scheme)
+                if table is None or len(table.due) > MANY:
+                    table = self._tables[scheme] = self._read(scheme)
+                elif table.due:
+                    self._read_again(table, scheme)
+                outdated = self._results.outdated(basis)
+            except BaseException:
+                self._tables.clear()  # what was to be read anew is known no more
+                raise
+            if table.seen is None or table.seen[0] != outdated:
+                table.seen = outdated, _overview(table, outdated)
+            return table.seen[1]
+
+    def _note_changes(self) -> None:
+        version = self._database.value("PRAGMA data_version")  # another program's changes
+        touched = {frame for (frame,) in self._database.rows("DELETE FROM touched RETURNING frame")}
+        if version != self._version or ALL_FRAMES in touched:
+            self._tables.clear()
+        self._version = version
+        for table in self._tables.values():
+            table.due |= touched
+
+    def _read(self, scheme: str) -> _Table:
+        rows = self._database.rows(f"{QUERY} ORDER BY number", scheme)
+        array = self._database.array
+        columns = list(zip(*rows, strict=True)) or [()] * (6 + len(MEASURES))
+        number, time_s, inputs, used, status, held, *sizes = columns
+        return _Table(
+            number=array(number, np.int64),
+            time_s=array(time_s, np.float64),
+            inputs=array([k or 0 for k in inputs], np.int64),
+            used=_objects(used),
+            held=_objects(held),
+            status=_objects([str(word or "") for word in status]),
+            sizes=array(sizes, np.float64).reshape(len(MEASURES), -1).T,
+        )
+
+    def _read_again(self, table: _Table, scheme: str) -> None:
+        """Read the rows that are due."""
+        array = self._database.array
+        for frame in table.due:
+            for row in self._database.rows(f"{QUERY} WHERE number = ?", scheme, frame):
+                place = int(np.searchsorted(table.number, frame))
+                table.time_s[place : place + 1] = array(row[1:2], np.float64)
+                table.inputs[place : place + 1] = array([row[2] or 0], np.int64)
+                table.used[place], table.held[place] = row[3], row[5]
+                table.status[place] = str(row[4] or "")
+                table.sizes[place] = array(row[6:], np.float64)
+        table.due.clear()
+        table.seen = None
+
+
+def _objects(values: Collection[object]) -> np.ndarray[tuple[int], np.dtype[np.object_]]:
+    found = np.empty(len(values), dtype=object)
+    found[:] = values
+    return found
+
+
+def _overview(table: _Table, outdated: Collection[int]) -> Overview:
+    stands = ~np.isin(table.inputs, list(outdated)) & (table.used == table.held)
+    return Overview(
+        frame=table.number.copy(),
+        time_s=table.time_s.copy(),
+        status=tuple(table.status.tolist()),
+        corrected=np.asarray(table.held != np.array(None), bool),
+        stale=(table.inputs > 0) & ~stands.astype(bool),
+        measures=dict(zip(MEASURES, table.sizes.T.copy(), strict=True)),
+    )
