@@ -19,7 +19,6 @@ from labapp.session.setup import Setup, parse_setup
 
 SETUP_CHANGED = "the rig or a calibration was changed"
 SETTINGS_CHANGED = "the settings were changed"
-INPUTS_DAMAGED = "what it was measured from is damaged"
 CORRECTION_CHANGED = "the dots or rows were corrected"
 
 
@@ -234,32 +233,6 @@ class Results:
         )
         return {(scheme, version): count for scheme, version, count in rows}
 
-    def overview(self, scheme: str, basis: Basis | None, corrections: dict[int, str]) -> Overview:
-        """All frames at a glance; see `get` for the parameters."""
-        outdated = self._outdated(basis)
-        rows = self._database.rows(
-            f"SELECT number, time_s, inputs, correction, status, {', '.join(MEASURES)} "
-            "FROM frame LEFT JOIN result ON frame = number AND scheme = ? ORDER BY number",
-            scheme,
-        )
-        array = self._database.array
-        sizes = array([row[5:] for row in rows], np.float64).reshape(-1, len(MEASURES))
-        return Overview(
-            frame=array([row[0] for row in rows], np.int64),
-            time_s=array([row[1] for row in rows], np.float64),
-            status=tuple(str(row[4] or "") for row in rows),
-            corrected=np.array([row[0] in corrections for row in rows], bool),
-            stale=np.array(
-                [
-                    row[2] is not None
-                    and bool(outdated.get(row[2]) or row[3] != corrections.get(row[0]))
-                    for row in rows
-                ],
-                bool,
-            ),
-            measures=dict(zip(MEASURES, sizes.T, strict=True)),
-        )
-
     def problems(self) -> list[str]:
         """Results that are damaged; empty if all is well."""
         found = []
@@ -291,17 +264,18 @@ class Results:
                 found.append(f"{named} is not what its frame gave")
         return found
 
-    def _outdated(self, basis: Basis | None) -> dict[int, tuple[str, ...]]:
-        """Why results of each row of `inputs` no longer stand."""
-        outdated = {}
+    def outdated(self, basis: Basis | None) -> frozenset[int]:
+        """Rows of `inputs` from which nothing would be measured now, whose results do not stand."""
+        found = set()
         for number, setup, settings in self._database.rows(
             "SELECT id, setup, settings FROM inputs"
         ):
             try:
-                outdated[number] = _differences(basis, self._inputs(setup, settings))
+                if _differences(basis, self._inputs(setup, settings)):
+                    found.add(number)
             except InputError:
-                outdated[number] = (INPUTS_DAMAGED,)
-        return outdated
+                found.add(number)
+        return frozenset(found)
 
     def _inputs(self, setup: bytes, settings: bytes) -> Basis:
         try:

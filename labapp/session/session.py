@@ -33,6 +33,7 @@ from labapp.session.export import ExportChoice, ExportedFile
 from labapp.session.frames import THE_RECORDING, Frames, Progress
 from labapp.session.kept_pictures import KeptPictures
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
+from labapp.session.overviews import Overviews
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.run import measure_each
 from labapp.session.setup import Setup, parse_setup, updated_setup
@@ -58,6 +59,7 @@ class Session:
         self._frames = Frames(database)
         self._pictures = KeptPictures(database)
         self._results = Results(database)
+        self._overviews = Overviews(database, self._results)
         self._signals = KeptSignals(self._documents)
 
     @classmethod
@@ -403,11 +405,7 @@ class Session:
 
     def overview(self, scheme: str | None = None) -> Overview:
         """All frames at a glance: status, corrections, what no longer stands, measures."""
-        return self._results.overview(
-            scheme or scheme_name(self.settings),
-            self._basis(),
-            self._documents.fingerprints("correction"),
-        )
+        return self._overviews.get(scheme or scheme_name(self.settings), self._basis())
 
     def corrected_frames(self) -> IntArray:
         """Frames with a correction by hand, ascending, shape (n,)."""
