@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,6 +21,9 @@ from labapp.errors import InputError
 from labapp.session.log import NAME
 
 POLL_MS = 10
+
+PROGRESS_MS = 100
+"""How far tasks are is told no more often."""
 
 
 class Cancelled(Exception):
@@ -34,9 +38,12 @@ class Control:
     ----------
     events
         Where what happens goes.
+    reached
+        How far the work is: done, and in all.
     """
 
     events: queue.SimpleQueue[tuple[str, Any]] = field(default_factory=queue.SimpleQueue)
+    reached: tuple[int, int] = (0, 0)
     cancelled: threading.Event = field(default_factory=threading.Event)
 
     def progress(self, done: int, total: int) -> None:
@@ -48,7 +55,7 @@ class Control:
             If the operator has cancelled it.
         """
         self.check()
-        self.events.put(("progress", (done, total)))
+        self.reached = done, total
 
     def part(self, value: object) -> None:
         """Hand over a part of the result: it reaches ``on_part`` on the GUI thread."""
@@ -85,8 +92,16 @@ class Task:
     thread: threading.Thread
     on_part: Callable[[Any], None] | None
     on_done: Callable[[Any], None] | None
-    done: int = 0
-    total: int = 0
+
+    @property
+    def done(self) -> int:
+        """How much is done."""
+        return self.control.reached[0]
+
+    @property
+    def total(self) -> int:
+        """How much there is to do; 0 while that is not known."""
+        return self.control.reached[1]
 
     def cancel(self) -> None:
         """Ask the work to stop; what it has finished stays."""
@@ -99,12 +114,15 @@ class Tasks(QObject):
     Signals
     -------
     changed
-        A task began, went on or ended.
+        A task began or ended.
+    progressed
+        Tasks have gone on.
     failed
         A task failed: its title and what to tell the operator.
     """
 
     changed = Signal()
+    progressed = Signal()
     failed = Signal(str, str)
 
     def __init__(self, parent: QObject | None = None) -> None:
@@ -113,6 +131,7 @@ class Tasks(QObject):
         self._timer = QTimer(self)
         self._timer.setInterval(POLL_MS)
         self._timer.timeout.connect(self._poll)
+        self._told: tuple[float, list[tuple[int, int]]] = (0.0, [])
 
     def start(
         self,
@@ -154,27 +173,30 @@ class Tasks(QObject):
 
     def _poll(self) -> None:
         for task in list(self.active):
-            while task in self.active:
-                try:
-                    kind, value = task.control.events.get_nowait()
-                except queue.Empty:
-                    break
-                self._take(task, kind, value)
+            # No more than there are now: what comes meanwhile waits for the hands.
+            for _ in range(task.control.events.qsize()):
+                if task in self.active:
+                    self._take(task, *task.control.events.get_nowait())
+        self._tell_progress()
         if not self.active:
             self._timer.stop()
 
+    def _tell_progress(self) -> None:
+        now, reached = time.monotonic(), [task.control.reached for task in self.active]
+        if reached != self._told[1] and (now - self._told[0]) * 1000 >= PROGRESS_MS:
+            self._told = now, reached
+            self.progressed.emit()
+
     def _take(self, task: Task, kind: str, value: Any) -> None:
-        if kind == "progress":
-            task.done, task.total = value
-        elif kind == "part":
+        if kind == "part":
             if task.on_part is not None and not task.control.cancelled.is_set():
                 task.on_part(value)
-        else:
-            self.active.remove(task)
-            if kind == "failed":
-                self.failed.emit(task.title, value)
-            elif kind == "done" and task.on_done is not None:
-                task.on_done(value)
+            return
+        self.active.remove(task)
+        if kind == "failed":
+            self.failed.emit(task.title, value)
+        elif kind == "done" and task.on_done is not None:
+            task.on_done(value)
         self.changed.emit()
 
 

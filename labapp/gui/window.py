@@ -154,6 +154,7 @@ class MainWindow(QMainWindow):
         space = self.workspace
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
+        space.measured.connect(self._changed)
         space.frame_changed.connect(self._frame_changed)
         space.said.connect(self.say)
         space.tasks.changed.connect(self.menus.refresh)

@@ -31,6 +31,8 @@ class Workspace(QObject):
         Another session is open, or none.
     changed
         A document, the recording or a result changed; pages in view show the session anew.
+    measured
+        A frame that is not in view was measured: many may follow in a second.
     frame_changed
         Another frame is in view.
     said
@@ -39,6 +41,7 @@ class Workspace(QObject):
 
     opened = Signal()
     changed = Signal()
+    measured = Signal()
     frame_changed = Signal(int)
     said = Signal(str, bool)
 
@@ -51,6 +54,7 @@ class Workspace(QObject):
         # Connected before anybody else: whoever hears of a change sees the frames as they are.
         self.opened.connect(self._forget)
         self.changed.connect(self._forget)
+        self.measured.connect(self._forget)
         self.tasks = Tasks(self)
         self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
 
@@ -159,23 +163,22 @@ class Workspace(QObject):
     def measure(self, frames: Sequence[int] | None = None) -> Task | None:
         """Measure frames in the background; None: those not measured, or stale.
 
-        Each frame that is kept makes `changed` go out.
+        Each frame that is kept makes `measured` go out; that in view, and the last, `changed`.
         """
         session = self.session
         if session is None:
             return None
-        numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
-
         if self._pool is None:
             self._pool = measuring_pool(max(1, (os.cpu_count() or 2) - 1))
         pool = self._pool
 
         def work(control: Control) -> int:
             done = 0
+            numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
-                for done, _ in enumerate(session.measure(numbers, pool), 1):
+                for done, (number, _) in enumerate(session.measure(numbers, pool), 1):
                     control.progress(done, len(numbers))
-                    control.part(None)
+                    control.part(number)
             except BrokenProcessPool as error:
                 control.check()  # ended on purpose
                 self._pool = None
@@ -188,4 +191,7 @@ class Workspace(QObject):
             self.said.emit(f"{count} frame{'s' * (count != 1)} measured", False)
             self.changed.emit()
 
-        return self.tasks.start("Measuring", work, finished, lambda _: self.changed.emit())
+        def kept(number: int) -> None:
+            (self.changed if number == self.frame else self.measured).emit()
+
+        return self.tasks.start("Measuring", work, finished, kept)

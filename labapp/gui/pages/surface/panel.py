@@ -66,6 +66,7 @@ class SurfacePanel:
             layout.addWidget(widget)
         layout.addStretch(1)
         workspace.tasks.changed.connect(self._show_progress)
+        workspace.tasks.progressed.connect(self._show_progress)
 
     def _measuring(self) -> QGridLayout:
         self.one = _button("&This frame", "Measure the frame in view (Shift+F5)", self.this_one)
