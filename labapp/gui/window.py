@@ -50,6 +50,9 @@ REST = 4
 
 LONGEST_REST_MS = 1000
 
+MEASURED_REST_MS = 250
+"""What is measured behind the operator's back is shown no more often."""
+
 TICKS = (
     Tick(Standing.NOT_MEASURED.words, "", "", ((0.0, 0.12),)),
     Tick(Standing.MEASURED.words, "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
@@ -109,6 +112,10 @@ class MainWindow(QMainWindow):
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)
         self._rest.timeout.connect(self._rested)
+        self._soon = QTimer(self)
+        self._soon.setSingleShot(True)
+        self._soon.setInterval(MEASURED_REST_MS)
+        self._soon.timeout.connect(self._changed)
         self._make_views()
         without = {f"step_{step.key}" for step in STEPS} - {f"step_{s.key}" for s in self._steps}
         self.menus = Menus(self, frozenset(action.name for action in ACTIONS) - without)
@@ -154,7 +161,7 @@ class MainWindow(QMainWindow):
         space = self.workspace
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
-        space.measured.connect(self._changed)
+        space.measured.connect(self._measured)
         space.frame_changed.connect(self._frame_changed)
         space.said.connect(self.say)
         space.tasks.changed.connect(self.menus.refresh)
@@ -258,6 +265,10 @@ class MainWindow(QMainWindow):
             self._changes_due = True
         else:
             self._show_session()
+
+    def _measured(self) -> None:
+        if not self._soon.isActive():
+            self._soon.start()
 
     def _rested(self) -> None:
         if self._changes_due:
@@ -449,6 +460,7 @@ class MainWindow(QMainWindow):
         self.workspace.opened.disconnect(self._session_opened)
         self.workspace.close()
         self._rest.stop()
+        self._soon.stop()
         event.accept()
 
 

@@ -165,7 +165,9 @@ class Spectrum:
         return float(self.frequency[strongest]), float(self.amplitude[strongest])
 
 
-def trend(seen: Overview, key: str, without_doubtful: bool = False) -> Trend:
+def trend(
+    seen: Overview, key: str, without_doubtful: bool = False, doubtful: BoolArray | None = None
+) -> Trend:
     """The course of a measure.
 
     Parameters
@@ -176,12 +178,14 @@ def trend(seen: Overview, key: str, without_doubtful: bool = False) -> Trend:
         Name of the measure, one of `BY_KEY`.
     without_doubtful
         Whether frames in doubt are left out of the statistics. What no longer stands always is.
+    doubtful
+        What `doubtful_frames` gives, if it is at hand.
     """
     quantity = BY_KEY[key]
     value = seen.measures[key]
     has = np.flatnonzero(np.isfinite(value))
     timed = bool(np.isfinite(seen.time_s).all())
-    doubtful = doubtful_frames(seen)
+    doubtful = doubtful_frames(seen) if doubtful is None else doubtful
     counts = ~seen.stale & ~(doubtful & without_doubtful)
     sigma = seen.measures[quantity.sigma] if quantity.sigma else np.full(len(value), np.nan)
     return Trend(

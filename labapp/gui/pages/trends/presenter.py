@@ -13,7 +13,7 @@ from labapp.gui.digits import ResultRow, rounded
 from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
-from labapp.session.trends import BY_KEY, Trend, spectrum, spread, trend
+from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
 
 MARKS = (
     Mark("●", "measured"),
@@ -80,18 +80,24 @@ class Shown:
 def show(session: Session, wish: Wish) -> Shown:
     """What to show of a session."""
     seen, signals = session.overview(), session.signals
-    courses = [trend(seen, key, wish.without_doubtful) for key in BY_KEY if key in wish.shown]
+    doubtful = doubtful_frames(seen)
+
+    def course_of(key: str) -> Trend:
+        return trend(seen, key, wish.without_doubtful, doubtful)
+
+    courses = [course_of(key) for key in BY_KEY if key in wish.shown]
     timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
     axis = Axis("Time", "s") if timed else Axis("Frame", "", decimals=0)
     curves = [_curve(course) for course in courses if len(course.frame)]
     if signals is not None and timed:
         curves += _signal_curves(signals, seen, wish.shown)
-    found, spectrum_axis, told = _spectrum(seen, wish, timed)
+    of = course_of(wish.spectrum_of) if wish.spectrum_of in BY_KEY else None
+    found, spectrum_axis, told = _spectrum(of, timed)
     return Shown(
         curves=tuple(curves),
         axis=axis,
         rows=tuple(row for course in courses for row in _rows(course)),
-        words=_counted(seen, wish.without_doubtful),
+        words=_counted(seen, course_of("height_mm")),
         spectrum=found,
         spectrum_axis=spectrum_axis,
         spectrum_words=told,
@@ -131,11 +137,10 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
     )
 
 
-def _counted(seen: Overview, without_doubtful: bool) -> str:
-    course = trend(seen, "height_mm", without_doubtful)
+def _counted(seen: Overview, course: Trend) -> str:
     total, has = len(seen.frame), len(course.frame)
     told = [f"{int(course.counts.sum())} of {total} frames count"]
-    unmeasured = sum(status == "" for status in seen.status)
+    unmeasured = seen.status.count("")
     reasons = (
         (unmeasured, "not measured yet"),
         (total - has - unmeasured, "without a surface"),
@@ -146,11 +151,10 @@ def _counted(seen: Overview, without_doubtful: bool) -> str:
     return ", ".join(told)
 
 
-def _spectrum(seen: Overview, wish: Wish, timed: bool) -> tuple[tuple[Curve, ...], Axis, str]:
+def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axis, str]:
     axis = Axis("Frequency", "Hz" if timed else "1/frame", 2 if timed else 4)
-    if wish.spectrum_of not in BY_KEY:
+    if course is None:
         return (), axis, ""
-    course = trend(seen, wish.spectrum_of, wish.without_doubtful)
     try:
         found = spectrum(course)
     except ValueError as error:
