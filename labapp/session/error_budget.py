@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,11 +15,9 @@ from labapp.core.plane_calibration import PlaneCalibration
 from labapp.core.rig import Rig
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.session.setup import Setup
+from labapp.simulation.parameter_deviation import NOMINAL, OFFSETS, QUANTITIES, AxisPoints, move
 
 SIZES = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
-
-NOMINAL_MM, NOMINAL_DEG, NOMINAL_PX = 0.1, 0.1, 0.1
-"""The ± of what nobody told a ± of."""
 
 
 @dataclass(frozen=True)
@@ -80,15 +77,14 @@ def calibration_budget(
             return np.full(len(SIZES), np.nan)
         return np.abs(_sizes(size) - _sizes(base))
 
-    found = [
-        Contribution(name, sigma, unit, nominal, change(match, rig))
-        for name, sigma, unit, nominal, rig in _moved_rigs(setup.rig, laser)
-    ]
-    points = [
-        Contribution(name, sigma, "px", nominal, _together([change(m, setup.rig) for m in moved]))
-        for name, sigma, nominal, moved in _moved_points(match, setup, plane)
-    ]
-    return (*found, *points)
+    axes, sigmas, nominal = _known(setup, laser, plane)
+    found = []
+    for quantity, sigma, assumed in zip(QUANTITIES, sigmas, nominal, strict=True):
+        steps = sigma * np.eye(OFFSETS)[list(quantity.parts)]
+        changes = [change(*move(match, setup.rig, axes, step)) for step in steps]
+        each = np.sqrt(np.sum(np.square(changes), axis=0))
+        found.append(Contribution(quantity.name, sigma, quantity.unit, assumed, each))
+    return tuple(found)
 
 
 def together(*contributions: FloatArray) -> FloatArray:
@@ -118,52 +114,16 @@ def _sizes(measures: Measures) -> FloatArray:
     return np.array([getattr(measures, name) for name in SIZES])
 
 
-def _together(changes: list[FloatArray]) -> FloatArray:
-    return np.asarray(np.sqrt(np.sum(np.square(changes), axis=0)))
-
-
-def _moved_rigs(
-    rig: Rig, laser: LaserCalibration | None
-) -> Iterator[tuple[str, float, str, bool, Rig]]:
-    """Name, ±, unit, whether it is nominal, and the rig with that one quantity moved."""
-    angle, distance, nominal = NOMINAL_DEG, NOMINAL_MM, True
-    if laser is not None and laser_in_use(laser, rig):
-        angle, distance, nominal = laser.angle_sigma_deg, laser.distance_sigma_mm, False
-    now = rig.laser
-    turned = replace(now, projection_angle_deg=now.projection_angle_deg + angle)
-    yield "laser, projection angle", angle, "°", nominal, replace(rig, laser=turned)
-    farther = replace(now, distance_mm=now.distance_mm + distance)
-    yield "laser, distance", distance, "mm", nominal, replace(rig, laser=farther)
-    for name, axis in (("distance", 1), ("s", 0), ("h", 2)):
-        origin = rig.imaging_plane.origin_mm + NOMINAL_MM * np.eye(3)[axis]
-        plane = replace(rig.imaging_plane, origin_mm=origin)
-        yield f"imaging plane, {name}", NOMINAL_MM, "mm", True, replace(rig, imaging_plane=plane)
-
-
-def _moved_points(
-    match: Match, setup: Setup, plane: PlaneCalibration | None
-) -> Iterator[tuple[str, float, bool, list[Match]]]:
-    """Name, ±, whether it is nominal, and the match with O′ or an axis point moved along u and v.
-
-    The dots stay where they are in the picture; their places on the plane follow the points.
-    """
-    calibration = setup.calibration
-    x_mm, z_mm = setup.rig.imaging_plane.width_mm / 2, setup.rig.imaging_plane.height_mm / 2
-    sigma, nominal = (NOMINAL_PX, NOMINAL_PX, NOMINAL_PX), True
-    if plane is not None and plane_in_use(plane, calibration):
-        x_mm, z_mm, sigma, nominal = plane.x_axis_mm, plane.z_axis_mm, plane.sigma_px, False
-    points = calibration.to_image(np.array([[0.0, 0.0], [x_mm, 0.0], [0.0, z_mm]]))
-    dots = _with_ones(calibration.to_image(match.plane_mm))
-    for k, name in enumerate(("O′", "point on O′X′", "point on O′Z′")):
-        moved = []
-        for step in np.eye(2):
-            seen = points.copy()
-            seen[k] += sigma[k] * step
-            # What was taken for the moved points is where the true ones are.
-            share = np.linalg.solve(_with_ones(seen).T, dots.T)
-            moved.append(replace(match, plane_mm=calibration.to_plane(share.T @ points)))
-        yield f"image calibration, {name}", sigma[k], nominal, moved
-
-
-def _with_ones(points: FloatArray) -> FloatArray:
-    return np.column_stack([points, np.ones(len(points))])
+def _known(
+    setup: Setup, laser: LaserCalibration | None, plane: PlaneCalibration | None
+) -> tuple[AxisPoints, list[float], list[bool]]:
+    """The axis points, the ± of each of `QUANTITIES`, and which of these are nominal."""
+    size = setup.rig.imaging_plane
+    axes = AxisPoints(setup.calibration, size.width_mm / 2, size.height_mm / 2)
+    sigma, nominal = list(NOMINAL), [True] * len(NOMINAL)
+    if laser is not None and laser_in_use(laser, setup.rig):
+        sigma[:2], nominal[:2] = [laser.angle_sigma_deg, laser.distance_sigma_mm], [False] * 2
+    if plane is not None and plane_in_use(plane, setup.calibration):
+        axes = AxisPoints(setup.calibration, plane.x_axis_mm, plane.z_axis_mm)
+        sigma[5:], nominal[5:] = plane.sigma_px, [False] * 3
+    return axes, sigma, nominal

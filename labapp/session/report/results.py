@@ -9,11 +9,12 @@ import numpy as np
 from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.session.error_budget import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX, calibration_budget
+from labapp.session.error_budget import calibration_budget
 from labapp.session.report import data, figures
 from labapp.session.report.data import FrameLine, Told
 from labapp.session.report.layout import Story
 from labapp.session.setup import parse_setup
+from labapp.simulation.parameter_deviation import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX
 
 LATEST_CHANGES = 40
 """So many of the newest changes are listed."""

@@ -1,0 +1,57 @@
+"""Tables of a simulation's results, as CSV and as Markdown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+
+Cell = str | int | float | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table that a command prints and writes.
+
+    Parameters
+    ----------
+    name
+        Name of its file, without the ending.
+    caption
+        One line that says what it shows, and which table or figure of the text it stands beside.
+    columns
+        Names of the columns, units in them.
+    rows
+        Cells; None or NaN where a value is unknown.
+    """
+
+    name: str
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def csv(self) -> str:
+        """CSV with a header row; an unknown value is an empty cell."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([_text(cell, 6) for cell in row] for row in self.rows)
+        return out.getvalue()
+
+    def markdown(self) -> str:
+        """The caption in bold, and the table with its columns in line."""
+        cells = [list(self.columns), *([_text(cell, 3) for cell in row] for row in self.rows)]
+        widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]
+        cells.insert(1, ["-" * width for width in widths])
+        lines = [
+            " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+            for row in cells
+        ]
+        return f"**{self.caption}**\n\n" + "".join(f"| {line} |\n" for line in lines)
+
+
+def _text(cell: Cell, digits: int) -> str:
+    if cell is None or (isinstance(cell, float) and math.isnan(cell)):
+        return ""
+    return f"{cell:.{digits}g}" if isinstance(cell, float) else str(cell)
