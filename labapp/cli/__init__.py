@@ -20,7 +20,7 @@ import typer.core
 import typer.main
 
 import labapp
-from labapp.cli import session
+from labapp.cli import session, simulate
 from labapp.cli.shared import (
     BAD_INPUT,
     FAULT,
@@ -34,7 +34,7 @@ from labapp.cli.shared import (
     note,
     progress_bar,
 )
-from labapp.cli.window import asks_for_app, open_app, show_in_app
+from labapp.cli.window import asks_for_app, open_app, show_in_app, tour
 from labapp.errors import InputError
 from labapp.session.log import log_file, start_log
 
@@ -61,6 +61,8 @@ app = typer.Typer(
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate the laser or the imaging plane.")
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(session.app, name="session")
+app.command()(simulate.simulate)
+app.command()(tour)
 
 SetupToChange = Annotated[
     Path | None,

@@ -9,9 +9,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from PySide6.QtCore import (
     QMessageLogContext,
@@ -27,6 +28,10 @@ from PySide6.QtWidgets import QApplication
 import labapp
 from labapp.errors import InputError
 from labapp.session.log import NAME, start_log
+
+if TYPE_CHECKING:
+    from labapp.gui.preferences import Preferences
+    from labapp.gui.window import MainWindow
 
 WITHOUT = "labapp --help tells what can be done on the command line"
 
@@ -61,19 +66,35 @@ def main(arguments: Sequence[str]) -> int:
     path = Path(arguments[0]).absolute() if arguments else None
     if path is not None and not path.exists():
         raise InputError(path, "file", "is not there", "a session, or a recording to import")
-    if not has_display(os.environ):
-        value = "none: neither DISPLAY nor WAYLAND_DISPLAY is set"
-        raise InputError("the app", "display", value, f"a desktop; {WITHOUT}")
-    # Before numpy is loaded: the matrices are small, and waiting threads keep the window from it.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app = start_app()
 
     from labapp.gui.preferences import preferences_file, read_preferences
-    from labapp.gui.window import MainWindow
 
     file = preferences_file()
     preferences, problem = read_preferences(file)
+    with open_window(app, preferences, file) as window:
+        if problem:
+            window.say(problem, True)
+        if path is not None:
+            QTimer.singleShot(0, window, lambda: window.files.open_path(path))
+        return app.exec()
+
+
+@contextlib.contextmanager
+def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iterator[MainWindow]:
+    """Show the window, with all that goes on beside it; ended, what was there before is back.
+
+    Parameters
+    ----------
+    app
+        Of `start_app`.
+    preferences
+        What is remembered from the last start.
+    file
+        Where they are kept.
+    """
+    from labapp.gui.window import MainWindow
+
     window = MainWindow(preferences, file)
     window.apply_theme()
     app.styleHints().colorSchemeChanged.connect(window.apply_theme)
@@ -83,15 +104,11 @@ def main(arguments: Sequence[str]) -> int:
     heartbeat.timeout.connect(lambda: None)
     heartbeat.start(HEARTBEAT_MS)
     former = signal.signal(signal.SIGINT, lambda *_: window.close())
-    if problem:
-        window.say(problem, True)
     window.show()
-    if path is not None:
-        QTimer.singleShot(0, window, lambda: window.files.open_path(path))
     loading = threading.Thread(target=_load_what_draws_in_3d, name="loading", daemon=True)
     QTimer.singleShot(LOAD_AFTER_MS, window, loading.start)
     try:
-        return app.exec()
+        yield window
     finally:
         if loading.is_alive():
             loading.join()
@@ -106,7 +123,19 @@ def _load_what_draws_in_3d() -> None:
 
 
 def start_app() -> QApplication:
-    """Qt's application, made if there is none yet."""
+    """Qt's application, made if there is none yet.
+
+    Raises
+    ------
+    InputError
+        If there is no display.
+    """
+    if not has_display(os.environ):
+        value = "none: neither DISPLAY nor WAYLAND_DISPLAY is set"
+        raise InputError("the app", "display", value, f"a desktop; {WITHOUT}")
+    # Before numpy is loaded: the matrices are small, and waiting threads keep the window from it.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     present = QApplication.instance()
     if isinstance(present, QApplication):
         return present

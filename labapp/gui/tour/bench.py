@@ -1,0 +1,84 @@
+"""What the tour has to work with: a folder of files such as an operator would bring along."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from labapp.media import GreyImage
+from labapp.session.copies import copy_sample
+from labapp.session.samples import sample_folder
+
+CROSS_MM = (4.65, 6.23, 2.75)
+"""l₁, l₂, l₃ that the laser of the sample draws with a fan angle of 10°."""
+
+PX_PER_MM = 30
+CENTRE_PX = (320, 200)
+SCALE_PX = ((120, 440), (420, 440))
+"""Ends of the 10 mm scale in the picture of the cross."""
+
+
+def lay_out(folder: Path) -> None:
+    """Put the files that the tour opens into a folder.
+
+    ``measurements`` holds set-up, recording, calibration pictures and a logger's table of a run;
+    ``blocked`` a session with frames that cannot be measured.
+
+    Raises
+    ------
+    InputError
+        If the samples are not there.
+    """
+    measurements = folder / "measurements"
+    (measurements / "earlier").mkdir(parents=True)
+    for name in ("setup.toml", "calibration.png", "recording.avi"):
+        shutil.copyfile(sample_folder("gtaw") / name, measurements / name)
+    cv2.imwrite(str(measurements / "cross_hair.png"), cross_hair())
+    blank = np.full((480, 640), 90, np.uint8)
+    cv2.imwrite(str(measurements / "no_target.png"), blank)
+    (measurements / "current.csv").write_text(logged(), "utf-8")
+    (measurements / "damaged.labsession").write_text("no session", "utf-8")
+    copy_sample("blocked_rows", folder / "blocked")
+
+
+def cross_hair() -> GreyImage:
+    """A picture of the cross hair beside a scale of 10 mm, from above, shape (480, 640)."""
+    image = np.full((480, 640), 30, np.uint8)
+    u, v = CENTRE_PX
+    near, far, across = (round(length * PX_PER_MM) for length in CROSS_MM)
+    cv2.line(image, (u, v - near), (u, v + far), 255, 5, cv2.LINE_AA)
+    cv2.line(image, (u - across, v), (u + across, v), 255, 5, cv2.LINE_AA)
+    (left, line), (right, _) = SCALE_PX
+    cv2.rectangle(image, (left - 20, line), (right + 20, line + 34), 170, -1)
+    for mm in range(11):
+        at = left + mm * PX_PER_MM
+        cv2.line(image, (at, line), (at, line + (22 if mm % 5 == 0 else 13)), 0, 2)
+    return np.asarray(cv2.GaussianBlur(image, (5, 5), 0))
+
+
+def places() -> dict[str, tuple[float, float]]:
+    """(u, v) of the ends of the cross and of the scale in that picture, px, by their names."""
+    u, v = CENTRE_PX
+    near, far, across = (length * PX_PER_MM for length in CROSS_MM)
+    return {
+        "laser's side": (u, v - near),
+        "far side": (u, v + far),
+        "left": (u - across, v),
+        "right": (u + across, v),
+        "scale 1": SCALE_PX[0],
+        "scale 2": SCALE_PX[1],
+    }
+
+
+def logged() -> str:
+    """What a logger wrote: time, current, voltage; CSV."""
+    time_s = np.arange(0.0, 0.5, 0.002)
+    rng = np.random.default_rng(4)
+    current = 75 + 4 * np.sin(2 * np.pi * 8 * time_s) + rng.normal(0, 0.4, len(time_s))
+    voltage = 11.5 - 0.05 * (current - 75) + rng.normal(0, 0.05, len(time_s))
+    table = zip(time_s, current, voltage, strict=True)
+    lines = [f"{t:.3f},{i:.2f},{u:.3f}" for t, i, u in table]
+    return "\n".join(["time_s,current_A,voltage_V", *lines]) + "\n"

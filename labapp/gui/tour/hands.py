@@ -1,0 +1,462 @@
+"""Hands and eyes of the tour: pressing, typing, waiting until the window rests, taking pictures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from PySide6.QtCore import (
+    QDir,
+    QElapsedTimer,
+    QEventLoop,
+    QPoint,
+    QPointF,
+    QRect,
+    QSize,
+    Qt,
+    QTimer,
+)
+from PySide6.QtGui import QColor, QImage, QPainter
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import (
+    QAbstractButton,
+    QApplication,
+    QComboBox,
+    QDialog,
+    QFileDialog,
+    QLineEdit,
+    QListView,
+    QMenu,
+    QMenuBar,
+    QScrollArea,
+    QTableWidget,
+    QWidget,
+)
+
+from labapp.gui.pages.page import Page
+from labapp.gui.views.fields import ChoiceField, Field
+from labapp.gui.views.picture import PictureView
+from labapp.gui.views.view3d import InteractiveView, View3d
+from labapp.gui.window import MainWindow
+
+LONGEST_MS = 60_000
+"""What takes longer than this has gone wrong."""
+
+LOOK_MS = 5
+
+TITLE_PX = 24
+"""Height of the title that is drawn over a dialog: its frame is the desktop's, not the app's."""
+
+LEAST_SPREAD = 3.0
+"""A 3-D view whose grey levels deviate by less than this shows nothing."""
+
+NONE, SHIFT, CTRL = (
+    Qt.KeyboardModifier.NoModifier,
+    Qt.KeyboardModifier.ShiftModifier,
+    Qt.KeyboardModifier.ControlModifier,
+)
+LEFT = Qt.MouseButton.LeftButton
+
+T = TypeVar("T", bound=QWidget)
+P = TypeVar("P", bound=Page)
+
+
+class TourFailed(Exception):
+    """The app did not do what it should: on which page, and what."""
+
+
+@dataclass
+class Hands:
+    """Drives a window as an operator does.
+
+    Parameters
+    ----------
+    window
+        The window.
+    out
+        Folder for the pictures.
+    size_px
+        Width and height of the pictures, px of the screen.
+    tell
+        Called with a line for every picture.
+    """
+
+    window: MainWindow
+    out: Path
+    size_px: tuple[int, int]
+    tell: Callable[[str], None]
+    count: int = field(default=0, init=False)
+
+    # --- waiting -----------------------------------------------------------------------------
+
+    def fail(self, words: str) -> TourFailed:
+        """What to raise when something went wrong on the page in view."""
+        return TourFailed(f"{self.page}: {words}")
+
+    @property
+    def page(self) -> str:
+        """Key of the page in view."""
+        return "welcome" if self.window.page is None else self.window.page.key
+
+    def wait(self, until: Callable[[], object], what: str) -> None:
+        """Let the window work until something is so."""
+        QApplication.processEvents()
+        if until():
+            return
+        loop, look, limit = QEventLoop(), QTimer(), QTimer()
+        look.timeout.connect(lambda: loop.quit() if until() else None)
+        limit.timeout.connect(lambda: loop.exit(1))
+        look.start(LOOK_MS)
+        limit.start(LONGEST_MS)
+        late = loop.exec()
+        for timer in (look, limit):
+            timer.stop()
+        if late:
+            working = ", ".join(task.title for task in self.window.workspace.tasks.active)
+            under_way = f" ({working} is under way)" if working else ""
+            raise self.fail(f"waited {LONGEST_MS // 1000} s in vain for {what}{under_way}")
+
+    def settle(self) -> None:
+        """Wait until nothing is under way any more, and nothing is due."""
+        self.wait(self._rests, "work to end")
+
+    def _rests(self) -> bool:
+        QApplication.sendPostedEvents()
+        timers = self.window.findChildren(QTimer)
+        due = any(timer.isActive() and timer.isSingleShot() for timer in timers)
+        return not due and not self.window.workspace.tasks.active
+
+    # --- doing -------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Make the window as large as the pictures."""
+        ratio = self.window.devicePixelRatioF()
+        self.window.resize(*(round(side / ratio) for side in self.size_px))
+        self.wait(self.window.isVisible, "the window to be seen")
+
+    def on(self, kind: type[P]) -> P:
+        """The page in view, which must be of this kind."""
+        page = self.window.page
+        if not isinstance(page, kind):
+            told = "; ".join(self.window.status_line.unread) or "the page does not come"
+            raise TourFailed(f"{kind.key}: {told}")
+        self.settle()
+        return page
+
+    def read(self) -> None:
+        """Read the problem that is told, and hide the messages again."""
+        self.press("Read")
+        self.do("log")
+
+    def do(self, name: str) -> None:
+        """Do an action of the menus."""
+        action = self.window.menus.actions[name]
+        if not action.isEnabled():
+            raise self.fail(f"“{action.text()}” is greyed out")
+        action.trigger()
+
+    def found(self, kind: type[T], words: str, words_of: Callable[[T], str]) -> T:
+        """The one widget in view that has these words."""
+        there = [
+            widget
+            for widget in self.window.findChildren(kind)
+            if widget.isVisible() and words_of(widget).replace("&", "") == words
+        ]
+        if len(there) != 1:
+            raise self.fail(f"{len(there)} of “{words}” are in view, not one")
+        return self.reveal(there[0])
+
+    def reveal(self, widget: T) -> T:
+        """Scroll to a widget."""
+        parent = widget.parentWidget()
+        while parent is not None:
+            if isinstance(parent, QScrollArea):
+                QApplication.processEvents()
+                parent.ensureWidgetVisible(widget)
+            parent = parent.parentWidget()
+        return widget
+
+    def press(self, words: str) -> None:
+        """Press the button with these words."""
+        button = self.found(QAbstractButton, words, QAbstractButton.text)
+        if not button.isEnabled():
+            raise self.fail(f"“{words}” cannot be pressed: {button.toolTip()}")
+        QTest.mouseClick(
+            button, LEFT, pos=QPoint(min(12, button.width() // 2), button.height() // 2)
+        )
+
+    def awake(self) -> None:
+        """Have the keys go to the window."""
+        if not self.window.isActiveWindow():
+            self.window.activateWindow()
+            self.wait(self.window.isActiveWindow, "the keys to go to the window")
+
+    def key(self, key: Qt.Key, held: Qt.KeyboardModifier = NONE) -> None:
+        """Press a key in the page in view."""
+        assert self.window.page is not None
+        self.awake()
+        QTest.keyClick(self.window.page.focusProxy() or self.window.page, key, held)
+
+    def enter(self, label: str, text: str) -> None:
+        """Type a text into the field with this label."""
+        editor = self.found(Field, label, lambda one: one.label.text()).editor
+        self.awake()
+        editor.setFocus()
+        QTest.keyClick(editor, Qt.Key.Key_A, CTRL)
+        QTest.keyClicks(editor, text)
+        QTest.keyClick(editor, Qt.Key.Key_Tab)
+
+    def enter_cell(self, table: QTableWidget, row: int, column: int, text: str) -> None:
+        """Type a text into a cell of a table."""
+        self.awake()
+        table.setFocus()
+        table.setCurrentCell(row, column)
+        QTest.keyClicks(table, text[0])
+
+        def editors() -> list[QLineEdit]:
+            found = table.viewport().findChildren(QLineEdit)
+            return [editor for editor in found if editor.isVisible()]
+
+        self.wait(editors, "the cell to be opened")
+        QTest.keyClicks(editors()[0], text[1:])
+        QTest.keyClick(editors()[0], Qt.Key.Key_Return)
+        self.wait(lambda: not editors(), "the cell to be left")
+
+    def choose(self, label: str, words: str) -> None:
+        """Choose what begins with these words in the list with this label."""
+        combo = self.found(ChoiceField, label, lambda one: one.label.text()).editor
+        assert isinstance(combo, QComboBox)
+        places = [k for k in range(combo.count()) if combo.itemText(k).startswith(words)]
+        if len(places) != 1:
+            raise self.fail(f"“{label}” has {len(places)} choices that begin with “{words}”")
+        combo.showPopup()
+        view = combo.view()
+        view.setCurrentIndex(combo.model().index(places[0], 0))
+        QTest.keyClick(view, Qt.Key.Key_Return)
+
+    def click_row(self, table: QTableWidget, row: int) -> None:
+        """Click a line of a table."""
+        self.reveal(table)
+        at = table.visualRect(table.model().index(row, 0)).center()
+        QTest.mouseClick(table.viewport(), LEFT, pos=at)
+
+    def click(self, view: PictureView, place: tuple[float, float], twice: bool = False) -> None:
+        """Click somewhere in a picture, (u, v) in px; or double click."""
+        at, port = _in_view(view, place), view.canvas.viewport()
+        QTest.mouseClick(port, LEFT, pos=at)
+        if twice:
+            QTest.mouseDClick(port, LEFT, pos=at)
+            QTest.mouseRelease(port, LEFT, pos=at)
+
+    def drag(self, view: PictureView, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Drag something in a picture from one place to another, (u, v) in px."""
+        port = view.canvas.viewport()
+        first, last = _in_view(view, start), _in_view(view, end)
+        QTest.mousePress(port, LEFT, pos=first)
+        for part in (0.3, 0.6, 1.0):
+            QTest.mouseMove(port, first + (last - first) * part)
+            QTest.qWait(LOOK_MS)  # the picture heeds so many moves a second
+        QTest.mouseRelease(port, LEFT, pos=last)
+
+    # --- pictures ----------------------------------------------------------------------------
+
+    def picture(self, name: str = "", *, trouble: bool = False, busy: bool = False) -> None:
+        """Take a picture of the window and what is open over it, when it rests.
+
+        Parameters
+        ----------
+        name
+            What is to be seen, after the page's own name; ``dialog-…`` for a dialog.
+        trouble
+            Whether a problem is to be told: there must be one; else there must be none.
+        busy
+            Whether work is to be seen: the picture is taken while it is under way.
+        """
+        if busy:
+            self.wait(lambda: self.window.workspace.tasks.active, "work to begin")
+        else:
+            self.settle()
+        unread = self.window.status_line.unread
+        if bool(unread) != trouble:
+            raise self.fail("; ".join(unread) or "a problem that should be told is not")
+        image = self._seen()
+        if image.size() != QSize(*self.size_px):
+            wide, high = image.width(), image.height()
+            raise self.fail(f"the window is {wide}×{high} px large: more than there is room for")
+        self.count += 1
+        part = name if name.startswith("dialog-") else "-".join(filter(None, (self.page, name)))
+        file = self.out / f"{self.count:02d}-{part}.png"
+        if not image.save(str(file)):
+            raise self.fail(f"{file} cannot be written")
+        over = [widget.windowTitle() for widget in _over(self.window)]
+        self.tell("  ".join(filter(None, (file.name, *over))))
+
+    def _seen(self) -> QImage:
+        image = self.window.grab().toImage().convertToFormat(QImage.Format.Format_RGB32)
+        painter = QPainter(image)
+        for view in self.window.findChildren(View3d):
+            self._paint_3d(painter, view)
+        for widget in _over(self.window):
+            self._paint_over(painter, widget)
+        painter.end()
+        return image
+
+    def _paint_3d(self, painter: QPainter, view: View3d) -> None:
+        """Paint what is drawn past Qt, after a look whether there is something."""
+        if not view.isVisible() or view.scene is None:
+            return
+        seen = view.picture()
+        if seen is None or float(np.std(seen.mean(axis=2))) < LEAST_SPREAD:
+            raise self.fail(f"“{view.accessibleName()}” shows nothing")
+        if isinstance(view, InteractiveView):
+            image = view.image()
+            assert image is not None
+            inner = view.rect().adjusted(1, 1, -1, -1)  # within the frame that shows the focus
+            painter.drawImage(QRect(view.mapTo(self.window, inner.topLeft()), inner.size()), image)
+
+    def _paint_over(self, painter: QPainter, widget: QWidget) -> None:
+        """Paint a dialog or a menu where it is; a dialog with a title, as a desktop gives it."""
+        is_dialog = isinstance(widget, QDialog)
+        top = TITLE_PX if is_dialog else 0
+        room = self.window.rect().adjusted(0, top, -widget.width(), -widget.height())
+        if room.width() < 1 or room.height() < 1:
+            raise self.fail(f"“{widget.windowTitle()}” is larger than the window")
+        at = self.window.mapFromGlobal(widget.mapToGlobal(QPoint(0, 0)))
+        at = QPoint(
+            max(room.left(), min(at.x(), room.right())), max(room.top(), min(at.y(), room.bottom()))
+        )
+        if is_dialog:
+            strip = QRect(at.x(), at.y() - top, widget.width(), top)
+            painter.fillRect(strip, widget.palette().highlight())
+            painter.setPen(widget.palette().highlightedText().color())
+            painter.drawText(strip, Qt.AlignmentFlag.AlignCenter, widget.windowTitle())
+        painter.drawPixmap(at, widget.grab())
+        painter.setPen(QColor("#808080"))
+        painter.drawRect(QRect(at, widget.size()).adjusted(-1, -top - 1, 0, 0))
+
+    # --- menus and dialogs -------------------------------------------------------------------
+
+    def menu(self, words: str) -> None:
+        """Open a menu of the menu bar, take its picture, and close it."""
+        bar: QMenuBar = self.window.menuBar()
+        action = next(a for a in bar.actions() if a.text().replace("&", "") == words)
+        menu, at = action.menu(), bar.actionGeometry(action).center()
+        assert isinstance(menu, QMenu)
+        self.popup(menu, words.lower(), lambda: QTest.mouseClick(bar, LEFT, pos=at))
+
+    def popup(self, menu: QMenu, name: str, show: Callable[[], object]) -> None:
+        """Show a menu, take its picture, and close it; ``show`` may return only when it is."""
+        closed: list[Exception | None] = []
+        look = QTimer()
+
+        def attend() -> None:
+            if menu.isVisible():
+                look.stop()
+                try:
+                    self.picture(f"menu-{name}")
+                    closed.append(None)
+                except Exception as error:
+                    closed.append(error)
+                QTest.keyClick(menu, Qt.Key.Key_Escape)
+                menu.close()
+
+        look.timeout.connect(attend)
+        look.start(LOOK_MS)
+        show()
+        self.wait(lambda: closed, f"the menu {name}")
+        if closed[0] is not None:
+            raise closed[0]
+
+    def asked(
+        self, name: str, do: Callable[[], object], answer: Callable[[QDialog], object] | None = None
+    ) -> None:
+        """Do what opens a dialog that must be answered; take its picture and answer it.
+
+        Parameters
+        ----------
+        name
+            Of the picture; empty for none.
+        do
+            Opens the dialog; may return only when it is closed.
+        answer
+            Answers it; without one it is given up by Escape.
+        """
+        ended: list[Exception | None] = []
+        look = QTimer()
+
+        def attend() -> None:
+            dialog = QApplication.activeModalWidget()
+            late = began.hasExpired(LONGEST_MS)
+            if not isinstance(dialog, QDialog) or not (late or _is_filled(dialog)):
+                return
+            look.stop()
+            try:
+                if late:
+                    raise self.fail(f"“{dialog.windowTitle()}” never shows what it is about")
+                if name:
+                    self.picture(f"dialog-{name}")
+                if answer is None:
+                    QTest.keyClick(dialog, Qt.Key.Key_Escape)
+                else:
+                    answer(dialog)
+                if dialog.isVisible():
+                    raise self.fail(f"“{dialog.windowTitle()}” stays open")
+                ended.append(None)
+            except Exception as error:
+                ended.append(error)
+                dialog.reject()
+
+        began = QElapsedTimer()
+        began.start()
+        look.timeout.connect(attend)
+        look.start(LOOK_MS)
+        do()
+        self.wait(lambda: ended, f"the dialog {name}")
+        if ended[0] is not None:
+            raise ended[0]
+
+
+def _in_view(view: PictureView, place: tuple[float, float]) -> QPoint:
+    at: QPoint = view.canvas.mapFromScene(view.box.mapViewToScene(QPointF(*place)))
+    return at
+
+
+def give(path: Path) -> Callable[[QDialog], None]:
+    """Answer a dialog that asks for a file or a folder."""
+
+    def answer(dialog: QDialog) -> None:
+        line = dialog.findChild(QLineEdit, "fileNameEdit")
+        assert isinstance(line, QLineEdit)
+        line.selectAll()
+        line.insert(str(path))
+        QTest.keyClick(line, Qt.Key.Key_Return)
+
+    return answer
+
+
+def _is_filled(dialog: QDialog) -> bool:
+    """Whether a dialog shows what it is about: the list of files is read in the background."""
+    if not dialog.isVisible():
+        return False
+    files = dialog.findChild(QListView, "listView")
+    if not isinstance(dialog, QFileDialog) or files is None:
+        return True
+    patterns = re.findall(r"\*[^\s)]*", dialog.selectedNameFilter())
+    kinds = QDir.Filter.AllDirs | QDir.Filter.NoDotAndDotDot
+    if dialog.fileMode() != QFileDialog.FileMode.Directory:
+        kinds |= QDir.Filter.Files
+    there = dialog.directory().entryList(patterns, kinds)
+    return not there or files.model().rowCount(files.rootIndex()) > 0
+
+
+def _over(window: MainWindow) -> list[QWidget]:
+    """Dialogs and menus that are open over the window."""
+    return [
+        widget
+        for widget in QApplication.topLevelWidgets()
+        if widget is not window and widget.isVisible() and isinstance(widget, QDialog | QMenu)
+    ]
