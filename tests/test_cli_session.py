@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -691,6 +692,25 @@ def test_results_are_exported(labapp: Run, measured: Path, tmp_path: Path) -> No
     assert measured.read_bytes() == before
 
 
+def test_a_film_is_exported(labapp: Run, tmp_path: Path) -> None:
+    pytest.importorskip("pyvista")
+    sample = Path(package.__file__).parents[1] / "sample_sessions" / "blocked_rows"
+    code, _, complained = labapp(
+        *("session", "export", sample / "blocked_rows.labsession", "--out", tmp_path / "out"),
+        *("--no-tables", "--surfaces", "none", "--pictures", "film"),
+        *("--view", "top", "--size", "480x320", "--film-rate", 5),
+    )
+    assert (code, complained) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *("film.mp4", "manifest.json")
+    ]
+    with av.open(str(tmp_path / "out" / "film.mp4")) as container:
+        frames = list(container.decode(video=0))
+    assert [frame.time for frame in frames] == pytest.approx([k / 5 for k in range(6)])
+    assert {(frame.width, frame.height) for frame in frames} == {(480, 320)}
+    assert all(np.ptp(frame.to_ndarray(format="gray")) > 100 for frame in frames)
+
+
 def test_an_exported_table_comes_back_as_a_correction(
     labapp: Run, measured: Path, tmp_path: Path
 ) -> None:
@@ -714,6 +734,9 @@ def test_an_exported_table_comes_back_as_a_correction(
     [
         ("--surfaces obj", "export: surfaces: obj; expected some of csv, stl"),
         ("--pictures all", "export: pictures: all; expected some of frames, surfaces, trends"),
+        ("--pictures film --size 1280", "--size: size: 1280; expected WIDTHxHEIGHT"),
+        ("--pictures film --size 1281x720", "export: size_px: 1281x720; expected even numbers"),
+        ("--pictures film --film-rate 0", "export: film_rate_hz: 0.0; expected above 0"),
         ("--surfaces csv --solid", "export: solid: no mesh format; expected one of stl"),
         ("--no-tables --surfaces none", "export: choice: nothing; expected tables, surfaces"),
         ("--scheme ers", "results: none by ers; expected frames to be measured"),

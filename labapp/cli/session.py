@@ -279,8 +279,22 @@ def export(
     ] = False,
     hdf5: Annotated[bool, typer.Option("--hdf5", help="Everything in one HDF5 file.")] = False,
     pictures: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, or none.")
+        str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, film, or none.")
     ] = "none",
+    view: Annotated[
+        Literal["free", "top", "side", "front"],
+        typer.Option(help="Where pictures of surfaces and the film look from; free: obliquely."),
+    ] = "free",
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Of these pictures and the film (px, even).")
+    ] = "1280x720",
+    film_rate: Annotated[
+        float | None,
+        typer.Option(
+            callback=finite,
+            help="Frames of the film a second (Hz); without it, as fast as they were recorded.",
+        ),
+    ] = None,
     report: Annotated[bool, typer.Option("--report", help="A PDF report.")] = False,
 ) -> None:
     """Write results into a folder, which is whole or not there, with a manifest.
@@ -299,6 +313,9 @@ def export(
         solid=solid,
         hdf5=hdf5,
         pictures=_words(pictures),
+        view=view,
+        size_px=_size(size),
+        film_rate_hz=film_rate,
     )
     with Session.open(file, read_only=True) as session, _counted(f"writing {out.name}") as progress:
         chosen = None if frames is None else choose_frames(session, frames)
@@ -310,7 +327,7 @@ def export(
             frames=chosen,
             scheme=scheme,
             report=report,
-            progress=lambda done: progress(done, len(wanted - missing)),
+            progress=progress,
         )
     if missing:
         typer.echo(f"Not measured, so not in it: {frames_text(missing)}")
@@ -320,6 +337,14 @@ def export(
 def _not_measured(session: Session, scheme: str | None) -> set[int]:
     seen = session.overview(scheme)
     return {int(f) for f, status in zip(seen.frame, seen.status, strict=True) if not status}
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Read ``1280x720``."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError("--size", "size", text, "WIDTHxHEIGHT, two whole numbers (px)")
+    return int(width), int(height)
 
 
 def _words(text: str) -> frozenset[str]:

@@ -13,8 +13,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from concurrent.futures import Executor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,19 +20,20 @@ from pathlib import Path
 import labapp
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
-from labapp.core.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.media import GreyImage
 from labapp.session.files import as_bytes
+from labapp.session.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.session.hdf5 import Hdf5Writer
 from labapp.session.meshes import FORMATS, SMALLEST_SPACING_MM, SPACING_MM
 from labapp.session.pictures import (
-    drawing_process,
     write_frame_picture,
     write_surface_picture,
     write_trend_picture,
 )
 from labapp.session.results import SURFACES, now, surface_files
+from labapp.session.scene import VIEWS, Direction
+from labapp.session.studio import PICTURE_PX, drawing_process, told
 from labapp.session.summary import Summary
 from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables
 
@@ -42,7 +41,11 @@ MANIFEST = "manifest.json"
 HDF5_FILE = "results.h5"
 TREND_FILE = "trends.png"
 TREND = ("width", "length", "height")
-PICTURES = ("frames", "surfaces", "trends")
+FILM_FILE = "film.mp4"
+PICTURES = ("frames", "surfaces", "trends", "film")
+
+SIZES_PX = range(320, 3841, 2)
+"""Widths and heights that pictures of surfaces can have: a film's are even."""
 
 UNITS = (
     "lengths in mm, angles in degrees, times in s, places in a frame in px; see the column names"
@@ -70,9 +73,17 @@ class ExportChoice:
     hdf5
         Whether to write everything into one HDF5 file.
     pictures
-        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D) and ``trends``.
+        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
+        ``film`` (the surfaces, one after the other in one view and on one colour scale).
     spacing_mm
         Distance of the surfaces' nodes, mm.
+    view
+        Where surfaces are looked at from, in pictures and the film: ``free`` (obliquely), ``top``,
+        ``side`` or ``front``.
+    size_px
+        Width and height of these, even, px.
+    film_rate_hz
+        Frames of the film a second; None: as fast as they were recorded (`film.film_times`).
 
     Raises
     ------
@@ -86,6 +97,9 @@ class ExportChoice:
     hdf5: bool = False
     pictures: frozenset[str] = frozenset()
     spacing_mm: float = SPACING_MM
+    view: Direction = "free"
+    size_px: tuple[int, int] = PICTURE_PX
+    film_rate_hz: float | None = None
 
     def __post_init__(self) -> None:
         allowed: dict[str, Collection[str]] = {
@@ -102,6 +116,15 @@ class ExportChoice:
             raise InputError(
                 "export", "spacing_mm", self.spacing_mm, f"from {SMALLEST_SPACING_MM} to 1 mm"
             )
+        if self.view not in VIEWS:
+            raise InputError("export", "view", self.view, f"one of {', '.join(VIEWS)}")
+        if any(side not in SIZES_PX for side in self.size_px):
+            size = "{}x{}".format(*self.size_px)
+            wanted = f"even numbers from {SIZES_PX[0]} to {SIZES_PX[-1]}"
+            raise InputError("export", "size_px", size, wanted)
+        rate = self.film_rate_hz
+        if rate is not None and not 0 < rate <= TICKS_HZ:
+            raise InputError("export", "film_rate_hz", rate, f"above 0, at most {TICKS_HZ}")
 
 
 @dataclass(frozen=True)
@@ -144,7 +167,8 @@ def export(
     folder
         Where to: a new or an empty folder, or an earlier export, which is replaced.
     measured
-        (frame, time in s, measurement) of each frame; taken one at a time.
+        (frame, time in s, measurement) of each frame; taken one at a time, and once more for a
+        film.
     calibration
         Pixel ↔ imaging plane, for the dots' places on the plane.
     provenance
@@ -156,7 +180,7 @@ def export(
     extras
         Further files, name → content: a report.
     progress
-        Called with the number of frames done; may raise to stop.
+        Called with the number of frames done, those of a film counted again; may raise to stop.
 
     Returns
     -------
@@ -177,9 +201,16 @@ def export(
         files = _Files(part)
         for name, content in (extras or {}).items():
             files.add(name, content)
-        frames = _write_results(
+        progress = progress or (lambda _: None)
+        summary, extent = _write_results(
             files, measured, calibration, provenance, choice, image_of, progress
         )
+        frames = len(summary.frames)
+        if "film" in choice.pictures and extent.known:
+            times_s = film_times([each[:2] for each in summary.frames], choice.film_rate_hz)
+            path = files.new(FILM_FILE)
+            with told("film"), drawing_process(choice.size_px, choice.view) as process:
+                write_film(path, measured, times_s, extent, process, lambda k: progress(frames + k))
         return files.finish({"frames": frames, "units": UNITS, "provenance": provenance})
 
 
@@ -257,10 +288,10 @@ def _write_results(
     provenance: Mapping[str, object],
     choice: ExportChoice,
     image_of: Callable[[int], GreyImage] | None,
-    progress: Callable[[int], None] | None,
-) -> int:
-    """Everything that is chosen, frame by frame; returns how many frames."""
-    summary = Summary()
+    progress: Callable[[int], None],
+) -> tuple[Summary, Extent]:
+    """Everything that is chosen but a film, frame by frame; what frames there are, how large."""
+    summary, extent = Summary(), Extent()
     for name in choice.tables:
         files.add(f"{name}.csv", csv_header(name).encode())
     with ExitStack() as stack:
@@ -270,7 +301,7 @@ def _write_results(
             writer = Hdf5Writer(files.new(HDF5_FILE), about, choice.spacing_mm)
             hdf5 = stack.enter_context(writer)
         if "surfaces" in choice.pictures:
-            process = stack.enter_context(drawing_process())
+            process = stack.enter_context(drawing_process(choice.size_px, choice.view))
         for frame, time_s, measurement in measured:
             reconstruction = measurement.reconstruction
             tables = frame_tables(frame, time_s, measurement, calibration)
@@ -288,13 +319,15 @@ def _write_results(
                 path = files.new(f"frame_{frame:06d}.png")
                 write_frame_picture(path, image_of(frame), measurement)
             if process is not None and reconstruction is not None:
-                _draw_surface(files.new(f"surface_{frame:06d}.png"), reconstruction, process)
+                with told("surfaces"):
+                    path = files.new(f"surface_{frame:06d}.png")
+                    write_surface_picture(path, reconstruction, process)
             summary.add(frame, time_s, measurement)
-            if progress is not None:
-                progress(len(summary.frames))
+            extent.add(measurement)
+            progress(len(summary.frames))
     if "trends" in choice.pictures and summary.example is not None:
         _draw_trend(files.new(TREND_FILE), summary)
-    return len(summary.frames)
+    return summary, extent
 
 
 def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
@@ -312,17 +345,6 @@ def _root_attributes(provenance: Mapping[str, object]) -> dict[str, object]:
     if isinstance(setup, Mapping) and "toml" in setup:
         about["setup"] = setup["toml"]
     return about
-
-
-def _draw_surface(path: Path, reconstruction: Reconstruction, process: Executor) -> None:
-    try:
-        write_surface_picture(path, reconstruction, process)
-    except ImportError as error:
-        wanted = f"{error.name}, which is not installed (pip install 'labapp[gui]')"
-        raise InputError("export", "pictures", "surfaces", wanted) from error
-    except BrokenProcessPool as error:
-        wanted = "a system on which OpenGL can be used; it cannot be used here"
-        raise InputError("export", "pictures", "surfaces", wanted) from error
 
 
 def _draw_trend(path: Path, summary: Summary) -> None:

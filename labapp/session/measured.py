@@ -12,7 +12,7 @@ import labapp
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.errors import InputError
-from labapp.session.blobs import Damaged, fingerprint, pack, unpack, unpack_from
+from labapp.session.blobs import Damaged, fingerprint, pack, unpack
 from labapp.session.database import Database
 from labapp.session.schema import MEASURES
 from labapp.session.setup import Setup, parse_setup
@@ -44,8 +44,7 @@ class Basis:
 
     def fingerprints(self) -> tuple[str, str]:
         """SHA-256 of what the setup says (comments aside) and of the settings."""
-        setup = fingerprint((self.setup.rig, self.setup.calibration))
-        return setup, fingerprint(self.settings)
+        return _said_by(self.setup.text), fingerprint(self.settings)
 
 
 @dataclass(frozen=True)
@@ -213,15 +212,16 @@ class Results:
             measurement = _unsealed(content, (frame, scheme, *found[0][:-1]))
         except Damaged as error:
             raise InputError(path, named, error, "what was written there") from error
-        outdated = _differences(basis, self._inputs(setup, settings))
+        inputs = self._inputs(setup, settings)
+        outdated = _differences(basis, inputs)
         return Result(
             frame=frame,
             measurement=measurement,
             scheme=scheme,
             version=version,
             measured=measured,
-            setup=unpack_from(path, named, setup, str),
-            settings=unpack_from(path, named, settings, Settings),
+            setup=inputs.setup.text,
+            settings=inputs.settings,
             stale=(*outdated, *((CORRECTION_CHANGED,) if corrected != correction else ())),
         )
 
@@ -304,6 +304,13 @@ def _unsealed(content: object, kept_with: tuple[object, ...]) -> Measurement:
 @functools.lru_cache(maxsize=64)
 def _read_inputs(setup: bytes, settings: bytes) -> Basis:
     return Basis(parse_setup(unpack(setup, str), "setup"), unpack(settings, Settings))
+
+
+@functools.lru_cache(maxsize=64)
+def _said_by(text: str) -> str:
+    """SHA-256 of what a setup says, comments aside."""
+    setup = parse_setup(text, "setup")
+    return fingerprint((setup.rig, setup.calibration))
 
 
 def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:

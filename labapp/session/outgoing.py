@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 
 import numpy as np
 
+from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.session.export import ExportChoice, ExportedFile, export
+from labapp.session.frames import Progress
 from labapp.session.measured import Result, scheme_name
 from labapp.session.report import report_pdf
 from labapp.session.session import Session
@@ -22,27 +25,44 @@ def export_session(
     frames: Sequence[int] | None,
     scheme: str | None,
     report: bool,
-    progress: Callable[[int], None] | None,
+    progress: Progress | None,
 ) -> tuple[ExportedFile, ...]:
     """Write a session's results into a folder; see `Session.export`."""
     scheme = scheme or scheme_name(session.settings)
     numbers = _standing(session, scheme, frames)
-    times_s = dict(zip(session.frames.tolist(), session.overview(scheme).time_s, strict=True))
-    extras = {"report.pdf": report_pdf(session, scheme, numbers)} if report else {}
-    measured = (
-        (number, times_s[number], _result(session, number, scheme).measurement)
-        for number in numbers
-    )
+    before = len(numbers) * report
+    total = before + len(numbers) * (2 if "film" in choice.pictures else 1)
+    told = progress or (lambda done, total: None)
+    extras = {}
+    if report:
+        extras["report.pdf"] = report_pdf(
+            session, scheme, numbers, progress=lambda done: told(done, total)
+        )
     return export(
         folder,
-        measured,
+        _Measured(session, scheme, numbers),
         session.setup.calibration,
         _provenance(session, scheme, numbers),
         choice,
         image_of=lambda number: session.frame(number).image,
         extras=extras,
-        progress=progress,
+        progress=lambda done: told(before + done, total),
     )
+
+
+class _Measured:
+    """What frames gave, read one after the other as often as it is gone through."""
+
+    def __init__(self, session: Session, scheme: str, numbers: Sequence[int]) -> None:
+        self._session, self._scheme, self._numbers = session, scheme, numbers
+
+    def __iter__(self) -> Iterator[tuple[int, float | None, Measurement]]:
+        seen = self._session.overview(self._scheme)
+        times_s = dict(zip(seen.frame.tolist(), seen.time_s.tolist(), strict=True))
+        for number in self._numbers:
+            measurement = _result(self._session, number, self._scheme).measurement
+            time_s = times_s[number]
+            yield number, time_s if math.isfinite(time_s) else None, measurement
 
 
 def _standing(session: Session, scheme: str, frames: Sequence[int] | None) -> list[int]:

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import colorsys
 import io
-import multiprocessing
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,8 @@ from labapp.core.pipeline import Measurement
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.session.files import write_whole
-from labapp.session.scene import draw_scene, scene_of
+from labapp.session.scene import scene_of
+from labapp.session.studio import draw_there, drawing_process
 
 ENLARGED = 3
 """Screen pixels per pixel of the frame, so that labels can be read."""
@@ -128,12 +127,6 @@ def write_trend_picture(
     write_whole(path, content.getvalue())
 
 
-def drawing_process() -> ProcessPoolExecutor:
-    """A process to draw in: VTK ends the one it runs in where there is no OpenGL."""
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(1, context, initializer=_quietly)
-
-
 def write_surface_picture(
     path: Path, reconstruction: Reconstruction, process: Executor | None = None
 ) -> None:
@@ -146,7 +139,8 @@ def write_surface_picture(
     reconstruction
         What to draw.
     process
-        A `drawing_process` to draw several pictures in; None starts one for this.
+        A `drawing_process` to draw several pictures in; None starts one for this, of the usual
+        size and view.
 
     Raises
     ------
@@ -157,12 +151,6 @@ def write_surface_picture(
     """
     with ExitStack() as stack:
         process = process or stack.enter_context(drawing_process())
-        drawing = process.submit(draw_scene, scene_of(reconstruction))
+        drawing = process.submit(draw_there, scene_of(reconstruction))
         _, content = cv2.imencode(".png", drawing.result())
     write_whole(path, content.tobytes())
-
-
-def _quietly() -> None:
-    """Keep VTK's warnings off the terminal."""
-    with open(os.devnull, "wb") as nowhere:
-        os.dup2(nowhere.fileno(), 2)

@@ -32,6 +32,10 @@ RAY_MM = 3.0
 SPACING_MM = 0.15
 """Largest distance between rings of the mesh that is drawn, mm."""
 
+VIEW_ANGLE_DEG = 30.0
+
+HEIGHT = "height (mm)"
+
 SPOKES = 120
 """About so many vertices a ring: its sides are within a thousandth of a pool's radius."""
 
@@ -83,6 +87,12 @@ class Scene:
         Whether to mark the electrode's axis, X = Y = 0.
     exaggeration
         Heights are drawn so many times as high; the axes tell true ones.
+    within_mm
+        Places that the axes hold in any case, shape (k, 3): pictures of a film share them.
+    stamp
+        Said in the upper right corner.
+    notice
+        Said in the middle: why there is no surface.
     foreground, background
         Colours of texts and axes, and behind everything.
     """
@@ -98,6 +108,9 @@ class Scene:
     rays_mm: dict[str, FloatArray] = field(default_factory=dict)
     electrode: bool = True
     exaggeration: float = EXAGGERATION
+    within_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    stamp: str = ""
+    notice: str = ""
     foreground: str = "#202020"
     background: str = "#ffffff"
 
@@ -122,7 +135,7 @@ def scene_of(
         Ends of the colour scale, mm; None: those of this surface.
     """
     vertices, triangles = _known(*_mesh(reconstruction))
-    values, label = vertices[:, 2], "height (mm)"
+    values, label = vertices[:, 2], HEIGHT
     if colour == "sigma":
         sigma = sigma_at(reconstruction, vertices[:, 0], vertices[:, 1])
         if np.isfinite(sigma).all():
@@ -256,10 +269,15 @@ class Drawing:
             ends = scene.rays_mm.get(name, EMPTY).reshape(-1, 3) * self._stretch
             self._put(name, _polydata(ends, "lines", 2), COLOURS[name], line_width=1)
         self._axes(scene)
+        self._say("stamp", scene.stamp, scene.foreground, position="upper_right", font_size=8)
+        size = max(5, self.plotter.window_size[0] // 90)
+        middle = {"position": (0.12, 0.75), "viewport": True, "font_size": size}
+        self._say("notice", scene.notice, scene.foreground, **middle)
 
     def look(self, direction: Direction) -> None:
         """Look from one of the `VIEWS`; from the top, side and front without perspective."""
         way, up = VIEWS[direction]
+        self.plotter.camera.view_angle = VIEW_ANGLE_DEG  # zooming has made it narrower
         self.plotter.camera.parallel_projection = direction != "free"
         self.plotter.view_vector(way, viewup=up, render=False)
         bounds = (self._box * self._stretch).T.ravel().tolist()
@@ -366,15 +384,16 @@ class Drawing:
         self._put("electrode", mark, scene.foreground, line_width=1)
         words = f"heights drawn {scene.exaggeration:g} times as high"
         words += "; upright line: the electrode's axis" if scene.electrode else ""
-        if self._is_new("caption", words):
-            self.plotter.add_text(
-                words,
-                position="upper_left",
-                font_size=8,
-                color=scene.foreground,
-                name="caption",
-                render=False,
-            )
+        self._say("caption", words, scene.foreground, position="upper_left", font_size=8)
+
+    def _say(self, name: str, words: str, colour: str, **style: Any) -> None:
+        """Put words over the picture; none take away those that were there."""
+        if not self._is_new(name, words):
+            return
+        if words:
+            self.plotter.add_text(words, name=name, color=colour, render=False, **style)
+        else:
+            self.plotter.remove_actor(name, render=False)
 
 
 def _box(scene: Scene) -> tuple[FloatArray, IntArray]:
@@ -382,7 +401,8 @@ def _box(scene: Scene) -> tuple[FloatArray, IntArray]:
 
     Whole millimetres, so that the numbers along the axes are; tenths upwards.
     """
-    low, high = scene.vertices_mm.min(axis=0), scene.vertices_mm.max(axis=0)
+    held = np.vstack([scene.vertices_mm, scene.within_mm])
+    low, high = held.min(axis=0), held.max(axis=0)
     extent = float(np.max((high - low)[:2]))
     along = next((step for step in (1.0, 2.0, 5.0) if extent <= 6 * step), 10.0)
     step = np.array([along, along, 0.1])
@@ -421,26 +441,17 @@ def _label_format(limits: tuple[float, float]) -> str:
     return f"%.{max(0, -int(np.floor(np.log10(step))))}f"
 
 
-def draw_scene(
-    scene: Scene, size: tuple[int, int] = (1200, 800), direction: Direction = "free"
-) -> npt.NDArray[np.uint8]:
-    """Draw a scene off-screen, shape (height, width, 3), B, G, R.
-
-    It ends the process where nothing can be drawn: ask `can_draw`, or use a process of its own.
-
-    Raises
-    ------
-    ImportError
-        Without pyvista.
-    """
-    import pyvista
-
-    draw_without_display()
-    plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(size))
-    build_scene(plotter, scene).look(direction)
-    picture = plotter.screenshot(return_img=True)
-    plotter.close()
-    return np.ascontiguousarray(picture[..., ::-1])
+def empty_scene(
+    within_mm: FloatArray, limits: tuple[float, float], stamp: str, notice: str
+) -> Scene:
+    """A picture without a surface among others of a film; parameters as of `Scene`."""
+    return Scene(
+        *(EMPTY, np.empty((0, 3), int), np.empty(0), HEIGHT, limits),
+        electrode=False,
+        within_mm=within_mm,
+        stamp=stamp,
+        notice=notice,
+    )
 
 
 def draw_without_display() -> None:

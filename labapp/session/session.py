@@ -7,7 +7,7 @@ and whatever happens before it returns leaves the session as it was.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from types import TracebackType
@@ -425,7 +425,7 @@ class Session:
         frames: Sequence[int] | None = None,
         scheme: str | None = None,
         report: bool = False,
-        progress: Callable[[int], None] | None = None,
+        progress: Progress | None = None,
     ) -> tuple[ExportedFile, ...]:
         """Write results into a folder: all of them, or nothing and what was there stays.
 
@@ -442,7 +442,7 @@ class Session:
         report
             Whether to add ``report.pdf``.
         progress
-            Called with the number of frames done; may raise to stop.
+            Called with steps done and in all: files, report, film, frame by frame; may raise.
 
         Raises
         ------

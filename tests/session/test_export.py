@@ -229,7 +229,12 @@ def test_further_files_have_names_of_their_own(run: Run, tmp_path: Path, name: s
     [
         {"tables": frozenset({"measure"})},
         {"surfaces": frozenset({"obj"})},
-        {"pictures": frozenset({"film"})},
+        {"pictures": frozenset({"movie"})},
+        {"view": "below"},
+        {"size_px": (1281, 720)},
+        {"size_px": (1280, 10_000)},
+        {"film_rate_hz": 0.0},
+        {"film_rate_hz": float("nan")},
         {"surfaces": frozenset({"csv"}), "solid": True},
         {"spacing_mm": 0.01},
         {"spacing_mm": float("nan")},

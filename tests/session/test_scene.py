@@ -12,6 +12,7 @@ from labapp.core.surface import FlatSurface
 from labapp.session import scene as scenes
 from labapp.session.heights import difference_at, profile, sigma_at
 from labapp.session.scene import difference_scene, rays_of, scene_of
+from labapp.session.studio import draw_scene
 from tests.scenes import BENCH_RIG
 
 RADIUS_MM, HEIGHT_MM = 3.0, 0.3
@@ -234,6 +235,6 @@ def test_heights_are_drawn_as_told_and_the_axes_stay_true(
 
 
 def test_a_picture_is_drawn_at_its_size(plotter: Any, pool: Reconstruction) -> None:
-    picture = scenes.draw_scene(scene_of(pool), (320, 240), "side")
+    picture = draw_scene(scene_of(pool), (320, 240), "side")
     assert picture.shape == (240, 320, 3)
     assert picture.std() > 10

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ def report_pdf(
     scheme: str | None = None,
     frames: Sequence[int] | None = None,
     now: datetime.datetime | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> bytes:
     """Report on a session: A4 pages, PDF. It tells of what there is, however little.
 
@@ -47,6 +48,8 @@ def report_pdf(
     now
         The report's date; None: this moment. The same session, libraries and date give the same
         bytes.
+    progress
+        Called with the number of frames done; may raise to stop.
 
     Raises
     ------
@@ -54,7 +57,7 @@ def report_pdf(
         If a frame is asked for that the session does not have, or what it notes is damaged.
     """
     now = now or datetime.datetime.now().astimezone()
-    told = Told.of(session, scheme, frames)
+    told = Told.of(session, scheme, frames, progress)
     title = session.record.title or session.path.stem
     story = Story()
     _experiment(story, told, title)

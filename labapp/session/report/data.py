@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,7 +128,13 @@ class Told:
     problems: tuple[InputError, ...]
 
     @classmethod
-    def of(cls, session: Session, scheme: str | None, frames: Sequence[int] | None) -> Told:
+    def of(
+        cls,
+        session: Session,
+        scheme: str | None,
+        frames: Sequence[int] | None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Told:
         """Gather it."""
         scheme = scheme or scheme_name(session.settings)
         setup: Setup | None = None
@@ -137,11 +143,19 @@ class Told:
             setup = session.setup
         except InputError as error:
             problems = error.problems
-        return cls(session, scheme, frame_lines(session, scheme, frames), setup, problems)
+        lines = frame_lines(session, scheme, frames, progress)
+        return cls(session, scheme, lines, setup, problems)
 
 
-def frame_lines(session: Session, scheme: str, frames: Sequence[int] | None) -> list[FrameLine]:
+def frame_lines(
+    session: Session,
+    scheme: str,
+    frames: Sequence[int] | None,
+    progress: Callable[[int], None] | None = None,
+) -> list[FrameLine]:
     """Tell of each frame what its result says; a damaged result is a status of its own.
+
+    ``progress`` is called with the number of frames done; it may raise to stop.
 
     Raises
     ------
@@ -155,12 +169,15 @@ def frame_lines(session: Session, scheme: str, frames: Sequence[int] | None) -> 
         if number not in times:
             raise InputError(session.path, "frame", number, "frames of the session")
     status = dict(zip(seen.frame.tolist(), seen.status, strict=True))
-    return [
-        _frame_line(session, scheme, number, times[number])
-        if status[number]
-        else FrameLine(number, times[number])
-        for number in numbers
-    ]
+    lines = []
+    for done, number in enumerate(numbers, 1):
+        line = FrameLine(number, times[number])
+        if status[number]:
+            line = _frame_line(session, scheme, number, times[number])
+        lines.append(line)
+        if progress is not None:
+            progress(done)
+    return lines
 
 
 def _frame_line(session: Session, scheme: str, number: int, time_s: float) -> FrameLine:

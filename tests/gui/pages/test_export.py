@@ -39,7 +39,7 @@ def test_the_usual_ticks_are_the_usual_export() -> None:
     assert everything.solid
     assert everything.hdf5
     assert len(everything.surfaces) == 5
-    assert everything.pictures == {"frames", "surfaces", "trends"}
+    assert everything.pictures == {"frames", "surfaces", "trends", "film"}
     assert keys > USUAL
     assert not Wish(ticked=frozenset({"solid", "surfaces:csv"})).choice().solid
 
@@ -161,10 +161,10 @@ def test_a_cancelled_export_leaves_nothing(
     original = Session.export
 
     def cancelled_midway(session: Session, *given, progress, **named):
-        def on(done: int) -> None:
+        def on(done: int, total: int) -> None:
             if done == 2 and page._writing is not None:
                 page._writing.cancel()
-            progress(done)
+            progress(done, total)
 
         return original(session, *given, progress=on, **named)
 

@@ -23,7 +23,9 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.pages.export.presenter import (
     GROUPS,
+    SIZES,
     USUAL,
+    VIEWS,
     Plan,
     Wish,
     Written,
@@ -102,6 +104,11 @@ class ExportPage(Page):
         for field in (self.first, self.last, self.every):
             for widget in (field, field.label):
                 widget.setVisible(self.wish.which == "part")
+        film = "film" in self.wish.some("pictures")
+        drawn = self.wish.has_view
+        for one, shown in ((self.view, drawn), (self.picture_size, drawn), (self.rate, film)):
+            one.setVisible(shown)
+            one.label.setVisible(shown)
         self._show_state()
 
     def _show_state(self) -> None:
@@ -222,6 +229,8 @@ class ExportPage(Page):
         area.setWidget(inner)
         area.setWidgetResizable(True)
         area.setFrameShape(QFrame.Shape.NoFrame)
+        area.setAccessibleName("What is exported")
+        area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
         self.canvas_layout.addWidget(area)
 
     def _make_result(self) -> QWidget:
@@ -263,8 +272,11 @@ class ExportPage(Page):
         self.spacing.edited.connect(
             lambda value: self._wish(spacing_mm=value) if value is not None else None
         )
+        self._make_view_fields()
         for field in (self.which, self.first, self.last, self.every, self.scheme, self.spacing):
             form.add(field)
+        for one in (self.view, self.picture_size, self.rate):
+            form.add(one)
         self.panel_layout.addWidget(form)
         self.folder = TextField(
             "Folder",
@@ -286,6 +298,30 @@ class ExportPage(Page):
         for widget in (self.notes, self.why_not, self.again_button, self.export_button):
             self.panel_layout.addWidget(widget)
         self.panel_layout.addStretch(1)
+
+    def _make_view_fields(self) -> None:
+        self.view = ChoiceField(
+            "3-D seen", VIEWS, tooltip="Where pictures of surfaces and the film look from"
+        )
+        self.view.edited.connect(lambda key: self._wish(view=key))
+        sizes = [(f"{width}x{height}", f"{width} × {height} px") for width, height in SIZES]
+        self.picture_size = ChoiceField(
+            "Picture size", sizes, tooltip="Of pictures of surfaces and of the film"
+        )
+        self.picture_size.edited.connect(
+            lambda key: self._wish(size_px=tuple(int(side) for side in key.split("x")))
+        )
+        self.rate = NumberField(
+            "Film",
+            "frames/s",
+            lowest=0.1,
+            highest=1000,
+            step=1,
+            decimals=1,
+            tooltip="How fast the film runs; empty: as fast as the frames were recorded",
+            optional=True,
+        )
+        self.rate.edited.connect(lambda value: self._wish(film_rate_hz=value))
 
 
 def _whole(label: str, lowest: int, tip: str, name: str, wish: Callable[..., None]) -> NumberField:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from labapp.core.values import IntArray
+from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.capture.presenter import size_in_words
 from labapp.session.export import (
+    FILM_FILE,
     HDF5_FILE,
     MANIFEST,
     TREND_FILE,
@@ -19,9 +20,13 @@ from labapp.session.export import (
     ExportedFile,
     verify_export,
 )
+from labapp.session.film import UNTIMED_HZ, film_times
+from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.meshes import FORMATS, SPACING_MM
+from labapp.session.scene import Direction
 from labapp.session.session import Session
+from labapp.session.studio import PICTURE_PX
 
 REPORT_FILE = "report.pdf"
 
@@ -35,6 +40,17 @@ SCHEMES = {
 }
 
 SHOWN_PROBLEMS = 5
+
+BRIEF_S = 3.0
+"""A film that is over sooner is too short to watch."""
+
+VIEWS = (
+    ("free", "obliquely"),
+    ("top", "from the top"),
+    ("side", "from the side"),
+    ("front", "from the front, as the camera"),
+)
+SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (800, 600))
 
 
 @dataclass(frozen=True)
@@ -78,11 +94,16 @@ GROUPS: tuple[tuple[str, tuple[Item, ...]], ...] = (
         ),
     ),
     (
-        "Pictures (PNG)",
+        "Pictures (PNG), film (MP4)",
         (
             Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
             Item("pictures:surfaces", "Surfaces", "Each surface in 3-D; takes a second each"),
             Item("pictures:trends", "Trends", "Width, length and height over time"),
+            Item(
+                "pictures:film",
+                "Film",
+                "The surface in 3-D over all frames, MP4: ten frames take a second or two",
+            ),
         ),
     ),
     (
@@ -115,6 +136,8 @@ class Wish:
         Whose results; empty: that of the settings.
     spacing_mm
         Distance of the surfaces' nodes.
+    view, size_px, film_rate_hz
+        As in `ExportChoice`.
     """
 
     ticked: frozenset[str] = USUAL
@@ -124,6 +147,9 @@ class Wish:
     every: int = 1
     scheme: str = ""
     spacing_mm: float = SPACING_MM
+    view: Direction = "free"
+    size_px: tuple[int, int] = PICTURE_PX
+    film_rate_hz: float | None = None
 
     def some(self, kind: str) -> frozenset[str]:
         """What is ticked of a kind."""
@@ -134,6 +160,11 @@ class Wish:
         """Whether surfaces are written as triangles, which solids need."""
         return bool(self.some("surfaces") & FORMATS.keys())
 
+    @property
+    def has_view(self) -> bool:
+        """Whether surfaces are drawn in 3-D, from somewhere and in some size."""
+        return bool(self.some("pictures") & {"surfaces", "film"})
+
     def choice(self) -> ExportChoice:
         """As the session takes it."""
         return ExportChoice(
@@ -143,6 +174,9 @@ class Wish:
             hdf5="hdf5" in self.ticked,
             pictures=self.some("pictures"),
             spacing_mm=self.spacing_mm,
+            view=self.view,
+            size_px=self.size_px,
+            film_rate_hz=self.film_rate_hz,
         )
 
 
@@ -199,6 +233,8 @@ def plan(session: Session, wish: Wish, frame: int) -> Plan:
     if measured.any() and surfaces < measured.sum():
         without = int(measured.sum()) - surfaces
         notes.append(f"{_frames(without)} without a surface: in the tables with the reason.")
+    if "film" in wish.some("pictures") and surfaces:
+        notes.append(film_note(seen.frame[measured], seen.time_s[measured], wish.film_rate_hz))
     frames = seen.frame[measured]
     again = np.union1d(stale, unmeasured) if scheme == own else np.zeros(0, np.int64)
     return Plan(
@@ -209,6 +245,18 @@ def plan(session: Session, wish: Wish, frame: int) -> Plan:
         notes=tuple(notes),
         files=_files(wish, len(frames), surfaces),
     )
+
+
+def film_note(frames: IntArray, time_s: FloatArray, rate_hz: float | None) -> str:
+    """How long the film takes, and what to do where that is too short to see anything."""
+    timed = [(int(k), t if np.isfinite(t) else None) for k, t in zip(frames, time_s, strict=True)]
+    lasts_s = float(film_times(timed, rate_hz)[-1])
+    told = f"The film lasts {lasts_s:.3g} s."
+    if rate_hz is None and not np.isfinite(time_s).all():
+        return f"{told} The recording has no time base: {UNTIMED_HZ:g} frames/s."
+    if rate_hz is None and len(frames) > 1 and lasts_s < BRIEF_S:
+        return f"{told} To see it slowed, enter its frames/s: 10, say."
+    return told
 
 
 def _chosen(frames: IntArray, wish: Wish, frame: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -254,6 +302,8 @@ def _files(wish: Wish, count: int, surfaces: int) -> tuple[str, ...]:
         lines.append(f"frame_NNNNNN.png, {count} of them")
     if "trends" in wish.some("pictures"):
         lines.append(TREND_FILE)
+    if "film" in wish.some("pictures") and surfaces:
+        lines.append(FILM_FILE)
     lines += [HDF5_FILE] * ("hdf5" in wish.ticked) + [REPORT_FILE] * ("report" in wish.ticked)
     return (*lines, f"{MANIFEST}: source, set-up, versions, every file with its SHA-256")
 
@@ -324,7 +374,7 @@ def write(
     wish: Wish,
     frames: Sequence[int],
     folder: Path,
-    progress: Callable[[int, int], None],
+    progress: Progress,
 ) -> Written:
     """Export, then read everything again and compare it with the manifest."""
     # The report's matrices are small: more threads than one get in each other's way.
@@ -335,6 +385,6 @@ def write(
             frames=frames,
             scheme=wish.scheme or None,
             report="report" in wish.ticked,
-            progress=lambda done: progress(done, len(frames)),
+            progress=progress,
         )
     return Written(folder, files, tuple(verify_export(folder)))
