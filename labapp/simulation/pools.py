@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
+from numpy.polynomial import Chebyshev
 from scipy import special
 
 from labapp.core.values import BoolArray, FloatArray
@@ -242,8 +242,20 @@ class Wave:
             raise ValueError("a mode (0, n) is round: it can stand, but not travel")
 
     @cached_property
-    def _wave_number(self) -> float:
-        return float(special.jn_zeros(self.mode[0], self.mode[1])[-1])
+    def _radial(self) -> tuple[Chebyshev, Chebyshev]:
+        """J_m(j_mn·ρ)/ρᵐ as a function of ρ², exact to rounding, and its derivative.
+
+        It is smooth at the centre, where ρ and φ are not, and quicker than the Bessel function.
+        """
+        m, n = self.mode
+        zero = float(special.jn_zeros(m, n)[-1])
+
+        def exact(rho2: FloatArray) -> FloatArray:
+            rho = np.sqrt(rho2)
+            return np.asarray(special.jv(m, zero * rho) / rho**m)
+
+        radial = Chebyshev.interpolate(exact, 20 + 4 * n, domain=[0.0, 1.0])
+        return radial, radial.deriv()
 
     @cached_property
     def _weight(self) -> complex:
@@ -255,21 +267,23 @@ class Wave:
         turn = np.exp(-1j * m * np.radians(self.turned_deg))
         return complex(self.amplitude_mm / largest * turn * run)
 
-    def _field(self, place: Place, m: int) -> npt.NDArray[np.complex128]:
-        """J_m(k·ρ)·exp(imφ), also beside the mode's own m."""
-        angle = np.arctan2(place.q, place.p)
-        radius = self._wave_number * np.sqrt(place.rho2)
-        return np.asarray(special.jv(m, radius) * np.exp(1j * m * angle))
-
     def height(self, place: Place) -> FloatArray:
         """Height that it adds, mm."""
-        return (self._weight * self._field(place, self.mode[0])).real
+        radial, _ = self._radial
+        run = place.p + 1j * place.q
+        mode = radial(np.minimum(place.rho2, 1)) * run ** self.mode[0]
+        return np.asarray((self._weight * mode).real)
 
     def gradient(self, place: Place) -> FloatArray:
         """Gradient that it adds, shape (…, 2)."""
-        below, beyond = (self._field(place, self.mode[0] + step) for step in (-1, 1))
-        half = self._weight * self._wave_number / 2
-        return place.gradient((half * (below - beyond)).real, (1j * half * (below + beyond)).real)
+        m = self.mode[0]
+        radial, derivative = (part(np.minimum(place.rho2, 1)) for part in self._radial)
+        run = place.p + 1j * place.q
+        outward = 2 * self._weight * derivative * run**m
+        around = m * self._weight * radial * run ** max(m - 1, 0)
+        return place.gradient(
+            (outward * place.p + around).real, (outward * place.q + 1j * around).real
+        )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,49 @@
+"""`labapp simulate`: a recording of a pool that is known, with its truth beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from labapp.cli.shared import INTERRUPTED, note, progress_bar, several
+
+
+def simulate(
+    scenario: Annotated[
+        Path,
+        typer.Argument(help="Pool, bench and camera (TOML; mm, degrees, px): docs/simulation.md."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder for the recording and its truth. An earlier one is replaced."),
+    ],
+    frames: Annotated[
+        int | None, typer.Option(min=1, max=1_000_000, help="How many, in place of the file's.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="In place of the file's.")
+    ] = None,
+) -> None:
+    """Simulate a recording of a known pool, with the truth about every dot.
+
+    It can be measured like any other: labapp reconstruct DIR/recording.avi --setup DIR/setup.toml.
+
+    The folder is whole or not there. The same file and seed give the same frames.
+    """
+    from labapp.session.scenario import read_scenario
+    from labapp.session.simulate import simulate as write
+
+    read = read_scenario(scenario, frames, seed)
+    count = len(read.recording.pools)
+    with progress_bar() as progress:
+        task = progress.add_task(scenario.name, total=count)
+        try:
+            write(read, out, progress=lambda: progress.advance(task))
+        except KeyboardInterrupt:
+            note(progress.console, f"stopped: nothing is written in {out}")
+            raise typer.Exit(INTERRUPTED) from None
+    name = read.recording.file
+    typer.echo(f"{several(count, 'frame')}, setup, calibration picture and truth are in {out}")
+    typer.echo(f"  labapp reconstruct {out / name} --setup {out / 'setup.toml'} --out results")

@@ -1,0 +1,82 @@
+"""Simulate a recording: a folder with it, its set-up, its calibration picture and its truth."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from labapp.errors import InputError
+from labapp.session.scenario import Scenario
+from labapp.session.scenario_keys import RECORDINGS
+
+SCENARIO = "scenario.toml"
+"""The scenario itself, kept beside what was made of it; by it a former simulation is known."""
+
+FILES = {SCENARIO, "setup.toml", "calibration.png", "truth.csv", "dots_truth.csv"}
+
+OWN_FOLDER = "a new folder, an empty one or that of a former simulation"
+
+
+def simulate(
+    scenario: Scenario,
+    out: str | os.PathLike[str],
+    workers: int | None = None,
+    progress: Callable[[], None] = lambda: None,
+) -> None:
+    """Render a scenario's recording into a folder, which is whole or not there.
+
+    A former simulation in it is replaced.
+
+    Parameters
+    ----------
+    scenario
+        What is rendered.
+    out
+        The folder.
+    workers
+        How many processes render; None: one a core. The result is the same.
+    progress
+        Called after each frame.
+
+    Raises
+    ------
+    InputError
+        If the folder holds anything else, or cannot be written.
+    """
+    out = Path(out).absolute()
+    _check_replaceable(out)
+    recording = scenario.recording
+    if workers is None:
+        workers = min(os.cpu_count() or 1, len(recording.pools))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as beside:
+            part = Path(beside) / out.name
+            recording.write_run(part, scenario.setup, workers, progress)
+            (part / SCENARIO).write_text(scenario.text, encoding="utf-8")
+            _check_replaceable(out)
+            if out.exists():
+                shutil.rmtree(out)
+            part.rename(out)
+    except OSError as error:
+        if error.errno == errno.ENOSPC:
+            raise  # the program says so itself
+        expected = "a folder that can be written"
+        raise InputError(out, "--out", error.strerror or error, expected) from error
+
+
+def _check_replaceable(out: Path) -> None:
+    """Refuse to replace a folder that holds anything but a former simulation."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(out, "--out", "is a file", OWN_FOLDER)
+    names = {path.name for path in out.iterdir()}
+    foreign = sorted(names - FILES - set(RECORDINGS.values()))
+    if names and (foreign or SCENARIO not in names):
+        found = f"holds {foreign[0]}" if foreign else f"holds no {SCENARIO}"
+        raise InputError(out, "--out", found, OWN_FOLDER)

@@ -1,0 +1,359 @@
+"""`labapp simulate`: what it writes, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from labapp.media import open_source
+from labapp.session.scenario import read_scenario
+from labapp.session.setup import read_setup
+from labapp.session.simulate import simulate
+from labapp.simulation.pools import Wave
+from labapp.simulation.torch import ConeTorch
+from tests.conftest import Run
+
+EXAMPLES = Path(__file__).parents[1] / "resources" / "simulations"
+SCENARIO = (EXAMPLES / "mode_11.toml").read_text("utf-8")
+BENCH = SCENARIO.partition("[laser]")[2].partition("[look]")[0]
+
+
+def scenario(folder: Path, pool: str = "", more: str = "", **changed: str) -> Path:
+    """A scenario of two small frames, its keys replaced by name, tables added."""
+    text = SCENARIO
+    if pool:
+        text = f"[pool]\n{pool}\n[laser]{BENCH}" + text[text.index("[look]") :]
+    for key, value in {"frames": "2", **changed}.items():
+        text, count = re.subn(rf"(?m)^{key} = .*$", f"{key} = {value}", text, count=1)
+        assert count == 1, key
+    path = folder / "scenario.toml"
+    path.write_text(text + more, "utf-8")
+    return path
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def column(path: Path, name: str) -> np.ndarray:
+    return np.array([float(row[name]) for row in rows(path)])
+
+
+# --- what it writes -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("simulated") / "out"
+    simulate(read_scenario(EXAMPLES / "mode_11.toml", frames=3), out, workers=1)
+    return out
+
+
+def test_a_recording_with_its_truth_is_written(written: Path) -> None:
+    names = {path.name for path in written.iterdir()}
+    tables = {"truth.csv", "dots_truth.csv"}
+    assert names == tables | {"recording.avi", "setup.toml", "calibration.png", "scenario.toml"}
+    assert [path.name for path in written.parent.iterdir()] == ["out"]
+    with open_source(written / "recording.avi") as source:
+        assert (len(source), source.frame_rate_hz, source.shape) == (3, 60.0, (640, 480))
+    assert column(written / "truth.csv", "time_s").tolist() == [0.0, 0.01667, 0.03333]
+    assert (written / "scenario.toml").read_text("utf-8") == SCENARIO
+
+
+def test_the_truth_lies_on_the_pool_and_on_its_dots(written: Path) -> None:
+    """Re-read from the files alone: rays, law of reflection and picture agree."""
+    setup = read_setup(written / "setup.toml")
+    lines = [row for row in rows(written / "dots_truth.csv") if row["frame"] == "1"]
+    shown = [row for row in lines if row["visible"] == "1"]
+    assert len(shown) == int(rows(written / "truth.csv")[1]["dots"]) > 90
+    with open_source(written / "recording.avi") as source:
+        image = source.frame(1).image.astype(float)
+    px = np.array([[float(row["u_px"]), float(row["v_px"])] for row in shown])
+    u, v = np.rint(px).astype(int).T
+    around = np.stack([image[v + dv, u + du] for du in (-1, 0, 1) for dv in (-1, 0, 1)])
+    assert (around.mean(axis=0) > np.median(image) + 8).mean() > 0.97
+    # Each point lies on its ray of the pattern, by the angles of the setup file.
+    point = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in shown])
+    ray = np.array([[int(row["ray_row"]), int(row["ray_column"])] for row in shown])
+    alpha, beta = np.radians([31.14, 0.77])
+    laser = 31.48 * np.array([0, np.cos(alpha), np.sin(alpha)])
+    from_laser = point - laser
+    axis, up = -laser / 31.48, np.array([0, -np.sin(alpha), np.cos(alpha)])
+    along = from_laser @ axis
+    np.testing.assert_allclose(
+        np.arctan2(from_laser[:, 0], along), (ray[:, 1] - 10) * beta, atol=0.02 * beta
+    )
+    np.testing.assert_allclose(
+        np.arctan2(from_laser @ up, along), (10 - ray[:, 0]) * beta, atol=0.02 * beta
+    )
+    assert setup.rig.laser.distance_mm == 31.48
+
+
+def test_the_same_seed_gives_the_same_bytes_by_one_process_or_two(
+    written: Path, tmp_path: Path
+) -> None:
+    for workers in (1, 2):
+        simulate(read_scenario(EXAMPLES / "mode_11.toml", 3), tmp_path / "again", workers)
+        for file in written.iterdir():
+            assert (tmp_path / "again" / file.name).read_bytes() == file.read_bytes(), file.name
+
+
+def test_another_seed_gives_other_noise_and_other_sizes(written: Path, labapp: Run,
+                                                        tmp_path: Path) -> None:  # fmt: skip
+    out = tmp_path / "other"
+    code, told, _ = labapp(
+        "simulate", EXAMPLES / "mode_11.toml", "--out", out, "--frames", 1, "--seed", 7
+    )
+    assert code == 0
+    assert "1 frame," in told
+    assert "labapp reconstruct" in told
+    with open_source(out / "recording.avi") as one, open_source(written / "recording.avi") as two:
+        assert (one.frame(0).image != two.frame(0).image).mean() > 0.3
+    assert abs(column(out / "truth.csv", "width_mm")[0] / 6.66 - 1) > 1e-4
+
+
+@pytest.mark.parametrize(("form", "bits", "kind"), [("tif", 12, "u2"), ("png", 16, "u2"),
+                                                    ("png", 8, "u1")])  # fmt: skip
+def test_pictures_of_more_bits_go_into_stacks_and_folders(
+    tmp_path: Path, form: str, bits: int, kind: str
+) -> None:
+    path = scenario(tmp_path, hot_pixels=f"2\nbits = {bits}", seed=f'1\nformat = "{form}"')
+    simulate(read_scenario(path, 2), tmp_path / "out", workers=1)
+    name = {"tif": "recording.tif", "png": "recording"}[form]
+    with open_source(tmp_path / "out" / name) as source:
+        image = source.frame(1).image
+        assert len(source) == 2
+    assert image.dtype == np.dtype(kind)
+    assert 60 / 255 < image.max() / (2**bits - 1) <= 1
+
+
+def test_a_moving_pool_changes_from_frame_to_frame_and_a_still_one_does_not(tmp_path: Path) -> None:
+    still = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3'
+    recording = read_scenario(scenario(tmp_path, still), 5).recording
+    assert len(set(recording.pools)) == 1
+    wave = "\n[[pool.wave]]\nmode = [0, 1]\namplitude_mm = 0.05\nfrequency_hz = 15.0\n"
+    swung = read_scenario(scenario(tmp_path, still, wave), 5).recording
+    heights = [pool.size.height_mm for pool in swung.pools]
+    np.testing.assert_allclose(heights, [0.35, 0.3, 0.25, 0.3, 0.35], atol=1e-6)
+
+
+def test_a_pool_wanders_by_what_was_asked_for_however_many_frames_there_are(tmp_path: Path) -> None:
+    path = scenario(tmp_path)
+    few, many = (read_scenario(path, count).recording.pools for count in (4, 3000))
+    widths, lengths, heights = np.array(
+        [[p.footprint.width_mm / 6.66, p.footprint.tail_mm / 4.4, p.peak_mm / 0.29] for p in many]
+    ).T
+    for course in (widths, lengths, heights):
+        assert course.std() == pytest.approx(0.02, rel=0.1)
+        assert course.mean() == pytest.approx(1, abs=2e-3)
+        assert np.abs(np.diff(course)).mean() < 0.3 * course.std()
+    assert abs(np.corrcoef(widths, lengths)[0, 1]) < 0.3
+    assert few == many[:4]
+
+
+# --- what a scenario says -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_example_can_be_simulated_and_shows_its_dots(path: Path) -> None:
+    recording = read_scenario(path, frames=1).recording
+    frame = recording.frame(0)
+    assert frame.shown.sum() > 60
+    size = frame.pool.size
+    assert 0.2 < max(size.height_mm, -size.depth_mm) < 0.8
+
+
+def test_every_key_arrives_where_it_belongs(tmp_path: Path) -> None:
+    pool = """
+    shape = "egg"
+    width_mm = 6.0
+    head_mm = 2.5
+    tail_mm = 4.0
+    height_mm = 0.25
+    center_mm = [0.1, -0.2]
+    fullness = 0.3
+    wave = { mode = [2, 1], amplitude_mm = 0.01, frequency_hz = 9.0, kind = "travelling", \
+turned_deg = 20.0, phase_deg = 30.0 }
+    dent = [{ depth_mm = 0.05, radius_mm = 0.8 }, { depth_mm = 0.02, radius_mm = 0.5, \
+offset_mm = [0.5, 0.4] }]
+    low_rear = { drop_mm = 0.04 }
+    """
+    more = """
+    [torch]
+    tip_mm = [0.2, -1.0, 2.0]
+    half_angle_deg = 20.0
+    [camera]
+    width_px = 500
+    focal_px = 900.0
+    k1 = -0.1
+    """
+    recording = read_scenario(scenario(tmp_path, pool, more), 2).recording
+    first = recording.pools[0]
+    assert first.footprint.head_mm == 2.5
+    assert (first.peak_mm, first.fullness) == (0.25, 0.3)
+    assert [type(term).__name__ for term in first.terms] == ["Dent", "Dent", "LowRear", "Wave"]
+    assert first.terms[1].offset_mm == (0.5, 0.4)
+    assert first.terms[3] == Wave((2, 1), 0.01, 9.0, 0.0, True, 20.0, 30.0)
+    assert recording.pools[1].terms[3].time_s == pytest.approx(1 / 60)
+    assert recording.torches == (ConeTorch((0.2, -1.0, 2.0), half_angle_deg=20.0),) * 2
+    assert recording.view.width_px == 500
+    assert recording.view.height_px == 640
+    assert recording.view.lens.k1 == -0.1
+    assert recording.look.hot_pixels == 2
+    assert recording.exposure_s == 0.002
+
+
+def test_a_surface_is_looked_for_beside_the_scenario(tmp_path: Path, labapp: Run) -> None:
+    path = scenario(tmp_path, 'shape = "surface"\nfile = "my.csv"\nspacing_mm = 0.2')
+    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    assert code == 2
+    assert f"{tmp_path / 'my.csv'}: file: No such file or directory" in err
+    (tmp_path / "my.csv").write_bytes((EXAMPLES / "height_map.csv").read_bytes())
+    assert read_scenario(path, 1).recording.pools[0].size.height_mm > 0.25
+
+
+# --- what it refuses ----------------------------------------------------------------------------
+
+CAP = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3\n'
+
+
+@pytest.mark.parametrize(
+    ("pool", "more", "changed", "words"),
+    [
+        ("", "[lock]\nx = 1\n", {}, "lock: unknown key; expected look, perhaps"),
+        ("", "[torches]\n", {}, "torches: unknown key; expected torch, perhaps"),
+        ("", "[torch]\nradius_mm = 1.0\n", {}, "torch.tip_mm: missing; expected [x, y, z]"),
+        ("", "", {"hot_pixels": "1.5"}, "look.hot_pixels: 1.5; expected a whole number from 0"),
+        ("", "", {"frames": "0"}, "recording.frames: 0; expected a whole number from 1"),
+        ("", "", {"frame_rate_hz": "nan"}, "recording.frame_rate_hz: nan; expected a number above"),
+        ("", "", {"seed": '"x"'}, 'recording.seed: "x"; expected a whole number'),
+        ("", "", {"exposure_ms": "20.0"}, "recording.exposure_ms: 20.0; expected at most 16.6667"),
+        ("", "", {"missing": "1.0\nbits = 12"}, 'expected 8 in a video; recording.format = "tif"'),
+        ("", "", {"missing": "0.0\nbits = 9"}, "look.bits: 9; expected 8, 12 or 16"),
+        ("", "", {"missing": "0.0\ndot_floor_mm = 0.9"}, "expected a number up to look.dot_ceil"),
+        ("", "[camera]\nk1 = -0.1\n", {}, "camera.focal_px: missing"),
+        ("", "[camera]\nfocal_px = 300\nk1 = -2\n", {}, "folds the picture; expected smaller k1"),
+        ("", "", {"distance_mm": "-1.0"}, "laser.distance_mm: -1.0; expected a number above 0"),
+        ("", "", {"mode": "[0, 0]"}, "pool.wave[0].mode: [0, 0]; expected [m, n]"),
+        ("", "", {"kind": '"running"'}, 'expected "standing" or "travelling"'),
+        ("", "", {"shape": '"eg"'}, 'pool.shape: "eg"; expected "cap" or "ellipsoid" or "egg"'),
+        ("width_mm = 6.0\n", "", {}, 'pool.shape: missing; expected "cap"'),
+        (CAP + "head_mm = 3.0\n", "", {}, "pool.head_mm: unknown key; expected height_mm, perhaps"),
+        (CAP + "dent = 3\n", "", {}, "pool.dent: 3; expected a table, or a list of them"),
+        (CAP + "dent = [3]\n", "", {}, "pool.dent[0]: 3; expected a table [[pool.dent]] with dep"),
+        (CAP + "[pool.low_rear]\n", "", {}, "pool.low_rear.drop_mm: missing"),
+        (CAP.replace("0.3", "3.6"), "", {}, "its sides would overhang"),
+        ('shape = "surface"\nfile = "a.csv"\nwave = []', "", {}, "pool.wave: unknown key"),
+        (CAP + '[[pool.wave]]\nmode = [0, 1]\namplitude_mm = 0.1\nfrequency_hz = 1\n'
+         'kind = "travelling"', "", {}, "it can stand, but not travel"),
+    ],
+)  # fmt: skip
+def test_a_wrong_key_is_named_with_what_is_allowed(
+    tmp_path: Path, labapp: Run, pool: str, more: str, changed: dict[str, str], words: str
+) -> None:
+    path = scenario(tmp_path, pool, more, **changed)
+    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    assert code == 2
+    assert words in err
+    assert err.startswith(f"labapp: {path}: ")
+    assert not (tmp_path / "out").exists()
+
+
+def test_all_that_is_wrong_is_told_together(tmp_path: Path, labapp: Run) -> None:
+    path = scenario(tmp_path, CAP + "widht_mm = 3.0\n", "[lens]\n", distance_mm="0", seed="-1")
+    _, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    found = [line.split(": ")[-2:][0] for line in err.splitlines()]
+    assert len(found) == 4, err
+    for key in ("laser.distance_mm", "lens", "pool.widht_mm", "recording.seed"):
+        assert key in err
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"[pool", "syntax"),
+        (b"\xff\xfe", "encoding: not UTF-8"),
+        (b"", "pool: missing; expected a table [pool] with shape"),
+        (b"pool = 3\nrecording = 4\nimage_calibration = 5\n", "pool: 3; expected a table [pool]"),
+    ],
+)
+def test_what_is_no_scenario_is_refused(
+    tmp_path: Path, labapp: Run, content: bytes, words: str
+) -> None:
+    path = tmp_path / "scenario.toml"
+    path.write_bytes(content)
+    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    assert code == 2
+    assert words in err
+
+
+def test_a_missing_scenario_and_a_homography_are_refused(tmp_path: Path, labapp: Run) -> None:
+    code, _, err = labapp("simulate", tmp_path / "no.toml", "--out", tmp_path / "out")
+    assert code == 2
+    assert "no.toml: file: No such file or directory" in err
+    text = SCENARIO[: SCENARIO.index("origin_px")] + SCENARIO[SCENARIO.index("[look]") :]
+    matrix = "homography = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\n"
+    path = tmp_path / "homography.toml"
+    path.write_text(text.replace("[image_calibration]\n", f"[image_calibration]\n{matrix}"))
+    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    assert code == 2
+    assert "image_calibration: a homography; expected the three points" in err
+
+
+def test_only_a_former_simulation_is_replaced(tmp_path: Path, labapp: Run) -> None:
+    path, out = scenario(tmp_path), tmp_path / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    code, _, err = labapp("simulate", path, "--out", out, "--frames", 1)
+    assert code == 2
+    assert "holds mine.txt; expected a new folder, an empty one or that of a former" in err
+    assert [file.name for file in out.iterdir()] == ["mine.txt"]
+    (out / "mine.txt").unlink()
+    for _ in range(2):
+        assert labapp("simulate", path, "--out", out, "--frames", 1)[0] == 0
+    (out / "scenario.toml").unlink()
+    code, _, err = labapp("simulate", path, "--out", out, "--frames", 1)
+    assert code == 2
+    assert "holds no scenario.toml" in err
+    code, _, err = labapp("simulate", path, "--out", path, "--frames", 1)
+    assert code == 2
+    assert "is a file" in err
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, labapp: Run) -> None:
+    path = scenario(tmp_path)
+    code, _, err = labapp("simulate", path, "--out", path / "out", "--frames", 1)
+    assert code == 2
+    assert f"{path / 'out'}: --out: " in err
+    assert "expected a folder that can be written" in err
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    path, out = scenario(tmp_path, frames="500"), tmp_path / "results" / "out"
+    running = subprocess.Popen(
+        [sys.executable, "-m", "labapp", "simulate", path, "--out", out],
+        stderr=subprocess.PIPE,
+        env={**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")},
+        text=True,
+    )
+    until = time.monotonic() + 60
+    while not list(tmp_path.glob("results/.out.*/out/recording.avi")):
+        assert running.poll() is None
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    running.send_signal(signal.SIGINT)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert "nothing is written" in err
+    assert "Traceback" not in err
+    assert list((tmp_path / "results").iterdir()) == []
