@@ -1,0 +1,36 @@
+"""Make the guide's pictures anew: those of `labapp tour` that its pages show, in few colours.
+
+Needs a display, or `xvfb-run -a -s "-screen 0 1366x768x24" .venv/bin/python THIS`.
+"""
+
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+
+GUIDE = Path(__file__).parent
+PICTURES = GUIDE / "pictures"
+COLOURS = 96
+
+
+def main() -> None:
+    """Take the tour and keep what is linked, under its name without the number."""
+    pages = "".join(page.read_text("utf-8") for page in GUIDE.glob("*.md"))
+    wanted = set(re.findall(r"\(pictures/(\S+)\.png\)", pages))
+    PICTURES.mkdir(exist_ok=True)
+    for old in PICTURES.glob("*.png"):
+        old.unlink()
+    with tempfile.TemporaryDirectory() as out:
+        subprocess.run([sys.executable, "-m", "labapp", "tour", "--out", out], check=True)
+        for name in sorted(wanted):
+            (taken,) = Path(out).glob(f"[0-9][0-9]-{name}.png")
+            picture = Image.open(taken).convert("RGB")
+            few = picture.quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+            few.save(PICTURES / f"{name}.png", optimize=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""The guide says what the app says, and shows it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from labapp.gui.actions import ACTIONS
+from labapp.gui.steps import STEPS, Step
+
+GUIDE = Path(__file__).resolve().parent.parent / "docs" / "guide"
+PAGES = sorted(GUIDE.glob("*.md"))
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+@pytest.mark.parametrize("step", STEPS, ids=[step.key for step in STEPS])
+def test_every_step_has_a_page_that_begins_with_its_hint(step: Step):
+    title, hint = (GUIDE / f"{step.key}.md").read_text("utf-8").split("\n\n")[:2]
+    assert title == f"# {STEPS.index(step) + 1} · {step.title}"
+    assert one_line(hint) == step.hint
+
+
+def test_the_index_says_what_the_app_says_of_itself():
+    pytest.importorskip("PySide6")
+    from labapp.gui.help import CLOSING, INTRODUCTION
+
+    index = one_line((GUIDE / "index.md").read_text("utf-8"))
+    for paragraph in re.findall(r"<p>(.*?)</p>", INTRODUCTION + CLOSING, re.S):
+        assert one_line(paragraph) in index
+
+
+def test_the_keys_of_the_index_are_those_of_the_actions():
+    text = (GUIDE / "index.md").read_text("utf-8").partition("## Keys")[2]
+    keys = re.findall(r"(?<![\w+])(?:(?:Ctrl|Shift)\+)*(?:F\d+|(?<=\+)[A-Z.](?!\w))", text)
+    assert len(keys) >= 15
+    assert set(keys) <= {action.key for action in ACTIONS}
+
+
+def test_every_picture_is_shown_and_small():
+    shown = {
+        name
+        for page in PAGES
+        for name in re.findall(r"\(pictures/(\S+)\)", page.read_text("utf-8"))
+    }
+    there = list((GUIDE / "pictures").iterdir())
+    assert {path.name for path in there} == shown
+    assert sum(path.stat().st_size for path in there) < 2_500_000
