@@ -479,9 +479,11 @@ def test_calibrate_plane_puts_its_values_into_a_setup(labapp: Run, tmp_path: Pat
         "calibrate", "plane", picture, "--unit-mm", 6.35, "--setup", setup
     )
     assert (code, complained) == (0, "")
-    assert said.count("±") == 3
+    assert said.count("±") == 6
+    assert "used       affine, 15 marks. No perspective" in said
+    assert said.count("residual 0.0") == 2
     assert "6.35 mm between flags" in said
-    assert "scale      5.66" in said
+    assert "scale      5.67" in said
     from labapp.session.setup import read_setup
 
     corners = np.array([[0.0, 0.0], [480, 0], [0, 640], [480, 640]])

@@ -344,13 +344,16 @@ def calibrate_plane(
     for name, length in lengths.items():
         typer.echo(f"{name}  {length:.4f} mm")
     typer.echo(f"unit       {unit_mm:g} mm between flags (--unit-mm)")
-    x_scale, z_scale = found.px_per_mm
+    (x_scale, z_scale), angle = found.px_per_mm, found.angle_deg
+    x_sigma, z_sigma, angle_sigma = found.scales_and_angle_sigma
     typer.echo(
-        f"scale      {x_scale:.4f} px/mm along X′, {z_scale:.4f} px/mm along Z′, "
-        f"{found.angle_deg:.2f} degrees between them"
+        f"scale      {x_scale:.4f} ± {x_sigma:.4f} px/mm along X′, "
+        f"{z_scale:.4f} ± {z_sigma:.4f} px/mm along Z′, "
+        f"{angle:.2f} ± {angle_sigma:.2f} degrees between them"
     )
-    values = {name: list(point) for name, point in points.items()} | lengths
-    _write_values(setup, {"image_calibration": {**values, "homography": None}})
+    for line in found.fit_lines():
+        typer.echo(line)
+    _write_values(setup, {"image_calibration": found.setup_keys})
 
 
 def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]) -> None:

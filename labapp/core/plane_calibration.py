@@ -4,18 +4,20 @@ The imaging plane shows a dot at O′ and a dark bar along each axis. The pictur
 thresholded, median filtered and dilated until three objects are left; these are thinned and
 told apart by shape. The text takes their centres to a whole pixel; by default each is then
 measured on the grey levels to a fraction of one, and every place is checked against the design:
-a wrong calibration is worse than none.
+a wrong calibration is worse than none. The ends and unit flags of the bars are more marks than
+three points: an affine map and a homography are fitted to them, and the better is taken.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
-import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, map_coordinates
 
 from labapp.core.coordinates import ImageCalibration
+from labapp.core.mark_fit import MarkFits, Model, fit_marks, root_mean_square
+from labapp.core.target_bars import Bar, bar_marks, dot_center, local_noise, measured_bar
 from labapp.core.target_marks import (
     Image,
     Mark,
@@ -27,6 +29,8 @@ from labapp.core.target_marks import (
     three_marks,
 )
 from labapp.core.values import CannotMeasure, FloatArray
+
+AXES = ("O′X′", "O′Z′")
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,10 @@ class PlaneCalibrationSettings(MarkSettings):
     middle_tolerance
         A bar's middle may be this many units from where its length and O′ have it. This tells a
         bar that is partly hidden: its middle moves by half of what is.
+    flag_units
+        How far the unit flags stand out of their bars, units.
+    mark_tolerance
+        A mark may be this many units from where the others have it, perspective allowed for.
     """
 
     unit_mm: float = 12.7
@@ -63,11 +71,13 @@ class PlaneCalibrationSettings(MarkSettings):
     sigma_limit_px: float = 0.5
     pointing_tolerance: float = 0.08
     middle_tolerance: float = 0.1
+    flag_units: float = 0.19
+    mark_tolerance: float = 0.05
 
 
 @dataclass(frozen=True)
 class PlaneCalibration:
-    """Where O′ and the axes are in the picture.
+    """Where O′ and the axes are in the picture, and what takes its pixels to the plane.
 
     Parameters
     ----------
@@ -79,6 +89,11 @@ class PlaneCalibration:
         Standard uncertainty of each of the three points along either direction, px.
     threshold
         Grey level at O′ below which the three objects were found.
+    marks
+        X′, Z′ (mm), u and v (px) of O′ and of the ends and flags of the bars, and the noise of
+        the picture there (any unit); empty where only the three points are known.
+    model
+        What is used: the three points, or a fit to the marks.
     """
 
     origin_px: tuple[float, float]
@@ -88,31 +103,129 @@ class PlaneCalibration:
     z_axis_mm: float
     sigma_px: tuple[float, float, float]
     threshold: float
+    marks: tuple[tuple[float, float, float, float, float], ...] = ()
+    model: Model = "three points"
+
+    @cached_property
+    def fits(self) -> MarkFits | None:
+        """Both fits to the marks; None without marks."""
+        if not self.marks:
+            return None
+        marks = np.array(self.marks)
+        return fit_marks(marks[:, :2], marks[:, 2:4], marks[:, 4])
+
+    @property
+    def points_px(self) -> FloatArray:
+        """(u, v) of O′ and of the points on O′X′ and O′Z′ as the model has them, shape (3, 2)."""
+        if self.fits is None or self.model == "three points":
+            return np.array([self.origin_px, self.x_axis_px, self.z_axis_px])
+        return self.fits.of(self.model).calibration.to_image(self._points_mm)
+
+    @property
+    def points_covariance_px2(self) -> FloatArray:
+        """Covariance of these points, shape (6, 6), px²."""
+        if self.fits is None or self.model == "three points":
+            return np.diag(np.repeat(np.square(self.sigma_px), 2))
+        return self.fits.of(self.model).covariance_px2(self._points_mm)
+
+    @property
+    def points_sigma_px(self) -> tuple[float, float, float]:
+        """Standard uncertainty of each of these points along either direction, px."""
+        variance = np.diag(self.points_covariance_px2).reshape(3, 2).mean(axis=1)
+        origin, on_x, on_z = np.sqrt(variance).tolist()
+        return origin, on_x, on_z
 
     @property
     def px_per_mm(self) -> tuple[float, float]:
-        """Scale along O′X′ and along O′Z′ (Eq. 4-6), px/mm."""
-        x_arm, z_arm = self._arms
-        return float(np.hypot(*x_arm)) / self.x_axis_mm, float(np.hypot(*z_arm)) / self.z_axis_mm
+        """Scale from O′ to the point on O′X′ and to that on O′Z′ (Eq. 4-6), px/mm."""
+        along_x, along_z, _ = self._scales_and_angle(self.points_px)
+        return float(along_x), float(along_z)
 
     @property
     def angle_deg(self) -> float:
         """Angle from O′X′ to O′Z′ as the picture shows it, anticlockwise, degrees."""
-        x_arm, z_arm = self._arms
-        turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
-        return float(np.degrees(turn) % 360.0)
+        return float(self._scales_and_angle(self.points_px)[2])
+
+    @property
+    def scales_and_angle_sigma(self) -> FloatArray:
+        """± of both scales, px/mm, and of the angle, degrees, shape (3,)."""
+        points, step = self.points_px, 1e-3
+        base = self._scales_and_angle(points)
+        change = [
+            (self._scales_and_angle(points + step * one.reshape(3, 2)) - base) / step
+            for one in np.eye(6)
+        ]
+        squares = np.einsum("pk,pq,qk->k", change, self.points_covariance_px2, change)
+        return np.asarray(np.sqrt(squares))
 
     @property
     def image_calibration(self) -> ImageCalibration:
-        """The calibration that the measurement uses."""
-        return ImageCalibration.from_three_points(
-            self.origin_px, self.x_axis_px, self.x_axis_mm, self.z_axis_px, self.z_axis_mm
+        """The calibration that the measurement uses.
+
+        Raises
+        ------
+        ValueError
+            If the three points lie on one line, or the marks do not give the model.
+        """
+        if self.model == "three points":
+            return ImageCalibration.from_three_points(
+                self.origin_px, self.x_axis_px, self.x_axis_mm, self.z_axis_px, self.z_axis_mm
+            )
+        if self.fits is None:
+            raise ValueError(f"without marks there is no {self.model}")
+        return self.fits.of(self.model).calibration
+
+    @property
+    def setup_keys(self) -> dict[str, object]:
+        """The same as keys of ``[image_calibration]``; None for one that must not be there."""
+        names = ("origin_px", "x_axis_px", "z_axis_px")
+        lengths = {"x_axis_mm": self.x_axis_mm, "z_axis_mm": self.z_axis_mm}
+        if self.model == "homography":
+            matrix = self.image_calibration.matrix
+            rows = (matrix / matrix[2, 2]).tolist()
+            return {**dict.fromkeys((*names, *lengths)), "homography": rows}
+        points = dict(zip(names, self.points_px.tolist(), strict=True))
+        return {**points, **lengths, "homography": None}
+
+    def fit_lines(self) -> list[str]:
+        """What the fits to the marks leave over, which is used and why, in words."""
+        if self.fits is None:
+            return ["used       the three points: too few marks where the target has them"]
+        named = (("affine", self.fits.affine), ("homography", self.fits.homography))
+        lines = [
+            f"{name:<10} residual {root_mean_square(fit.residual_px):.3f} px, "
+            f"{root_mean_square(fit.residual_mm):.4f} mm; worst "
+            f"{np.hypot(*fit.residual_px.T).max():.3f} px; of a mark left out "
+            f"{root_mean_square(fit.left_out_px):.3f} px"
+            for name, fit in named
+            if fit is not None
+        ]
+        why = self.fits.reason if self.model == self.fits.best else "chosen by hand"
+        return [*lines, f"used       {self.model}, {len(self.marks)} marks. {why}"]
+
+    def with_scale(self, factor: float) -> PlaneCalibration:
+        """The same picture of a target that is larger by a factor."""
+        return replace(
+            self,
+            x_axis_mm=self.x_axis_mm * factor,
+            z_axis_mm=self.z_axis_mm * factor,
+            marks=tuple((x * factor, z * factor, u, v, noise) for x, z, u, v, noise in self.marks),
         )
 
     @property
-    def _arms(self) -> tuple[FloatArray, FloatArray]:
-        origin = np.array(self.origin_px)
-        return np.array(self.x_axis_px) - origin, np.array(self.z_axis_px) - origin
+    def _points_mm(self) -> FloatArray:
+        return np.array([[0.0, 0.0], [self.x_axis_mm, 0.0], [0.0, self.z_axis_mm]])
+
+    def _scales_and_angle(self, points_px: FloatArray) -> FloatArray:
+        x_arm, z_arm = points_px[1:] - points_px[0]
+        turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
+        return np.array(
+            [
+                np.hypot(*x_arm) / self.x_axis_mm,
+                np.hypot(*z_arm) / self.z_axis_mm,
+                np.degrees(turn) % 360.0,
+            ]
+        )
 
 
 def calibrate_plane(
@@ -150,24 +263,6 @@ def calibrate_plane(
     raise CannotMeasure("no-target", failure.reason)
 
 
-@dataclass(frozen=True)
-class _Bar:
-    """A bar measured on the grey levels.
-
-    Parameters
-    ----------
-    middle, direction
-        (u, v) of its middle, px; unit vector along its midline.
-    half_length, sigma_px
-        Half its length; standard uncertainty of the middle, px.
-    """
-
-    middle: FloatArray
-    direction: FloatArray
-    half_length: float
-    sigma_px: float
-
-
 def _measured(
     marks: tuple[Mark, Mark, Mark],
     darkness: FloatArray,
@@ -177,8 +272,8 @@ def _measured(
 ) -> PlaneCalibration:
     """Measure the three objects and hold them to the design."""
     dot, x_mark, z_mark = marks
-    origin, origin_sigma = _dot_center(dot, darkness)
-    x_bar, z_bar = _bar(x_mark, darkness, "O′X′"), _bar(z_mark, darkness, "O′Z′")
+    origin, origin_sigma = dot_center(dot, darkness)
+    x_bar, z_bar = measured_bar(x_mark, darkness, "O′X′"), measured_bar(z_mark, darkness, "O′Z′")
     points = [origin, x_bar.middle, z_bar.middle]
     sigma = [origin_sigma, x_bar.sigma_px, z_bar.sigma_px]
     for name, uncertain in zip(("dot of O′", "bar on O′X′", "bar on O′Z′"), sigma, strict=True):
@@ -200,8 +295,18 @@ def _measured(
         sigma_px=(sigma[0], sigma[1], sigma[2]),
         threshold=bare * (1.0 - level) if level is not None else float(settings.threshold or 0.0),
     )
-    _check_bar("O′X′", origin, x_bar, settings.x_units, settings)
-    _check_bar("O′Z′", origin, z_bar, settings.z_units, settings)
+    bars = (x_bar, z_bar)
+    for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
+        _check_pointing(axis, origin, bar, units, settings)
+    ticks = _tick_marks(origin, bars, darkness, settings)
+    if not ticks:
+        # Without flags in their places the ends alone must tell whether the bars are whole.
+        for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
+            _check_length(axis, origin, bar, units, settings)
+    if ticks and settings.subpixel:
+        found = replace(found, marks=ticks)
+        assert found.fits is not None
+        found = replace(found, model=found.fits.best)
     along_x, along_z = found.px_per_mm
     if abs(along_x / along_z - 1.0) > settings.scale_tolerance:
         raise Refusal(
@@ -214,119 +319,71 @@ def _measured(
     return found
 
 
-def _dot_center(dot: Mark, darkness: FloatArray) -> tuple[FloatArray, float]:
-    """(u, v) of the dot's centre and its standard uncertainty, px.
-
-    A pixel weighs by the part of it that the dot covers: 0 below a fifth, 1 above four fifths of
-    the dot's darkness, linear between, so that uneven light does not pull the centre.
-    """
-    v, u = np.nonzero(cv2.dilate(dot.mask.astype(np.uint8), np.ones((5, 5), np.uint8)))
-    dark = darkness[v, u]
-    full = float(np.median(np.sort(dark)[len(dark) // 2 :]))
-    span = 0.6 * full
-    weight = np.clip((dark - 0.2 * full) / span, 0.0, 1.0)
-    total = float(weight.sum())
-    if total <= 0.0:
-        raise Refusal(4, "The dot of O′ is too faint to be measured.")
-    place = np.stack([u, v], -1).astype(float)
-    center = weight @ place / total
-    edge = (weight > 0.0) & (weight < 1.0)
-    spread = np.sum((place[edge] - center) ** 2) / 2.0
-    noise = 1.4826 * float(np.median(np.abs(darkness - np.median(darkness))))
-    return center, float(np.hypot(noise / span * np.sqrt(spread) / total, 0.05))
-
-
-def _bar(mark: Mark, darkness: FloatArray, axis: str) -> _Bar:
-    """Measure a bar: midline from cuts across it, ends where its darkness falls to half.
-
-    The middle between the ends does not depend on how the light falls along the bar, as a
-    centroid would. Cuts through unit flags are outliers of the midline and are left out.
-    """
-    step = 0.5
-    margin = 1.5 * mark.width
-    along = np.arange(-mark.length / 2.0 - margin, mark.length / 2.0 + margin, step)
-    across = np.arange(-mark.width, mark.width + step / 2.0, step)
-    normal = np.array([-mark.direction[1], mark.direction[0]])
-    grid = mark.center + along[:, None, None] * mark.direction + across[None, :, None] * normal
-    cut = map_coordinates(darkness, [grid[..., 1], grid[..., 0]], order=1, mode="nearest")
-    cut = gaussian_filter1d(cut, 1.0 / step, axis=0)
-
-    core = np.abs(along) < 0.4 * mark.length
-    full = float(np.median(cut[core].max(axis=1)))
-    weight = np.clip((cut - 0.2 * full) / (0.6 * full), 0.0, 1.0)
-    total = weight.sum(axis=1)
-    core &= total > 0.0
-    if full <= 0.0 or core.sum() < 10:
-        raise Refusal(4, f"The bar on {axis} is too faint to be measured.")
-    offset = (weight @ across)[core] / total[core]
-    slope, intercept, scatter = _robust_line(along[core], offset)
-
-    # Ends on the bar's inner half: the midline is there even where flags stand out.
-    midline = np.abs(across[None, :] - intercept - slope * along[:, None])
-    inner = midline < max(0.2 * mark.width, step)
-    profile = (cut * inner).sum(axis=1) / np.maximum(inner.sum(axis=1), 1)
-    low, low_sigma = _end(-along[::-1], profile[::-1], mark.length / 2.0, axis)
-    high, high_sigma = _end(along, profile, mark.length / 2.0, axis)
-    middle = (high - low) / 2.0
-    # Cuts 1 px and a blur apart share their noise: about a third of them are independent.
-    midline_sigma = scatter / np.sqrt(max(core.sum() * step / 3.0, 1.0))
-    sigma = np.sqrt((low_sigma**2 + high_sigma**2) / 8.0 + midline_sigma**2 / 2.0)
-    direction = mark.direction + slope * normal
-    return _Bar(
-        middle=mark.center + middle * mark.direction + (intercept + slope * middle) * normal,
-        direction=direction / np.hypot(*direction),
-        half_length=float((high + low) / 2.0 * np.hypot(1.0, slope)),
-        sigma_px=float(np.hypot(sigma, 0.05)),
-    )
+def _tick_marks(
+    origin: FloatArray,
+    bars: tuple[Bar, Bar],
+    darkness: FloatArray,
+    settings: PlaneCalibrationSettings,
+) -> tuple[tuple[float, float, float, float, float], ...]:
+    """O′, the ends of the bars and their flags; none if too few are where the design has them."""
+    unit_px = float(np.hypot(*(bars[0].middle - origin))) / (sum(settings.x_units) / 2.0)
+    places = [(0.0, 0.0, origin)]
+    least = 1
+    for k, units in enumerate((settings.x_units, settings.z_units)):
+        bar, other = bars[k], bars[1 - k].direction
+        along = bar_marks(bar, origin, units, other, settings.flag_units, darkness)
+        places += [(t, 0.0, place) if k == 0 else (0.0, t, place) for t, place in along]
+        least += 2 + (int(np.ceil(units[1])) - int(np.floor(units[0])) - 1) // 2
+    marks = [
+        (x, z, *_pair(place), local_noise(darkness, place, 0.5 * unit_px)) for x, z, place in places
+    ]
+    ends = {(t, 0.0) for t in settings.x_units} | {(0.0, t) for t in settings.z_units}
+    while len(marks) >= least:
+        table = np.array(marks)
+        fit = fit_marks(table[:, :2] * settings.unit_mm, table[:, 2:4], table[:, 4]).homography
+        if fit is None:
+            return ()
+        off = np.hypot(*fit.left_out_px.T)
+        worst = int(np.argmax(off))
+        stray = off[worst] > max(5.0 * float(np.median(off)), 0.3)
+        # A scratch or a speck can be taken for a flag; O′ and the ends have been checked.
+        if stray and worst and marks[worst][:2] not in ends:
+            del marks[worst]
+            continue
+        if off[worst] > settings.mark_tolerance * unit_px:
+            return ()
+        unit = settings.unit_mm
+        return tuple((x * unit, z * unit, u, v, noise) for x, z, u, v, noise in marks)
+    return ()
 
 
-def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float, float]:
-    """Slope, intercept and scatter of a line through points with outliers."""
-    use = np.ones(len(x), bool)
-    for _ in range(4):
-        slope, intercept = np.polyfit(x[use], y[use], 1)
-        residual = y - intercept - slope * x
-        scatter = 1.4826 * float(np.median(np.abs(residual)))
-        use = np.abs(residual) <= max(2.5 * scatter, 1e-6)
-    return float(slope), float(intercept), scatter
-
-
-def _end(
-    along: FloatArray, profile: FloatArray, half_length: float, axis: str
-) -> tuple[float, float]:
-    """Where a profile first falls to half of what it is within, going up; with its σ, px.
-
-    The level is that of the bar's last part on this side: light may fall along the bar.
-    """
-    begin, end = 0.5 * half_length, 0.8 * half_length
-    part = profile[(along >= begin) & (along <= end)]
-    half = float(np.median(part)) / 2.0
-    beyond = np.flatnonzero((along[1:] > begin) & (profile[1:] < half) & (profile[:-1] >= half))
-    if half <= 0.0 or beyond.size == 0:
-        raise Refusal(4, f"The bar on {axis} has no clear end.")
-    i = int(beyond[0])
-    fall = profile[i] - profile[i + 1]
-    place = along[i] + (profile[i] - half) / fall * (along[i + 1] - along[i])
-    slope = fall / (along[i + 1] - along[i])
-    return float(place), float(part.std() / slope)
-
-
-def _check_bar(
+def _check_pointing(
     axis: str,
     origin: FloatArray,
-    bar: _Bar,
+    bar: Bar,
     units: tuple[float, float],
     settings: PlaneCalibrationSettings,
 ) -> None:
-    """Refuse a bar that does not point at O′, or does not begin and end where it should."""
+    """Refuse a bar that does not point at O′."""
     arm = bar.middle - origin
-    begin, end = units
-    unit_px = float(np.hypot(*arm)) / ((begin + end) / 2.0)
+    unit_px = float(np.hypot(*arm)) / (sum(units) / 2.0)
     passes_by = abs(arm[0] * bar.direction[1] - arm[1] * bar.direction[0]) / unit_px
     if passes_by > settings.pointing_tolerance:
         raise Refusal(
             4, f"The bar on {axis} does not point at O′: it passes {passes_by:.2g} units off."
         )
+
+
+def _check_length(
+    axis: str,
+    origin: FloatArray,
+    bar: Bar,
+    units: tuple[float, float],
+    settings: PlaneCalibrationSettings,
+) -> None:
+    """Refuse a bar that does not begin and end where it should."""
+    begin, end = units
+    unit_px = float(np.hypot(*(bar.middle - origin))) / ((begin + end) / 2.0)
     expected = (end - begin) / 2.0 * unit_px
     # With 2s of it hidden a bar's half is s shorter, but s·(end - begin) / (end + begin) of that
     # is expected of its new middle. Half a pixel an end may be off even in a coarse picture.

@@ -125,5 +125,5 @@ def _known(
         sigma[:2], nominal[:2] = [laser.angle_sigma_deg, laser.distance_sigma_mm], [False] * 2
     if plane is not None and plane_in_use(plane, setup.calibration):
         axes = AxisPoints(setup.calibration, plane.x_axis_mm, plane.z_axis_mm)
-        sigma[5:], nominal[5:] = plane.sigma_px, [False] * 3
+        sigma[5:], nominal[5:] = plane.points_sigma_px, [False] * 3
     return axes, sigma, nominal

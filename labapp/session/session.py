@@ -228,20 +228,15 @@ class Session:
         Raises
         ------
         ValueError
-            If its three points lie on one line.
+            If its three points lie on one line, or its marks do not give its model.
         """
         _ = found.image_calibration  # which refuses such points
-        calibration = {
-            **{f"{point}_px": list(getattr(found, f"{point}_px")) for point in POINTS},
-            **{f"{point}_mm": getattr(found, f"{point}_mm") for point in POINTS[1:]},
-            "homography": None,
-        }
         readings = PlanePicture(unit_mm, found, self._pictures.keep(name, image))
         self._change(
             "imaging-plane calibration",
             {
                 ("plane-calibration", WHOLE): readings,
-                ("setup", WHOLE): self._updated({"image_calibration": calibration}),
+                ("setup", WHOLE): self._updated({"image_calibration": found.setup_keys}),
             },
         )
 
@@ -493,6 +488,3 @@ class Session:
             return Basis(self.setup, self.settings)
         except InputError:
             return None
-
-
-POINTS = ("origin", "x_axis", "z_axis")

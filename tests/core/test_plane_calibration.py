@@ -114,6 +114,7 @@ def test_the_points_of_eq_5_6_in_a_dim_picture() -> None:
     assert found.px_per_mm == pytest.approx((34 / 12.7, 34 / 12.7), rel=5e-3)
     assert found.angle_deg == pytest.approx(90.0, abs=0.3)
     assert 12 < found.threshold < 32
+    assert (len(found.marks), found.model) == (15, "affine")
     plane = found.image_calibration.to_plane(scene.truth)
     assert plane == pytest.approx(np.array([[0, 0], [69.85, 0], [0, 31.75]]), abs=0.15)
 
@@ -155,6 +156,51 @@ def test_the_fixed_threshold_and_whole_pixels_of_the_text() -> None:
     assert np.array_equal(points(found), np.floor(points(found)))
     assert np.abs(points(found) + 0.5 - scene.truth).max() < 1.5
     assert min(found.sigma_px) >= 1 / np.sqrt(12)
+    assert (found.marks, found.model) == ((), "three points")
+
+
+def test_a_flag_that_is_hidden_is_no_mark() -> None:
+    scene = Scene(noise=0.5)
+    image = scene.render().astype(float)
+    along_x, along_z = scene.axes
+    for begin, end in ((0.16, 0.5), (-0.16, -0.5)):
+        ends = [scene.truth[0] + 6 * along_x + at * along_z for at in (begin, end)]
+        places = [tuple(round(c) for c in place) for place in ends]
+        cv2.line(image, *places, float(np.median(image)), 5)
+    found = calibrate_plane(image)
+    assert len(found.marks) == 14
+    assert 6 * 12.7 not in [mark[0] for mark in found.marks]
+    assert np.abs(points(found) - scene.truth).max() < 0.3
+
+
+def test_the_marks_make_the_points_more_certain() -> None:
+    scenes = [random_scene(seed) for seed in range(20, 32)]
+    errors, sigma = [], []
+    for scene in scenes:
+        found = calibrate_plane(scene.render())
+        errors.append(found.points_px - scene.truth)
+        sigma.append(np.sqrt(np.diag(found.points_covariance_px2)).reshape(3, 2))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.12
+    assert 0.4 < np.sqrt(np.mean(np.square(np.array(errors) / sigma))) < 2.0
+
+
+def test_scales_and_angle_carry_the_points_uncertainty() -> None:
+    square = PlaneCalibration(
+        (50.0, 400.0), (380.0, 400.0), 55.0, (50.0, 250.0), 25.0, (0.1, 0.2, 0.3), 14.0
+    )
+    assert square.px_per_mm == pytest.approx((6.0, 6.0))
+    at_origin = np.hypot(0.1 / 330, 0.1 / 150)
+    angle = np.degrees(np.sqrt((0.2 / 330) ** 2 + (0.3 / 150) ** 2 + at_origin**2))
+    expected = [np.hypot(0.1, 0.2) / 55, np.hypot(0.1, 0.3) / 25, angle]
+    np.testing.assert_allclose(square.scales_and_angle_sigma, expected, rtol=1e-3)
+
+
+def test_another_unit_scales_the_marks_too() -> None:
+    found = calibrate_plane(Scene().render())
+    half = found.with_scale(0.5)
+    assert half.px_per_mm == pytest.approx([2 * scale for scale in found.px_per_mm])
+    assert half.points_px == pytest.approx(found.points_px)
+    assert half.model == found.model
 
 
 @pytest.mark.parametrize(

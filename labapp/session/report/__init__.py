@@ -257,14 +257,17 @@ def _plane(story: Story, told: Told) -> None:
         )
     ]
     along_x, along_z = found.px_per_mm
+    x_sigma, z_sigma, angle_sigma = found.scales_and_angle_sigma
     story.table(
         f"What was found in the calibration picture; a unit of the axes is {plane.unit_mm:.6g} mm. "
-        f"Scale {along_x:.4f} px/mm along O′X′, {along_z:.4f} px/mm along O′Z′; "
-        f"{found.angle_deg:.3f}° between them.",
+        f"Scale {along_x:.4f} ± {x_sigma:.4f} px/mm along O′X′, "
+        f"{along_z:.4f} ± {z_sigma:.4f} px/mm along O′Z′; {found.angle_deg:.3f} ± {angle_sigma:.3f}° between them.",
         [["point", "X′, Z′ (mm)", "u (px)", "v (px)", "± (px)"], *rows],
         "llrrr",
         (0.36, 0.22, 0.14, 0.14, 0.14),
     )
+    if found.fits is not None:
+        story.text("; ".join(" ".join(line.split()) for line in found.fit_lines()) + ".")
     if told.setup is not None and not plane_in_use(found, told.setup.calibration):
         story.text("The image calibration was changed after this one: other values are in use.")
     try:
