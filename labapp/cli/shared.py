@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,20 +66,13 @@ def several(count: int, thing: str) -> str:
     return f"{count} {thing}{'s' * (count != 1)}"
 
 
-def frames_text(frames: Iterable[int]) -> str:
+def frames_text(frames: Collection[int]) -> str:
     """Frames in short: "frames 0 to 3, 7"; "no frame"."""
-    runs: list[list[int]] = []
-    ordered = sorted(frames)
-    for frame in ordered:
-        if runs and frame == runs[-1][-1] + 1:
-            runs[-1] = [runs[-1][0], frame]
-        else:
-            runs.append([frame])
-    if not runs:
+    from labapp.session.summary import runs_text
+
+    if not frames:
         return "no frame"
-    told = [" to ".join(map(str, run)) for run in runs]
-    shown = ", ".join([*told[:RUNS_SHOWN], *(["…"] if len(told) > RUNS_SHOWN else [])])
-    return f"frame{'s' * (len(ordered) > 1)} {shown}"
+    return f"frame{'s' * (len(frames) > 1)} {runs_text(frames, ' to ', RUNS_SHOWN)}"
 
 
 def finite(value: float | None) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -96,17 +97,47 @@ def states(session: Session | None, seen: Overview | None = None) -> dict[str, S
     """State of every step, by its key; ``seen`` is the session's overview, if it is at hand."""
     if session is None:
         return {step.key: State(Mark.TODO, "Open or make a session first") for step in STEPS}
+    problems: tuple[InputError, ...] = ()
     try:
         _ = session.setup
-        missing = ""
     except InputError as error:
-        missing = "; ".join(f"{problem.field}: {problem.value}" for problem in error.problems[:3])
+        problems = error.problems
+    missing = setup_to_do(problems)
+    parts = {problem.field.partition(".")[0] for problem in problems}
     return {
-        "setup": State(Mark.DONE, "Complete") if not missing else State(Mark.READY, missing),
-        "laser": _calibrated(session.laser_calibration is not None, "laser." in missing),
-        "plane": _calibrated(session.plane_calibration is not None, "image_calibration" in missing),
+        "setup": State(Mark.READY, missing) if missing else State(Mark.DONE, "Complete"),
+        "laser": _calibrated(session.laser_calibration is not None, "laser" in parts),
+        "plane": _calibrated(session.plane_calibration is not None, "image_calibration" in parts),
         **_frame_states(session, missing, seen),
     }
+
+
+PARTS = {
+    "laser": "the laser",
+    "pattern": "the dot pattern",
+    "electrode": "the electrode",
+    "imaging_plane": "the imaging plane",
+}
+"""Sections of the set-up that are typed in, in words."""
+
+
+def setup_to_do(problems: Iterable[InputError]) -> str:
+    """What to do for the set-up to be complete, in words; empty if nothing."""
+    enter, wrong, calibrate = [], [], []
+    for problem in problems:
+        part, _, key = problem.field.partition(".")
+        if part == "image_calibration":
+            calibrate = ["calibrate the picture (step Imaging plane)"]
+        elif part not in PARTS:
+            wrong.append(f"take out {problem.field}: {problem.expected}")
+        elif problem.value == "missing":
+            enter.append(PARTS[part])
+        else:
+            told = f"{PARTS[part]}, {key.replace('_', ' ')}"
+            wrong.append(f"put right {told}: {problem.value} is not {problem.expected}")
+    typed = [f"enter {', '.join(dict.fromkeys(enter))}"] if enter else []
+    words = "; ".join([*wrong, *typed, *calibrate])
+    return words[:1].upper() + words[1:]
 
 
 def _calibrated(done: bool, needed: bool) -> State:
@@ -142,7 +173,8 @@ def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict
     elif measured < count:
         surface = State(Mark.READY, f"{count - measured} of {count} frames are not measured yet")
     else:
-        surface = State(Mark.DONE, f"All {count} frames are measured")
+        bare = f", {without} without a surface" if without else ""
+        surface = State(Mark.DONE, f"All {count} frames are measured{bare}")
     dots = State(Mark.READY if measured < count else Mark.DONE, "No frame is in doubt")
     if without:
         dots = State(Mark.ATTENTION, f"{without} frames could not be measured: look at their dots")

@@ -23,17 +23,19 @@ from labapp.core.dots import Dots
 from labapp.core.lattice import Lattice
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
+from labapp.session.csv_tables import (
+    PROBLEMS_SHOWN,
+    bounded_lines,
+    number_in,
+    opened_table,
+)
 
 NEEDED = ("u_px", "v_px", "reflected_row", "reflected_column")
 A_TABLE = f"a table of dots (CSV, UTF-8) with the columns {', '.join(NEEDED)}"
 
 LARGEST_FILE = 1 << 29
-LONGEST_LINE = 1 << 14
-HEAD_BYTES = 1 << 16
 MOST_DOTS = 10_000
 """Beyond these a file is no table of the dots of a recording."""
-
-PROBLEMS_SHOWN = 10
 
 SAME_PX = 1.0
 """A dot of the table is the one that was there within this distance …"""
@@ -132,25 +134,16 @@ def _read(path: Path, frame: int, frame_shape: tuple[int, int]) -> list[_Row]:
     """The table's rows of one frame; there is at least one."""
     problems: list[InputError] = []
     rows: list[_Row] = []
-    try:
-        _check_head(path)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = _Reader(path, file, frame, frame_shape, problems)
-            for line, cells in reader.lines():
-                row = reader.row(line, cells)
-                rows += [] if row is None else [row]
-                if len(rows) > MOST_DOTS:
-                    raise InputError(
-                        path, f"line {line}", f"dot {len(rows)}", f"at most {MOST_DOTS} dots"
-                    )
-                if len(problems) >= PROBLEMS_SHOWN:
-                    break
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, A_TABLE) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "encoding", "not UTF-8", A_TABLE) from error
-    except csv.Error as error:
-        raise InputError(path, "syntax", error, A_TABLE) from error
+    with opened_table(path, A_TABLE, LARGEST_FILE) as file:
+        reader = _Reader(path, file, frame, frame_shape, problems)
+        for line, cells in reader.lines():
+            row = reader.row(line, cells)
+            rows += [] if row is None else [row]
+            if len(rows) > MOST_DOTS:
+                wanted = f"at most {MOST_DOTS} dots"
+                raise InputError(path, f"line {line}", f"dot {len(rows)}", wanted)
+            if len(problems) >= PROBLEMS_SHOWN:
+                break
     problems = problems or _contradictions(path, rows)
     if problems:
         raise InputError.gather(problems[:PROBLEMS_SHOWN])
@@ -158,16 +151,6 @@ def _read(path: Path, frame: int, frame_shape: tuple[int, int]) -> list[_Row]:
         which = f"no dot of frame {frame}" if reader.has_frames else "no dot"
         raise InputError(path, "rows", which, "a row for each dot of the frame")
     return rows
-
-
-def _check_head(path: Path) -> None:
-    """Refuse at once what is no text, or too large."""
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST_FILE} bytes")
-    with path.open("rb") as file:
-        if b"\0" in file.read(HEAD_BYTES):
-            raise InputError(path, "content", "binary, or UTF-16", A_TABLE)
 
 
 class _Reader:
@@ -185,7 +168,7 @@ class _Reader:
         self._frame = frame
         self._problems = problems
         self._bounds = {"u_px": frame_shape[1] - 0.5, "v_px": frame_shape[0] - 0.5}
-        bounded = self._bounded(file)
+        bounded = bounded_lines(path, file, A_TABLE)
         head = next(bounded, "")
         self._separator = max(",;\t", key=head.count)
         self._reader = csv.reader(itertools.chain([head], bounded), delimiter=self._separator)
@@ -243,7 +226,7 @@ class _Reader:
         return _Row(line, u, v, row, column, blocked)
 
     def _place(self, line: int, name: str, cells: dict[str, str]) -> float | None:
-        value = self._number(cells[name])
+        value = number_in(cells[name], self._separator)
         if value is None or not -0.5 <= value <= self._bounds[name]:
             inside = f"a number from -0.5 to {self._bounds[name]:g} (px, within the frame)"
             self._wrong(line, name, cells[name], inside)
@@ -253,36 +236,16 @@ class _Reader:
     def _whole(
         self, line: int, name: str, cells: dict[str, str], least: int, expected: str
     ) -> int | None:
-        value = self._number(cells[name])
+        value = number_in(cells[name], self._separator)
         most = MOST if least else math.inf
         if value is None or value != math.floor(value) or not least <= value <= most:
             self._wrong(line, name, cells[name], expected)
             return None
         return int(value)
 
-    def _number(self, cell: str) -> float | None:
-        if self._separator != ",":
-            cell = cell.replace(",", ".")
-        try:
-            value = float(cell) if "_" not in cell else math.nan
-        except ValueError:
-            return None
-        return value if math.isfinite(value) else None
-
     def _wrong(self, line: int, name: str, value: object, expected: str) -> None:
         shown = value if value != "" else "nothing"
         self._problems.append(InputError(self._path, f"line {line}, {name}", shown, expected))
-
-    def _bounded(self, file: TextIO) -> Iterator[str]:
-        """The lines; one without an end is refused before it fills the memory."""
-        for number in itertools.count(1):
-            text = file.readline(LONGEST_LINE)
-            if len(text) >= LONGEST_LINE:
-                long = f"more than {LONGEST_LINE} characters"
-                raise InputError(self._path, f"line {number}", long, A_TABLE)
-            if not text:
-                return
-            yield text
 
 
 def _contradictions(path: Path, rows: list[_Row]) -> list[InputError]:

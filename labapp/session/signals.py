@@ -17,17 +17,19 @@ import numpy as np
 
 from labapp.core.values import FloatArray, freeze
 from labapp.errors import InputError
+from labapp.session.csv_tables import (
+    PROBLEMS_SHOWN,
+    bounded_lines,
+    number_in,
+    opened_table,
+)
 
 A_TABLE = "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), a current, a voltage"
 
 LARGEST_FILE = 1 << 28
-LONGEST_LINE = 1 << 14
 MOST_ROWS = 500_000
-HEAD_BYTES = 1 << 16
 LINES_ABOVE = 60
 """Loggers tell of themselves in so many lines before the names at most."""
-
-PROBLEMS_SHOWN = 10
 
 NAMES = {
     "time": "time|zeit|t|seconds",
@@ -93,30 +95,12 @@ def read_signals(path: str | os.PathLike[str]) -> Signals:
         problems are reported together, each with its line and column.
     """
     path = Path(path)
-    try:
-        _check_head(path)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return _read(path, file)
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, A_TABLE) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "encoding", "not UTF-8", A_TABLE) from error
-    except csv.Error as error:
-        raise InputError(path, "syntax", error, A_TABLE) from error
-
-
-def _check_head(path: Path) -> None:
-    """Refuse at once what is no text, or too large."""
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST_FILE} bytes")
-    with path.open("rb") as file:
-        if b"\0" in file.read(HEAD_BYTES):
-            raise InputError(path, "content", "binary, or UTF-16", A_TABLE)
+    with opened_table(path, A_TABLE, LARGEST_FILE) as file:
+        return _read(path, file)
 
 
 def _read(path: Path, file: TextIO) -> Signals:
-    lines = _bounded(path, file)
+    lines = bounded_lines(path, file, A_TABLE)
     above, separator, columns, width = _find_names(path, lines)
     problems: list[InputError] = []
     held = {column.quantity: array("d") for column in columns}
@@ -199,7 +183,7 @@ def _take(
     time_s = None
     for column in columns:
         cell = cells[column.place].strip()
-        value = _number(cell, separator)
+        value = number_in(cell, separator)
         if column.quantity == "time":
             time_s = None if value is None else value * column.factor
         elif not cell:
@@ -211,25 +195,3 @@ def _take(
             value = math.nan
         held[column.quantity].append(value * column.factor)
     return time_s
-
-
-def _number(cell: str, separator: str) -> float | None:
-    if separator != ",":
-        cell = cell.replace(",", ".")
-    try:
-        value = float(cell) if "_" not in cell else math.nan
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
-
-
-def _bounded(path: Path, file: TextIO) -> Iterator[str]:
-    """The lines; one without an end is refused before it fills the memory."""
-    for number in itertools.count(1):
-        text = file.readline(LONGEST_LINE)
-        if len(text) >= LONGEST_LINE:
-            long = f"more than {LONGEST_LINE} characters"
-            raise InputError(path, f"line {number}", long, A_TABLE)
-        if not text:
-            return
-        yield text

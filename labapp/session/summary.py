@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -69,3 +70,15 @@ class Summary:
     def _finite(self, name: str) -> FloatArray:
         values = self.series(name)
         return np.asarray(values[np.isfinite(values)])
+
+
+def runs_text(frames: Iterable[int], to: str = "–", most: int = 12) -> str:
+    """Frame numbers in short, so many runs of them at most: ``0–4, 7, 9–11``."""
+    runs: list[list[int]] = []
+    for frame in sorted(frames):
+        if runs and frame == runs[-1][-1] + 1:
+            runs[-1] = [runs[-1][0], frame]
+        else:
+            runs.append([frame])
+    more = f" and {len(runs) - most} more" if len(runs) > most else ""
+    return ", ".join(to.join(map(str, run)) for run in runs[:most]) + more

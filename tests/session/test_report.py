@@ -29,6 +29,7 @@ from labapp.session.report.layout import Story, plain
 from labapp.session.report.results import tell_corrections, tell_example, tell_results
 from labapp.session.session import Session
 from labapp.session.setup import Setup, parse_setup
+from labapp.session.summary import runs_text
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap
 from tests.scenes import FRAME_SHAPE, as_dots
@@ -208,10 +209,16 @@ def test_the_frame_that_stands_for_all_has_the_median_peak(seen: Measurement):
 
 @pytest.mark.parametrize(
     ("numbers", "text"),
-    [([], ""), ([3], "3"), ([0, 1, 2, 5, 7, 8], "0–2, 5, 7–8"), ([2, 1], "1–2")],
+    [
+        ([], ""),
+        ([3], "3"),
+        ([0, 1, 2, 5, 7, 8], "0–2, 5, 7–8"),
+        ([2, 1], "1–2"),
+        (list(range(0, 30, 2)), "0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22 and 3 more"),
+    ],
 )
 def test_frames_are_named_in_short(numbers: list[int], text: str):
-    assert data.frames_text(numbers) == text
+    assert runs_text(numbers) == text
 
 
 def test_settings_that_differ_are_told_with_their_defaults():

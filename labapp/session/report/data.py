@@ -21,6 +21,7 @@ from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
 from labapp.session.session import Session
 from labapp.session.setup import Setup
+from labapp.session.summary import runs_text
 
 DOUBTFUL_MARGIN = 5.0
 """A frame is doubtful where another correspondence comes within this factor of the residual."""
@@ -237,19 +238,6 @@ def with_unit(value: float | None, unit: str) -> str:
     return "" if value is None else f"{value:.6g} {unit}"
 
 
-def frames_text(numbers: Sequence[int], most: int = 12) -> str:
-    """Frame numbers in short: ``0–4, 7, 9–11``."""
-    runs: list[list[int]] = []
-    for k in sorted(numbers):
-        if runs and k == runs[-1][1] + 1:
-            runs[-1][1] = k
-        else:
-            runs.append([k, k])
-    shown = [f"{a}" if a == b else f"{a}–{b}" for a, b in runs]
-    more = f" and {len(shown) - most} more" if len(shown) > most else ""
-    return ", ".join(shown[:most]) + more
-
-
 def status_cells(lines: Sequence[FrameLine]) -> Cells:
     """How many frames came to what, and which: those that count first."""
     groups: dict[tuple[str, str], list[FrameLine]] = {}
@@ -259,7 +247,7 @@ def status_cells(lines: Sequence[FrameLine]) -> Cells:
         groups.setdefault((status, NUMBER.sub("#", why)), []).append(line)
     ranked = sorted(groups.items(), key=lambda item: (item[0][0] != "in the mean", item[0]))
     rows = [
-        [*_outcome(found[0]), str(len(found)), frames_text([line.frame for line in found])]
+        [*_outcome(found[0]), str(len(found)), runs_text([line.frame for line in found])]
         for _, found in ranked
     ]
     return [["outcome", "why", "frames", "which"], *rows]

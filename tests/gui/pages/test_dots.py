@@ -21,6 +21,7 @@ from labapp.core.lattice import Lattice
 from labapp.core.pipeline import start_correction
 from labapp.errors import InputError
 from labapp.gui.pages.dots import DotsPage, presenter
+from labapp.gui.pages.dots.fitting import Processes, Refit
 from labapp.gui.tasks import Control
 from labapp.gui.window import MainWindow
 from labapp.gui.workspace import Workspace
@@ -58,6 +59,8 @@ def unfitted(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     """Frames that would have been measured."""
     asked: list[list[int]] = []
     monkeypatch.setattr(Workspace, "measure", lambda self, frames=None: asked.append(list(frames)))
+    monkeypatch.setattr(Refit, "_fit", lambda self, frame: asked.append([frame]))
+    monkeypatch.setattr(Processes, "begin", lambda self: None)
     return asked
 
 
@@ -174,6 +177,44 @@ def test_a_spoiled_frame_is_put_right_in_fifteen_actions(
     qtbot.waitUntil(lambda: not page.refit.pending)
     table = {row.name: row.value for row in page.dots_panel.fit.rows}
     assert str(table["Fit"]).endswith("→ ok")
+
+
+def test_a_newer_edit_ends_the_fit_of_the_one_before(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample
+) -> None:
+    """One fit at a time, and the last edit wins: the first one's process does not go on."""
+    session = show(page, qtbot, copy_sample("gtaw"), 0)
+    refit, kept = page.refit, list[float]()
+    qtbot.waitUntil(lambda: refit.processes.ready, timeout=60_000)
+
+    def nudge() -> None:
+        page.editor.selection = np.array([12])
+        page.editor.shift_px[:] = 0.2, 0.0
+        page.editor.drop()
+
+    def note() -> None:
+        result = session.result(0)
+        if result is not None and result.measurement.correction is not None:
+            kept.append(float(result.measurement.correction.dots.u_px[12]))
+
+    page.workspace.changed.connect(note)
+    began = float(page.editor.dots_px[12, 0])
+    nudge()
+    first, pool = refit._task, refit.processes.first
+    assert refit.pending
+    nudge()
+    nudge()  # the process to take its place is not warm yet: the second's fit goes on until it is
+    assert first is not None
+    assert first.control.cancelled.is_set()
+    assert refit.processes.first is not pool
+    assert not pool._processes or not any(p.is_alive() for p in pool._processes.values())
+    qtbot.waitUntil(
+        lambda: not refit.pending and not presenter.needs_fit(presenter.shown(session, 0, None)),
+        timeout=60_000,
+    )
+    page.workspace.changed.disconnect(note)
+    assert kept[-1] == pytest.approx(began + 0.6, abs=1e-9)
+    assert began + 0.2 not in kept
 
 
 def test_an_unmeasured_frame_shows_what_is_found_in_it(

@@ -1,4 +1,4 @@
-"""What the dots page does in the background: read, look for dots, fit again, carry on."""
+"""What the dots page does in the background: read, look for dots, carry on."""
 
 from __future__ import annotations
 
@@ -106,40 +106,6 @@ class Looking(QObject):
         self._task = self._space.tasks.start(
             "Looking for dots", lambda _: presenter.detect(image, frame, (dots, lattice)), done
         )
-
-
-class Refit:
-    """Measures a frame anew whenever its dots or rows were changed by hand.
-
-    One fit at a time: an edit made meanwhile makes another follow, of what the frame has then.
-
-    Attributes
-    ----------
-    pending
-        Whether a fit is under way.
-    """
-
-    def __init__(self, workspace: Workspace) -> None:
-        self._space = workspace
-        self._task: Task | None = None
-        self._failed: tuple[int, object] | None = None
-
-    @property
-    def pending(self) -> bool:
-        """Whether a fit is under way."""
-        return self._task is not None and self._task in self._space.tasks.active
-
-    def want(self, seen: Shown) -> None:
-        """Fit a frame if what it was measured from has been changed."""
-        session = self._space.session
-        if session is None or self.pending or not presenter.needs_fit(seen):
-            return
-        # A fit that was refused or cancelled is not begun again until something else is tried.
-        state = (seen.frame, session.history)
-        if state == self._failed or presenter.why_no_fit(session):
-            return
-        self._failed = state
-        self._task = self._space.measure([seen.frame])
 
 
 def carry_on(workspace: Workspace, seen: Shown, most: int | None) -> None:

@@ -12,8 +12,9 @@ from labapp.core.correction import Correction
 from labapp.core.lattice import Site
 from labapp.core.pipeline import Settings
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.background import Looking, Refit, carry_on
+from labapp.gui.pages.dots.background import Looking, carry_on
 from labapp.gui.pages.dots.editing import Editor
+from labapp.gui.pages.dots.fitting import Refit
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
 from labapp.gui.pages.dots.presenter import Figures, Shown

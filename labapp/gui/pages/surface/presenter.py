@@ -16,6 +16,7 @@ from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
+from labapp.gui.steps import setup_to_do
 from labapp.session.heights import Profile
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.scene import Scene, rays_of, scene_of
@@ -312,8 +313,7 @@ def why_not(session: Session) -> str:
     try:
         _ = session.setup
     except InputError as error:
-        problem = error.problems[0]
-        return f"The set-up is not complete: {problem.field}: {problem.value}"
+        return f"The set-up is not complete. {setup_to_do(error.problems)}"
     return ""
 
 

@@ -1,0 +1,160 @@
+"""The fit that follows an edit: one at a time, and the last edit wins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+from PySide6.QtCore import QTimer
+
+from labapp.core.pipeline import Settings
+from labapp.gui.pages.dots import presenter
+from labapp.gui.pages.dots.presenter import Shown
+from labapp.gui.tasks import Cancelled, Control, Task
+from labapp.gui.workspace import Workspace
+from labapp.session.run import measuring_pool
+
+AGAIN_MS = 50
+"""An edit that cannot take the place of the fit before it yet tries again after so long."""
+
+
+class Processes:
+    """A process to fit in, and another, warm, that takes its place when it is ended."""
+
+    def __init__(self) -> None:
+        self._pools: list[tuple[ProcessPoolExecutor, Future[Settings]]] = []
+
+    def begin(self) -> None:
+        """Have both: the second is there at once when the first is ended."""
+        while len(self._pools) < 2:
+            pool = measuring_pool(1)
+            # To make settings it loads the whole measurement.
+            self._pools.append((pool, pool.submit(Settings)))
+
+    @property
+    def first(self) -> ProcessPoolExecutor:
+        """The one to fit in."""
+        self.begin()
+        return self._pools[0][0]
+
+    @property
+    def ready(self) -> bool:
+        """Whether the second could begin at once."""
+        return len(self._pools) == 2 and self._pools[1][1].done()
+
+    def replace(self) -> None:
+        """End the first, whatever it is at, and put the second in its place."""
+        _end(self._pools.pop(0)[0])
+        self.begin()
+
+    def end(self) -> None:
+        """End both."""
+        while self._pools:
+            _end(self._pools.pop()[0])
+
+
+class Refit:
+    """Measures a frame anew whenever its dots or rows were changed by hand.
+
+    One fit at a time, in a process of its own: a long measurement does not hold it up. An edit made
+    meanwhile ends it at once and begins another, of what the frame has then.
+
+    Attributes
+    ----------
+    processes
+        Where it fits.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._space = workspace
+        self._task: Task | None = None
+        self._begun: tuple[int, object] | None = None
+        self._seen: Shown | None = None
+        self.processes = Processes()
+        self._again = QTimer(workspace)
+        self._again.setSingleShot(True)
+        self._again.setInterval(AGAIN_MS)
+        self._again.timeout.connect(self._once_more)
+        workspace.opened.connect(self._forget)
+
+    @property
+    def pending(self) -> bool:
+        """Whether a fit is under way."""
+        return self._task is not None and self._task in self._space.tasks.active
+
+    def want(self, seen: Shown) -> None:
+        """Fit a frame if what it was measured from has been changed."""
+        session = self._space.session
+        if session is None or presenter.why_no_fit(session):
+            return
+        self._seen = seen
+        self.processes.begin()
+        # A fit that was refused or cancelled is not begun again until something else is tried.
+        state = (seen.frame, session.history)
+        if state == self._begun:
+            return
+        if self.pending and not self._give_up(seen.frame):
+            return
+        if presenter.needs_fit(seen):
+            self._begun = state
+            self._fit(seen.frame)
+
+    def _once_more(self) -> None:
+        if self._seen is not None:
+            self.want(self._seen)
+
+    def _give_up(self, frame: int) -> bool:
+        """End the fit under way if it is of this frame, as it was; False if it goes on."""
+        assert self._task is not None
+        if self._begun is None or self._begun[0] != frame:
+            return False
+        if not self.processes.ready:
+            self._again.start()
+            return False
+        self._task.cancel()
+        self._task = None
+        self.processes.replace()
+        return True
+
+    def _fit(self, frame: int) -> None:
+        space, session, pool = self._space, self._space.session, self.processes.first
+        assert session is not None
+
+        def work(control: Control) -> None:
+            try:
+                for _ in session.measure([frame], _Patient(pool, control)):
+                    control.check()
+            except BrokenProcessPool as error:
+                control.check()  # ended on purpose
+                raise ValueError("the process that fits has ended: measure the frame") from error
+
+        self._task = space.tasks.start("Fitting", work, lambda _: space.changed.emit())
+
+    def _forget(self) -> None:
+        """Another session is open, or none."""
+        self._again.stop()
+        self._task = self._begun = self._seen = None
+        self.processes.end()
+
+
+class _Patient(Executor):
+    """A pool whose results are waited for only as long as the task is wanted."""
+
+    def __init__(self, pool: Executor, control: Control) -> None:
+        self._pool, self._control = pool, control
+
+    def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+        future = self._pool.submit(work, *given, **named)
+        while not wait([future], timeout=0.02).done:
+            if self._control.cancelled.is_set():
+                future.cancel()
+                raise Cancelled
+        return future
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    for process in list((pool._processes or {}).values()):
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,77 @@
+"""What readers of tables share: text that is no table, or has no end, is refused at once."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TextIO
+
+from labapp.errors import InputError
+
+LONGEST_LINE = 1 << 14
+HEAD_BYTES = 1 << 16
+
+PROBLEMS_SHOWN = 10
+"""Of all that is wrong with a table, so much is told together."""
+
+
+@contextmanager
+def opened_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
+    """Open a table as text; what is wrong with file, encoding or syntax is told.
+
+    Parameters
+    ----------
+    path
+        Where it is.
+    wanted
+        What it should be.
+    largest
+        So many bytes it may have.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is too large, or is no text.
+    """
+    try:
+        size = path.stat().st_size
+        if size > largest:
+            raise InputError(path, "size", f"{size} bytes", f"at most {largest} bytes")
+        with path.open("rb") as head:
+            if b"\0" in head.read(HEAD_BYTES):
+                raise InputError(path, "content", "binary, or UTF-16", wanted)
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            yield file
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, wanted) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "encoding", "not UTF-8", wanted) from error
+    except csv.Error as error:
+        raise InputError(path, "syntax", error, wanted) from error
+
+
+def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
+    """The lines; one without an end is refused before it fills the memory."""
+    for number in itertools.count(1):
+        text = file.readline(LONGEST_LINE)
+        if len(text) >= LONGEST_LINE:
+            long = f"more than {LONGEST_LINE} characters"
+            raise InputError(path, f"line {number}", long, wanted)
+        if not text:
+            return
+        yield text
+
+
+def number_in(cell: str, separator: str) -> float | None:
+    """The finite number in a cell, with a decimal comma where no comma separates; None if none."""
+    if separator != ",":
+        cell = cell.replace(",", ".")
+    try:
+        value = float(cell) if "_" not in cell else math.nan
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

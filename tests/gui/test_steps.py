@@ -1,0 +1,48 @@
+"""The steps' states, in words that say what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from labapp.errors import InputError
+from labapp.gui.steps import Mark, setup_to_do, states
+from labapp.session.session import Session
+from labapp.session.setup import parse_setup
+
+LASER = "[laser]\nprojection_angle_deg = 31.14\ndistance_mm = 31.48\n"
+PATTERN = "[pattern]\nrows = 19\ncolumns = 19\ninter_beam_angle_deg = 0.77\n"
+TYPED = "the electrode, the imaging plane"
+CALIBRATE = "calibrate the picture (step Imaging plane)"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", f"Enter the laser, the dot pattern, {TYPED}; {CALIBRATE}"),
+        (LASER, f"Enter the dot pattern, {TYPED}; {CALIBRATE}"),
+        (
+            LASER.replace("31.48", "-3") + PATTERN,
+            "Put right the laser, distance mm: -3 is not a number above 0 and below 10000 (mm); "
+            f"enter {TYPED}; {CALIBRATE}",
+        ),
+    ],
+)
+def test_what_is_missing_in_the_setup_is_said_as_what_to_do(text: str, words: str) -> None:
+    with pytest.raises(InputError) as refused:
+        parse_setup(text, "setup")
+    assert setup_to_do(refused.value.problems) == words
+
+
+def test_a_new_session_has_nothing_entered(tmp_path: Path) -> None:
+    with Session.create(tmp_path / "new.labsession") as session:
+        found = states(session)
+    assert found["setup"].mark is Mark.READY
+    assert found["setup"].why.startswith("Enter the laser")
+    assert (
+        found["laser"].why
+        == found["plane"].why
+        == ("Not calibrated yet, and no values were entered")
+    )
+    assert setup_to_do(()) == ""
