@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TypeVar
@@ -92,6 +92,8 @@ class Workspace(QObject):
 
     def _stop_measuring(self) -> None:
         """End the processes: what they are at is not kept, and can take seconds of a hard frame."""
+        for task in self.tasks.active:
+            task.cancel()  # or it would take the end of its processes for a fault
         pool, self._pool = self._pool, None
         if pool is not None:
             for process in list((pool._processes or {}).values()):
@@ -179,7 +181,7 @@ class Workspace(QObject):
                 for done, (number, _) in enumerate(session.measure(numbers, pool), 1):
                     control.progress(done, len(numbers))
                     control.part(number)
-            except BrokenProcessPool as error:
+            except (BrokenProcessPool, CancelledError) as error:
                 control.check()  # ended on purpose
                 self._pool = None
                 raise ValueError(

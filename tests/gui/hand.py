@@ -51,6 +51,7 @@ class Hand:
             self.window.activateWindow()
             QApplication.processEvents()
         QTest.keyClick(QApplication.focusWidget() or self.window, key, modifiers)
+        QApplication.processEvents()  # as between two presses of a finger
 
     def write(self, text: str) -> None:
         """Write over what the widget with the focus holds."""

@@ -1,0 +1,207 @@
+"""Random actions on the real window: by `test_random_actions.py`, or by hand for longer.
+
+``python -m tests.gui.random_actions SEED [STEPS] [RUNS]`` plays as many actions on every page, and
+prints what each kind did. What goes wrong is told with its seed and the actions before it; a seed
+plays the same actions again, as far as the work behind the window ends in the same order.
+
+A run goes wrong where anything is raised; where Qt or the log tells of a fault; where a change that
+the session acknowledged, or a number that was typed on the set-up page and taken, is not in the
+file; or where at the end a session or an export is not whole, or something half-written is left.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+if __name__ == "__main__":
+    os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
+
+from PySide6.QtWidgets import QApplication
+
+from labapp.session.database import SUFFIX
+from labapp.session.export import MANIFEST, verify_export
+from labapp.session.log import NAME
+from labapp.session.session import Session
+from tests.gui.random_hand import BUSY_S, RandomHand, Run, open_window
+from tests.gui.watching import Answers, Files, noted
+from tests.gui.witness import Witness
+
+STEPS = 300
+
+LAST_S = 60.0
+"""Work that was cancelled ends within this."""
+
+
+class Fault(Exception):
+    """Something went wrong; what, and what led to it."""
+
+
+class Player:
+    """Plays one run.
+
+    Parameters
+    ----------
+    seed
+        Of its actions.
+    folder
+        For all its files; empty.
+
+    Attributes
+    ----------
+    counts, seen, changed
+        How often each (page, kind of action) was played, did anything that can be seen, and
+        changed a session.
+    longest
+        The action that took longest: seconds, and which.
+    """
+
+    def __init__(self, seed: int, folder: Path) -> None:
+        self.seed, self.folder = seed, folder
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self.seen: Counter[tuple[str, str]] = Counter()
+        self.changed: Counter[tuple[str, str]] = Counter()
+        self.longest = (0.0, "")
+        self._look: object = None
+
+    def play(self, steps: int) -> Run:
+        """Play so many actions, close everything, and check all files.
+
+        Raises
+        ------
+        Fault
+            If anything is wrong.
+        """
+        faults: list[str] = []
+        files, witness = Files(self.folder / "files"), Witness()
+        with noted(faults), witness.listening():
+            run = Run(files, witness, random.Random(self.seed), open_window(files.folder))
+            run.faults = faults
+            with Answers(files, lambda: run.random, lambda what: note(run, what)).given():
+                run.window.files.open(files.sessions[0])
+                hand = RandomHand(run)
+                for number in range(steps):
+                    run.random = random.Random(f"{self.seed} {number}")
+                    self._act(run, hand, number)
+                    if faults:
+                        break
+                self._end(run)
+        if faults:
+            told, actions = "\n".join(faults), "\n".join(run.played)
+            raise Fault(f"{told}\n\nseed {self.seed}, {len(run.played)} actions:\n{actions}")
+        return run
+
+    def _act(self, run: Run, hand: RandomHand, number: int) -> None:
+        kind = run.random.choices(list(hand.kinds), [often for often, _ in hand.kinds.values()])[0]
+        place, before, began = (run.page, kind), run.witness.changes, time.perf_counter()
+        run.played.append(f"{number} {place[0]} {kind}:")
+        try:
+            note(run, hand.act(kind))
+        except Exception:
+            run.faults.append(traceback.format_exc())
+            return
+        run.rest(BUSY_S if run.random.random() < 0.7 else 0.0)
+        self.longest = max(self.longest, (time.perf_counter() - began, run.played[-1]))
+        former, self._look = self._look, look(run)
+        self.counts[place] += 1
+        self.seen[place] += self._look != former
+        self.changed[place] += run.witness.changes != before
+        run.check()
+
+    def _end(self, run: Run) -> None:
+        """Cancel what is under way, close the window, and check every file."""
+        try:
+            for task in run.window.workspace.tasks.active:
+                task.cancel()
+            run.rest(LAST_S)
+            run.window.close()
+            QApplication.processEvents()
+            run.check()
+            run.faults += not_whole(run.files)
+        except Exception:
+            run.faults.append(traceback.format_exc())
+
+
+def note(run: Run, what: str) -> None:
+    """Add to what is told of the action under way."""
+    if run.played:
+        run.played[-1] += f" [{what}]"
+
+
+def look(run: Run) -> object:
+    """What the operator sees."""
+    window = run.window
+    return (
+        hash(bytes(window.grab().toImage().constBits())),
+        id(QApplication.focusWidget()),
+        len(window.workspace.tasks.active),
+        window.log_panel.count(),
+        QApplication.clipboard().text(),
+        sum(widget.isVisible() for widget in QApplication.topLevelWidgets()),
+    )
+
+
+def not_whole(files: Files) -> list[str]:
+    """What is wrong with the sessions and exports of a run, and what is half-written, by lines."""
+    wrong = [f"left behind: {path.name}" for path in files.folder.rglob("*.part")]
+    for path in sorted(files.folder.rglob(f"*{SUFFIX}")):
+        if path.is_file() and path != files.garbage:
+            with Session.open(path) as session:
+                there = session.missing_recording is None
+                problems = session.problems(recording=there)
+            wrong += [f"verify {path.name}: {problem}" for problem in problems]
+    for manifest in files.folder.rglob(MANIFEST):
+        wrong += [
+            f"export {manifest.parent.name}: {each}" for each in verify_export(manifest.parent)
+        ]
+    return wrong
+
+
+def table(players: Sequence[Player]) -> str:
+    """How often each kind of action did anything, page by page, in all runs."""
+    counts, seen, changed = (
+        sum((getattr(player, name) for player in players), Counter())
+        for name in ("counts", "seen", "changed")
+    )
+    lines = [f"{'page':9} {'action':8} {'played':>7} {'seen':>6} {'changed':>8}"]
+    lines += [
+        f"{page:9} {kind:8} {count:7} {seen[page, kind]:6} {changed[page, kind]:8}"
+        for (page, kind), count in sorted(counts.items())
+    ]
+    return "\n".join(lines)
+
+
+def main(seed: int, steps: int = STEPS, runs: int = 1) -> int:
+    """Play runs of seeds that follow each other; how many went wrong."""
+    warnings.simplefilter("error", RuntimeWarning)
+    app = QApplication([NAME])
+    app.setQuitOnLastWindowClosed(False)
+    players, wrong = [], 0
+    for number in range(seed, seed + runs):
+        with tempfile.TemporaryDirectory() as folder:
+            player = Player(number, Path(folder))
+            players.append(player)
+            began, verdict = time.perf_counter(), "whole"
+            try:
+                player.play(steps)
+            except Fault as fault:
+                wrong, verdict = wrong + 1, f"WRONG\n{fault}"
+            told = f"{player.counts.total()} actions, {player.changed.total()} changed a session"
+            took, (longest, action) = time.perf_counter() - began, player.longest
+            print(f"seed {number}: {told}, {took:.0f} s, longest {longest:.1f} s: {action[:90]}")
+            print(verdict, flush=True)
+    print(table(players), flush=True)
+    return wrong
+
+
+if __name__ == "__main__":
+    status = main(*(int(word) for word in sys.argv[1:]))
+    os._exit(min(status, 1))  # windows with pictures can crash when they are destroyed

@@ -1,0 +1,57 @@
+"""What is open: measuring that ends because another session is wanted is no fault."""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import Executor, Future
+from typing import Any
+
+import pytest
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from labapp.gui import workspace as module
+from labapp.gui.workspace import Workspace
+from labapp.session.log import NAME
+from tests.gui.conftest import CopySample
+from tests.gui.watching import Noting
+
+
+class Stuck(Executor):
+    """Never measures anything; what waits for it is let go when it is shut down."""
+
+    def __init__(self) -> None:
+        self._processes: dict[int, Any] = {}
+        self.begun: list[Future[Any]] = []
+
+    def submit(self, *_: object, **__: object) -> Future[Any]:
+        self.begun.append(Future())
+        return self.begun[-1]
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        assert cancel_futures
+        for future in self.begun:
+            future.cancel()
+
+
+def test_measuring_that_is_left_for_another_session_is_no_fault(
+    qapp: QApplication, state: object, copy_sample: CopySample, qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    faults: list[str] = []
+    stuck, noting, log = Stuck(), Noting(faults), logging.getLogger(NAME)
+    monkeypatch.setattr(module, "measuring_pool", lambda _: stuck)
+    log.addHandler(noting)
+    space = Workspace()
+    said: list[str] = []
+    space.said.connect(lambda words, _: said.append(words))
+    assert space.open(copy_sample("blocked_rows"))
+    task = space.measure([0, 1, 2])
+    assert task is not None
+    qtbot.waitUntil(lambda: bool(stuck.begun))
+    space.show(None)
+    task.thread.join()
+    log.removeHandler(noting)
+    assert faults == []
+    assert said == []
+    assert task.control.cancelled.is_set()

@@ -1,0 +1,174 @@
+"""What every session file must hold: kept beside the program, from what it acknowledged.
+
+A change counts from when the session's call returns. The files are read with SQLite alone.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from labapp.session.blobs import pack, unpack
+from labapp.session.documents import Documents
+from labapp.session.frames import Frames
+from labapp.session.measured import Results
+
+Key = tuple[str, int]
+Values = dict[Key, bytes | None]
+
+
+class Kept:
+    """One session file: its documents, and what undo and redo would bring back.
+
+    Parameters
+    ----------
+    path
+        The file as it was first met.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.documents = dict(_documents(path))
+        self.results: dict[tuple[int, str], str] = {}
+        self.recording: bytes | None = None
+        self.done: list[tuple[Values, Values]] = []
+        self.undone: list[tuple[Values, Values]] = []
+        sides: dict[int, tuple[bool, Values, Values]] = {}
+        for number, undone, kind, frame, before, after in _rows(
+            path,
+            "SELECT id, undone, kind, frame, before, after FROM change "
+            "JOIN change_part ON change = id ORDER BY id",
+        ):
+            _, old, new = sides.setdefault(number, (bool(undone), {}, {}))
+            old[kind, frame], new[kind, frame] = before, after
+        for was_undone, old, new in sides.values():
+            (self.undone if was_undone else self.done).append((old, new))
+        self.undone.reverse()
+
+    def change(self, values: Mapping[Key, object]) -> None:
+        """Set documents."""
+        after = {key: None if value is None else pack(value) for key, value in values.items()}
+        after = {key: blob for key, blob in after.items() if blob != self.documents.get(key)}
+        if after:
+            self.done.append(({key: self.documents.get(key) for key in after}, after))
+            self.undone.clear()
+            self._put(after)
+
+    def step(self, back: bool) -> None:
+        """Undo, or redo."""
+        source, target = (self.done, self.undone) if back else (self.undone, self.done)
+        if source:
+            old, new = source.pop()
+            target.append((old, new))
+            self._put(old if back else new)
+
+    def _put(self, values: Values) -> None:
+        for key, blob in values.items():
+            if blob is None:
+                self.documents.pop(key, None)
+            else:
+                self.documents[key] = blob
+
+
+class Witness:
+    """Listens to what sessions acknowledge while it is `listening`.
+
+    Attributes
+    ----------
+    changes
+        How many there were.
+    kept
+        By path.
+    """
+
+    def __init__(self) -> None:
+        self.changes = 0
+        self.kept: dict[Path, Kept] = {}
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Hear every change of every session of this process."""
+        with (
+            self._after(Documents, "change", lambda kept, _, __, values: kept.change(values)),
+            self._after(Documents, "undo", lambda kept, *_: kept.step(back=True)),
+            self._after(Documents, "redo", lambda kept, *_: kept.step(back=False)),
+            self._after(Frames, "take_in", self._taken),
+            self._after(Results, "put", self._measured),
+        ):
+            yield
+
+    def meet(self, path: Path) -> None:
+        """Note what a file holds before it is changed for the first time."""
+        if path not in self.kept:
+            self.kept[path] = Kept(path)
+
+    def differences(self) -> list[str]:
+        """How the files differ from what they must hold, a line each."""
+        found = []
+        for path, kept in self.kept.items():
+            held = _documents(path)
+            for key in sorted(held.keys() | kept.documents.keys()):
+                if held.get(key) != kept.documents.get(key):
+                    found.append(f"{path.name}: {key} is not as it was acknowledged")
+            results = dict(_results(path))
+            for (frame, scheme), status in kept.results.items():
+                if results.get((frame, scheme)) != status:
+                    found.append(f"{path.name}: the {scheme} result of frame {frame} is lost")
+            if kept.recording is not None and _recording(path) != kept.recording:
+                found.append(f"{path.name}: the recording is not the one that was imported")
+        return found
+
+    def value(self, path: Path, key: str) -> object:
+        """What a file holds of the setup (``section.key``) or the record (a name)."""
+        section, _, name = key.partition(".")
+        blob = _documents(path).get(("setup" if name else "record", -1))
+        if blob is None:
+            return None
+        if name:
+            return tomllib.loads(unpack(blob)).get(section, {}).get(name)
+        return getattr(unpack(blob), section)
+
+    def _after(self, owner: type, name: str, note: Callable[..., object]) -> Any:
+        original = getattr(owner, name)
+
+        def wrapped(this: Any, *given: Any, **named: Any) -> Any:
+            path = this._database.path
+            self.meet(path)
+            answer = original(this, *given, **named)
+            note(self.kept[path], answer, *given)
+            self.changes += 1
+            return answer
+
+        return mock.patch.object(owner, name, wrapped)
+
+    def _taken(self, kept: Kept, answer: object, *_: object) -> None:
+        kept.recording = pack(answer)
+
+    def _measured(
+        self, kept: Kept, _: object, frame: int, measurement: Any, basis: Any, *__: Any
+    ) -> None:
+        kept.results[frame, basis.scheme] = measurement.status
+
+
+def _rows(path: Path, sql: str) -> list[tuple[Any, ...]]:
+    with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
+        return connection.execute(sql).fetchall()
+
+
+def _documents(path: Path) -> dict[Key, bytes]:
+    rows = _rows(path, "SELECT kind, frame, content FROM document")
+    return {(kind, frame): content for kind, frame, content in rows}
+
+
+def _results(path: Path) -> dict[tuple[int, str], str]:
+    rows = _rows(path, "SELECT frame, scheme, status FROM result")
+    return {(frame, scheme): status for frame, scheme, status in rows}
+
+
+def _recording(path: Path) -> bytes | None:
+    rows = _rows(path, "SELECT content FROM recording")
+    return rows[0][0] if rows else None
