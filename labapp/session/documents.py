@@ -17,6 +17,7 @@ from labapp.core.correction import Correction
 from labapp.core.pipeline import Settings
 from labapp.session.blobs import Damaged, fingerprint, pack, unpack, unpack_from
 from labapp.session.database import Database
+from labapp.session.kept import Kept
 from labapp.session.record import LaserReadings, PlanePicture, Record
 from labapp.session.signals import Signals
 
@@ -86,6 +87,7 @@ class Documents:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._kept = Kept(database)
 
     def get(self, kind: Kind, frame: int = WHOLE) -> Any:
         """The document; None where there is none.
@@ -95,6 +97,11 @@ class Documents:
         InputError
             If it is damaged.
         """
+        if frame != WHOLE:
+            return self._read(kind, frame)
+        return self._kept.get(kind, lambda: self._read(kind, frame))
+
+    def _read(self, kind: Kind, frame: int) -> Any:
         blob = self._database.value(
             "SELECT content FROM document WHERE kind = ? AND frame = ?", kind, frame
         )
@@ -108,10 +115,14 @@ class Documents:
 
     def fingerprint(self, kind: Kind, frame: int = WHOLE) -> str | None:
         """SHA-256 of a document; None where there is none."""
-        found: str | None = self._database.value(
-            "SELECT sha256 FROM document WHERE kind = ? AND frame = ?", kind, frame
-        )
-        return found
+
+        def read() -> str | None:
+            found: str | None = self._database.value(
+                "SELECT sha256 FROM document WHERE kind = ? AND frame = ?", kind, frame
+            )
+            return found
+
+        return read() if frame != WHOLE else self._kept.get((kind, "sha256"), read)
 
     def change(self, label: str, values: Mapping[Key, object]) -> bool:
         """Set documents in one step; None takes one away. What was undone can no more be redone.
@@ -146,6 +157,7 @@ class Documents:
                 [(number, *part) for part in parts],
             )
             _cut(connection)
+        self._kept.forget()
         return True
 
     def undo(self) -> Change | None:
@@ -173,10 +185,15 @@ class Documents:
                     unpack_from(self._database.path, named, content, CLASSES.get(kind, Never))
                 _put(connection, kind, frame, content)
             connection.execute("UPDATE change SET undone = ? WHERE id = ?", (not undone, number))
+        self._kept.forget()
         return next(change for change in self.history() if change.number == number)
 
     def history(self) -> tuple[Change, ...]:
         """Every change that is kept, the oldest first."""
+        found: tuple[Change, ...] = self._kept.get("history", self._read_history)
+        return found
+
+    def _read_history(self) -> tuple[Change, ...]:
         keys: dict[int, list[Key]] = {}
         for number, kind, frame in self._database.rows(
             "SELECT change, kind, frame FROM change_part ORDER BY change, kind, frame"

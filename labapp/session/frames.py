@@ -25,6 +25,7 @@ from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.session.blobs import MAGIC, pack, unpack_from
 from labapp.session.database import Database
+from labapp.session.kept import Kept
 from labapp.session.record import Recording
 from labapp.session.run import select_frames
 
@@ -50,11 +51,15 @@ class Frames:
         self._database = database
         self._turn = threading.RLock()
         self._source: FrameSource | None = None
-        self._numbers: tuple[int, IntArray] | None = None
+        self._kept = Kept(database)
 
     @property
     def recording(self) -> Recording | None:
         """The recording; None before one was imported."""
+        found: Recording | None = self._kept.get("recording", self._read_recording)
+        return found
+
+    def _read_recording(self) -> Recording | None:
         blob = self._database.value("SELECT content FROM recording")
         if blob is None:
             return None
@@ -64,14 +69,14 @@ class Frames:
     @property
     def numbers(self) -> IntArray:
         """Numbers of the session's frames in the recording, from 0, ascending, shape (n,)."""
-        version = self._database.value("PRAGMA data_version")  # another program's changes
-        held = self._numbers
-        if held is None or held[0] != version:
-            rows = self._database.rows("SELECT number FROM frame")
-            held = version, self._database.array([number for (number,) in rows], np.int64)
-            held[1].flags.writeable = False
-            self._numbers = held
-        return held[1]
+        found: IntArray = self._kept.get("numbers", self._read_numbers)
+        return found
+
+    def _read_numbers(self) -> IntArray:
+        rows = self._database.rows("SELECT number FROM frame")
+        found = self._database.array([number for (number,) in rows], np.int64)
+        found.flags.writeable = False
+        return found
 
     def time_s(self, number: int) -> float | None:
         """Time of one frame, s; None where unknown.
@@ -196,7 +201,6 @@ class Frames:
                 )
             recording = replace(recording, frames_sha256=self._fingerprint())
             connection.execute("INSERT OR REPLACE INTO recording VALUES (1, ?)", (pack(recording),))
-        self._numbers = None
         self.close()
         return recording
 
@@ -265,6 +269,7 @@ class Frames:
 
     def close(self) -> None:
         """Let go of the recording; it is opened again when needed."""
+        self._kept.forget()
         with self._turn:
             if self._source is not None:
                 self._source.close()
