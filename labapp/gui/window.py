@@ -50,9 +50,6 @@ REST = 4
 
 LONGEST_REST_MS = 1000
 
-MEASURED_REST_MS = 250
-"""What is measured behind the operator's back is shown no more often."""
-
 TICKS = (
     Tick(Standing.NOT_MEASURED.words, "", "", ((0.0, 0.12),)),
     Tick(Standing.MEASURED.words, "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
@@ -112,10 +109,6 @@ class MainWindow(QMainWindow):
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)
         self._rest.timeout.connect(self._rested)
-        self._soon = QTimer(self)
-        self._soon.setSingleShot(True)
-        self._soon.setInterval(MEASURED_REST_MS)
-        self._soon.timeout.connect(self._changed)
         self._make_views()
         without = {f"step_{step.key}" for step in STEPS} - {f"step_{s.key}" for s in self._steps}
         self.menus = Menus(self, frozenset(action.name for action in ACTIONS) - without)
@@ -161,7 +154,7 @@ class MainWindow(QMainWindow):
         space = self.workspace
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
-        space.measured.connect(self._measured)
+        space.measured.connect(self._show_measured)
         space.frame_changed.connect(self._frame_changed)
         space.said.connect(self.say)
         space.tasks.changed.connect(self.menus.refresh)
@@ -266,10 +259,6 @@ class MainWindow(QMainWindow):
         else:
             self._show_session()
 
-    def _measured(self) -> None:
-        if not self._soon.isActive():
-            self._soon.start()
-
     def _rested(self) -> None:
         if self._changes_due:
             self._show_session()
@@ -278,6 +267,15 @@ class MainWindow(QMainWindow):
         """Show what the session holds now, everywhere."""
         began = time.perf_counter()
         self._changes_due = False
+        self._show_frames()
+        self._show_page()
+        self.menus.refresh()
+        self.setWindowTitle(title(self.workspace.session))
+        took_ms = (time.perf_counter() - began) * 1000
+        self._rest.start(min(LONGEST_REST_MS, round(REST * took_ms)))
+
+    def _show_frames(self) -> None:
+        """Show how all frames stand, and with them the steps."""
         session = self.workspace.session
         seen = self.workspace.tried(self.workspace.overview)
         if seen is None:
@@ -289,11 +287,16 @@ class MainWindow(QMainWindow):
         self.timeline.set_frame(self.workspace.frame)
         self._states = self.workspace.tried(lambda: states(session, seen)) or states(None)
         self.step_list.show_states(self._states)
-        self._show_page()
-        self.menus.refresh()
-        self.setWindowTitle(title(session))
-        took_ms = (time.perf_counter() - began) * 1000
-        self._rest.start(min(LONGEST_REST_MS, round(REST * took_ms)))
+
+    def _show_measured(self) -> None:
+        """Show that frames were measured that are not in view."""
+        if self._rest.isActive():
+            return  # more will follow, and the last is shown with all the rest
+        if self.page is None or self.page.shows_all_frames:
+            self._show_session()
+        else:
+            self._show_frames()
+            self.side_panel.show_state(self._states[self.page.key])
 
     def _show_page(self) -> None:
         if self.page is not None and self.workspace.session is not None:
@@ -460,7 +463,6 @@ class MainWindow(QMainWindow):
         self.workspace.opened.disconnect(self._session_opened)
         self.workspace.close()
         self._rest.stop()
-        self._soon.stop()
         event.accept()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -18,6 +19,9 @@ from labapp.session.session import Session
 
 T = TypeVar("T")
 
+MEASURED_S = 0.25
+"""What is measured behind the operator's back is shown no more often."""
+
 
 class Workspace(QObject):
     """The session that a window shows, the frame in view, and the work under way.
@@ -32,7 +36,7 @@ class Workspace(QObject):
     changed
         A document, the recording or a result changed; pages in view show the session anew.
     measured
-        A frame that is not in view was measured: many may follow in a second.
+        Frames that are not in view were measured; told some times a second while more follow.
     frame_changed
         Another frame is in view.
     said
@@ -51,17 +55,19 @@ class Workspace(QObject):
         self.frame = 0
         self._pool: ProcessPoolExecutor | None = None
         self._overview: Overview | None = None
+        self._measuring: list[Task] = []
         # Connected before anybody else: whoever hears of a change sees the frames as they are.
         self.opened.connect(self._forget)
         self.changed.connect(self._forget)
-        self.measured.connect(self._forget)
         self.tasks = Tasks(self)
+        self.tasks.changed.connect(self._show_end)
         self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
 
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""
         if self.tasks.active:
             self._stop_measuring()
+        self._measuring.clear()
         self.tasks.cancel_all()
         if self.session is not None:
             self.session.close()
@@ -165,7 +171,7 @@ class Workspace(QObject):
     def measure(self, frames: Sequence[int] | None = None) -> Task | None:
         """Measure frames in the background; None: those not measured, or stale.
 
-        Each frame that is kept makes `measured` go out; that in view, and the last, `changed`.
+        Frames that are kept make `measured` go out; that in view, and the last, `changed`.
         """
         session = self.session
         if session is None:
@@ -175,12 +181,17 @@ class Workspace(QObject):
         pool = self._pool
 
         def work(control: Control) -> int:
-            done = 0
+            done, told = 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
                 for done, (number, _) in enumerate(session.measure(numbers, pool), 1):
                     control.progress(done, len(numbers))
-                    control.part(number)
+                    if number == self.frame:
+                        control.part(None)
+                    elif time.monotonic() - told > MEASURED_S:
+                        # Looked up here: the window would wait for results that are being saved.
+                        control.part(session.overview())
+                        told = time.monotonic()
             except (BrokenProcessPool, CancelledError) as error:
                 control.check()  # ended on purpose
                 self._pool = None
@@ -191,9 +202,21 @@ class Workspace(QObject):
 
         def finished(count: int) -> None:
             self.said.emit(f"{count} frame{'s' * (count != 1)} measured", False)
+
+        def kept(seen: Overview | None) -> None:
+            if seen is None:
+                self.changed.emit()
+            else:
+                self._overview = seen
+                self.measured.emit()
+
+        task = self.tasks.start("Measuring", work, finished, kept)
+        self._measuring.append(task)
+        return task
+
+    def _show_end(self) -> None:
+        """Have everything shown that was kept, however the measuring has ended."""
+        ended = [task for task in self._measuring if task not in self.tasks.active]
+        if ended:
+            self._measuring = [task for task in self._measuring if task not in ended]
             self.changed.emit()
-
-        def kept(number: int) -> None:
-            (self.changed if number == self.frame else self.measured).emit()
-
-        return self.tasks.start("Measuring", work, finished, kept)

@@ -20,6 +20,8 @@ class Page(QWidget):
     ----------
     key
         Of its step in `steps.STEPS`.
+    shows_all_frames
+        Whether it shows what all frames gave, and not only the one in view.
     workspace
         What is open.
     panel
@@ -27,6 +29,7 @@ class Page(QWidget):
     """
 
     key = ""
+    shows_all_frames = False
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()

@@ -35,6 +35,7 @@ class TrendsPage(Page):
     """How the pool changes over the recording."""
 
     key = "trends"
+    shows_all_frames = True
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
@@ -70,7 +71,7 @@ class TrendsPage(Page):
             self.plots.set_current(frame)
             return
         self._in_view = frame
-        self.shown = shown = show(session, self.wish)
+        self.shown = shown = show(session, self.wish, self.workspace.overview())
         self.plots.show_curves(shown.curves, shown.axis)
         self.plots.set_current(frame)
         self.plots.setVisible(bool(shown.curves))

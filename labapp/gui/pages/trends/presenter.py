@@ -77,9 +77,9 @@ class Shown:
     signals_words: str
 
 
-def show(session: Session, wish: Wish) -> Shown:
-    """What to show of a session."""
-    seen, signals = session.overview(), session.signals
+def show(session: Session, wish: Wish, seen: Overview | None = None) -> Shown:
+    """What to show of a session; ``seen`` is its overview, if it is at hand."""
+    seen, signals = seen or session.overview(), session.signals
     doubtful = doubtful_frames(seen)
 
     def course_of(key: str) -> Trend:
