@@ -60,7 +60,7 @@ def in_parallel(
         workers, multiprocessing.get_context("spawn"), initializer=threadpool_limits, initargs=(1,)
     )
     try:
-        with _deaf():
+        with deaf():
             futures = [pool.submit(function, task) for task in tasks]
         for future in futures:
             results.append(future.result())
@@ -71,7 +71,7 @@ def in_parallel(
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
+def deaf() -> Iterator[None]:
     """Ignore Ctrl-C: processes that are started now do so for good, and leave it to this one."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import multiprocessing
-import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -17,11 +16,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import tifffile
+from threadpoolctl import threadpool_limits
 
 from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
+from labapp.simulation.parallel import deaf
 from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
 from labapp.simulation.target import Target, TargetLook, render_target
 from labapp.simulation.torch import Torch
@@ -204,7 +205,10 @@ class Recording:
         with ProcessPoolExecutor(workers, context, _become_worker, (self,)) as processes:
             waiting: deque[Future[_Told]] = deque()
             try:
-                waiting += (processes.submit(_work, n) for n in islice(numbers, workers + AHEAD))
+                with deaf():
+                    waiting += (
+                        processes.submit(_work, n) for n in islice(numbers, workers + AHEAD)
+                    )
                 while waiting:
                     yield waiting.popleft().result()
                     waiting += (processes.submit(_work, n) for n in islice(numbers, 1))
@@ -266,7 +270,7 @@ _rendered: Recording
 def _become_worker(recording: Recording) -> None:
     global _rendered  # noqa: PLW0603 - set once, where the process begins
     _rendered = recording
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's
+    threadpool_limits(1)
 
 
 def _work(number: int) -> _Told:
