@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -32,7 +32,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         lacks("xvfb-run is not installed")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def opengl() -> None:
     """Let only what can draw in 3-D off-screen go on."""
     from labapp.session.scene import can_draw
@@ -42,14 +42,19 @@ def opengl() -> None:
 
 
 @pytest.fixture
-def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep the log out of the home folder; start each test without its handler."""
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Keep the log out of the home folder; start and end each test without its handler."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    _end_log()
+    yield tmp_path / "state"
+    _end_log()
+
+
+def _end_log() -> None:
     logger = log.start_log()
     for handler in list(logger.handlers):
         handler.close()
         logger.removeHandler(handler)
-    return tmp_path / "state"
 
 
 @pytest.fixture

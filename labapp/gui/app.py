@@ -106,10 +106,15 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     former = signal.signal(signal.SIGINT, lambda *_: window.close())
     window.show()
     loading = threading.Thread(target=_load_what_draws_in_3d, name="loading", daemon=True)
-    QTimer.singleShot(LOAD_AFTER_MS, window, loading.start)
+    load = QTimer(window)
+    load.setSingleShot(True)
+    load.timeout.connect(loading.start)
+    load.start(LOAD_AFTER_MS)
     try:
         yield window
     finally:
+        load.stop()
+        heartbeat.stop()
         if loading.is_alive():
             loading.join()
         signal.signal(signal.SIGINT, former)

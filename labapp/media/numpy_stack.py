@@ -90,6 +90,10 @@ class NumpyStack(StoredFrames):
             time_s=time_s,
         )
 
+    def close(self) -> None:
+        """Let go of the file, which is mapped as long as its array is there."""
+        self._frames = self._frames[:0].copy()
+
     def _grey(self, index: int) -> GreyImage:
         image = np.asarray(self._frames[index])
         if image.dtype == bool:

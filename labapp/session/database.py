@@ -137,6 +137,9 @@ class Database:
                 return database._checked()
             except sqlite3.OperationalError:
                 database.close()  # a change that was cut off is to be taken back
+            except BaseException:
+                database.close()
+                raise
         folder = Path(tempfile.mkdtemp(prefix="labapp-"))
         try:
             copy = folder / path.name

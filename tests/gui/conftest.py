@@ -15,6 +15,7 @@ from PySide6.QtWidgets import QApplication, QWidget
 
 from labapp.gui.preferences import Preferences
 from labapp.gui.window import MainWindow
+from tests.gui.leaks import Left
 
 SAMPLES = Path(__file__).parents[2] / "sample_sessions"
 
@@ -37,7 +38,17 @@ def copy_sample(tmp_path: Path) -> CopySample:
 
 
 @pytest.fixture(autouse=True)
-def hide_windows() -> Iterator[None]:
+def nothing_left(qapp: QApplication, tmp_path: Path) -> Iterator[None]:
+    """Fail a test that leaves threads, processes, ticking timers or open files behind."""
+    with pytest.MonkeyPatch.context() as patched:
+        left = Left(tmp_path, patched)
+        yield
+        found = left.found()
+    assert not found, found
+
+
+@pytest.fixture(autouse=True)
+def hide_windows(nothing_left: None) -> Iterator[None]:
     """Leave none in view: an app that is tested ends when the last one goes."""
     yield
     for widget in QApplication.topLevelWidgets():
