@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from PySide6.QtCore import QPointF, Qt
 from PySide6.QtGui import QGuiApplication, QImage
-from PySide6.QtWidgets import QAbstractButton, QApplication, QScrollArea, QSplitter, QWidget
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import (
+    QAbstractButton,
+    QApplication,
+    QFileDialog,
+    QScrollArea,
+    QSplitter,
+    QWidget,
+)
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.surface import SurfacePage
@@ -194,6 +202,20 @@ def test_the_picture_is_copied_and_written(page: SurfacePage, tmp_path: Path) ->
     assert QImage(str(tmp_path / "pool.png")).size() == page.view.size()
     page.write_picture(tmp_path / "nowhere" / "pool.png")
     assert [bad for _, bad in said] == [False, False, True]
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_key_saves_the_picture(
+    page: SurfacePage, qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = str(tmp_path / "pool.png")
+    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *given: (chosen, "PNG"))
+    page.activateWindow()
+    qtbot.waitUntil(page.isActiveWindow)
+    keys = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
+    QTest.keyClick(page, Qt.Key.Key_P, keys)
+    qtbot.waitUntil(Path(chosen).exists)
+    assert QImage(chosen).size() == page.view.size()
 
 
 @pytest.mark.usefixtures("opengl")

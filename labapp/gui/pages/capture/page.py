@@ -33,13 +33,18 @@ from labapp.gui.pages.capture.presenter import (
 )
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import FieldForm, NumberField
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.session.record import Recording
 
 MOST_HZ = 1e7
 NONE_YET = "Choose a video, an image, a folder of images or a stack, or drop it on the window."
+
+NO_CAMERA = (
+    "This version shows no camera live, nor the simulated one: record with the camera's own "
+    "program and import the file. Try the sample (menu File) opens a simulated recording."
+)
 
 
 class CapturePage(Page):
@@ -320,7 +325,18 @@ class CapturePage(Page):
         self.told.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         layout.addLayout(self.told)
         self.panel_layout.addWidget(self.told_group)
+        self._make_camera()
         self.panel_layout.addStretch(1)
+
+    def _make_camera(self) -> None:
+        group, layout = _group("Capture")
+        form = FieldForm()
+        self.camera = ChoiceField("Camera", [("", "none")], tooltip=NO_CAMERA)
+        self.camera.setEnabled(False)
+        form.add(self.camera)
+        layout.addWidget(form)
+        layout.addWidget(_words(NO_CAMERA))
+        self.panel_layout.addWidget(group)
 
     def _make_missing(self) -> None:
         self.missing = _words()

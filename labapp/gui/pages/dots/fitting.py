@@ -16,6 +16,9 @@ from labapp.gui.tasks import Cancelled, Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.session.run import measuring_pool
 
+WARM_MS = 1500
+"""The page is shown first; its processes begin then."""
+
 AGAIN_MS = 50
 """An edit that cannot take the place of the fit before it yet tries again after so long."""
 
@@ -32,6 +35,11 @@ class Processes:
             pool = measuring_pool(1)
             # To make settings it loads the whole measurement.
             self._pools.append((pool, pool.submit(Settings)))
+
+    @property
+    def begun(self) -> bool:
+        """Whether there are any."""
+        return bool(self._pools)
 
     @property
     def first(self) -> ProcessPoolExecutor:
@@ -73,10 +81,14 @@ class Refit:
         self._begun: tuple[int, object] | None = None
         self._seen: Shown | None = None
         self.processes = Processes()
-        self._again = QTimer(workspace)
-        self._again.setSingleShot(True)
-        self._again.setInterval(AGAIN_MS)
-        self._again.timeout.connect(self._once_more)
+        self._warm, self._again = QTimer(workspace), QTimer(workspace)
+        for timer, rest_ms, work in (
+            (self._warm, WARM_MS, self.processes.begin),
+            (self._again, AGAIN_MS, self._once_more),
+        ):
+            timer.setSingleShot(True)
+            timer.setInterval(rest_ms)
+            timer.timeout.connect(work)
         workspace.opened.connect(self._forget)
 
     @property
@@ -90,7 +102,8 @@ class Refit:
         if session is None or presenter.why_no_fit(session):
             return
         self._seen = seen
-        self.processes.begin()
+        if not self.processes.begun and not self._warm.isActive():
+            self._warm.start()
         # A fit that was refused or cancelled is not begun again until something else is tried.
         state = (seen.frame, session.history)
         if state == self._begun:
@@ -134,6 +147,7 @@ class Refit:
 
     def _forget(self) -> None:
         """Another session is open, or none."""
+        self._warm.stop()
         self._again.stop()
         self._task = self._begun = self._seen = None
         self.processes.end()

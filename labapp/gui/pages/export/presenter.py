@@ -97,12 +97,14 @@ GROUPS: tuple[tuple[str, tuple[Item, ...]], ...] = (
         "Pictures (PNG), film (MP4)",
         (
             Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
-            Item("pictures:surfaces", "Surfaces", "Each surface in 3-D; takes a second each"),
+            Item(
+                "pictures:surfaces", "Surfaces", "Each surface in 3-D, seen from where you choose"
+            ),
             Item("pictures:trends", "Trends", "Width, length and height over time"),
             Item(
                 "pictures:film",
                 "Film",
-                "The surface in 3-D over all frames, MP4: ten frames take a second or two",
+                "The surface in 3-D over all frames, each at its time",
             ),
         ),
     ),

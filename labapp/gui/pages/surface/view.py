@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QSize, Qt, QTimer
-from PySide6.QtGui import QAction, QGuiApplication, QPixmap, QResizeEvent
+from PySide6.QtGui import QAction, QGuiApplication, QKeySequence, QPixmap, QResizeEvent
 from PySide6.QtWidgets import (
     QBoxLayout,
     QFileDialog,
@@ -172,7 +172,8 @@ class SurfacePage(Page):
             line.addWidget(_tool(words, what, partial(self._look, direction)))
         line.addStretch(1)
         self.copy = _tool("Copy", "Copy the 3-D picture to the clipboard", self.copy_picture)
-        self.save = _tool("Save …", "Save the 3-D picture as PNG", self.save_picture)
+        self.save = _tool("Save …", "Save the 3-D picture as PNG (Ctrl+Shift+P)", self.save_picture)
+        self.save.setShortcut(QKeySequence("Ctrl+Shift+P"))
         self.comparing = _tool("Compare", "Put two schemes side by side", self._toggle_compare)
         self.comparing.setCheckable(True)
         for button in (self.copy, self.save, self.comparing):
