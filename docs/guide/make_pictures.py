@@ -13,7 +13,6 @@ from PIL import Image
 
 GUIDE = Path(__file__).parent
 PICTURES = GUIDE / "pictures"
-COLOURS = 96
 
 
 def main() -> None:
@@ -28,7 +27,10 @@ def main() -> None:
         for name in sorted(wanted):
             (taken,) = Path(out).glob(f"[0-9][0-9]-{name}.png")
             picture = Image.open(taken).convert("RGB")
-            few = picture.quantize(COLOURS, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+            # The few bright points among much grey must keep their colours.
+            few = picture.quantize(
+                256, Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE
+            )
             few.save(PICTURES / f"{name}.png", optimize=True)
 
 

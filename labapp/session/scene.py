@@ -321,8 +321,8 @@ class Drawing:
         mesh.set_active_scalars("values")
         title = scene.label.replace(" (", "\n(")  # narrow, to stay within the picture
         if self._is_new("surface", (scene.label, scene.diverging)):
-            for title in list(self.plotter.scalar_bars.keys()):
-                self.plotter.remove_scalar_bar(title, render=False)
+            for former in list(self.plotter.scalar_bars.keys()):
+                self.plotter.remove_scalar_bar(former, render=False)
             actor = self.plotter.add_mesh(
                 mesh,
                 scalars="values",
@@ -382,8 +382,9 @@ class Drawing:
         top = np.array([[0, 0, box[0, 2]], [0, 0, box[1, 2] + 0.5]]) * self._stretch
         mark = _polydata(top if scene.electrode else EMPTY, "lines", 2)
         self._put("electrode", mark, scene.foreground, line_width=1)
-        words = f"heights drawn {scene.exaggeration:g} times as high"
-        words += "; upright line: the electrode's axis" if scene.electrode else ""
+        high = scene.exaggeration
+        told = [f"heights drawn {high:g} times as high"] if high != 1 else []
+        words = "; ".join(told + ["upright line: the electrode's axis"] * scene.electrode)
         self._say("caption", words, scene.foreground, position="upper_left", font_size=8)
 
     def _say(self, name: str, words: str, colour: str, **style: Any) -> None:

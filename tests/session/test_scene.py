@@ -205,6 +205,13 @@ def test_a_frame_takes_the_place_of_another(plotter: Any, pool: Reconstruction) 
     np.testing.assert_allclose(seen(plotter), moved, atol=2)
 
 
+def test_the_scale_says_what_the_colours_are(plotter: Any, pool: Reconstruction) -> None:
+    drawing = scenes.build_scene(plotter, scene_of(pool))
+    for label in ("± (mm)", "height (mm)", "± (mm)"):
+        drawing.update(replace(scene_of(pool), label=label))
+        assert list(plotter.scalar_bars.keys()) == [label.replace(" (", "\n(")]
+
+
 def test_a_dark_window_has_a_dark_scene(plotter: Any, pool: Reconstruction) -> None:
     drawing = scenes.build_scene(plotter, scene_of(pool))
     assert amount(seen(plotter), "#ffffff") > 60_000

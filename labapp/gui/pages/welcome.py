@@ -93,8 +93,8 @@ class Welcome(QWidget):
         self.label.setBuddy(self.list)
         column.addWidget(self.list, 1)
         self.nothing = QLabel(
-            "None yet. Drop a video, an image, a folder of images or a session anywhere on this "
-            "window to begin, or try the sample."
+            "No session was opened yet. Drop a video, an image, a folder of images or a session "
+            "anywhere on this window to begin, or try the sample."
         )
         self.nothing.setWordWrap(True)
         column.addWidget(self.nothing)

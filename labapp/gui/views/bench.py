@@ -35,7 +35,7 @@ class BenchView(Drawn):
         self.whole, self.near = _plot(), _plot()
         self.whole.setLabel("left", "Z, mm")
         self.near.setLabel("bottom", "the same, enlarged, mm")
-        layout = QVBoxLayout(self)
+        self._column = layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.setSpacing(0)
         plots = QHBoxLayout()
@@ -52,6 +52,8 @@ class BenchView(Drawn):
         self.describe(words)
         for plot in (self.whole, self.near):
             plot.setVisible(view is not None)
+        for place, wide in enumerate((view is not None, view is None)):
+            self._column.setStretch(place, int(wide))  # alone, the words stand in the middle
         center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft
         self.words.setAlignment(center if view is None else left)
         self._draw()

@@ -67,7 +67,7 @@ def test_what_cannot_be_is_said_at_its_field(empty: Session) -> None:
 def test_the_bench_counts_what_comes_back(empty: Session) -> None:
     presenter.load_setup(empty, SAMPLES / "gtaw" / "setup.toml")
     usual = presenter.bench(empty)
-    assert "Usual pool: 5 × 6 mm, 0 mm high" in usual.words
+    assert "Usual pool: 5 × 6 mm, flat" in usual.words
     for name, value in (("width", 6.0), ("length", 8.0), ("height", 0.8)):
         presenter.note(empty, f"expected_{name}_mm", value)
     bench = presenter.bench(empty)

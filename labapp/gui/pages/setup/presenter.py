@@ -351,7 +351,7 @@ def bench(session: Session) -> Bench:
         f"(solid). {tally[Fate.BLOCKED]} are blocked by the torch (dashed red), "
         f"{tally[Fate.PAST]} miss the plane (dotted grey), {tally[Fate.UNUSED]} do not meet the "
         f"pool (thin grey). {'Expected' if given else 'Usual'} pool: {width:g} × {length:g} mm, "
-        f"{height:g} mm high. Drawn: the central column of the pattern."
+        f"{f'{height:g} mm high' if height else 'flat'}. Drawn: the central column of the pattern."
     )
     rows = (
         ResultRow("Rays that come back", str(tally[Fate.CAUGHT])),
