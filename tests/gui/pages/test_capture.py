@@ -75,7 +75,7 @@ def test_what_was_read_is_told(copy_sample) -> None:
         told = dict(recording_in_words(recording))
         assert told["Frames"] == "30 in the recording, used: all"
         assert told["Time base"] == "60 frames/s"
-        assert told["At random"] == "frame-exact"
+        assert told["Seeking"] == "frame-exact"
         assert told["SHA-256"] == recording.sha256
         assert told["Size"] == "3.9 MB"
         other = replace(
@@ -84,7 +84,7 @@ def test_what_was_read_is_told(copy_sample) -> None:
         told = dict(recording_in_words(other))
         assert told["Frames"] == "30 in the recording, used: 6, 2 to 19, every 3."
         assert told["Time base"] == "60 frames/s (entered)"
-        assert told["At random"].startswith("not frame-exact")
+        assert told["Seeking"].startswith("not frame-exact")
         assert told["Kept"] == "in the session itself"
         seen = look(session, 0)
         assert seen.exposure is not None

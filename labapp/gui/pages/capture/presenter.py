@@ -108,7 +108,11 @@ def look(session: Session, number: int) -> Seen:
     try:
         image = session.frame(number).image
     except InputError as error:
-        return Seen(title, None, None, str(error))
+        missing = session.missing_recording
+        words = (
+            f"{missing.name} is not there: say where it is." if missing is not None else str(error)
+        )
+        return Seen(title, None, None, words)
     depth = None if recording is None else recording.bit_depth
     return Seen(title, image, _judged(image, session.settings.dots, depth))
 
@@ -219,7 +223,7 @@ def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
         ("Picture", f"{recording.columns} × {recording.rows} px, {recording.bit_depth} bit"),
         ("Frames", f"{recording.frames} in the recording, used: {which}"),
         ("Time base", base),
-        ("At random", exact),
+        ("Seeking", exact),
         ("Kept", "in the session itself" if recording.embedded else recording.path),
         ("Size", size_in_words(recording.size)),
         ("SHA-256", recording.sha256),
