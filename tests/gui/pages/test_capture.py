@@ -234,3 +234,9 @@ def test_every_button_says_what_it_does(page: CapturePage) -> None:
     for button in page.panel.findChildren(QAbstractButton):
         if button.text():
             assert button.toolTip(), button.text()
+
+
+def test_where_a_camera_will_be_chosen_it_says_that_there_is_none(page: CapturePage) -> None:
+    assert page.camera.isVisibleTo(page.panel)
+    assert not page.camera.isEnabled()
+    assert "import the file" in page.camera.editor.toolTip()
