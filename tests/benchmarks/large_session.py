@@ -8,6 +8,7 @@ are busy.
 
 from __future__ import annotations
 
+import itertools
 import os
 import resource
 import sqlite3
@@ -15,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -47,14 +48,21 @@ def make_recording(path: Path, frames: int) -> None:
         pictures.append(
             cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY)[80:560].repeat(2, axis=1)[:, :640]
         )
+    write_recording(path, (pictures[number % len(pictures)] for number in range(frames)))
+
+
+def write_recording(path: Path, pictures: Iterable[np.ndarray]) -> None:
+    """Pictures of one size, at least one, as MJPG, 500 frames a second."""
+    following = iter(pictures)
+    first = next(following)
     command = (
         f"{imageio_ffmpeg.get_ffmpeg_exe()} -loglevel error -f rawvideo -pix_fmt gray "
-        f"-s 640x480 -r 500 -i - -c:v mjpeg -q:v 4 -pix_fmt yuvj420p -y"
+        f"-s {first.shape[1]}x{first.shape[0]} -r 500 -i - -c:v mjpeg -q:v 4 -pix_fmt yuvj420p -y"
     )
     with subprocess.Popen([*command.split(), path], stdin=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None
-        for number in range(frames):
-            ffmpeg.stdin.write(np.ascontiguousarray(pictures[number % len(pictures)]).tobytes())
+        for picture in itertools.chain([first], following):
+            ffmpeg.stdin.write(np.ascontiguousarray(picture).tobytes())
         ffmpeg.stdin.close()
     assert ffmpeg.returncode == 0
 

@@ -1,0 +1,361 @@
+"""How quick the app is for its operator: start, opening, scrubbing, 3-D, and the longest stalls.
+
+Run as ``xvfb-run -a -s "-screen 0 1920x1080x24" python tests/benchmarks/app.py [frames] [part …]``
+with the parts ``start``, ``scrub``, ``import`` and ``measure``; without any, all of them. Each
+figure is told beside something plain that was timed in the same run, and with the load of the
+machine, as machines differ and are busy.
+
+Frames are those of the GTAW sample, then dark ones: a fit takes seconds, a dark frame none, so that
+results come as fast as they ever can. Every frame holds one of the sample's results before.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("LIBGL_ALWAYS_SOFTWARE", "1")
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from large_session import SAMPLE, write_recording
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QApplication, QLabel, QMainWindow
+from stall_meter import StallMeter, run_for, run_until
+
+from labapp.gui.preferences import Preferences
+from labapp.gui.window import MainWindow
+from labapp.session.session import Session
+
+STARTS = 5
+SCRUB_S = 4.0
+MOST_MS = 50.0
+"""No call may keep the GUI thread longer."""
+
+BRIGHT = 300
+"""So many frames of the recording show dots."""
+
+CHILD = Path(__file__).with_name("app_start.py")
+PARTS = ("start", "scrub", "import", "measure")
+
+
+def told(name: str, value: str, beside: str, bar: str) -> None:
+    print(f"{name:<34}{value:>14}   {beside:<44}{bar:<22} load {os.getloadavg()[0]:.1f}")
+    sys.stdout.flush()
+
+
+# --- start and opening ------------------------------------------------------------------------
+
+
+def started(*arguments: object) -> dict[str, float]:
+    """Seconds from a program's beginning to what it tells of."""
+    began = time.monotonic()
+    answer = subprocess.run(
+        [sys.executable, CHILD, str(began), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    pairs = [line.split() for line in answer.stdout.splitlines()]
+    return {name: float(value) for name, value in pairs}
+
+
+def start(folder: Path) -> None:
+    shutil.copytree(SAMPLE, folder / "gtaw")
+    sample = folder / "gtaw" / "gtaw.labsession"
+    runs: dict[str, list[dict[str, float]]] = {"bare": [], "app": [], "file": [], "later": []}
+    started("bare")
+    for _ in range(STARTS):
+        runs["bare"].append(started("bare"))
+        runs["app"].append(started("app"))
+        runs["file"].append(started("file", sample))
+        runs["later"].append(started("later", sample))
+
+    def median(kind: str, name: str) -> float:
+        return float(np.median([run[name] for run in runs[kind]]))
+
+    bare = median("bare", "usable")
+    for name, kind, event, bar in (
+        ("start to usable window", "app", "usable", "wanted ≤ 2.5 s"),
+        ("start with the sample, to 3-D", "file", "drawn", "wanted ≤ 4.0 s"),
+        ("open the sample later, to 3-D", "later", "drawn", "wanted ≤ 1.5 s"),
+    ):
+        took, busy = median(kind, event), median(kind, f"{event}_cpu")
+        beside = f"{busy:.2f} s of processor; {took / bare:.1f} × a bare Qt window"
+        told(name, f"{took:.2f} s", beside, bar)
+
+
+# --- the session ------------------------------------------------------------------------------
+
+
+def sample_pictures() -> list[np.ndarray]:
+    video = cv2.VideoCapture(str(SAMPLE / "recording.avi"))
+    pictures = []
+    while (read := video.read())[0]:
+        pictures.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY))
+    return pictures
+
+
+def make_recording(path: Path, frames: int) -> None:
+    bright = sample_pictures()
+    dark = [np.full_like(bright[0], level) for level in range(10)]
+    write_recording(
+        path,
+        (bright[k % len(bright)] if k < BRIGHT else dark[k % len(dark)] for k in range(frames)),
+    )
+
+
+def fill(session: Session) -> None:
+    """Give every frame one of the sample's results."""
+    with Session.open(SAMPLE / "gtaw.labsession", read_only=True) as sample:
+        kept = [sample.result(int(k)) for k in sample.frames]
+        session.set_setup(sample.setup_text)
+        session.set_settings(sample.settings)
+    basis = session._basis()
+    assert basis is not None
+    with session._database.transaction():
+        for number in session.frames.tolist():
+            result = kept[number % len(kept)]
+            assert result is not None
+            session._results.put(number, result.measurement, basis, None)
+
+
+def new_window(folder: Path) -> MainWindow:
+    window = MainWindow(Preferences(theme="dark"), folder / "preferences.json")
+    window.apply_theme()
+    window.resize(1600, 1000)
+    window.show()
+    run_for(0.3)
+    return window
+
+
+# --- scrubbing and 3-D ------------------------------------------------------------------------
+
+
+def shown_by(window: MainWindow) -> Callable[[], bool]:
+    """Whether the page in view shows the frame in view, drawn."""
+    page: Any = window.page
+    space = window.workspace
+    if page.key == "dots":
+        return lambda: page.seen is not None and page.seen.frame == space.frame
+    if page.key == "capture":
+        return lambda: page._seen == (None, space.frame)
+    if page.key == "surface":
+        return lambda: page.told.result.frame == space.frame and not page.view._late.isActive()
+    return lambda: True
+
+
+def rate(step: Callable[[int], None], seconds: float = SCRUB_S) -> float:
+    step(0)
+    began, done = time.perf_counter(), 0
+    while time.perf_counter() - began < seconds:
+        done += 1
+        step(done)
+    return done / (time.perf_counter() - began)
+
+
+def scrub(window: MainWindow, session: Session) -> None:
+    numbers = np.random.default_rng(1).integers(0, BRIGHT, 10_000).tolist()
+    decoded = rate(lambda k: session.frame(numbers[k]) and None)
+    print(f"{len(session.frames)} frames; decoding alone: {decoded:.0f} frames/s")
+    for key in ("capture", "dots", "surface", "trends"):
+        window.show_step(key)
+        run_until(shown_by(window))
+        run_for(1.5)
+
+        def step(k: int) -> None:
+            window.timeline.scrubber.go_to(numbers[k])
+            run_until(shown_by(window))
+            QApplication.processEvents()  # which draws what was updated
+
+        with StallMeter() as meter:
+            reached = rate(step)
+        beside = f"{reached / decoded:.2f} of decoding"
+        told(f"scrubbing, {key}", f"{reached:.1f} /s", beside, "wanted ≥ 30 /s")
+        tell_stalls(meter, 1)
+    window.show_step("surface")
+    run_until(shown_by(window))
+    draw(window)
+
+
+def draw(window: MainWindow) -> None:
+    """Another surface in the 3-D view, which has to be built and drawn."""
+    page: Any = window.page
+    scenes = []
+    for number in range(10):
+        window.workspace.show_frame(number)
+        run_until(shown_by(window))
+        scenes.append(page.view.scene)
+    plotter = page.view._drawing.plotter
+    bare = rate(lambda _: plotter.render() and None)
+
+    def step(k: int) -> None:
+        page.view.show_scene(scenes[k % len(scenes)])
+        run_until(lambda: not page.view._late.isActive())
+        QApplication.processEvents()
+
+    reached = rate(step)
+    size = plotter.window_size
+    beside = f"{reached / bare:.2f} of bare renders, {size[0]}×{size[1]} px"
+    told("3-D updates", f"{reached:.1f} /s", beside, "wanted ≥ 20 /s")
+
+
+# --- long work --------------------------------------------------------------------------------
+
+
+def tell_stalls(meter: StallMeter, count: int) -> None:
+    for stall in meter.longest[:count]:
+        print(f"      {stall.wall_ms:6.1f} ms ({stall.cpu_ms:.0f} of processor)  {stall.calls}")
+    sys.stdout.flush()
+
+
+def tell_longest(name: str, meter: StallMeter, beside: str) -> None:
+    longest = meter.longest
+    most = longest[0].wall_ms if longest else 0.0
+    over = sum(stall.wall_ms > MOST_MS for stall in longest)
+    busy = max((stall.cpu_ms for stall in longest), default=0.0)
+    beside = f"of processor {busy:.0f} ms; {over} over {MOST_MS:g}; {beside}"
+    told(name, f"{most:.0f} ms", beside, f"wanted ≤ {MOST_MS:g} ms")
+    tell_stalls(meter, 4)
+
+
+def idle(folder: Path) -> None:
+    """What a window that does nothing comes to, beside a process that is busy as one measures."""
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    bare = QMainWindow()
+    bare.setCentralWidget(QLabel("nothing"))
+    bare.show()
+    try:
+        with StallMeter() as meter:
+            run_for(5)
+    finally:
+        busy.kill()
+        busy.wait()
+        bare.close()
+    tell_longest("a bare window, another busy", meter, "5 s")
+
+
+def take_in(window: MainWindow, recording: Path, frames: int) -> None:
+    """Import by the recording page: watch, cancel, begin again, and look at it meanwhile."""
+    window.show_step("capture")
+    page: Any = window.page
+    tasks = window.workspace.tasks
+    page.take(recording)
+    run_until(lambda: page.preview is not None)
+    run_until(lambda: not tasks.active)
+    for words, part in (("cancelled", 0.3), ("to its end", 2.0)):
+        began = time.perf_counter()
+        with StallMeter() as meter:
+            page.import_chosen()
+            task = page._importing
+            looked = 0
+            while task in tasks.active:
+                run_for(0.05)
+                looked += 1
+                page.slider.setValue((looked * 37) % frames)
+                if task.total and task.done > part * task.total:
+                    task.cancel()
+            run_until(lambda: not tasks.active)
+        took = time.perf_counter() - began
+        tell_longest(f"importing, {words}", meter, f"{took / frames * 1000:.1f} ms a frame")
+        held = 0 if window.workspace.session is None else len(window.workspace.session.frames)
+        print(f"      {task.done} of {task.total} done; the session holds {held} frames")
+
+
+def watch(window: MainWindow, part: Sequence[int], most: int) -> int:
+    """Measure frames, at most so many, while others are looked at; how many were kept."""
+    space = window.workspace
+    task = space.measure(part)
+    assert task is not None
+    looked = 0
+    while task in space.tasks.active:
+        run_for(0.1)
+        looked += 1
+        space.show_frame(looked % BRIGHT)
+        if task.done > most:
+            task.cancel()
+    run_until(lambda: not space.tasks.active)
+    return task.done
+
+
+def measure(window: MainWindow, session: Session) -> None:
+    """Measure on every page, while frames are stepped through; cancel, and go on to the end."""
+    space = window.workspace
+    dark = session.frames[BRIGHT:].tolist()
+    for key in window._kinds:
+        window.show_step(key)
+        run_for(1.0)
+    space.measure(dark[:200])  # the processes are there, and what is made once
+    run_until(lambda: not space.tasks.active, 120)
+    keys = list(window._kinds)
+    share = len(dark) // len(keys)
+    worst = StallMeter()
+    began = time.perf_counter()
+    for place, key in enumerate(keys):
+        window.show_step(key)
+        run_for(0.5)
+        began_part = time.perf_counter()
+        part = dark[place * share : (place + 1) * share]
+        with StallMeter() as meter:
+            kept = watch(window, part, share // 2 if place == 0 else share)
+            if kept < share:
+                print(f"      cancelled after {kept} of {share}")
+                watch(window, part[kept:], share)
+        took = time.perf_counter() - began_part
+        tell_longest(f"measuring, {key}", meter, f"{share / took:.0f} results/s")
+        worst.stalls += meter.stalls
+    took = time.perf_counter() - began
+    tell_longest(f"measuring {len(keys) * share}", worst, f"{took:.0f} s")
+    statuses = session.overview().status
+    wrong = [k for k in dark[: len(keys) * share] if statuses[k] == "ok"]
+    print(f"      results that were not replaced: {len(wrong)}; problems: {session.problems()}")
+
+
+def main(arguments: Sequence[str]) -> None:
+    numbers = [int(each) for each in arguments if each.isdigit()]
+    frames = numbers[0] if numbers else 10_000
+    parts = [each for each in arguments if each in PARTS] or list(PARTS)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for variable in ("XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_DOCUMENTS_DIR"):
+            os.environ[variable] = str(folder / "home")
+        if "start" in parts:
+            start(folder)
+        if not set(parts) - {"start"}:
+            return
+        recording = folder / "large.avi"
+        make_recording(recording, frames)
+        app = QApplication.instance() or QApplication(["labapp"])
+        assert isinstance(app, QApplication)
+        idle(folder)
+        window = new_window(folder)
+        window.workspace.create(folder / "large.labsession")
+        session = window.workspace.session
+        assert session is not None
+        if "import" in parts:
+            take_in(window, recording, frames)
+        else:
+            session.import_recording(recording)
+        fill(session)
+        window.workspace.changed.emit()
+        if "scrub" in parts:
+            scrub(window, session)
+        if "measure" in parts:
+            measure(window, session)
+        window.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose, False)
+        window.close()
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,114 @@
+"""The app in a process of its own for `app.py`: tells when it can be used, and when 3-D is drawn.
+
+``app_start.py BEGAN bare|app|file|later [SESSION]``, BEGAN by `time.monotonic`, s.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+POLL_MS = 2
+LATER_MS = 3000
+
+
+def tell(name: str, since: float, busy: float = 0.0) -> None:
+    """Tell how long it took, and how much of the processor; s."""
+    print(name, time.monotonic() - since)
+    print(f"{name}_cpu", time.process_time() - busy)
+    sys.stdout.flush()
+
+
+def bare(began: float) -> None:
+    """A window of Qt's and nothing in it."""
+    from PySide6.QtCore import QTimer
+    from PySide6.QtWidgets import QApplication, QMainWindow
+
+    app = QApplication([])
+    window = QMainWindow()
+    window.resize(1600, 1000)
+    window.show()
+
+    def look() -> None:
+        handle = window.windowHandle()
+        if handle is not None and handle.isExposed():
+            timer.stop()
+            QTimer.singleShot(0, lambda: (tell("usable", began), app.quit()))
+
+    timer = QTimer()
+    timer.timeout.connect(look)
+    timer.start(POLL_MS)
+    app.exec()
+
+
+class Onlooker:
+    """Looks at the app's window every other millisecond."""
+
+    def __init__(self, app: Any, began: float, kind: str, session: Path | None) -> None:
+        from PySide6.QtCore import QTimer
+
+        self._app, self._kind, self._session = app, kind, session
+        self._since = began, 0.0
+        self._usable = False
+        self._timer = QTimer(app)
+        self._timer.timeout.connect(self._look)
+        self._timer.start(POLL_MS)
+
+    def _look(self) -> None:
+        from labapp.gui.window import MainWindow
+
+        for window in self._app.topLevelWidgets():
+            if isinstance(window, MainWindow):
+                handle = window.windowHandle()
+                if self._usable:
+                    self._look_for_surface(window)
+                elif handle is not None and handle.isExposed():
+                    self._tell_usable(window)
+
+    def _tell_usable(self, window: Any) -> None:
+        from PySide6.QtCore import QTimer
+
+        self._usable = True
+        tell("usable", *self._since)
+        if self._kind == "app":
+            window.close()
+        elif self._kind == "later":
+            QTimer.singleShot(LATER_MS, self._app, lambda: self._open(window))
+
+    def _open(self, window: Any) -> None:
+        self._since = time.monotonic(), time.process_time()
+        window.files.open(self._session)
+
+    def _look_for_surface(self, window: Any) -> None:
+        drawing = getattr(getattr(window.page, "view", None), "_drawing", None)
+        if drawing and drawing.plotter.renderer.GetLastRenderTimeInSeconds() > 0:
+            self._timer.stop()
+            tell("drawn", *self._since)
+            window.close()
+
+
+def start(began: float, kind: str, session: Path | None) -> None:
+    """The command, with an onlooker."""
+    from labapp import cli
+    from labapp.gui import app as gui_app
+
+    make = gui_app.start_app
+    lookers = []
+
+    def start_app() -> Any:
+        app = make()
+        lookers.append(Onlooker(app, began, kind, session))
+        return app
+
+    gui_app.start_app = start_app
+    cli.main([str(session)] if kind == "file" else [])
+
+
+if __name__ == "__main__":
+    first, how, *others = sys.argv[1:]
+    if how == "bare":
+        bare(float(first))
+    else:
+        start(float(first), how, Path(others[0]) if others else None)

@@ -1,0 +1,193 @@
+"""The app killed while it imports or measures: run by `test_long_work.py`, or by hand.
+
+``python tests/gui/kill.py FOLDER KILLS SEED``: a process of its own opens the window on a session
+and works as an operator has it work; it is killed at random moments. After each kill the session
+must open and be whole, hold every result that was there for the operator to see, and either all of
+the recording's frames or none; and no process may be left over.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import labapp
+from labapp.session.session import Session
+
+FRAMES = 600
+SIDE_PX = 64
+SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw" / "setup.toml"
+GONE_S = 60.0
+TOLD = 4
+"""Bytes a number."""
+
+
+# --- in the process that is killed ------------------------------------------------------------
+
+
+def work(path: Path, recording: Path, pipe: int) -> None:
+    """Import where there are no frames yet, else measure; tell each frame that is done."""
+    from PySide6.QtCore import QTimer
+
+    from labapp.gui.app import start_app
+    from labapp.gui.preferences import Preferences
+    from labapp.gui.window import MainWindow
+
+    def tell(number: int) -> None:
+        os.write(pipe, number.to_bytes(TOLD, "little"))
+
+    measure, take_in = Session.measure, Session.import_recording
+
+    def measured(session, frames=None, pool=None):  # type: ignore[no-untyped-def]
+        for number, measurement in measure(session, frames, pool):
+            tell(number)
+            yield number, measurement
+
+    def imported(session, *given, progress, **named):  # type: ignore[no-untyped-def]
+        def step(done: int, total: int) -> None:
+            tell(done)
+            progress(done, total)
+
+        return take_in(session, *given, progress=step, **named)
+
+    Session.measure = measured  # type: ignore[method-assign]
+    Session.import_recording = imported  # type: ignore[method-assign]
+    app = start_app()
+    window = MainWindow(Preferences(), path.with_name("preferences.json"))
+    window.show()
+    window.workspace.open(path)
+    session = window.workspace.session
+    assert session is not None
+
+    def begin() -> None:
+        page = window.pages["capture"]
+        if page.preview is None:  # type: ignore[attr-defined]
+            QTimer.singleShot(10, begin)
+        else:
+            page.import_chosen()  # type: ignore[attr-defined]
+
+    if len(session.frames):
+        window.measure_all()
+    else:
+        window.files.take(recording)
+        begin()
+    app.exec()
+
+
+# --- who kills it -----------------------------------------------------------------------------
+
+
+def killed(path: Path, recording: Path, rng: random.Random) -> list[int]:
+    """Let the app work and kill it; the frames that it told of."""
+    reading, writing = os.pipe()
+    environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "XDG_STATE_HOME": str(path.parent)}
+    child = subprocess.Popen(
+        [sys.executable, __file__, "work", path, recording, str(writing)],
+        pass_fds=[writing],
+        env=environment,
+        start_new_session=True,
+    )
+    os.close(writing)
+    told: list[int] = []
+    try:
+        told += some(reading, 1 + rng.randrange(40))
+        time.sleep(rng.uniform(0, 0.02))
+    finally:
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+    told += some(reading, FRAMES)
+    os.close(reading)
+    wait_for_all(child.pid)
+    return told
+
+
+def some(pipe: int, most: int) -> list[int]:
+    """The next numbers told, or fewer if nobody is left to tell."""
+    told: list[int] = []
+    while len(told) < most and (part := os.read(pipe, TOLD)):
+        told.append(int.from_bytes(part, "little"))
+    return told
+
+
+def wait_for_all(group: int) -> None:
+    """Wait until the processes that measured have gone as well."""
+    ends = time.monotonic() + GONE_S
+    try:
+        while time.monotonic() < ends:
+            os.killpg(group, 0)
+            time.sleep(0.05)
+    except ProcessLookupError:
+        return
+    os.killpg(group, signal.SIGKILL)
+    raise SystemExit("a process that measured was left over")
+
+
+def check(path: Path, known: set[int], told: list[int], importing: bool) -> set[int]:
+    """The frames with results; ends the program where something is lost or not whole."""
+    with Session.open(path) as session:
+        problems = session.problems()
+        count = len(session.frames)
+        has = set(measured_frames(session))
+    if problems:
+        raise SystemExit(f"not whole: {problems}")
+    if count not in (0, FRAMES):
+        raise SystemExit(f"{count} of {FRAMES} frames were imported")
+    if not importing and not (known | set(told)) <= has:
+        raise SystemExit(f"lost: {sorted((known | set(told)) - has)}")
+    if not importing and len(has - known - set(told)) > 1:
+        raise SystemExit("more than the frame in work was kept and not told")
+    return has
+
+
+def measured_frames(session: Session) -> Iterator[int]:
+    seen = session.overview()
+    for number, status in zip(seen.frame.tolist(), seen.status, strict=True):
+        if status:
+            yield number
+
+
+def main(folder: Path, kills: int, seed: int) -> None:
+    rng = random.Random(seed)
+    recording = folder / "dark.npy"
+    np.save(recording, np.zeros((FRAMES, SIDE_PX, SIDE_PX), np.uint8))
+    path = folder / "killed.labsession"
+    with Session.create(path) as session:
+        session.set_setup(SAMPLE.read_text("utf-8"))
+    told = {"importing": 0, "measuring": 0}
+    known: set[int] = set()
+    for kill in range(kills):
+        importing = kill < kills // 2
+        if kill == kills // 2:
+            with Session.open(path) as session:
+                session.import_recording(recording)
+        acknowledged = killed(path, recording, rng)
+        if not acknowledged:
+            raise SystemExit("it was killed before it did anything")
+        told["importing" if importing else "measuring"] += len(acknowledged)
+        if importing:
+            check(path, known, acknowledged, importing)
+            with Session.open(path) as session:
+                whole = len(session.frames) > 0
+            if whole:  # it came to its end before: begin again with none
+                path.unlink()
+                with Session.create(path) as session:
+                    session.set_setup(SAMPLE.read_text("utf-8"))
+        else:
+            known = check(path, known, acknowledged, importing)
+    print(json.dumps({"kills": kills, "measured": len(known), **told}))
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "work":
+        work(Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]))
+    else:
+        main(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
