@@ -6,7 +6,6 @@ import ast
 import itertools
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,7 +19,6 @@ import labapp
 from labapp.gui.actions import MENUS
 from labapp.gui.help import TITLES
 from labapp.gui.pages import PAGES
-from labapp.session.scene import can_draw
 from tests.conftest import Run
 
 GUI = Path(labapp.__file__).parent / "gui"
@@ -35,10 +33,8 @@ def environment(home: Path, platform: str) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def taken(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Path]:
+def taken(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Path]:
     """The pictures' folder, what was said, and the home folder of who took the tour."""
-    if shutil.which("xvfb-run") is None or not can_draw():
-        pytest.skip("Xvfb is not installed, or nothing can be drawn in 3-D")
     out, home = tmp_path_factory.mktemp("tour"), tmp_path_factory.mktemp("home")
     size = f"{SIZE[0]}x{SIZE[1]}"
     screen = ["xvfb-run", "-a", "-s", f"-screen 0 {size}x24 -nolisten tcp"]
@@ -63,6 +59,7 @@ def named(taken: tuple[Path, str, Path], part: str) -> list[Path]:
     return sorted(taken[0].glob(f"[0-9][0-9]-{part}.png"))
 
 
+@pytest.mark.xvfb
 def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
     taken: tuple[Path, str, Path],
 ):
@@ -77,17 +74,20 @@ def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
         assert len(np.unique(picture)) > 20, name
 
 
+@pytest.mark.xvfb
 def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
     out, _, _ = taken
     seen = [path.read_bytes() for path in sorted(out.iterdir())]
     assert len(set(seen)) == len(seen)
 
 
+@pytest.mark.xvfb
 @pytest.mark.parametrize("key", ["welcome", *(page.key for page in PAGES)])
 def test_every_page_has_a_picture(taken: tuple[Path, str, Path], key: str):
     assert named(taken, key) + named(taken, f"{key}-*")
 
 
+@pytest.mark.xvfb
 def test_every_menu_has_a_picture(taken: tuple[Path, str, Path]):
     for menu in MENUS:
         assert named(taken, f"*-menu-{menu.replace('&', '').lower()}"), menu
@@ -133,6 +133,7 @@ def _titles_in(function: ast.FunctionDef, path: Path) -> Iterator[str]:
         )
 
 
+@pytest.mark.xvfb
 def test_every_question_for_a_file_and_every_other_question_has_a_picture(
     taken: tuple[Path, str, Path],
 ):
@@ -142,6 +143,7 @@ def test_every_question_for_a_file_and_every_other_question_has_a_picture(
     assert not [t for t in titles if not any(one.startswith(t) for one in shown)]
 
 
+@pytest.mark.xvfb
 def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
     """`HelpDialog` is the only one of the app's own; it has a picture for each of its texts."""
     own = {
@@ -156,6 +158,7 @@ def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
         assert named(taken, f"dialog-{kind}")
 
 
+@pytest.mark.xvfb
 def test_the_3d_views_are_drawn(taken: tuple[Path, str, Path]):
     """Middle of the canvas, where the surface is: many levels, and not those of another look."""
     looks = []
@@ -169,6 +172,7 @@ def test_the_3d_views_are_drawn(taken: tuple[Path, str, Path]):
         assert np.abs(one.astype(int) - other).mean() > 1
 
 
+@pytest.mark.xvfb
 def test_nothing_is_left_in_the_home_folder_but_the_log(taken: tuple[Path, str, Path]):
     home = taken[2]
     left = {path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()}
@@ -208,7 +212,7 @@ cli.main(["tour", "--out", sys.argv[1]])
 """
 
 
-@pytest.mark.skipif(not can_draw(), reason="nothing can be drawn in 3-D here")
+@pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize(
     ("page", "kind", "method"),
     [("setup", "SetupPage", "refresh"), ("laser", "LaserPage", "_show_way")],

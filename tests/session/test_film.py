@@ -18,7 +18,6 @@ import pytest
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.session import scene as scenes
 from labapp.session.export import ExportChoice, export, verify_export
 from labapp.session.film import Extent, film_scene, film_times, write_film, write_video
 from labapp.session.scene import Scene
@@ -162,10 +161,8 @@ def test_all_frames_share_room_and_colours(frames: Frames, measured: Measurement
     assert [len(scene.triangles) > 0 for scene in made] == [True, False, True, True]
 
 
+@pytest.mark.usefixtures("opengl")
 def test_a_studio_draws_from_the_same_place_each_time(frames: Frames, extent: Extent) -> None:
-    pytest.importorskip("pyvista")
-    if not scenes.can_draw():
-        pytest.skip("OpenGL cannot be used here")
     studio = Studio(SIZE, "free")
     first, words, again = (
         studio.draw(film_scene(3, 0.3, measurement, extent))
