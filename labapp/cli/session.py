@@ -43,6 +43,29 @@ app = typer.Typer(
 File = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")]
 Frames = Annotated[str | None, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)]
 
+WhoseResults = Annotated[
+    Literal["fit", "ers", "irs-opa", "irs-epa-r", "irs-epa-c", "irs-epa-rc"] | None,
+    typer.Option(
+        metavar="SCHEME",
+        help="Whose results: fit, ers, irs-opa, irs-epa-r, irs-epa-c, irs-epa-rc; without it, "
+        "those of the session's settings.",
+    ),
+]
+View = Annotated[
+    Literal["free", "top", "side", "front"],
+    typer.Option(help="Where pictures of surfaces and the film look from; free: obliquely."),
+]
+Size = Annotated[
+    str, typer.Option(metavar="WIDTHxHEIGHT", help="Of these pictures and the film (px, even).")
+]
+FilmRate = Annotated[
+    float | None,
+    typer.Option(
+        callback=finite,
+        help="Frames of the film a second (Hz); without it, as fast as they were recorded.",
+    ),
+]
+
 
 def _quantity(text: str) -> Any:
     return typer.Option(min=0, callback=finite, help=text)
@@ -259,14 +282,7 @@ def export(
     ],
     *,
     frames: Frames = None,
-    scheme: Annotated[
-        Literal["fit", "ers", "irs-opa", "irs-epa-r", "irs-epa-c", "irs-epa-rc"] | None,
-        typer.Option(
-            metavar="SCHEME",
-            help="Whose results: fit, ers, irs-opa, irs-epa-r, irs-epa-c, irs-epa-rc; without it, "
-            "those of the session's settings.",
-        ),
-    ] = None,
+    scheme: WhoseResults = None,
     tables: Annotated[
         bool, typer.Option(help="Measures, dots, points and boundaries as CSV (mm, px).")
     ] = True,
@@ -281,20 +297,9 @@ def export(
     pictures: Annotated[
         str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, film, or none.")
     ] = "none",
-    view: Annotated[
-        Literal["free", "top", "side", "front"],
-        typer.Option(help="Where pictures of surfaces and the film look from; free: obliquely."),
-    ] = "free",
-    size: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="Of these pictures and the film (px, even).")
-    ] = "1280x720",
-    film_rate: Annotated[
-        float | None,
-        typer.Option(
-            callback=finite,
-            help="Frames of the film a second (Hz); without it, as fast as they were recorded.",
-        ),
-    ] = None,
+    view: View = "free",
+    size: Size = "1280x720",
+    film_rate: FilmRate = None,
     report: Annotated[bool, typer.Option("--report", help="A PDF report.")] = False,
 ) -> None:
     """Write results into a folder, which is whole or not there, with a manifest.
