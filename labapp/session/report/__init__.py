@@ -261,7 +261,8 @@ def _plane(story: Story, told: Told) -> None:
     story.table(
         f"What was found in the calibration picture; a unit of the axes is {plane.unit_mm:.6g} mm. "
         f"Scale {along_x:.4f} ± {x_sigma:.4f} px/mm along O′X′, "
-        f"{along_z:.4f} ± {z_sigma:.4f} px/mm along O′Z′; {found.angle_deg:.3f} ± {angle_sigma:.3f}° between them.",
+        f"{along_z:.4f} ± {z_sigma:.4f} px/mm along O′Z′; "
+        f"{found.angle_deg:.3f} ± {angle_sigma:.3f}° between them.",
         [["point", "X′, Z′ (mm)", "u (px)", "v (px)", "± (px)"], *rows],
         "llrrr",
         (0.36, 0.22, 0.14, 0.14, 0.14),

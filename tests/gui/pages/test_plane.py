@@ -60,6 +60,51 @@ def test_what_cannot_be_used_and_what_is_odd_is_said() -> None:
     assert not presenter.result(SQUARE).warnings
 
 
+def askew(perspective: float) -> PlaneCalibration:
+    """Marks of a target whose far end of O′X′ is seen smaller, with a little noise."""
+    units = [(0, 0), *((n, 0) for n in range(1, 11)), *((0, n) for n in range(1, 5))]
+    plane = 10.0 * np.array(units, float)
+    shrink = 1 + perspective * plane[:, :1]
+    seen = ([50.0, 400.0] + plane * [6.0, -6.0]) / shrink
+    seen += np.random.default_rng(4).normal(0, 0.05, seen.shape)
+    marks = tuple((*row, 1.0) for row in np.column_stack([plane, seen]).tolist())
+    return replace(SQUARE, marks=marks, model="affine")
+
+
+def test_the_model_is_proposed_with_its_reason_and_can_be_overridden() -> None:
+    tilted = askew(1e-3)
+    assert [model for model, _ in presenter.choices(tilted)] == [
+        "affine",
+        "homography",
+        "three points",
+    ]
+    assert dict(presenter.choices(tilted))["homography"].endswith("(proposed)")
+    assert "perspective along X′" in presenter.why(tilted)
+    assert dict(presenter.choices(askew(0.0)))["affine"].endswith("(proposed)")
+    assert "No perspective" in presenter.why(askew(0.0))
+    assert presenter.choices(SQUARE) == (("three points", "Three points"),)
+    rows = {row.name: row.value for row in presenter.result(tilted).rows}
+    assert 0.03 < rows["Homography off by"] < 0.1 < rows["Affine off by"]
+    used = presenter.with_model(tilted, "homography").image_calibration
+    np.testing.assert_allclose(used.to_image(np.array([[100.0, 0.0]])), [[590.9, 363.6]], atol=0.3)
+    by_hand = presenter.moved(tilted, 0, (51.0, 400.0))
+    assert (by_hand.model, by_hand.marks) == ("three points", ())
+
+
+def test_the_residual_map_shows_how_far_the_model_is_off() -> None:
+    tilted = askew(1e-3)
+    shown = presenter.residual_map(tilted, 640)
+    assert shown is not None
+    assert shown.share.max() == 1.0
+    arrows = np.hypot(*(shown.end_px - shown.begin_px).T)
+    assert 12 < arrows.max() <= 64
+    times = float(shown.words.split("×")[1].split(",")[0])
+    marks = np.array(tilted.marks)
+    places = tilted.image_calibration.to_image(marks[:, :2])
+    np.testing.assert_allclose((shown.end_px - shown.begin_px) / times, places - marks[:, 2:4])
+    assert presenter.residual_map(SQUARE, 640) is None
+
+
 def test_a_point_placed_by_hand_is_less_certain() -> None:
     moved = presenter.moved(SQUARE, 1, (381.0, 401.0))
     assert moved.x_axis_px == (381.0, 401.0)
@@ -194,6 +239,33 @@ def test_a_new_unit_is_followed_at_once(qtbot: QtBot, page: PlanePage) -> None:
     qtbot.keyClicks(page.unit.editor, "12.7")
     qtbot.keyClick(page.unit.editor, Qt.Key.Key_Return)
     assert page.result.rows[0].value == pytest.approx(scale / 2)
+
+
+def test_the_operator_may_use_another_model(qtbot: QtBot, page: PlanePage) -> None:
+    session = page.workspace.session
+    assert session is not None
+    page.load(GTAW / "calibration.png")
+    qtbot.waitUntil(lambda: page.found is not None and bool(page.found.marks))
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.model.value() == "affine"
+    assert "No perspective" in page.why.text()
+    assert "Arrows" in page.why.text()
+    before = session.setup_text
+    page.model.edited.emit("homography")
+    chosen = page.found
+    assert chosen is not None
+    assert chosen.model == "homography"
+    page.use_button.click()
+    assert "homography = [" in session.setup_text
+    assert "origin_px" not in session.setup_text
+    corners = np.array([[0.0, 0.0], [480.0, 0.0], [480.0, 640.0]])
+    np.testing.assert_allclose(
+        session.setup.calibration.to_plane(corners),
+        chosen.image_calibration.to_plane(corners),
+        rtol=1e-9,
+    )
+    page.workspace.undo()
+    assert session.setup_text == before
 
 
 def test_every_button_says_what_it_does(page: PlanePage) -> None:

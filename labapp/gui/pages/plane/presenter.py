@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from labapp.core.coordinates import ImageCalibration
+from labapp.core.mark_fit import Model, root_mean_square
 from labapp.core.plane_calibration import (
     PlaneCalibration,
     PlaneCalibrationSettings,
@@ -64,16 +65,23 @@ def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
 
 
 def moved(found: PlaneCalibration, point: int, place: Place) -> PlaneCalibration:
-    """The calibration with one of its points placed by hand."""
+    """The calibration with one of its points placed by hand; it is that of the three points."""
     sigma = list(found.sigma_px)
     sigma[point] = HAND_SIGMA_PX
     of_point = {("origin_px", "x_axis_px", "z_axis_px")[point]: place}
-    return replace(found, sigma_px=(sigma[0], sigma[1], sigma[2]), **of_point)  # type: ignore[arg-type]
+    return replace(
+        found,
+        sigma_px=(sigma[0], sigma[1], sigma[2]),
+        marks=(),
+        model="three points",
+        **of_point,  # type: ignore[arg-type]
+    )
 
 
 def with_unit(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
     """The same points on a target of another unit."""
-    return _of_units(found, unit_mm)
+    x_mm = sum(DESIGN.x_units) / 2 * unit_mm
+    return found.with_scale(x_mm / found.x_axis_mm)
 
 
 def _of_units(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
@@ -88,12 +96,12 @@ def places(found: PlaneCalibration) -> tuple[Place, Place, Place]:
 
 @dataclass(frozen=True)
 class Result:
-    """What follows from the three points.
+    """What follows from the points and the marks.
 
     Parameters
     ----------
     rows
-        Scales and angle with ±.
+        Scales and angle with ±, and the residuals.
     why_not
         Why they cannot be used; empty if they can.
     warnings
@@ -118,12 +126,14 @@ def result(found: PlaneCalibration | None) -> Result:
     ]
     if waiting:
         return Result(why_not=f"Drag {' and '.join(waiting)} to where it is in the picture")
-    values, sigmas = _numbers(found), _sigmas(found)
+    values = (*found.px_per_mm, found.angle_deg)
+    sigmas = found.scales_and_angle_sigma.tolist()
     units = (("Scale along O′X′", "px/mm"), ("Scale along O′Z′", "px/mm"), ("Angle", "°"))
     rows = [
         ResultRow(name, value, sigma, unit)
         for (name, unit), value, sigma in zip(units, values, sigmas, strict=True)
     ]
+    rows += _residual_rows(found)
     rows += [
         ResultRow(name, f"{u:.1f}, {v:.1f}", unit="px", note=f"± {sigma:.2f} px each way")
         for name, (u, v), sigma in zip(POINTS, places(found), found.sigma_px, strict=True)
@@ -137,19 +147,86 @@ def result(found: PlaneCalibration | None) -> Result:
     return Result(tuple(rows), "", tuple(warnings))
 
 
-def _numbers(found: PlaneCalibration) -> FloatArray:
-    return np.array([*found.px_per_mm, found.angle_deg])
+def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:
+    """What each fit leaves over at the marks, and which is used."""
+    fits = found.fits
+    if fits is None:
+        return []
+    rows = []
+    for name, fit in (("Affine", fits.affine), ("Homography", fits.homography)):
+        if fit is not None:
+            worst = float(np.hypot(*fit.residual_px.T).max())
+            left_out, mm = root_mean_square(fit.left_out_px), root_mean_square(fit.residual_mm)
+            note = (
+                f"Residual, root mean square over {len(found.marks)} marks: {mm:.4f} mm on the "
+                f"plane; worst {worst:.2f} px; of a mark that is left out of the fit "
+                f"{left_out:.3f} px"
+            )
+            value = root_mean_square(fit.residual_px)
+            rows.append(ResultRow(f"{name} off by", value, None, "px", 3, note))
+    return rows
 
 
-def _sigmas(found: PlaneCalibration) -> FloatArray:
-    """± of scales and angle: each point's ± along u and along v, carried through."""
-    base, step = _numbers(found), 1e-3
-    squares = np.zeros(3)
-    for point, (u, v) in enumerate(places(found)):
-        for place in ((u + step, v), (u, v + step)):
-            change = (_numbers(moved(found, point, place)) - base) / step
-            squares += (change * found.sigma_px[point]) ** 2
-    return np.asarray(np.sqrt(squares))
+def choices(found: PlaneCalibration | None) -> tuple[tuple[Model, str], ...]:
+    """The models that can be used, and how they are named; the better fit says so."""
+    if found is None or found.fits is None:
+        return (("three points", "Three points"),)
+    best = found.fits.best
+    named: list[tuple[Model, str]] = [("affine", "Affine")]
+    if found.fits.homography is not None:
+        named.append(("homography", "Homography"))
+    told = [(model, f"{words} (proposed)" if model == best else words) for model, words in named]
+    return (*told, ("three points", "Three points"))
+
+
+def with_model(found: PlaneCalibration, model: Model) -> PlaneCalibration:
+    """The same marks with another model."""
+    return replace(found, model=model)
+
+
+def why(found: PlaneCalibration | None) -> str:
+    """Why the model that is proposed is."""
+    if found is None or UNPLACED in found.sigma_px:
+        return ""
+    if found.fits is None:
+        return "Only the three points are used: tick marks were not found, or points were moved"
+    return f"{found.fits.reason}."
+
+
+@dataclass(frozen=True)
+class ResidualMap:
+    """Where the model has the marks, against where they are, enlarged.
+
+    Parameters
+    ----------
+    begin_px, end_px
+        Arrows from the marks towards where the model has them, shape (n, 2), px.
+    share
+        Length of each over the longest, shape (n,), 0 … 1.
+    words
+        How much they are enlarged, and the longest.
+    """
+
+    begin_px: FloatArray
+    end_px: FloatArray
+    share: FloatArray
+    words: str
+
+
+def residual_map(found: PlaneCalibration | None, height_px: int) -> ResidualMap | None:
+    """Residuals of the model as arrows, enlarged to be seen in a picture of such a height."""
+    if found is None or found.fits is None or found.model == "three points":
+        return None
+    residual = found.fits.of(found.model).residual_px
+    length = np.hypot(*residual.T)
+    longest = max(float(length.max()), 1e-9)
+    # 1, 2 or 5 times a power of ten: the longest becomes a tenth of the picture at most.
+    room = 0.1 * height_px / longest
+    power = 10.0 ** np.floor(np.log10(room))
+    times = max(step for step in (1, 2, 5) if step * power <= room) * power
+    begin = np.array(found.marks)[:, 2:4]
+    words = f"Arrows: residuals × {times:g}, the longest {longest:.2f} px"
+    return ResidualMap(begin, begin + times * residual, length / longest, words)
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:
@@ -166,11 +243,12 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     except (TypeError, ValueError, KeyError):
         pass  # it is not there, or not right: the set-up page says what
     else:
-        origin, along_x, along_z = calibration.to_image(np.array([[0.0, 0], [1, 0], [0, 1]]))
-        of_one_mm = PlaneCalibration(
-            _place(origin), _place(along_x), 1.0, _place(along_z), 1.0, (0.0, 0.0, 0.0), 0.0
-        )
-        values = _numbers(of_one_mm).tolist()
+        kept = session.plane_calibration
+        x_mm, z_mm = (kept.found.x_axis_mm, kept.found.z_axis_mm) if kept else (1.0, 1.0)
+        points = calibration.to_image(np.array([[0.0, 0.0], [x_mm, 0.0], [0.0, z_mm]]))
+        origin, on_x, on_z = (_place(point) for point in points)
+        shown = PlaneCalibration(origin, on_x, x_mm, on_z, z_mm, (0.0, 0.0, 0.0), 0.0)
+        values = [*shown.px_per_mm, shown.angle_deg]
     note = "From this session's calibration" if session.plane_calibration else "As entered"
     return tuple(
         ResultRow(name, value, None, unit, 3 if unit == "px/mm" else 2, note)

@@ -7,13 +7,14 @@ from pathlib import Path
 import pyqtgraph as pg
 from PySide6.QtWidgets import QFileDialog, QLabel, QPushButton
 
+from labapp.core.mark_fit import Model
 from labapp.core.plane_calibration import PlaneCalibration
 from labapp.gui.pages.laser.presenter import read_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
 from labapp.gui.tasks import Control
-from labapp.gui.views.fields import FieldForm, NumberField, ResultTable
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
 from labapp.gui.views.picture import DragPoint, PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -40,6 +41,7 @@ class PlanePage(Page):
         self._marks = pg.PlotDataItem(
             pen=None, symbol="+", symbolSize=11, symbolPen=pg.mkPen(COLOR, width=1.5)
         )
+        self._residuals: list[pg.PlotDataItem] = []
         self.points: list[DragPoint] = []
         self._make_panel()
 
@@ -112,7 +114,9 @@ class PlanePage(Page):
         if self.workspace.attempt(
             lambda session: presenter.use(session, found, unit, image, self._name)
         ):
-            self.workspace.said.emit("The imaging plane is in use; undo brings the former", False)
+            self.workspace.said.emit(
+                "The imaging plane is in use; undo brings the former back", False
+            )
 
     def leave(self) -> None:
         """Finish the edit under way."""
@@ -156,8 +160,24 @@ class PlanePage(Page):
         )
         help_text.setWordWrap(True)
         self.panel_layout.addWidget(help_text)
-        self.result = ResultTable("What follows from the three points")
+        self._make_results()
+        self.panel_layout.addStretch(1)
+
+    def _make_results(self) -> None:
+        self.result = ResultTable("What follows from the points and marks")
         self.panel_layout.addWidget(self.result)
+        model = FieldForm()
+        self.model = ChoiceField(
+            "Use",
+            presenter.choices(None),
+            tooltip="What takes pixels to the plane: a fit to the tick marks, or the three points",
+        )
+        self.model.edited.connect(self.choose_model)
+        model.add(self.model)
+        self.panel_layout.addWidget(model)
+        self.why = QLabel()
+        self.why.setWordWrap(True)
+        self.panel_layout.addWidget(self.why)
         self.words = QLabel()
         self.words.setWordWrap(True)
         self.panel_layout.addWidget(self.words)
@@ -173,7 +193,6 @@ class PlanePage(Page):
                 self._choose_target,
             )
         )
-        self.panel_layout.addStretch(1)
 
     def _button(self, words: str, tooltip: str, work: object) -> QPushButton:
         button = QPushButton(words)
@@ -246,9 +265,43 @@ class PlanePage(Page):
             self.found = presenter.moved(self.found, point, (u, v))
             self._follow()
 
+    def choose_model(self, model: Model) -> None:
+        """Use another model than is proposed."""
+        if self.found is not None:
+            self._place(presenter.with_model(self.found, model))
+
+    def _show_residuals(self) -> None:
+        """Draw the residual map anew."""
+        for item in self._residuals:
+            self.view.remove(item)
+        self._residuals = []
+        picture = self.view.picture
+        shown = None if picture is None else presenter.residual_map(self.found, picture.shape[0])
+        words = (presenter.why(self.found), "" if shown is None else shown.words)
+        self.why.setText("\n".join(filter(None, words)))
+        self.why.setVisible(any(words))
+        if shown is None:
+            return
+        colors = pg.colormap.get("viridis").map(0.3 + 0.7 * shown.share, mode="qcolor")
+        for begin, end, color in zip(shown.begin_px, shown.end_px, colors, strict=True):
+            u, v = zip(begin, end, strict=True)
+            # The dot is where the mark is: an arrow by shape as well as by colour.
+            item = pg.PlotDataItem(
+                u, v, pen=pg.mkPen(color, width=2.5), symbol="o", symbolBrush=color
+            )
+            item.setSymbolSize([5, 0])
+            item.setSymbolPen(None)
+            self.view.add(item)
+            self._residuals.append(item)
+
     def _follow(self) -> None:
         """Show what follows from the points."""
         result = presenter.result(self.found)
+        self.model.set_choices(presenter.choices(self.found))
+        self.model.setEnabled(self.found is not None and bool(self.found.marks))
+        if self.found is not None:
+            self.model.set_value(self.found.model)
+        self._show_residuals()
         self.result.set_rows(result.rows)
         self.result.setVisible(bool(result.rows))
         why_not = (result.why_not,) if result.why_not else ()
