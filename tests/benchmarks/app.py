@@ -178,9 +178,11 @@ def scrub(window: MainWindow, session: Session) -> None:
             run_until(shown_by(window))
             QApplication.processEvents()  # which draws what was updated
 
+        busy = time.process_time()
         with StallMeter() as meter:
             reached = rate(step)
-        beside = f"{reached / decoded:.2f} of decoding"
+        busy = (time.process_time() - busy) / (reached * SCRUB_S) * 1000
+        beside = f"{reached / decoded:.2f} of decoding; {busy:.0f} ms of processor each"
         told(f"scrubbing, {key}", f"{reached:.1f} /s", beside, "wanted ≥ 30 /s")
         tell_stalls(meter, 1)
     window.show_step("surface")
