@@ -42,5 +42,12 @@ def takes_keys(widget: QWidget, part: QWidget) -> bool:
     return stops and _holds(part, widget) and widget.isEnabled() and widget.isVisible()
 
 
+def finish_edit(*parts: QWidget) -> None:
+    """Take the keys from what has them in some parts: a field is finished when it is left."""
+    focus = QApplication.focusWidget()
+    if focus is not None and any(_holds(part, focus) for part in parts):
+        focus.clearFocus()
+
+
 def _holds(part: QWidget, widget: QWidget) -> bool:
     return part is widget or part.isAncestorOf(widget)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.gui.actions import ACTIONS
 from labapp.gui.files import Files
+from labapp.gui.focus import finish_edit
 from labapp.gui.help import HelpDialog
 from labapp.gui.menus import Menus
 from labapp.gui.messages import LogPanel, StatusLine
@@ -152,6 +152,7 @@ class MainWindow(QMainWindow):
 
     def _connect(self) -> None:
         space = self.workspace
+        space.closing.connect(self._leave)
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
         space.measured.connect(self._show_measured)
@@ -234,6 +235,7 @@ class MainWindow(QMainWindow):
 
     def _leave(self) -> None:
         if self.page is not None:
+            finish_edit(self.page, self.page.panel)
             self.workspace.tried(self.page.leave)
             self.page = None
 
@@ -413,7 +415,8 @@ class MainWindow(QMainWindow):
             (lambda held: self.restoreState(held, LAYOUT_VERSION), self.preferences.layout),
         )
         for restore, text in restored:
-            _restored(restore, text)
+            if text:
+                restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
         if self.preferences.layout:
             self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
 
@@ -457,9 +460,6 @@ class MainWindow(QMainWindow):
                 layout=_text(self.saveState(LAYOUT_VERSION)),
             )
         )
-        for page in self.pages.values():
-            self.workspace.tried(page.leave)
-        self.page = None
         self.workspace.opened.disconnect(self._session_opened)
         self.workspace.close()
         self._rest.stop()
@@ -490,11 +490,6 @@ def table_text(table: QTableView) -> str:
         if not table.isRowHidden(row):
             rows.append([model.index(row, n).data() for n in columns])
     return "\n".join("\t".join("" if v is None else str(v) for v in cells) for cells in rows)
-
-
-def _restored(restore: Callable[[QByteArray], bool], text: str) -> None:
-    if text:
-        restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
 
 
 def _text(held: QByteArray) -> str:

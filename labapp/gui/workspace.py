@@ -31,6 +31,8 @@ class Workspace(QObject):
 
     Signals
     -------
+    closing
+        The session that is open will be closed: what the hand is at can still be kept in it.
     opened
         Another session is open, or none.
     changed
@@ -43,6 +45,7 @@ class Workspace(QObject):
         Something for the operator to read: a sentence, and whether it is a problem.
     """
 
+    closing = Signal()
     opened = Signal()
     changed = Signal()
     measured = Signal()
@@ -65,6 +68,8 @@ class Workspace(QObject):
 
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""
+        if self.session is not None:
+            self.closing.emit()
         if self.tasks.active:
             self._stop_measuring()
         self._measuring.clear()

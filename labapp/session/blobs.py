@@ -153,6 +153,18 @@ def fingerprint(value: object) -> str:
     return hashlib.sha256(_canonical(value)).hexdigest()
 
 
+def fingerprint_of(blob: bytes) -> str:
+    """`fingerprint` of the value that was packed, as it was then: no field added since changes it.
+
+    Raises
+    ------
+    Damaged
+        If the bytes were changed.
+    """
+    unpack(blob)
+    return hashlib.sha256(_decompressed(blob[HEAD.size :])).hexdigest()
+
+
 def _canonical(value: object) -> bytes:
     arrays: dict[bytes, int] = {}
     tree = json.dumps(_tree(value, arrays), separators=(",", ":")).encode()

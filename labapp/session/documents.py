@@ -15,7 +15,7 @@ from typing import Any, Literal, Never
 
 from labapp.core.correction import Correction
 from labapp.core.pipeline import Settings
-from labapp.session.blobs import Damaged, fingerprint, pack, unpack, unpack_from
+from labapp.session.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
 from labapp.session.database import Database
 from labapp.session.kept import Kept
 from labapp.session.record import LaserReadings, PlanePicture, Record
@@ -231,7 +231,8 @@ class Documents:
         for (kind, frame), (sha256, content) in held.items():
             named = _named(kind, frame)
             try:
-                if fingerprint(unpack(content, CLASSES.get(kind, Never))) != sha256:
+                unpack(content, CLASSES.get(kind, Never))
+                if fingerprint_of(content) != sha256:
                     found.append(f"{named} is not what was written")
             except Damaged as error:
                 found.append(f"{named} is damaged: {error}")
@@ -281,7 +282,7 @@ def _put(connection: sqlite3.Connection, kind: str, frame: int, content: bytes |
     else:
         connection.execute(
             "INSERT OR REPLACE INTO document VALUES (?, ?, ?, ?)",
-            (kind, frame, fingerprint(unpack(content)), content),
+            (kind, frame, fingerprint_of(content), content),
         )
 
 

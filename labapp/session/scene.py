@@ -328,6 +328,7 @@ class Drawing:
                 scalars="values",
                 name="surface",
                 cmap="coolwarm" if scene.diverging else "viridis",
+                clim=scene.limits,  # the values may all be unknown
                 interpolate_before_map=True,
                 ambient=0.35,
                 diffuse=0.75,

@@ -254,10 +254,10 @@ class RandomHand:
         return found
 
     def _place(self, widget: QWidget) -> QPoint:
-        """Somewhere on a widget, in its window."""
-        rng = self._run.random
-        across, down = (max(1, size) for size in (widget.width(), widget.height()))
-        return widget.mapTo(widget.window(), QPoint(rng.randrange(across), rng.randrange(down)))
+        """Somewhere on what is seen of a widget, in its window."""
+        rng, seen = self._run.random, widget.visibleRegion().boundingRect()
+        across, down = (rng.randrange(max(1, size)) for size in (seen.width(), seen.height()))
+        return widget.mapTo(widget.window(), seen.topLeft() + QPoint(across, down))
 
     def _click(self) -> str:
         rng = self._run.random
@@ -338,11 +338,11 @@ class RandomHand:
             "nothing": lambda: None,
         }
         way = run.random.choices(list(ways), [6, 4, 3, 1, 1, 2])[0]
-        session, key = run.window.workspace.session, self._key_of(chosen)
+        page, session, key = run.page, run.window.workspace.session, self._key_of(chosen)
         told = f"{chosen.label.text()} ← {text[:40]!r}, {way}"
         ways[way]()
-        kept = session is not None and not session.read_only and key and way != "nothing"
-        if kept and good and session is not None:
+        finished = way not in ("nothing", "another step") or run.page != page
+        if key and good and finished and session is not None and not session.read_only:
             wanted = text if isinstance(chosen, TextField) else float(text)
             held = run.witness.value(session.path, key)
             if held != wanted:

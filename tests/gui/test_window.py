@@ -17,6 +17,7 @@ from pytestqt.qtbot import QtBot
 from labapp.errors import InputError
 from labapp.gui import app, dialogs
 from labapp.gui import window as window_module
+from labapp.gui.pages.dots.presenter import NUMBERS, detector_value
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.recent import look_at
@@ -589,3 +590,33 @@ def test_the_app_starts_opens_a_session_and_ends(
     assert app.main([str(path)]) == 0
     assert seen["title"] == "thumb_tack — labapp"
     assert "preferences file is damaged" in str(seen["problems"])
+
+
+@pytest.mark.parametrize("way", ["close", "another session", "quit"])
+def test_a_number_that_is_being_typed_is_kept_when_the_session_is_closed(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot, way: str
+):
+    path, other = copy_sample("thumb_tack"), copy_sample("blocked_rows")
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    for key, number in (("setup", "41.5"), ("dots", "5")):
+        assert window.files.open(path)
+        window.show_step(key)
+        if key == "setup":
+            field = window.pages[key].record_fields["voltage_v"]  # type: ignore[attr-defined]
+        else:
+            field = window.pages[key].dots_panel.numbers[0]  # type: ignore[attr-defined]
+        field.editor.setFocus()
+        qtbot.keyClick(field.editor, Qt.Key.Key_A, Qt.KeyboardModifier.ControlModifier)
+        qtbot.keyClicks(field.editor, number)
+        if way == "close":
+            window.menus.do("close")
+        elif way == "another session":
+            assert window.files.open(other)
+        else:
+            window.close()
+        with Session.open(path, read_only=True) as session:
+            held = session.record.voltage_v, detector_value(session.settings, NUMBERS[0])
+        assert held[key == "dots"] == float(number)
+        if way == "quit":
+            return

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import zlib
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from labapp.core.interpolation import CloughTocherSurface, ThinPlateSurface
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.spline import SplineBasis, SplineSurface
-from labapp.session.blobs import HEAD, MAGIC, Damaged, fingerprint, pack, unpack
+from labapp.session.blobs import HEAD, MAGIC, Damaged, fingerprint, fingerprint_of, pack, unpack
 
 plain = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -105,7 +106,11 @@ def test_what_an_earlier_version_did_not_know_gets_its_default():
     """A class's field that is not in the blob: as if an earlier labapp had written it."""
     tree = b'{"Settings":{"scheme":"ers"}}'
     body = zlib.compress(len(tree).to_bytes(4, "little") + tree)
-    assert unpack(HEAD.pack(MAGIC, zlib.crc32(body)) + body) == Settings(scheme="ers")
+    blob = HEAD.pack(MAGIC, zlib.crc32(body)) + body
+    assert unpack(blob) == Settings(scheme="ers")
+    written = hashlib.sha256(len(tree).to_bytes(4, "little") + tree).hexdigest()
+    assert fingerprint_of(blob) == written != fingerprint(unpack(blob))
+    assert fingerprint_of(pack(unpack(blob))) == fingerprint(unpack(blob))
 
 
 def test_what_only_a_later_version_knows_is_refused():
