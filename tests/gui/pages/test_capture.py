@@ -226,7 +226,7 @@ def test_a_missing_recording_is_found_again(copy_sample, tmp_path: Path, qtbot: 
     page.relink(moved)
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
     assert not page.find_button.isVisibleTo(page.panel)
-    assert page.verdict.text().startswith("● Good.")
+    qtbot.waitUntil(lambda: page.verdict.text().startswith("● Good."))
     workspace.close()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtWidgets import (
     QCheckBox,
     QFileDialog,
@@ -39,6 +39,9 @@ from labapp.gui.workspace import Workspace
 from labapp.session.record import Recording
 
 MOST_HZ = 1e7
+REST_MS = 120
+"""Exposure is judged where a frame stays in view so long: not while frames rush by."""
+
 NONE_YET = "Choose a video, an image, a folder of images or a stack, or drop it on the window."
 
 NO_CAMERA = (
@@ -61,6 +64,10 @@ class CapturePage(Page):
         self._wanted: tuple[Preview | None, int] | None = None
         self._seen: tuple[Preview | None, int] | None = None
         self._told: Recording | None = None
+        self._rest = QTimer(self)
+        self._rest.setSingleShot(True)
+        self._rest.setInterval(REST_MS)
+        self._rest.timeout.connect(self._judge)
         self._last_folder = Path()
         self.title = QLabel()
         self.title.setContentsMargins(8, 4, 8, 0)
@@ -94,6 +101,12 @@ class CapturePage(Page):
         self._show_import()
         self._look()
 
+    def leave(self) -> None:
+        """Judge no frame that nobody sees."""
+        if self._rest.isActive():
+            self._rest.stop()
+            self._seen = None
+
     def take(self, path: Path) -> None:
         """Look at a recording, to import it."""
         self.choose(path)
@@ -125,9 +138,11 @@ class CapturePage(Page):
     def _show_seen(self, seen: Seen) -> None:
         self.title.setText(seen.title)
         self.picture_view.show_picture(seen.image, seen.words)
-        self.exposure_group.setVisible(seen.exposure is not None)
         if seen.exposure is None:
-            return
+            if seen.image is None:
+                self.exposure_group.hide()
+            return  # else the verdict on the frame before stays until this one is judged
+        self.exposure_group.show()
         for bar, widget in zip(bars(seen.exposure), self.bars, strict=True):
             widget.setValue(round(100 * bar.part))
             widget.setFormat(bar.words)
@@ -152,7 +167,12 @@ class CapturePage(Page):
         if self._wanted != self._seen and self._reading not in self.workspace.tasks.active:
             self._read()
 
-    def _read(self) -> None:
+    def _judge(self) -> None:
+        """Judge the exposure of the frame that has stayed in view."""
+        if self._wanted == self._seen and self._reading not in self.workspace.tasks.active:
+            self._read(judged=True)
+
+    def _read(self, judged: bool = False) -> None:
         session, wanted = self.workspace.session, self._wanted
         if session is None or wanted is None:
             return
@@ -160,8 +180,8 @@ class CapturePage(Page):
 
         def work(_: Control) -> Seen:
             if preview is not None:
-                return preview.look(number, session.settings.dots)
-            return look(session, number)
+                return preview.look(number, session.settings.dots if judged else None)
+            return look(session, number, judged)
 
         def done(seen: Seen) -> None:
             if self.workspace.session is not session:
@@ -171,6 +191,8 @@ class CapturePage(Page):
                 self._show_seen(seen)
             if self._wanted not in (None, wanted):
                 self._read()
+            elif not judged and seen.image is not None:
+                self._rest.start()
 
         self._reading = self.workspace.tasks.start("Reading a frame", work, done)
 

@@ -28,7 +28,7 @@ class Seen:
     image
         Grey levels, shape (rows, columns); None where it cannot be read.
     exposure
-        How it is exposed; None where it cannot be read.
+        How it is exposed; None where it cannot be read, or was not judged yet.
     words
         Why it cannot be read; empty if it can.
     """
@@ -84,8 +84,8 @@ class Preview:
         self.description = self._source.description
         self.warnings = self._source.warnings
 
-    def look(self, number: int, settings: DotSettings) -> Seen:
-        """Read a frame and judge its exposure."""
+    def look(self, number: int, settings: DotSettings | None) -> Seen:
+        """Read a frame and judge its exposure, unless there are no settings to find dots by."""
         title = f"{self.path.name}, frame {number} (of 0 to {self.frames - 1}), not imported yet"
         with self._turn:
             try:
@@ -101,8 +101,8 @@ class Preview:
             self._source.close()
 
 
-def look(session: Session, number: int) -> Seen:
-    """Read a frame of the session and judge its exposure."""
+def look(session: Session, number: int, judged: bool = True) -> Seen:
+    """Read a frame of the session and, if wanted, judge its exposure."""
     recording = session.recording
     title = f"Frame {number} of the session"
     try:
@@ -114,10 +114,14 @@ def look(session: Session, number: int) -> Seen:
         )
         return Seen(title, None, None, words)
     depth = None if recording is None else recording.bit_depth
-    return Seen(title, image, _judged(image, session.settings.dots, depth))
+    return Seen(title, image, _judged(image, session.settings.dots if judged else None, depth))
 
 
-def _judged(image: GreyImage, settings: DotSettings, bit_depth: int | None) -> Exposure:
+def _judged(
+    image: GreyImage, settings: DotSettings | None, bit_depth: int | None
+) -> Exposure | None:
+    if settings is None:
+        return None
     try:
         dots = find_dots(image, settings)
     except CannotMeasure:
