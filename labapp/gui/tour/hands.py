@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,7 +17,6 @@ from PySide6.QtCore import (
     QPoint,
     QPointF,
     QRect,
-    QSize,
     Qt,
     QTimer,
 )
@@ -135,7 +135,8 @@ class Hands:
     def begin(self) -> None:
         """Make the window as large as the pictures."""
         ratio = self.window.devicePixelRatioF()
-        self.window.resize(*(round(side / ratio) for side in self.size_px))
+        # At 150 % a screen may end within a pixel of the layout: the rest is cut off.
+        self.window.resize(*(math.ceil(side / ratio) for side in self.size_px))
         self.wait(self.window.isVisible, "the window to be seen")
 
     def on(self, kind: type[P]) -> P:
@@ -284,16 +285,18 @@ class Hands:
         if bool(unread) != trouble:
             raise self.fail("; ".join(unread) or "a problem that should be told is not")
         image = self._seen()
-        if image.size() != QSize(*self.size_px):
-            wide, high = image.width(), image.height()
-            raise self.fail(f"the window is {wide}×{high} px large: more than there is room for")
+        wide, high = image.width(), image.height()
+        over = (wide - self.size_px[0], high - self.size_px[1])
+        if not all(0 <= px < self.window.devicePixelRatioF() for px in over):
+            raise self.fail(f"the window is {wide}×{high} px large, not as it was asked for")
+        image = image.copy(0, 0, *self.size_px)
         self.count += 1
         part = name if name.startswith("dialog-") else "-".join(filter(None, (self.page, name)))
         file = self.out / f"{self.count:02d}-{part}.png"
         if not image.save(str(file)):
             raise self.fail(f"{file} cannot be written")
-        over = [widget.windowTitle() for widget in _over(self.window)]
-        self.tell("  ".join(filter(None, (file.name, *over))))
+        titles = [widget.windowTitle() for widget in _over(self.window)]
+        self.tell("  ".join(filter(None, (file.name, *titles))))
 
     def _seen(self) -> QImage:
         image = self.window.grab().toImage().convertToFormat(QImage.Format.Format_RGB32)
