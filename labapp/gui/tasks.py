@@ -206,7 +206,11 @@ def _run(work: Work, control: Control) -> None:
     except Cancelled:
         control.events.put(("cancelled", None))
     except Exception as error:
-        control.events.put(("failed", in_words(error)))
+        if control.cancelled.is_set():  # what it worked on may have been closed under it
+            logging.getLogger(NAME).info("after a cancel", exc_info=error)
+            control.events.put(("cancelled", None))
+        else:
+            control.events.put(("failed", in_words(error)))
 
 
 def in_words(error: Exception) -> str:

@@ -102,3 +102,19 @@ def test_a_problem_stays_until_it_was_read(qtbot: QtBot):
     assert line.message.text() == ""
     line.say("One frame measured", False)
     assert line.message.text() == "One frame measured"
+
+
+def test_an_error_after_a_cancel_is_told_to_nobody(qapp: object, qtbot: QtBot):
+    tasks, told, begun = Tasks(), [], threading.Event()
+    tasks.failed.connect(lambda *words: told.append(words))
+
+    def work(control: Control) -> None:
+        begun.set()
+        control.cancelled.wait()
+        raise RuntimeError("the session is closed")
+
+    task = tasks.start("Reading", work)
+    begun.wait()
+    task.cancel()
+    qtbot.waitUntil(lambda: not tasks.active)
+    assert told == []
