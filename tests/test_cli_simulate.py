@@ -161,6 +161,33 @@ def test_a_pool_wanders_by_what_was_asked_for_however_many_frames_there_are(tmp_
     assert few == many[:4]
 
 
+@pytest.mark.parametrize("kind", ["cap", "concave"])
+def test_what_is_simulated_can_be_measured_and_every_label_is_right(
+    tmp_path: Path, labapp: Run, kind: str
+) -> None:
+    out, results = tmp_path / "out", tmp_path / "results"
+    assert labapp("simulate", EXAMPLES / f"{kind}.toml", "--out", out, "--frames", 1)[0] == 0
+    setup = out / "setup.toml"
+    code, _, _ = labapp(
+        "reconstruct", out / "recording.avi", "--setup", setup, "--out", results, "--surfaces",
+        "none",
+    )  # fmt: skip
+    assert code == 0
+    truth = {
+        (row["ray_row"], row["ray_column"]): np.array([float(row["u_px"]), float(row["v_px"])])
+        for row in rows(out / "dots_truth.csv")
+        if row["visible"] == "1"
+    }
+    labelled = [row for row in rows(results / "dots.csv") if row["ray_row"]]
+    assert len(labelled) > 0.9 * len(truth) > 50
+    for row in labelled:
+        apart = truth[row["ray_row"], row["ray_column"]] - [float(row["u_px"]), float(row["v_px"])]
+        assert np.hypot(*apart) < 1.5
+    size, measured = rows(out / "truth.csv")[0], rows(results / "measures.csv")[0]
+    which = "depth_mm" if kind == "concave" else "height_mm"
+    assert float(measured[which]) == pytest.approx(float(size[which]), rel=0.1)
+
+
 # --- what a scenario says -----------------------------------------------------------------------
 
 
@@ -210,7 +237,7 @@ offset_mm = [0.5, 0.4] }]
     assert recording.view.height_px == 640
     assert recording.view.lens.k1 == -0.1
     assert recording.look.hot_pixels == 2
-    assert recording.exposure_s == 0.002
+    assert recording.exposure_s == 0.0005
 
 
 def test_a_surface_is_looked_for_beside_the_scenario(tmp_path: Path, labapp: Run) -> None:
