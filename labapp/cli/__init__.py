@@ -20,7 +20,7 @@ import typer.core
 import typer.main
 
 import labapp
-from labapp.cli import session, simulate
+from labapp.cli import analyze, session, simulate
 from labapp.cli.shared import (
     BAD_INPUT,
     FAULT,
@@ -60,6 +60,7 @@ app = typer.Typer(
 )
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate the laser or the imaging plane.")
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
 app.command()(simulate.simulate)
 app.command()(tour)

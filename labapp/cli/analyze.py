@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
     from labapp.simulation.setup_budget import Bench
     from labapp.simulation.tables import Table
 
-Part = Literal["CE", "LE", "ME", "measurement", "images", "parameters"]
+PARTS = ("CE", "LE", "ME", "measurement", "images", "parameters")
 """What `labapp analyze errors` can work out."""
+
+SCHEMES = ("irs", "ers", "fit")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -81,15 +83,15 @@ def errors(
         Path, typer.Option(help="Folder for tables and pictures; files in it are replaced.")
     ],
     part: Annotated[
-        list[Part] | None,
+        list[str] | None,
         typer.Option(
-            help="What to work out; repeat for more. CE, LE, ME: configuration, system limitation "
-            "and methodology error. Default: all."
+            help=f"{', '.join(PARTS)}: what to work out; repeat for more. CE, LE, ME are "
+            "configuration, system limitation and methodology error. Default: all."
         ),
     ] = None,
     scheme: Annotated[
-        list[Literal["irs", "ers", "fit"]] | None,
-        typer.Option(help="A scheme; repeat for more. Default: all three."),
+        list[str] | None,
+        typer.Option(help=f"{', '.join(SCHEMES)}; repeat for more. Default: all three."),
     ] = None,
     step: Annotated[
         float,
@@ -107,10 +109,8 @@ def errors(
 
     What is done is written before the next part begins. All of it takes long: see --part.
     """
-    from labapp.simulation.error_analysis import SCHEMES
-
-    asked = part or get_args(Part)
-    schemes = tuple(one for one in SCHEMES if one in (scheme or SCHEMES))
+    asked = _chosen("part", part, PARTS)
+    schemes = cast("tuple[Scheme, ...]", _chosen("scheme", scheme, SCHEMES))
     folder = _begin(out)
     assert folder is not None
     with _progress() as progress:
@@ -149,9 +149,17 @@ def budget(
         _give(folder, [budget_table(setup_budget(bench, pool, progress))], True)
 
 
+def _chosen(name: str, asked: list[str] | None, known: tuple[str, ...]) -> tuple[str, ...]:
+    """What was asked for, in the usual order; all of it if nothing was."""
+    for one in asked or ():
+        if one not in known:
+            raise InputError(f"--{name}", name, one, f"one of {', '.join(known)}")
+    return tuple(one for one in known if one in (asked or known))
+
+
 def _surveys(
     folder: Path,
-    kinds: list[str],
+    kinds: Sequence[str],
     schemes: tuple[Scheme, ...],
     step: float,
     progress: Progress,

@@ -1,0 +1,151 @@
+"""`labapp analyze`: what it writes and prints, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import cv2
+import pytest
+
+from labapp.simulation import error_analysis
+from tests.conftest import Run
+
+DATA = Path(__file__).parent / "data"
+SETUP = Path(__file__).parents[1] / "sample_sessions" / "gtaw" / "setup.toml"
+
+pytestmark = pytest.mark.usefixtures("state")
+
+
+@pytest.fixture
+def few_caps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of the 28 caps, done here."""
+    caps = error_analysis.caps_8_3_1()[2::14]
+    monkeypatch.setattr(error_analysis, "caps_8_3_1", lambda: caps)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("kind", ["positioning", "correspondence"])
+def test_tables_alone_are_printed_and_nothing_is_written(
+    labapp: Run, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    code, out, err = labapp("analyze", kind, "--tables")
+    assert (code, err) == (0, "")
+    assert {"positioning": "| 20 ", "correspondence": "I/I*"}[kind] in out
+    assert list((tmp_path / "here").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "tables", "pictures"), [("positioning", 4, 2), ("correspondence", 2, 3)]
+)
+def test_tables_and_pictures_are_written(
+    labapp: Run, kind: str, tables: int, pictures: int, tmp_path: Path
+) -> None:
+    folder = tmp_path / "new" / "folder"
+    code, out, _ = labapp("analyze", kind, "--out", str(folder))
+    assert (code, out) == (0, "")
+    assert len(list(folder.glob("*.csv"))) == len(list(folder.glob("*.md"))) == tables
+    drawn = sorted(folder.glob("*.png"))
+    assert len(drawn) == pictures
+    for picture in drawn:
+        assert cv2.imread(str(picture)).std() > 5
+    for name in DATA.glob("table_4_*.csv"):
+        made = folder / name.name
+        assert not made.exists() or made.read_bytes() == name.read_bytes()
+    former = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert labapp("analyze", kind, "--out", str(folder))[0] == 0
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == former
+
+
+def test_pictures_can_be_drawings(labapp: Run, tmp_path: Path) -> None:
+    assert labapp("analyze", "correspondence", "--out", str(tmp_path), "--format", "svg")[0] == 0
+    assert (tmp_path / "figure_4_20_convex.svg").read_text("utf-8").startswith("<?xml")
+    assert not list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.usefixtures("few_caps")
+def test_errors_are_written_part_by_part(labapp: Run, tmp_path: Path) -> None:
+    arguments = ("--part", "LE", "--part", "CE", "--scheme", "ers", "--step", "10")
+    code, out, err = labapp("analyze", "errors", "--out", str(tmp_path), *arguments)
+    assert (code, err) == (0, "")
+    rows = table(tmp_path / "errors.csv")
+    assert [row["error"] for row in rows[::3]] == ["CE-D", "CE-B", "LE-D", "LE-B"]
+    assert float(rows[6]["ers_mean_pct"]) <= float(rows[6]["ers_worst_pct"])
+    assert rows[2]["text_worst_pct"] == "26.9"
+    assert "CE-D" in out
+    caps = table(tmp_path / "errors_by_cap.csv")
+    assert [row["height_mm"] for row in caps] == ["0.3", "-0.3"] * 2
+    assert sorted(path.stem for path in tmp_path.glob("*.png")) == [
+        "figure_8_6_CE",
+        "figure_8_7_CE_are",
+        "figure_8_8_LE",
+        "figure_8_9_LE_are",
+    ]
+
+
+@pytest.mark.usefixtures("few_caps")
+def test_other_parts_have_their_tables(labapp: Run, tmp_path: Path) -> None:
+    arguments = ("--part", "measurement", "--part", "parameters", "--scheme", "ers")
+    arguments += ("--frames", "1", "--draws", "10")
+    assert labapp("analyze", "errors", "--out", str(tmp_path), *arguments)[0] == 0
+    tack = table(tmp_path / "measurement_error.csv")
+    assert [row["text"] for row in tack] == ["9.12", "1.4903", "0.18815"]
+    assert float(tack[0]["frames_mean"]) < 10
+    moved = table(tmp_path / "parameter_deviation.csv")
+    assert [row["surface"] for row in moved] == ["convex"] * 10 + ["concave"] * 10
+    assert moved[0]["quantity"] == "laser, projection angle"
+    assert float(moved[9]["height_pct"]) > 0
+    assert (tmp_path / "figure_8_2_thumb_tack.png").exists()
+    assert (tmp_path / "parameter_deviation_concave.png").exists()
+
+
+@pytest.mark.usefixtures("few_caps")
+def test_the_budget_of_a_setup_file(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labapp.simulation.setup_budget.POOLS", 2)
+    monkeypatch.setattr("labapp.simulation.setup_budget.MOVED_POOLS", 1)
+    arguments = ("--setup", str(SETUP), "--width", "6.5", "--length", "7.5", "--height", "0.3")
+    code, out, _ = labapp("analyze", "budget", *arguments, "--out", str(tmp_path))
+    assert code == 0
+    rows = {row["source"]: row for row in table(tmp_path / "error_budget.csv")}
+    assert "which rays come back" in out
+    assert float(rows["laser, distance"]["simulated_pct"]) > 0
+    everything, random = rows["everything"], rows["these together"]
+    assert float(everything["predicted_pct"]) > float(random["predicted_pct"]) > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("positioning",), "--out: folder: none; expected one for tables and pictures, or"),
+        (("errors", "--out", "{}", "--part", "XE"), "--part: part: XE; expected one of CE, LE"),
+        (("errors", "--out", "{}", "--scheme", "EPA"), "--scheme: scheme: EPA; expected one of"),
+        (("errors", "--out", "{}", "--step", "0"), "--step"),
+        (("errors", "--out", "{}/file"), "expected a folder that can be written"),
+        (("budget", "--height", "0"), "--height: height: 0.0; expected 0.01 to 30 mm"),
+        (("budget", "--height", "nan"), "--height: height: nan; expected 0.01 to 30 mm"),
+        (("budget", "--height", "4"), "expected a pool that can be"),
+        (("budget", "--width", "-3"), "--width: width: -3.0; expected 1 to 30 mm"),
+        (("budget", "--setup", "{}/none.toml"), "none.toml"),
+        (("positioning", "--out", "{}", "--format", "gif"), "--format"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    labapp: Run, arguments: tuple[str, ...], told: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "here"
+    folder.mkdir()
+    (folder / "file").write_text("mine")
+    code, out, err = labapp("analyze", *(one.format(folder) for one in arguments))
+    assert (code, out) == (2, "")
+    assert told in " ".join(err.split())
+    assert (folder / "file").read_text() == "mine"
+    assert [path.name for path in folder.iterdir()] == ["file"]
