@@ -167,10 +167,10 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
     """A plot for each error and each kind of surface; full lines D = B/20, dashed D = B/10."""
     size = np.array([(cap.footprint.width_mm, cap.peak_mm) for cap in survey.caps])
     with rc_context(STYLE):
-        figure = _figure(INCHES, 4.2)
+        figure = _figure(INCHES, 4.5)
         plots = figure.subplots(2, 2, sharex=True, sharey="row")
         for line, (error, label, scale) in zip(plots, rows, strict=True):
-            for plot, surface, sign in zip(line, ("convex", "concave"), (1, -1), strict=True):
+            for plot, sign in zip(line, (1, -1), strict=True):
                 for scheme in survey.schemes:
                     for ratio, style in ((20, "-"), (10, "--")):
                         chosen = np.isclose(size[:, 1] * sign * ratio, size[:, 0])
@@ -184,14 +184,14 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
                             label=f"{scheme}, D = B/{ratio}",
                         )
                 plot.grid(alpha=0.25, lw=0.4)
-                if line is plots[0]:
-                    plot.set_title(surface, fontsize=8)
             line[0].set_ylabel(label)
             _capped(line[0], survey, error, scale)
+        for plot, surface in zip(plots[0], ("convex", "concave"), strict=True):
+            plot.set_title(surface, fontsize=8)
         for plot in plots[1]:
             plot.set_xlabel("diameter B (mm)")
         handles, names = plots[0, 0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=len(survey.schemes) * 2)
+        figure.legend(handles, names, loc="outside lower center", ncols=len(survey.schemes))
         return figure
 
 
