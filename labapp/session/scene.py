@@ -242,6 +242,7 @@ class Drawing:
         self._box = np.zeros((2, 3))
         self._stretch = np.ones(3)
         self._axes_actor: Any = None
+        self._bar: Any = None
         self._parts: dict[str, tuple[Any, Any]] = {}
         self._made_for: dict[str, object] = {}
 
@@ -320,7 +321,8 @@ class Drawing:
         mesh.point_data.active_normals = _normals(np.asarray(mesh.points), scene.triangles)
         mesh.set_active_scalars("values")
         title = scene.label.replace(" (", "\n(")  # narrow, to stay within the picture
-        if self._is_new("surface", (scene.label, scene.diverging)):
+        made_for = (scene.label, scene.diverging)
+        if self._made_for.get("surface") != made_for:
             for former in list(self.plotter.scalar_bars.keys()):
                 self.plotter.remove_scalar_bar(former, render=False)
             actor = self.plotter.add_mesh(
@@ -352,12 +354,14 @@ class Drawing:
             actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
             actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(2.0, 2.0)
             self._parts["surface"] = (mesh, actor)
+            self._bar = self.plotter.scalar_bars[title]
+            self._made_for["surface"] = made_for  # only now: what failed is made another time
         held, actor = self._parts["surface"]
         if held is not mesh:
             held.ShallowCopy(mesh)
         actor.mapper.lookup_table.scalar_range = scene.limits
         actor.mapper.scalar_range = scene.limits
-        self.plotter.scalar_bars[title].SetLabelFormat(_label_format(scene.limits))
+        self._bar.SetLabelFormat(_label_format(scene.limits))
 
     def _axes(self, scene: Scene) -> None:
         box, steps = _box(scene)
