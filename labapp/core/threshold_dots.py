@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-import pywt
 
 from labapp.core.dots import Dots
 from labapp.core.values import BoolArray, FloatArray
@@ -158,6 +157,8 @@ def wavelet_dots(frame: Frame, settings: WaveletSettings | None = None) -> Dots:
 
 def _enhance(grey: FloatArray, noise: float, settings: WaveletSettings) -> FloatArray:
     """Damp the coarsest approximation and shrink the details by the noise, shape as given."""
+    import pywt  # not needed by the usual chain
+
     levels = min(settings.levels, pywt.dwtn_max_level(grey.shape, settings.wavelet))
     if levels < 1:
         return grey

@@ -38,7 +38,14 @@ WITHOUT = "labapp --help tells what can be done on the command line"
 BAD_INPUT = 2
 
 LOAD_AFTER_MS = 300
-"""The window is there first; then what it will need for 3-D is loaded behind it."""
+"""The window is there first; then what it will need is loaded behind it."""
+
+NEEDED_LATER = (
+    "labapp.session.session",
+    *(f"labapp.gui.pages.{key}" for key in ("surface", "dots", "trends", "capture", "setup")),
+    "pyvistaqt",
+)
+"""Sessions, the pages and what draws in 3-D: one or two seconds."""
 
 HEARTBEAT_MS = 300
 """So often Python gets a turn to notice Ctrl-C in the terminal."""
@@ -105,7 +112,7 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     heartbeat.start(HEARTBEAT_MS)
     former = signal.signal(signal.SIGINT, lambda *_: window.close())
     window.show()
-    loading = threading.Thread(target=_load_what_draws_in_3d, name="loading", daemon=True)
+    loading = threading.Thread(target=_load_what_is_needed, name="loading", daemon=True)
     load = QTimer(window)
     load.setSingleShot(True)
     load.timeout.connect(loading.start)
@@ -121,10 +128,11 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
         faults.uninstall()
 
 
-def _load_what_draws_in_3d() -> None:
-    """Load it while the operator looks at the first page: it takes a second or two."""
-    with contextlib.suppress(ImportError):
-        importlib.import_module("pyvistaqt")
+def _load_what_is_needed() -> None:
+    """Load it while the operator looks at the first page."""
+    with contextlib.suppress(ImportError):  # there may be nothing to draw with in 3-D
+        for name in NEEDED_LATER:
+            importlib.import_module(name)
 
 
 def start_app() -> QApplication:

@@ -6,16 +6,20 @@ from pathlib import Path
 
 from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
 
-from labapp.media import RECORDING_SUFFIXES
-from labapp.media.images import IMAGE_SUFFIXES
-from labapp.media.tiff import TIFF_SUFFIXES
 from labapp.session.database import SUFFIX
 
 SESSIONS = f"Sessions (*{SUFFIX})"
-RECORDINGS = "Recordings ({})".format(
-    " ".join(f"*{suffix}" for suffix in sorted(RECORDING_SUFFIXES | IMAGE_SUFFIXES | TIFF_SUFFIXES))
-)
 EVERYTHING = "All files (*)"
+
+
+def recordings() -> str:
+    """The filter of a file dialog for everything that can be imported."""
+    from labapp.media import RECORDING_SUFFIXES
+    from labapp.media.images import IMAGE_SUFFIXES
+    from labapp.media.tiff import TIFF_SUFFIXES
+
+    suffixes = sorted(RECORDING_SUFFIXES | IMAGE_SUFFIXES | TIFF_SUFFIXES)
+    return f"Recordings ({' '.join(f'*{suffix}' for suffix in suffixes)})"
 
 
 def ask_session(parent: QWidget, folder: Path) -> Path | None:
@@ -39,7 +43,7 @@ def ask_new_session(parent: QWidget, proposed: Path, title: str = "New session")
 def ask_recording(parent: QWidget, folder: Path) -> Path | None:
     """Ask which recording to import."""
     name, _ = QFileDialog.getOpenFileName(
-        parent, "Import a recording", str(folder), f"{RECORDINGS};;{EVERYTHING}"
+        parent, "Import a recording", str(folder), f"{recordings()};;{EVERYTHING}"
     )
     return Path(name) if name else None
 

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from labapp.gui import dialogs
-from labapp.session.copies import copy_sample, copy_session
 from labapp.session.database import SUFFIX, SessionInUse
-from labapp.session.session import Session
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
+    from labapp.session.session import Session
 
 
 class Files:
@@ -81,6 +80,8 @@ class Files:
         proposed = dialogs.new_path(session.path.parent, f"{session.path.stem} copy")
         path = dialogs.ask_new_session(self._window, proposed, "Save a copy")
         if path is not None:
+            from labapp.session.copies import copy_session
+
             source = session.path
             self._window.workspace.tasks.start(
                 "Saving a copy",
@@ -90,6 +91,8 @@ class Files:
 
     def try_sample(self) -> None:
         """Open a copy of the sample run, in a folder of the user's."""
+        from labapp.session.copies import copy_sample
+
         folder = self._window.preferences.samples_folder / "gtaw"
         path = self._window.workspace.tried(lambda: copy_sample("gtaw", folder))
         if path is not None and self.open(path):
@@ -107,6 +110,8 @@ class Files:
         self.list_recent()
 
     def _create(self, proposed: Path) -> bool:
+        from labapp.session.session import Session
+
         path = dialogs.ask_new_session(self._window, proposed)
         session = (
             None if path is None else self._window.workspace.tried(lambda: Session.create(path))
@@ -117,6 +122,8 @@ class Files:
         return True
 
     def _opened(self, path: Path) -> Session | None:
+        from labapp.session.session import Session
+
         try:
             return Session.open(path)
         except SessionInUse:

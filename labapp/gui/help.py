@@ -7,7 +7,6 @@ from html import escape
 
 import numpy
 import PySide6
-import scipy
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QKeySequence
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
@@ -70,6 +69,8 @@ def keys() -> str:
 
 def about() -> str:
     """What the program is; HTML."""
+    import scipy
+
     built_on = (
         f"Python {sys.version.split()[0]}, numpy {numpy.__version__}, scipy {scipy.__version__}, "
         f"Qt for Python {PySide6.__version__}"

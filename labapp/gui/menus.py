@@ -10,10 +10,10 @@ from PySide6.QtGui import QAction, QActionGroup, QKeyEvent, QKeySequence
 from PySide6.QtWidgets import QMenu
 
 from labapp.gui.actions import ACTIONS, MENUS, Action
-from labapp.session.session import Session
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
+    from labapp.session.session import Session
 
 
 class Menus:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import datetime
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from labapp.errors import InputError
-from labapp.media import GreyImage
-from labapp.session.session import Session
+
+if TYPE_CHECKING:
+    from labapp.media import GreyImage
+    from labapp.session.session import Session
 
 THUMBNAIL_PX = (128, 96)
 
@@ -43,6 +45,8 @@ class Recent:
 
 def look_at(path: Path) -> Recent:
     """Look into a session file without changing anything."""
+    from labapp.session.session import Session
+
     try:
         changed = datetime.datetime.fromtimestamp(path.stat().st_mtime)
         with Session.open(path, read_only=True) as session:
@@ -65,6 +69,8 @@ def _counted(frames: int, measured: int) -> str:
 
 
 def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:
+    import cv2
+
     if not len(frames):
         return None
     try:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from labapp.core.values import BoolArray, IntArray
-from labapp.session.measured import Overview
-from labapp.session.trends import doubtful_frames
+
+if TYPE_CHECKING:
+    from labapp.session.measured import Overview
 
 
 class Standing(IntEnum):
@@ -40,6 +42,8 @@ DOUBTFUL = (Standing.DOUBTFUL, Standing.NOT_MEASURABLE)
 
 def standings(seen: Overview) -> IntArray:
     """How every frame stands, values of `Standing`, shape (n,)."""
+    from labapp.session.trends import doubtful_frames
+
     status = np.array(seen.status, dtype=object)
     measured, fine = status != "", status == "ok"
     found = np.where(measured, Standing.MEASURED, Standing.NOT_MEASURED)

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from labapp.errors import InputError
-from labapp.session.measured import Overview
-from labapp.session.session import Session
+
+if TYPE_CHECKING:
+    from labapp.session.measured import Overview
+    from labapp.session.session import Session
 
 
 class Mark(Enum):

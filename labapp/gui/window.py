@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QByteArray, QSize, Qt, QTimer, QUrl
@@ -43,7 +44,9 @@ from labapp.gui.theme import apply_theme
 from labapp.gui.views.timeline import Tick, Timeline
 from labapp.gui.workspace import Workspace
 from labapp.session.log import log_file
-from labapp.session.session import Session
+
+if TYPE_CHECKING:
+    from labapp.session.session import Session
 
 REST = 4
 """After showing a change the window rests so many times as long as that took, for the hands."""
@@ -101,8 +104,7 @@ class MainWindow(QMainWindow):
         self.files = Files(self)
         self.standings: IntArray = np.zeros(0, np.int64)
         self.page: Page | None = None
-        self._kinds = {kind.key: kind for kind in PAGES}
-        self._steps = tuple(step for step in STEPS if step.key in self._kinds)
+        self._steps = tuple(step for step in STEPS if step.key in PAGES)
         self.pages: dict[str, Page] = {}
         self._states = states(None)
         self._changes_due = False
@@ -187,10 +189,10 @@ class MainWindow(QMainWindow):
 
     def show_step(self, key: str) -> None:
         """Bring a step's page into view; it is made when it is first shown."""
-        if self.workspace.session is None or key not in self._kinds:
+        if self.workspace.session is None or key not in PAGES:
             return
         if key not in self.pages:
-            made = self.workspace.tried(lambda: self._kinds[key](self.workspace))
+            made = self.workspace.tried(lambda: PAGES[key](self.workspace))
             if made is None:
                 return
             self.pages[key] = made

@@ -8,14 +8,15 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui.tasks import Control, Task, Tasks, in_words
-from labapp.session.measured import Overview
-from labapp.session.run import measuring_pool
-from labapp.session.session import Session
+
+if TYPE_CHECKING:
+    from labapp.session.measured import Overview
+    from labapp.session.session import Session
 
 T = TypeVar("T")
 
@@ -84,6 +85,8 @@ class Workspace(QObject):
 
     def open(self, path: Path, read_only: bool = False) -> bool:
         """Open a session file; False if it was refused, which is said."""
+        from labapp.session.session import Session
+
         session = self.tried(lambda: Session.open(path, read_only))
         if session is not None:
             self.show(session)
@@ -91,6 +94,8 @@ class Workspace(QObject):
 
     def create(self, path: Path) -> bool:
         """Make a new session file and open it; False if it was refused, which is said."""
+        from labapp.session.session import Session
+
         session = self.tried(lambda: Session.create(path))
         if session is not None:
             self.show(session)
@@ -182,6 +187,8 @@ class Workspace(QObject):
         if session is None:
             return None
         if self._pool is None:
+            from labapp.session.run import measuring_pool
+
             self._pool = measuring_pool(max(1, (os.cpu_count() or 2) - 1))
         pool = self._pool
 

@@ -8,12 +8,11 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import tifffile
 
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
@@ -28,6 +27,9 @@ from labapp.media.stored import (
     read_bytes,
     unpack_bits,
 )
+
+if TYPE_CHECKING:
+    import tifffile
 
 TIFF_MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
@@ -69,6 +71,8 @@ class TiffStack(StoredFrames):
     def __init__(self, path: Path) -> None:
         self._path = path
         self._size = file_size(path)
+        import tifffile  # not needed by the usual recordings
+
         self._tiff = _guarded(path, lambda: tifffile.TiffFile(path, is_ome=False))
         try:
             _guarded(path, self._start)

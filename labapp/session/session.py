@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from labapp.media import Frame, GreyImage, open_source
 from labapp.session.blobs import fingerprint
 from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Change, Documents, KeptSignals, Key
-from labapp.session.export import ExportChoice, ExportedFile
 from labapp.session.frames import THE_RECORDING, Frames, Progress
 from labapp.session.kept_pictures import KeptPictures
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
@@ -38,6 +37,9 @@ from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.run import measure_each
 from labapp.session.setup import Setup, parse_setup, updated_setup
 from labapp.session.signals import Signals
+
+if TYPE_CHECKING:
+    from labapp.session.export import ExportChoice, ExportedFile
 
 
 class Session:
@@ -444,11 +446,11 @@ class Session:
         InputError
             If a result no longer stands, nothing was measured, or the folder cannot be written.
         """
+        from labapp.session.export import ExportChoice
         from labapp.session.outgoing import export_session  # which reports on a `Session`
 
-        return export_session(
-            self, folder, choice or ExportChoice(), frames, scheme, report, progress
-        )
+        what = choice or ExportChoice()
+        return export_session(self, folder, what, frames, scheme, report, progress)
 
     @property
     def measured_by(self) -> dict[tuple[str, str], int]:

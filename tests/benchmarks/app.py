@@ -33,6 +33,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication, QLabel, QMainWindow
 from stall_meter import StallMeter, run_for, run_until
 
+from labapp.gui.pages import PAGES
 from labapp.gui.preferences import Preferences
 from labapp.gui.window import MainWindow
 from labapp.session.session import Session
@@ -294,12 +295,12 @@ def measure(window: MainWindow, session: Session) -> None:
     """Measure on every page, while frames are stepped through; cancel, and go on to the end."""
     space = window.workspace
     dark = session.frames[BRIGHT:].tolist()
-    for key in window._kinds:
+    for key in PAGES:
         window.show_step(key)
         run_for(1.0)
     space.measure(dark[:200])  # the processes are there, and what is made once
     run_until(lambda: not space.tasks.active, 120)
-    keys = list(window._kinds)
+    keys = list(PAGES)
     share = len(dark) // len(keys)
     worst = StallMeter()
     began = time.perf_counter()

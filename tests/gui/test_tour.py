@@ -82,7 +82,7 @@ def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
 
 
 @pytest.mark.xvfb
-@pytest.mark.parametrize("key", ["welcome", *(page.key for page in PAGES)])
+@pytest.mark.parametrize("key", ["welcome", *PAGES])
 def test_every_page_has_a_picture(taken: tuple[Path, str, Path], key: str):
     assert named(taken, key) + named(taken, f"{key}-*")
 

@@ -76,7 +76,8 @@ def plain(
     qapp: QApplication, tmp_path: Path, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[MainWindow]:
     """A window with pages of the tests' own."""
-    monkeypatch.setattr(window_module, "PAGES", (SetUp, Capture, Surface, Broken))
+    kinds = (SetUp, Capture, Surface, Broken)
+    monkeypatch.setattr(window_module, "PAGES", {kind.key: kind for kind in kinds})
     made = MainWindow(Preferences(theme="light"), tmp_path / "preferences.json")
     KEPT.append(made)
     made.show()

@@ -10,8 +10,8 @@ import pytest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from labapp.gui import workspace as module
 from labapp.gui.workspace import Workspace
+from labapp.session import run
 from labapp.session.log import NAME
 from tests.gui.conftest import CopySample
 from tests.gui.watching import Noting
@@ -40,7 +40,7 @@ def test_measuring_that_is_left_for_another_session_is_no_fault(
 ) -> None:  # fmt: skip
     faults: list[str] = []
     stuck, noting, log = Stuck(), Noting(faults), logging.getLogger(NAME)
-    monkeypatch.setattr(module, "measuring_pool", lambda _: stuck)
+    monkeypatch.setattr(run, "measuring_pool", lambda _: stuck)
     log.addHandler(noting)
     space = Workspace()
     said: list[str] = []

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
-from labapp.gui.pages.capture import CapturePage
-from labapp.gui.pages.dots import DotsPage
-from labapp.gui.pages.export import ExportPage
-from labapp.gui.pages.laser import LaserPage
-from labapp.gui.pages.page import Page
-from labapp.gui.pages.plane import PlanePage
-from labapp.gui.pages.setup import SetupPage
-from labapp.gui.pages.surface import SurfacePage
-from labapp.gui.pages.trends import TrendsPage
+import importlib
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
-PAGES: tuple[type[Page], ...] = (
-    SetupPage,
-    LaserPage,
-    PlanePage,
-    CapturePage,
-    DotsPage,
-    SurfacePage,
-    TrendsPage,
-    ExportPage,
-)
-"""In the order of `steps.STEPS`; a step without a page is not shown."""
+if TYPE_CHECKING:
+    from labapp.gui.pages.page import Page
+    from labapp.gui.workspace import Workspace
+
+
+def _maker(key: str, name: str) -> Callable[[Workspace], Page]:
+    """What makes a step's page; its module is loaded with the first: the window is there before."""
+
+    def make(workspace: Workspace) -> Page:
+        page: Page = getattr(importlib.import_module(f"{__name__}.{key}"), name)(workspace)
+        return page
+
+    return make
+
+
+PAGES: Mapping[str, Callable[[Workspace], Page]] = {
+    key: _maker(key, name)
+    for key, name in (
+        ("setup", "SetupPage"),
+        ("laser", "LaserPage"),
+        ("plane", "PlanePage"),
+        ("capture", "CapturePage"),
+        ("dots", "DotsPage"),
+        ("surface", "SurfacePage"),
+        ("trends", "TrendsPage"),
+        ("export", "ExportPage"),
+    )
+}
+"""By key, in the order of `steps.STEPS`; a step without a page is not shown."""

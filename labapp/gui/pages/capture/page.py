@@ -19,7 +19,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.gui.dialogs import EVERYTHING, RECORDINGS
+from labapp.gui.dialogs import EVERYTHING, recordings
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
@@ -201,7 +201,7 @@ class CapturePage(Page):
     def choose_file(self) -> None:
         """Ask for a recording that is a file."""
         name, _ = QFileDialog.getOpenFileName(
-            self, "Choose a recording", str(self._folder()), f"{RECORDINGS};;{EVERYTHING}"
+            self, "Choose a recording", str(self._folder()), f"{recordings()};;{EVERYTHING}"
         )
         if name:
             self.choose(Path(name))

@@ -1,0 +1,61 @@
+"""What the first window loads, and what it leaves for later."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+FOR_LATER = {
+    *("scipy", "cv2", "av", "pyqtgraph", "matplotlib", "pyvista", "vtkmodules"),
+    *("h5py", "tifffile", "pywt", "reportlab", "labapp.core.pipeline", "labapp.session.session"),
+}
+"""Each of them takes from some hundredths to one second to load."""
+
+NOT_FOR_A_SURFACE = {"h5py", "tifffile", "pywt", "reportlab"}
+
+FIRST_WINDOW = """
+import sys
+from pathlib import Path
+from labapp import cli
+from labapp.gui.app import start_app
+from labapp.gui.preferences import Preferences
+app = start_app()
+from labapp.gui.window import MainWindow
+window = MainWindow(Preferences(), Path(sys.argv[1]))
+window.show()
+app.processEvents()
+print(*sys.modules)
+"""
+
+SURFACE_PAGE = """
+import sys
+import labapp.session.session
+import labapp.gui.pages.surface
+print(*sys.modules)
+"""
+
+
+def loaded(program: str, *arguments: object) -> set[str]:
+    """Names of the modules that a program says it has loaded."""
+    ran = subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
+    )
+    return set(ran.stdout.split())
+
+
+def test_the_first_window_loads_nothing_that_only_pages_need(tmp_path: Path):
+    found = loaded(FIRST_WINDOW, tmp_path / "preferences.json")
+    assert "labapp.gui.pages.welcome" in found
+    assert found & FOR_LATER == set()
+
+
+def test_a_surface_is_shown_without_what_reads_and_writes_other_files():
+    found = loaded(SURFACE_PAGE)
+    assert "scipy" in found
+    assert found & NOT_FOR_A_SURFACE == set()
