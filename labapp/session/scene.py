@@ -58,6 +58,10 @@ COLOURS = {
     "section": "#ff5fd2",
 }
 
+BAR_WIDTH = 0.04
+BAR_NUMBERS_PX = 56
+"""Width of the colour scale, a part of the picture's, and what its numbers take beside it."""
+
 EMPTY = np.empty((0, 3))
 
 
@@ -243,6 +247,8 @@ class Drawing:
         self._stretch = np.ones(3)
         self._axes_actor: Any = None
         self._bar: Any = None
+        # Before every picture: its size may have changed.
+        plotter.renderer.AddObserver("StartEvent", lambda *_: self._place_bar())
         self._parts: dict[str, tuple[Any, Any]] = {}
         self._made_for: dict[str, object] = {}
 
@@ -285,10 +291,10 @@ class Drawing:
         self.plotter.reset_camera(render=False, bounds=bounds)
         # The numbers along the axes are as tall in a small picture.
         height = self.plotter.window_size[1]
-        fill, margin = (1.3, 75) if direction == "free" else (1.15, 70)
+        fill, margin = (1.3, 78) if direction == "free" else (1.15, 85)
         self.plotter.camera.zoom(fill * max(1 - margin / height, 0.5))
-        # To the left, beside the colour scale.
-        self.plotter.camera.SetWindowCenter(0.12, 0.0)
+        # To the left, beside the colour scale; and up, for the names of the axes are below.
+        self.plotter.camera.SetWindowCenter(0.12, -34 / height)
 
     def _is_new(self, part: str, made_for: object) -> bool:
         """Whether a part must be made anew: it was made for something else."""
@@ -340,13 +346,11 @@ class Drawing:
                     "title": title,
                     "color": scene.foreground,
                     "vertical": True,
-                    "position_x": 0.85,
-                    "position_y": 0.2,
                     "height": 0.6,
                     "title_font_size": 14,
                     "label_font_size": 13,
                     "unconstrained_font_size": True,
-                    "width": 0.04,
+                    "width": BAR_WIDTH,
                 },
             )
             actor.prop.interpolation = "Phong"
@@ -355,6 +359,7 @@ class Drawing:
             actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(2.0, 2.0)
             self._parts["surface"] = (mesh, actor)
             self._bar = self.plotter.scalar_bars[title]
+            self._place_bar()
             self._made_for["surface"] = made_for  # only now: what failed is made another time
         held, actor = self._parts["surface"]
         if held is not mesh:
@@ -362,6 +367,12 @@ class Drawing:
         actor.mapper.lookup_table.scalar_range = scene.limits
         actor.mapper.scalar_range = scene.limits
         self._bar.SetLabelFormat(_label_format(scene.limits))
+
+    def _place_bar(self) -> None:
+        """Put the colour scale where its numbers, as tall in any picture, stay within."""
+        if self._bar is not None:
+            left = 1 - BAR_WIDTH - BAR_NUMBERS_PX / self.plotter.window_size[0]
+            self._bar.SetPosition(min(left, 0.85), 0.2)
 
     def _axes(self, scene: Scene) -> None:
         box, steps = _box(scene)
