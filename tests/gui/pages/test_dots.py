@@ -12,7 +12,7 @@ import pytest
 from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
 from PySide6.QtGui import QMouseEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication, QHBoxLayout, QWidget
+from PySide6.QtWidgets import QApplication, QHBoxLayout, QToolButton, QWidget
 from pytestqt.qtbot import QtBot
 
 from labapp.core.correction import Correction, add_dot, delete_dots, shift_row
@@ -350,6 +350,29 @@ def test_split_merge_and_reference(
     key(page, Qt.Key.Key_M)
     np.testing.assert_array_equal(editor.correction.lattice.row, before.lattice.row)
     assert editor.correction.lattice.reference == (6, 8)
+
+
+def test_a_button_asks_for_the_click_it_needs(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("blocked_rows"), 3)
+    panel = page.dots_panel
+    assert "Press Reference" in panel.why.text()
+    button = next(b for b in panel.findChildren(QToolButton) if b.text() == "Reference")
+    place, left = np.array([278.0, 281.0]), button.mapTo(page.panel, QPoint())
+    button.click()
+    assert panel.chosen.text().startswith("Click where the dark centre of the pattern is")
+    key(page, Qt.Key.Key_Escape)
+    assert panel.chosen.text().startswith("Nothing chosen")
+    button.click()
+    click(page, place)
+    kept = session.correction(3)
+    assert kept is not None
+    assert kept.lattice.reference == (6, 8)  # as blocked_rows/README.md has it
+    assert panel.chosen.text().startswith("Nothing chosen")
+    assert "Press Reference" not in panel.why.text()
+    assert button.mapTo(page.panel, QPoint()) == left
+    assert unfitted == [[3]]
 
 
 def test_a_correction_is_carried_on_and_taken_back(

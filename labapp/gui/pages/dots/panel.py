@@ -1,4 +1,4 @@
-"""The panel of the dots page: what is seen, the fit, the edits, the rows, the detector."""
+"""The panel of the dots page: what is seen, the edits, the fit, the rows, the detector."""
 
 from __future__ import annotations
 
@@ -58,13 +58,18 @@ class DotsPanel(QWidget):
         layout.setContentsMargins(0, 0, 0, 0)
         self.seen, self.why, self.chosen = _words(), _words(), _words()
         self.fit = ResultTable("Fit before the last edit and after it")
+        for words in (self.seen, self.chosen):
+            # The buttons stay under the hand, whatever there is to say.
+            words.setMinimumHeight(2 * words.fontMetrics().lineSpacing())
+            words.setAlignment(Qt.AlignmentFlag.AlignTop)
         layout.addWidget(self.seen)
-        layout.addWidget(self.why)
-        layout.addWidget(self.fit)
         layout.addWidget(_heading("Put right"))
         layout.addWidget(self.chosen)
         layout.addLayout(self._sites())
         layout.addLayout(_buttons(edits))
+        layout.addWidget(_heading("Fit"))
+        layout.addWidget(self.why)
+        layout.addWidget(self.fit)
         layout.addWidget(_heading("Rows"))
         self.rows = _RowList()
         self.rows.itemSelectionChanged.connect(lambda: self.rows_chosen.emit(self.rows.chosen()))

@@ -22,6 +22,8 @@ from labapp.gui.pages.page import Page
 from labapp.gui.views.picture import SHIFT, PictureView, Tool, arrow_step
 from labapp.gui.workspace import Workspace
 
+NO_REFERENCE = "The reference is not known: can you tell it from other frames? Press Reference"
+
 REACH = 9.0
 """A dot is meant by a pointer this near, in points of the screen."""
 
@@ -118,9 +120,13 @@ class DotsPage(Page):
         figures = presenter.figures(seen.result)
         stands = seen.result is not None and not seen.result.stale
         pending = "fitting …" if self.refit.pending else "" if stands else "–"
+        why = seen.why or (presenter.why_no_fit(session) if not stands else "")
+        dots = seen.correction
+        if seen.why and dots is not None and dots.lattice.reference is None:
+            why = f"{why}. {NO_REFERENCE}"
         self.dots_panel.show_frame(
             sentence,
-            seen.why or (presenter.why_no_fit(session) if not stands else ""),
+            why,
             presenter.compared(
                 before[1] if before is not None and before[0] == seen.frame else None,
                 figures,
@@ -142,7 +148,8 @@ class DotsPage(Page):
             site = int(lattice.row[dot]), int(lattice.column[dot])
         elif len(editor.rows) == 1:
             site = editor.rows[0], 0
-        words = presenter.chosen_words(editor.correction, editor.selection.tolist())
+        chosen = presenter.chosen_words(editor.correction, editor.selection.tolist())
+        words = self.hand.asked or chosen
         self.dots_panel.show_chosen(words, editor.rows, site)
 
     def choose(self, way: Callable[..., None], *given: object) -> None:
@@ -224,9 +231,9 @@ class DotsPage(Page):
         if self._pointer is not None:
             do(*self._pointer)
         else:
-            self.hand.next_click = do
-            self.workspace.said.emit(f"{ask} (Esc: leave it)", False)
+            self.hand.ask(do, f"{ask} (Esc: leave it)")
             self.view.setFocus()
+            self.draw()
 
     def _carry_on(self) -> None:
         seen = self.seen
@@ -270,7 +277,9 @@ class DotsPage(Page):
     def _edits(self) -> tuple[Command, ...]:
         editor = self.editor
         return (
-            Command("Add dot", "A", "Add the dot under the pointer, or double click it",
+            Command("Add dot", "A",
+                    "Add a dot: click where it is, or double click it; the key takes the "
+                    "one under the pointer",
                     lambda: self._at_pointer(self.add_at, "Click where the dot is")),
             Command("Delete", "Del", "Take the chosen dots out", lambda: self._then(editor.delete)),
             Command("Number", "N", "Give the chosen dots the row and column their neighbours tell",
@@ -290,7 +299,9 @@ class DotsPage(Page):
                     editor.merge),
             Command("Blocked", "B", "Mark the chosen rows as hidden in part by the torch, or not",
                     editor.block),
-            Command("Reference", "R", "The dark centre of the pattern is under the pointer",
+            Command("Reference", "R",
+                    "Click where the dark centre of the pattern is; the key takes the place "
+                    "under the pointer",
                     lambda: self._at_pointer(editor.point_at_reference,
                                              "Click where the dark centre of the pattern is")),
             Command("No reference", "Shift+R", "Leave it to the program to find the reference",
@@ -334,32 +345,39 @@ class Hand(Tool):
 
     Attributes
     ----------
-    next_click
-        What the next click does, where a button asked for one.
+    asked
+        What a button asks a click for; empty if none does.
     """
 
     def __init__(self, page: DotsPage) -> None:
         self._page = page
         self._start: tuple[float, float] | None = None
         self._boxing = self._adds = False
-        self.next_click: Callable[[float, float], object] | None = None
+        self._next_click: Callable[[float, float], object] | None = None
+        self.asked = ""
 
     @property
     def busy(self) -> bool:
         """Whether a drag is under way or a click is asked for."""
-        return self._start is not None or self.next_click is not None
+        return self._start is not None or self._next_click is not None
+
+    def ask(self, do: Callable[[float, float], object], words: str) -> None:
+        """Do something where the next click is."""
+        self._next_click, self.asked = do, words
 
     def give_up(self) -> None:
         """Leave the dots where they were."""
-        self._start = self.next_click = None
+        self._start = self._next_click = None
+        self.asked = ""
         self._page.editor.shift_px[:] = 0
         self._page.overlay.hide_box()
 
     def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
         """Choose a dot, Shift: in addition; or do what a button asked a click for."""
-        if self.next_click is not None:
-            do, self.next_click = self.next_click, None
+        if self._next_click is not None:
+            do, self._next_click, self.asked = self._next_click, None, ""
             do(u, v)
+            self._page.draw()
             return
         self._page.choose(self._page.editor.click, u, v, self._reach(), bool(modifiers & SHIFT))
 
