@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from PySide6.QtCore import Qt, Signal
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import (
     QAbstractItemView,
     QGridLayout,
@@ -23,7 +24,7 @@ from labapp.gui.views.fields import ChoiceField
 from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.workspace import Workspace
 
-COLUMNS = ("", "first", "second", "difference", "unit")
+COLUMNS = ("", "First", "Second", "Difference", "Unit")
 
 
 class CompareView(QWidget):
@@ -133,6 +134,18 @@ class CompareView(QWidget):
                 item.setToolTip(f"{row[0]}: {text} {row[4] if 0 < column < 4 else ''}".strip())
                 self.table.setItem(k, column, item)
         self.table.resizeRowsToContents()
+        self._make_room()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Have all figures be seen where there is the height for it."""
+        super().resizeEvent(event)
+        self._make_room()
+
+    def _make_room(self) -> None:
+        rows = sum(self.table.rowHeight(k) for k in range(self.table.rowCount()))
+        header = self.table.horizontalHeader().sizeHint().height()
+        wanted = rows + header + 2 * self.table.frameWidth()
+        self.table.setMinimumHeight(min(wanted, self.height() * 2 // 5))
 
 
 class _SchemeBox(QWidget):
@@ -163,6 +176,8 @@ def _table() -> QTableWidget:
     table.setTabKeyNavigation(False)
     table.setShowGrid(False)
     table.setWordWrap(False)
+    # All columns have room: the scroll bar would take a line's place.
+    table.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
     header = table.horizontalHeader()
     header.setHighlightSections(False)
     header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
