@@ -35,6 +35,7 @@ from stall_meter import StallMeter, run_for, run_until
 
 from labapp.gui.pages import PAGES
 from labapp.gui.preferences import Preferences
+from labapp.gui.views.view3d import OffscreenView
 from labapp.gui.window import MainWindow
 from labapp.session.session import Session
 
@@ -143,6 +144,13 @@ def new_window(folder: Path) -> MainWindow:
 # --- scrubbing and 3-D ------------------------------------------------------------------------
 
 
+def is_drawn(view: Any) -> bool:
+    """Whether a 3-D view has drawn its scene, as far as that is its own work."""
+    if isinstance(view, OffscreenView):
+        return view._picture is not None
+    return not view._late.isActive()
+
+
 def shown_by(window: MainWindow) -> Callable[[], bool]:
     """Whether the page in view shows the frame in view, drawn."""
     page: Any = window.page
@@ -152,7 +160,7 @@ def shown_by(window: MainWindow) -> Callable[[], bool]:
     if page.key == "capture":
         return lambda: page._seen == (None, space.frame)
     if page.key == "surface":
-        return lambda: page.told.result.frame == space.frame and not page.view._late.isActive()
+        return lambda: page.told.result.frame == space.frame and is_drawn(page.view)
     return lambda: True
 
 
@@ -204,7 +212,7 @@ def draw(window: MainWindow) -> None:
 
     def step(k: int) -> None:
         page.view.show_scene(scenes[k % len(scenes)])
-        run_until(lambda: not page.view._late.isActive())
+        run_until(lambda: is_drawn(page.view))
         QApplication.processEvents()
 
     reached = rate(step)

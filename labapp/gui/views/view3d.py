@@ -1,11 +1,13 @@
 """The 3-D view: a scene that can be turned, in the window's own OpenGL or drawn off-screen.
 
 Where Qt has no OpenGL for VTK (no display, or Wayland) the scene is drawn off-screen and shown as
-a picture. Where nothing can be drawn, words say so.
+a picture. So it is where the processor draws: a window with OpenGL in it is put together whole for
+every picture, which costs more than the scene does. Where nothing can be drawn, words say so.
 """
 
 from __future__ import annotations
 
+import functools
 import sys
 from dataclasses import replace
 from typing import Any
@@ -18,6 +20,7 @@ from PySide6.QtGui import (
     QImage,
     QKeyEvent,
     QMouseEvent,
+    QOffscreenSurface,
     QOpenGLContext,
     QPainter,
     QPaintEvent,
@@ -54,6 +57,14 @@ TURNS = {
 }
 
 KEYS_TOLD = "arrow keys turn, + and − zoom, 1 to 4 look from the top, side, front and obliquely"
+
+GL_RENDERER = 0x1F01
+
+ON_THE_PROCESSOR = (
+    *("llvmpipe", "softpipe", "software", "swiftshader", "swrast"),
+    *("gdi generic", "basic render"),
+)
+"""Parts of the names of what draws OpenGL without a graphics card."""
 
 NOTHING_HERE = "The 3-D view needs OpenGL, which cannot be used here. All figures are measured."
 
@@ -407,11 +418,28 @@ class InteractiveView(View3d):
 
 
 def make_view3d(name: str = "3-D view") -> View3d:
-    """A view in the window's own OpenGL where Qt and VTK share one, else one of pictures."""
+    """A view in the window's own OpenGL where a card draws it for Qt and VTK, else of pictures."""
     shared = {"linux": "xcb", "win32": "windows", "darwin": "cocoa"}.get(sys.platform)
-    if QGuiApplication.platformName() == shared and QOpenGLContext().create():
+    if QGuiApplication.platformName() == shared and has_card(_renderer()):
         return InteractiveView(name)
     return OffscreenView(name)
+
+
+def has_card(renderer: str) -> bool:
+    """Whether a graphics card draws, by OpenGL's name of what does; empty for nothing."""
+    return bool(renderer) and not any(part in renderer.lower() for part in ON_THE_PROCESSOR)
+
+
+@functools.cache
+def _renderer() -> str:
+    """What draws OpenGL for Qt; empty without."""
+    context, surface = QOpenGLContext(), QOffscreenSurface()
+    surface.create()
+    if not (context.create() and context.makeCurrent(surface)):
+        return ""
+    name = context.functions().glGetString(GL_RENDERER)
+    context.doneCurrent()
+    return str(name or "")
 
 
 def as_image(picture: npt.NDArray[np.uint8]) -> QImage:
