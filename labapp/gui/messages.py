@@ -143,6 +143,8 @@ class StatusLine(QWidget):
         layout.addWidget(self.message, 1)
         for widget in (self.title, self.bar, self.cancel_button):
             layout.addWidget(widget)
+        # What comes and goes must not move the window's other parts.
+        self.setMinimumHeight(layout.sizeHint().height())
         tasks.changed.connect(self.show_progress)
         tasks.progressed.connect(self.show_progress)
         self.show_progress()

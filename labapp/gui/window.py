@@ -245,6 +245,7 @@ class MainWindow(QMainWindow):
         """Show another session from the start, or the welcome page."""
         session = self.workspace.session
         self.timeline.set_playing(False)
+        self.status_line.say("", False)  # what was said of another session
         self._leave()
         self._show_session()
         if session is None:

@@ -201,3 +201,10 @@ def test_the_mouse_reaches_the_picture_as_the_desktop_sends_it(view: PictureView
     qtbot.waitUntil(lambda: bool(noting.seen))
     assert seen  # pyqtgraph passes on so many moves a second, and no more
     assert noting.seen[0] == ("click", pytest.approx(80, abs=1), pytest.approx(60, abs=1))
+
+
+def test_the_pointers_place_does_not_make_the_view_wider(view: PictureView) -> None:
+    before = view.minimumSizeHint().width()
+    view.box.scene().sigMouseMoved.emit(view.box.mapViewToScene(QPointF(100.0, 50.0)))
+    assert "level" in view._place.text()
+    assert view.minimumSizeHint().width() == before

@@ -222,6 +222,25 @@ def test_space_plays_and_arrows_in_a_field_stay_there(
     assert plain.workspace.frame == frame
 
 
+def test_what_was_said_of_another_session_goes_but_no_problem(
+    plain: MainWindow, copy_sample: CopySample
+):
+    plain.files.open(copy_sample("thumb_tack"))
+    plain.say("Undone: something")
+    plain.files.close()
+    assert plain.status_line.message.text() == ""
+    plain.say("The disk is full", True)
+    plain.files.open(copy_sample("gtaw"))
+    assert "The disk is full" in plain.status_line.message.text()
+
+
+def test_the_status_line_is_as_high_with_a_problem(plain: MainWindow):
+    height = plain.status_line.minimumHeight()
+    plain.say("The disk is full", True)
+    assert plain.status_line.read_button.isVisible()
+    assert plain.status_line.sizeHint().height() <= height
+
+
 def test_a_page_that_fails_is_said_and_the_window_stays(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):

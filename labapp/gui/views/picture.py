@@ -123,6 +123,8 @@ class PictureView(Drawn):
         self.box.addItem(self._item)
         self._place = QLabel()
         self._place.setTextFormat(Qt.TextFormat.PlainText)
+        # Or the window would grow as the pointer comes.
+        self._place.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
         self._empty = QLabel("", self.canvas)
         self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self._empty.setWordWrap(True)
@@ -162,9 +164,9 @@ class PictureView(Drawn):
         self.describe(f"{columns} by {rows} px")
         self._item.setRect(QRectF(-0.5, -0.5, columns, rows))
         if not same:
-            self.box.setLimits(
-                xMin=-columns, xMax=2 * columns, yMin=-rows, yMax=2 * rows, minXRange=MOST_ZOOM_PX
-            )
+            side = max(rows, columns)  # all of it also fits a narrow view
+            u, v = columns + side, rows + side
+            self.box.setLimits(xMin=-side, xMax=u, yMin=-side, yMax=v, minXRange=MOST_ZOOM_PX)
             self.fit()
 
     @property
@@ -275,22 +277,21 @@ class PictureView(Drawn):
         bar.addWidget(label)
         self._contrast = QSlider(Qt.Orientation.Horizontal)
         self._contrast.setRange(-3 * CONTRAST_STEPS, 5 * CONTRAST_STEPS)
-        self._contrast.setFixedWidth(110)
+        self._contrast.setFixedWidth(80)
         self._contrast.setAccessibleName("Contrast")
         self._contrast.setToolTip("Brings out faint dots, or calms bright ones ([ and ])")
         self._contrast.valueChanged.connect(lambda _: self._item.setLevels(self._shown_levels()))
         label.setBuddy(self._contrast)
         bar.addWidget(self._contrast)
         button("Auto", "Automatic contrast", "Fit contrast to the picture (0)", self.auto_contrast)
-        bar.addStretch(1)
-        bar.addWidget(self._place)
+        bar.addWidget(self._place, 1)
         return bar
 
     def _moved(self, at: QPointF) -> None:
         place = self.box.mapSceneToView(at)
         u, v = float(place.x()), float(place.y())
         level = level_at(self._image, u, v)
-        self._place.setText("" if level is None else f"u {u:6.1f}  v {v:6.1f} px   level {level:g}")
+        self._place.setText("" if level is None else f"u {u:.1f}, v {v:.1f} px, level {level:g}")
         self.pointed.emit(u, v, level)
 
     def _paint(self) -> None:
