@@ -94,12 +94,15 @@ class Axis:
         Of a place on it in words.
     key_name
         What a point's key is: "frame".
+    span
+        Both ends of what is to be seen in any case; None: the curves alone.
     """
 
     name: str
     unit: str
     decimals: int = 4
     key_name: str = "frame"
+    span: tuple[float, float] | None = None
 
     @property
     def title(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -168,3 +169,16 @@ def test_ten_thousand_frames_pan_at_speed(view: PlotStack) -> None:
         took.append(time.perf_counter() - began)
     assert len(view._plots[0].points.data) <= MOST_POINTS
     assert float(np.median(took)) < 0.2  # 4 plots, software, another program beside
+
+
+def test_a_frame_without_a_point_is_marked_where_it_is(view: PlotStack) -> None:
+    axis = replace(TIME, span=(-1.0, 9.0))
+    view.show_curves([curve()], axis)
+    view.set_current(1, 8.5)
+    (plot,) = view._plots
+    assert plot.current.isVisible()
+    assert plot.current.value() == 8.5
+    low, high = plot.getViewBox().viewRange()[0]
+    assert low < -1.0 < 9.0 < high
+    view.set_current(16)
+    assert plot.current.value() == 1.6

@@ -34,7 +34,8 @@ NEAR = 18.0
 """A click this near to a point, in screen pixels, means it."""
 
 AXIS_WIDTH = 60
-LEAST_HEIGHT = 62
+TITLE_HEIGHT = 18
+LEAST_HEIGHT = 76
 """A plot is no lower than this; where they do not fit, they scroll."""
 
 SYMBOLS = {"●": "o", "○": "o", "■": "s", "×": "x"}
@@ -64,6 +65,7 @@ class PlotStack(Plotted):
         self.axis = Axis("", "")
         self._plots: list[_Plot] = []
         self._current: int | None = None
+        self._place: float | None = None
         self.setToolTip(f"Click a point to go to its frame; wheel or drag along the axis. {KEYS}")
         self.canvas = pg.GraphicsLayoutWidget()
         self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
@@ -108,14 +110,15 @@ class PlotStack(Plotted):
         if not same:
             self.fit()
         self._show_legend()
-        self.set_current(self._current)
+        self.set_current(self._current, self._place)
 
-    def set_current(self, key: int | None) -> None:
-        """Mark the point with a key in every plot: the frame in view."""
-        self._current = key
+    def set_current(self, key: int | None, place: float | None = None) -> None:
+        """Mark the point with a key in every plot, or a place where no curve has it."""
+        self._current, self._place = key, place
         found = [(curve, _index_of(curve, key)) for curve in self.curves]
         points = [(curve, index) for curve, index in found if index is not None]
-        place = float(points[0][0].x[points[0][1]]) if points else None
+        if points:
+            place = float(points[0][0].x[points[0][1]])
         for plot in self._plots:
             plot.mark_place(place)
         self._tell(_joined([point_in_words(curve, index, self.axis) for curve, index in points]))
@@ -123,6 +126,7 @@ class PlotStack(Plotted):
     def fit(self) -> None:
         """Show all of the axis."""
         ends = [(float(c.x[0]), float(c.x[-1])) for c in self.curves if len(c.x)]
+        ends += [self.axis.span] if self.axis.span else []
         if ends and self._plots:
             low, high = min(low for low, _ in ends), max(high for _, high in ends)
             room = 0.02 * (high - low) or 0.5
@@ -278,10 +282,10 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         for side in ("left", "bottom"):
             self.getAxis(side).enableAutoSIPrefix(False)
         self.getAxis("left").setWidth(AXIS_WIDTH)
-        # In the plot: beside a low one its name would be cut off.
-        self.name = pg.LabelItem(justify="left")
-        self.name.setParentItem(box)
-        self.name.anchor(itemPos=(0, 0), parentPos=(0, 0), offset=(4, -2))
+        # Above the plot: beside a low one its name would be cut off.
+        self.titleLabel.setVisible(True)
+        self.titleLabel.setMaximumHeight(TITLE_HEIGHT)
+        self.layout.setRowFixedHeight(0, TITLE_HEIGHT)
         self.line = pg.PlotDataItem(connect="finite", autoDownsample=True, clipToView=True)
         self.line.setDownsampling(auto=True, method="peak")
         self.bars = pg.PlotCurveItem(connect="pairs")
@@ -305,7 +309,9 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             axis = self.getAxis(side)
             axis.setPen(look.color(Role.Mid))
             axis.setTextPen(text)
-        self.name.setText(curve.title, color=text.name(), bold=True)
+        size = f"{QGuiApplication.font().pointSizeF():g}pt"
+        look_of = {"color": text.name(), "bold": True, "justify": "left", "size": size}
+        self.titleLabel.setText(curve.title, **look_of)
         if self.getAxis("bottom").labelText:
             self.setLabel("bottom", self.getAxis("bottom").labelText, color=text.name())
         self.showGrid(x=True, y=True, alpha=0.18)

@@ -167,3 +167,10 @@ def test_every_control_has_a_name_and_a_tip(page: TrendsPage) -> None:
     for button in page.panel.findChildren(QAbstractButton):
         if button.text():
             assert button.toolTip(), button.text()
+
+
+def test_the_axis_holds_frames_without_a_surface(copy_sample) -> None:
+    with Session.open(copy_sample("blocked_rows")) as session:
+        shown = show(session, Wish())
+    assert shown.curves[0].x.max() < shown.places[5] == 5.0
+    assert shown.axis.span == (0.0, 5.0)

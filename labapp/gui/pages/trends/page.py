@@ -68,12 +68,12 @@ class TrendsPage(Page):
         if self._in_view not in (None, frame):
             # The frame in view is another one, and nothing else: stepping must be quick.
             self._in_view = frame
-            self.plots.set_current(frame)
+            self._mark(frame)
             return
         self._in_view = frame
         self.shown = shown = show(session, self.wish, self.workspace.overview())
         self.plots.show_curves(shown.curves, shown.axis)
-        self.plots.set_current(frame)
+        self._mark(frame)
         self.plots.setVisible(bool(shown.curves))
         self.nothing.setVisible(not shown.curves)
         self.counted.setText(shown.words)
@@ -84,6 +84,9 @@ class TrendsPage(Page):
         self.spectrum_words.setVisible(bool(shown.spectrum_words))
         self.signals_words.setText(shown.signals_words)
         self._show_signals(session.signals, session.read_only)
+
+    def _mark(self, frame: int) -> None:
+        self.plots.set_current(frame, None if self.shown is None else self.shown.places.get(frame))
 
     def leave(self) -> None:
         """Show everything anew when it comes back."""

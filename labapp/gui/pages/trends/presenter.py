@@ -54,7 +54,9 @@ class Shown:
     Parameters
     ----------
     curves, axis
-        Of the course over time.
+        Of the course over time; the axis holds all frames.
+    places
+        Where every frame is on the axis, by its number.
     rows
         Mean ± standard deviation and range, two rows a measure.
     words
@@ -69,6 +71,7 @@ class Shown:
 
     curves: tuple[Curve, ...]
     axis: Axis
+    places: dict[int, float]
     rows: tuple[ResultRow, ...]
     words: str
     spectrum: tuple[Curve, ...]
@@ -87,7 +90,9 @@ def show(session: Session, wish: Wish, seen: Overview | None = None) -> Shown:
 
     courses = [course_of(key) for key in BY_KEY if key in wish.shown]
     timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
-    axis = Axis("Time", "s") if timed else Axis("Frame", "", decimals=0)
+    at = seen.time_s if timed else seen.frame.astype(float)
+    span = (float(at.min()), float(at.max())) if len(at) else None
+    axis = Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span)
     curves = [_curve(course) for course in courses if len(course.frame)]
     if signals is not None and timed:
         curves += _signal_curves(signals, seen, wish.shown)
@@ -96,6 +101,7 @@ def show(session: Session, wish: Wish, seen: Overview | None = None) -> Shown:
     return Shown(
         curves=tuple(curves),
         axis=axis,
+        places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
         rows=tuple(row for course in courses for row in _rows(course)),
         words=_counted(seen, course_of("height_mm")),
         spectrum=found,
