@@ -143,6 +143,12 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
     return words[:1].upper() + words[1:]
 
 
+def recording_gone(session: Session) -> str:
+    """That the recording is not where it was, and what to do; empty if it is."""
+    missing = session.missing_recording
+    return "" if missing is None else f"{missing.name} is not where it was: say where it is now"
+
+
 def _calibrated(done: bool, needed: bool) -> State:
     if done:
         return State(Mark.DONE, "Calibrated")
@@ -152,7 +158,7 @@ def _calibrated(done: bool, needed: bool) -> State:
 
 
 def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict[str, State]:
-    recording, gone = session.recording, session.missing_recording
+    recording, gone = session.recording, recording_gone(session)
     if recording is None:
         first = State(Mark.TODO, "Import a recording first")
         return {
@@ -166,8 +172,8 @@ def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict
     stale = int(seen.stale.sum())
     count = len(seen.frame)
     capture = State(Mark.DONE, f"{count} frames")
-    if gone is not None:
-        capture = State(Mark.ATTENTION, f"{gone.name} is not where it was: say where it is now")
+    if gone:
+        capture = State(Mark.ATTENTION, gone)
     blocked = f"Set-up: {missing}" if missing else ""
     if blocked and not measured:
         surface = State(Mark.TODO, blocked)

@@ -65,8 +65,8 @@ class BenchView(Drawn):
         if self._view is not None:
             left, right, top = _extent(self._view)
             self.whole.setRange(xRange=(left, right), yRange=(-2.0, top), padding=0.04)
-            reach = _reach(self._view)
-            self.near.setRange(xRange=(-reach, reach), yRange=(-0.4 * reach, reach), padding=0)
+            left, right = _near(self._view)
+            self.near.setRange(xRange=(-left, right), yRange=(-0.4 * right, right), padding=0)
 
     def changeEvent(self, event: QEvent) -> None:
         """Follow a change of theme."""
@@ -147,18 +147,20 @@ class BenchView(Drawn):
         self._text(self.whole, "laser", view.laser_mm, (0.5, 1.5))
         top = np.minimum(view.plane_mm[1], [np.inf, _extent(view)[2]])
         self._text(self.whole, "imaging plane", top, (-0.1, 0.0))
-        lengths = ("L1", -view.clearance.l1_mm), ("L2", view.clearance.l2_mm)
-        reach = _reach(view)
-        level = -0.15 * reach
-        for name, length in lengths:
+        left, right = _near(view)
+        lengths = (
+            ("L1", -view.clearance.l1_mm, -left / 2),
+            ("L2", view.clearance.l2_mm, right / 2),
+        )
+        level = -0.15 * right
+        for name, length, middle in lengths:
             if not np.isfinite(length) or length == 0:
                 continue
             ends = np.array([[0.0, level], [length, level]])
             pen = pg.mkPen(self._ink, width=1.2)
             _line(self.near, ends, pen, symbol="|", symbolSize=10, symbolPen=pen)
             words = f"{name} {abs(length):.1f} mm"
-            place = np.array([np.sign(length) * reach / 2, level])
-            self._text(self.near, words, place, (0.5, 0.0))
+            self._text(self.near, words, np.array([middle, level]), (0.5, 0.0))
 
     def _text(
         self, plot: pg.PlotWidget, words: str, place: FloatArray, anchor: tuple[float, float]
@@ -185,9 +187,11 @@ def _line(
     return plot.plot(points[:, 0], points[:, 1], pen=pen, connect="finite", **symbol)
 
 
-def _reach(view: SideView) -> float:
-    """How far from the electrode the enlarged part goes, mm."""
-    return 1.3 * float(max(view.pool_mm[-1, 0], view.clearance.l2_mm, 3.0))
+def _near(view: SideView) -> tuple[float, float]:
+    """How far from the electrode the enlarged part goes, to the left and to the right, mm."""
+    right = 1.3 * float(max(view.pool_mm[-1, 0], view.clearance.l2_mm, 3.0))
+    l1_mm = view.clearance.l1_mm
+    return max(right, min(1.1 * l1_mm, 3 * right) if np.isfinite(l1_mm) else 0.0), right
 
 
 def _broken(paths: list[FloatArray]) -> FloatArray:

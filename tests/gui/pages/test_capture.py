@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import threading
 from collections.abc import Iterator
@@ -74,6 +75,7 @@ def test_what_was_read_is_told(copy_sample) -> None:
         assert recording is not None
         told = dict(recording_in_words(recording))
         assert told["Frames"] == "30 in the recording, used: all"
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d", told["Imported"])
         assert told["Time base"] == "60 frames/s"
         assert told["Seeking"] == "frame-exact"
         assert told["SHA-256"] == recording.sha256
@@ -103,7 +105,7 @@ def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
         assert missing_in_words(session).startswith("recording.avi is not where it was")
         seen = look(session, 0)
         assert seen.image is None
-        assert "is not there" in seen.words
+        assert seen.words == "recording.avi is not where it was: say where it is now"
 
 
 @pytest.fixture(autouse=True)

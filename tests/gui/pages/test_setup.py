@@ -188,3 +188,11 @@ def test_every_control_has_a_name_and_says_what_it_does(page: SetupPage) -> None
         assert field.editor.toolTip()
     for box in page.ticks.values():
         assert box.toolTip()
+
+
+def test_a_tab_is_no_higher_than_what_it_holds(page: SetupPage) -> None:
+    heights = []
+    for number in range(page.tabs.count()):
+        page.tabs.setCurrentIndex(number)
+        heights.append(page.tabs.heightForWidth(350))
+    assert max(heights[:2]) < heights[2]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 
 from labapp.core.detection import DotSettings, find_dots
 from labapp.core.exposure import Exposure, judge_exposure
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
+from labapp.gui.steps import recording_gone
 from labapp.media import GreyImage, open_source
 from labapp.session.record import Recording
 from labapp.session.session import Session
@@ -108,11 +110,7 @@ def look(session: Session, number: int, judged: bool = True) -> Seen:
     try:
         image = session.frame(number).image
     except InputError as error:
-        missing = session.missing_recording
-        words = (
-            f"{missing.name} is not there: say where it is." if missing is not None else str(error)
-        )
-        return Seen(title, None, None, words)
+        return Seen(title, None, None, recording_gone(session) or str(error))
     depth = None if recording is None else recording.bit_depth
     return Seen(title, image, _judged(image, session.settings.dots if judged else None, depth))
 
@@ -231,8 +229,13 @@ def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
         ("Kept", "in the session itself" if recording.embedded else recording.path),
         ("Size", size_in_words(recording.size)),
         ("SHA-256", recording.sha256),
-        ("Imported", recording.imported.replace("T", " ")),
+        ("Imported", local_time(recording.imported)),
     )
+
+
+def local_time(iso: str) -> str:
+    """A time with its zone as the clock on the wall shows it."""
+    return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
 
 
 def size_in_words(size: int) -> str:

@@ -7,6 +7,7 @@ from PySide6.QtCore import QObject, QTimer, Signal
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.presenter import Carried, Found, Shown
+from labapp.gui.steps import recording_gone
 from labapp.gui.tasks import Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -69,7 +70,7 @@ class Looking(QObject):
             try:
                 return frame, session.frame(frame).image, ""
             except InputError as error:
-                return frame, None, str(error)
+                return frame, None, recording_gone(session) or str(error)
 
         def done(read: tuple[int, GreyImage | None, str]) -> None:
             self.frame, self.image, self.why = read

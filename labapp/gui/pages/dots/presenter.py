@@ -18,6 +18,7 @@ from labapp.core.tracking import carry_on
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow, plain
+from labapp.gui.steps import recording_gone
 from labapp.gui.tasks import Cancelled, Control
 from labapp.session.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
@@ -207,8 +208,8 @@ def why_no_fit(session: Session) -> str:
     """Why no fit can be made at all, a sentence; empty if it can."""
     if session.read_only:
         return "The session is open read-only: nothing can be changed or measured"
-    if session.missing_recording is not None:
-        return f"{session.missing_recording.name} is not where it was: say where it is now"
+    if gone := recording_gone(session):
+        return gone
     try:
         _ = session.setup
     except InputError as error:

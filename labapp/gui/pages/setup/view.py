@@ -45,9 +45,17 @@ class SetupPage(Page):
         self._drawn: object = None
         self.tabs = QTabWidget()
         self.tabs.tabBar().setAccessibleName("Parts of the set-up")
-        self.tabs.addTab(self._experiment(), "Experiment")
-        self.tabs.addTab(self._safety(), "Safety")
-        self.tabs.addTab(self._bench(), "Bench")
+        contents = (self._experiment(), self._safety(), self._bench())
+        for content, title in zip(contents, ("Experiment", "Safety", "Bench"), strict=True):
+            self.tabs.addTab(_top(content), title)
+
+        def show_tab(number: int) -> None:
+            # Or the highest tab would have the others scroll over nothing.
+            for tab, content in enumerate(contents):
+                content.setVisible(tab == number)
+
+        self.tabs.currentChanged.connect(show_tab)
+        show_tab(EXPERIMENT_TAB)
         self.panel_layout.addWidget(self.tabs)
         self.panel_layout.setContentsMargins(0, 0, 0, 0)
 
@@ -108,7 +116,7 @@ class SetupPage(Page):
         form = FieldForm()
         for entry in EXPERIMENT:
             self._add_noted(form, entry)
-        return _top(form)
+        return form
 
     def _add_noted(self, form: FieldForm, entry: Entry) -> None:
         field: NumberField | TextField
@@ -141,7 +149,6 @@ class SetupPage(Page):
                 layout.addWidget(label)
             layout.addSpacing(4)
             self.ticks[item], self._times[item] = box, time
-        layout.addStretch(1)
         return page
 
     def _tick(self, item: str, ticked: bool) -> None:
@@ -174,7 +181,7 @@ class SetupPage(Page):
             self._add_noted(form, entry)
         self.table = ResultTable("What the bench lets through")
         form.add_wide(self.table)
-        return _top(form)
+        return form
 
     def _add_rig(self, form: FieldForm, entry: Entry) -> None:
         field = _number(entry)
@@ -230,10 +237,10 @@ def _buttons(*wanted: tuple[str, str, Callable[[], object]]) -> QWidget:
     return row
 
 
-def _top(form: FieldForm) -> QWidget:
+def _top(content: QWidget) -> QWidget:
     page = QWidget()
     layout = QVBoxLayout(page)
-    layout.addWidget(form)
+    layout.addWidget(content)
     layout.addStretch(1)
     return page
 

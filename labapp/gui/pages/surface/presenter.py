@@ -16,7 +16,7 @@ from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
-from labapp.gui.steps import setup_to_do
+from labapp.gui.steps import recording_gone, setup_to_do
 from labapp.session.heights import Profile
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.scene import Scene, rays_of, scene_of
@@ -308,8 +308,8 @@ def why_not(session: Session) -> str:
     """Why nothing can be measured now; empty if it can."""
     if not len(session.frames):
         return "Import a recording first"
-    if (missing := session.missing_recording) is not None:
-        return f"{missing.name} is not where it was: say where it is now"
+    if gone := recording_gone(session):
+        return gone
     try:
         _ = session.setup
     except InputError as error:

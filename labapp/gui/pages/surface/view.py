@@ -131,20 +131,17 @@ class SurfacePage(Page):
             decimals=2,
             tooltip="How far to the left of the electrode the line passes",
         )
-        lines = []
-        for field, words, angle in (
-            (self.angle, "Along X", 0.0),
-            (self.offset, "Along Y", 90.0),
-        ):
+        direction, place = QHBoxLayout(), QHBoxLayout()
+        for field, line in ((self.angle, direction), (self.offset, place)):
             field.label.setWordWrap(False)
             field.edited.connect(self._enter_section)
-            cut = partial(self._set_section, angle, 0.0)
-            line = QHBoxLayout()
             line.addWidget(field.label)
             line.addWidget(field, 1)
-            line.addWidget(_tool(words, f"Cut {words.lower()}, through the electrode's axis", cut))
-            lines.append(line)
-        return _Tools(*lines)
+        for words, angle in (("Along X", 0.0), ("Along Y", 90.0)):
+            cut = partial(self._set_section, angle, 0.0)
+            what = f"Cut {words.lower()}, through the electrode's axis"
+            direction.addWidget(_tool(words, what, cut))
+        return _Tools(direction, place)
 
     def _tools(self) -> QWidget:
         self.colour = ChoiceField(
