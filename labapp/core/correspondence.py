@@ -311,8 +311,8 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     if best.stray > strays or best.missed > settings.missed[0] + settings.missed[1] * best.count:
         raise CannotMeasure(
             "no-match",
-            f"the best surface leaves {best.stray} dots without a ray and {best.missed} rays "
-            f"without a dot amid {best.count} pairs",
+            f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
+            f"{_counted(best.missed, 'ray')} without a dot amid {best.count} pairs",
         )
     own = best.orientation(scene)
     doubtful: list[int] = []
@@ -444,6 +444,10 @@ def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
             row = _most(rows.row[bound.contested])
             reason += f", as the surface would have dots elsewhere that are given row {row}"
         raise CannotMeasure("no-match", reason)
+
+
+def _counted(count: int, thing: str) -> str:
+    return f"{count} {thing}{'s' * (count != 1)}"
 
 
 def _most(rows: IntArray) -> int:

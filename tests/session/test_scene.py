@@ -139,11 +139,10 @@ def test_normals_point_up_and_stand_upright_on_the_surface(pool: Reconstruction)
 
 
 @pytest.fixture
-def plotter() -> Any:
-    pyvista = pytest.importorskip("pyvista")
-    if not scenes.can_draw():
-        pytest.skip("nothing can be drawn in 3-D here")
-    made = pyvista.Plotter(off_screen=True, window_size=[480, 360])
+def plotter(opengl: None) -> Any:
+    import pyvista
+
+    made: Any = pyvista.Plotter(off_screen=True, window_size=[480, 360])
     yield made
     made.close()
 
