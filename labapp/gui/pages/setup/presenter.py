@@ -129,7 +129,7 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
             ),
             Entry(
                 "imaging_plane.s_mm",
-                "s",
+                "s, to the left",
                 "mm",
                 "How far O′ lies to the left of the electrode, as the camera sees it",
                 -10_000,
@@ -139,7 +139,7 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
             ),
             Entry(
                 "imaging_plane.h_mm",
-                "h",
+                "h, above",
                 "mm",
                 "How high O′ lies above the work piece",
                 -10_000,

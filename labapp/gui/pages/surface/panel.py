@@ -103,7 +103,8 @@ class SurfacePanel:
         settings = session.settings
         self.scheme.set_value(scheme_name(settings))
         self.correspondence.set_value(settings.correspondence)
-        self.status.setText(f"{SIGNS[told.state]} {told.words}")
+        remedy = " Its dots can be put right in step 5." if told.state == "failed" else ""
+        self.status.setText(f"{SIGNS[told.state]} {told.words}{remedy}")
         self.again.setVisible(told.state == "stale")
         self.provenance.setText(told.provenance)
         self.provenance.setVisible(bool(told.provenance))
