@@ -145,6 +145,29 @@ def test_whole_numbers_and_empty_ones(qtbot):
     assert type(told[0]) is int
 
 
+@pytest.mark.parametrize(
+    ("field", "old", "typed", "new"),
+    [
+        (lambda: NumberField("Angle", lowest=0, highest=90), 30.0, "27.5", 27.5),
+        (lambda: TextField("Title"), "old", "new", "new"),
+        (lambda: TextField("Notes", lines=3), "old", "new", "new"),
+    ],
+)
+def test_what_is_typed_outlives_a_refresh_while_another_window_is_active(
+    qtbot, field, old, typed, new
+):
+    made = field()
+    qtbot.addWidget(made)  # never shown: it cannot have the focus
+    told = []
+    made.edited.connect(told.append)
+    made.set_value(old)
+    made.editor.selectAll()
+    qtbot.keyClicks(made.editor, typed)
+    made.set_value(old)
+    made.flush()
+    assert told == [new]
+
+
 @pytest.mark.parametrize("lines", [1, 3])
 def test_words_are_told_when_they_are_finished(qtbot, lines):
     field = TextField("Notes", lines=lines)

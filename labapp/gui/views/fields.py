@@ -147,7 +147,7 @@ class NumberField(Field):
         """Show another value; tells nobody."""
         if self._pause.isActive():
             return
-        typing = self._box.text() != self._shown(self._value) and self._box.hasFocus()
+        typing = self._box.text() != self._shown(self._value) and self._box.line.isModified()
         self._value = self._told = value
         if not typing:
             self._show()
@@ -272,7 +272,9 @@ class TextField(Field):
 
     def set_value(self, value: str) -> None:
         """Show other words; tells nobody, and leaves alone what is being typed."""
-        typing = self._edit.hasFocus() and self.value() != self._told
+        edit = self._edit
+        modified = edit if isinstance(edit, QLineEdit) else edit.document()
+        typing = modified.isModified() and self.value() != self._told
         self._told = value
         if typing or value == self.value():
             return
