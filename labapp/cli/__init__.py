@@ -20,7 +20,7 @@ import typer.core
 import typer.main
 
 import labapp
-from labapp.cli import analyze, session, simulate
+from labapp.cli import advise, analyze, session, simulate
 from labapp.cli.shared import (
     BAD_INPUT,
     FAULT,
@@ -63,6 +63,7 @@ app.add_typer(calibrate, name="calibrate")
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
 app.command()(simulate.simulate)
+app.command()(advise.advise)
 app.command()(tour)
 
 SetupToChange = Annotated[

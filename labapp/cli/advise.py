@@ -1,0 +1,163 @@
+"""`labapp advise`: where laser and imaging plane should stand for the pools expected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from labapp.cli.analyze import _begin, _draw, _progress, _write
+from labapp.cli.shared import NOTHING
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.simulation.adviser import Advice
+    from labapp.simulation.bench_limits import BenchLimits
+    from labapp.simulation.expected_pools import ExpectedPools
+
+
+def advise(
+    *,
+    out: Annotated[
+        Path, typer.Option(help="Folder for advice.md, .csv, .png, setup.toml; they are replaced.")
+    ],
+    question: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE.toml]", help="Pools and bench (TOML): docs/adviser.md."),
+    ] = None,
+    width: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Of the pools along X, from A to B (mm).")
+    ] = None,
+    length: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Of the pools along Y (mm).")
+    ] = None,
+    height: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Of the pools, above 0 (mm).")
+    ] = None,
+    convex: Annotated[
+        bool | None, typer.Option("--convex/--concave", help="Above the work piece, or below it.")
+    ] = None,
+    angle: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Of the laser: it can stand so (degrees).")
+    ] = None,
+    distance: Annotated[str | None, typer.Option(metavar="A:B", help="Of the laser (mm).")] = None,
+    plane: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Distance of the imaging plane (mm).")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A coarser search: a tenth of the time.")
+    ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Hold the advice against 50 fresh pools and a grid.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="The same gives the same.")] = 4,
+) -> None:
+    """Advise where laser and imaging plane should stand for the pools that are expected.
+
+    Options replace what FILE.toml says. The setup.toml that is written lacks the image
+    calibration, which the bench must be measured for: labapp calibrate plane.
+    """
+    from labapp.session.advice_keys import parse_question, read_question
+
+    values = read_question(question) if question else {}
+    kind = None if convex is None else "convex" if convex else "concave"
+    for table, key, value in (
+        ("pools", "kind", kind),
+        ("pools", "width_mm", _span("--width", width)),
+        ("pools", "length_mm", _span("--length", length)),
+        ("pools", "height_mm", _span("--height", height)),
+        ("bench", "projection_angle_deg", _span("--angle", angle)),
+        ("bench", "distance_mm", _span("--distance", distance)),
+        ("bench", "plane_distance_mm", _span("--plane", plane)),
+    ):
+        if value is not None and isinstance(values.setdefault(table, {}), dict):
+            values[table][key] = value
+    expected, limits = parse_question(values, question or "labapp advise")
+    if not _advised(expected, limits, out, quick, check, seed):
+        raise typer.Exit(NOTHING)
+
+
+def _advised(
+    expected: ExpectedPools, limits: BenchLimits, out: Path, quick: bool, check: bool, seed: int
+) -> bool:
+    """Search, tell and write; whether any set-up is possible."""
+    from labapp.simulation import adviser, adviser_check
+    from labapp.simulation.advice_report import advice_text, cost_table
+
+    folder = _begin(out)
+    assert folder is not None
+    effort = adviser.QUICK if quick else adviser.Effort()
+    with _progress() as progress:
+        advice = adviser.advise(expected, limits, effort, seed, progress)
+        typer.echo(advice_text(advice))
+        _keep(folder, advice)
+        if advice.possible:
+            typer.echo("\n" + cost_table(advice).markdown())
+        if check and advice.possible:
+            told = adviser_check.check_text(adviser_check.check(advice, progress=progress))
+            _write(folder / "check.txt", told.encode() + b"\n")
+            typer.echo(told)
+    typer.echo(f"Tables and picture are in {folder.absolute()}")
+    return advice.possible
+
+
+def _span(option: str, text: str | None) -> list[float] | None:
+    """Two numbers from ``A:B``, or twice the one of ``A``."""
+    if text is None:
+        return None
+    try:
+        low, _, high = text.partition(":")
+        return [float(low), float(high or low)]
+    except ValueError as error:
+        expected = "two numbers A:B, from the smaller to the larger"
+        raise InputError(option, "range", text, expected) from error
+
+
+def _keep(folder: Path, advice: Advice) -> None:
+    from labapp.session.setup import updated_setup
+    from labapp.simulation.advice_report import (
+        advice_picture,
+        advice_table,
+        advice_text,
+        cost_table,
+    )
+
+    tables = [cost_table(advice)] if advice.possible else []
+    words = "\n\n".join([advice_text(advice), *(table.markdown() for table in tables)])
+    _write(folder / "advice.md", words.encode() + b"\n")
+    _write(folder / "advice.csv", advice_table(advice).csv().encode())
+    _draw(folder, "advice", advice_picture(advice), "png")
+    if advice.possible:
+        text = (
+            "# Recommended by labapp advise. Set the bench up so, then measure where it really\n"
+            "# stands: labapp calibrate laser and labapp calibrate plane, both with --setup.\n"
+            "# [image_calibration] is missing until calibrate plane writes it.\n\n"
+        )
+        path = folder / "setup.toml"
+        _write(path, updated_setup(text, path, _setup_values(advice)).encode())
+
+
+def _setup_values(advice: Advice) -> dict[str, dict[str, Any]]:
+    place, limits = advice.best.place, advice.limits
+    pattern = limits.pattern
+    return {
+        "laser": {
+            "projection_angle_deg": round(place.projection_angle_deg, 2),
+            "distance_mm": round(place.distance_mm, 2),
+        },
+        "pattern": {
+            "rows": pattern.rows,
+            "columns": pattern.columns,
+            "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
+            "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
+        },
+        "electrode": {"height_mm": limits.electrode_mm},
+        "imaging_plane": {
+            "distance_mm": round(place.plane_mm, 2),
+            "s_mm": round(place.s_mm, 2),
+            "h_mm": round(place.h_mm, 2),
+            "width_mm": limits.plate_mm[0],
+            "height_mm": limits.plate_mm[1],
+        },
+    }
