@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from html import escape
 
 import numpy
 import PySide6
 from PySide6.QtCore import QSize, Qt
-from PySide6.QtGui import QKeySequence
+from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
 
 import labapp
@@ -50,21 +51,31 @@ def guide() -> str:
     return f"<h2>Guide</h2>{INTRODUCTION}{steps}{frames}{CLOSING}"
 
 
-def keys() -> str:
-    """Every action that has a key; HTML."""
+def keys(page: QWidget | None = None) -> str:
+    """Every action that has a key, those of the page in view first; HTML."""
+    from labapp.gui.views import picture, plots, view3d
+
     parts = []
+    if page is not None:
+        own = [(_key(action), action.text(), action.toolTip()) for action in page.actions()]
+        rows = [(key, text, tip.removesuffix(f" ({key})")) for key, text, tip in own if key]
+        parts += [_table(f"This page: {page.accessibleName()}", rows)] if rows else []
+    in_views = (("Pictures", picture.KEYS), ("3-D views", view3d.KEYS_TOLD), ("Plots", plots.KEYS))
+    told = "".join(f"<p><b>{name}</b>: {escape(words)}.</p>" for name, words in in_views)
+    parts.append(f"<h3>In what is drawn</h3>{told}")
     for menu in MENUS:
-        rows = "".join(
-            f"<tr><td width='110'>{escape(_shown(action.key))}</td>"
-            f"<td width='190'><b>{escape(action.text.replace('&', ''))}</b></td>"
-            f"<td>{escape(action.tip)}</td></tr>"
-            for action in ACTIONS
-            if action.menu == menu and action.key
-        )
-        parts.append(
-            f"<h3>{escape(menu.replace('&', ''))}</h3><table cellpadding='2'>{rows}</table>"
-        )
+        rows = [(_shown(a.key), a.text, a.tip) for a in ACTIONS if a.menu == menu and a.key]
+        parts.append(_table(menu.replace("&", ""), rows))
     return f"<h2>Keys</h2>{''.join(parts)}"
+
+
+def _table(heading: str, rows: list[tuple[str, str, str]]) -> str:
+    lines = "".join(
+        f"<tr><td width='110'>{escape(key)}</td>"
+        f"<td width='190'><b>{escape(text.replace('&', ''))}</b></td><td>{escape(tip)}</td></tr>"
+        for key, text, tip in rows
+    )
+    return f"<h3>{escape(heading)}</h3><table cellpadding='2'>{lines}</table>"
 
 
 def about() -> str:
@@ -83,7 +94,7 @@ def about() -> str:
     )
 
 
-TEXTS = {"guide": guide, "keys": keys, "about": about}
+TEXTS: dict[str, Callable[[], str]] = {"guide": guide, "keys": keys, "about": about}
 
 
 class HelpDialog(QDialog):
@@ -93,9 +104,13 @@ class HelpDialog(QDialog):
     ----------
     kind
         ``guide``, ``keys`` or ``about``.
+    page
+        The page in view, whose keys are told too.
     """
 
-    def __init__(self, kind: str, parent: QWidget | None = None) -> None:
+    def __init__(
+        self, kind: str, parent: QWidget | None = None, page: QWidget | None = None
+    ) -> None:
         super().__init__(parent)
         self.setObjectName(f"help-{kind}")
         self.setWindowTitle(TITLES[kind])
@@ -103,7 +118,7 @@ class HelpDialog(QDialog):
         self.browser = QTextBrowser()
         self.browser.setAccessibleName(TITLES[kind])
         self.browser.setAccessibleDescription("Arrow keys and Page Up and Down move the text")
-        self.browser.setHtml(TEXTS[kind]())
+        self.browser.setHtml(keys(page) if kind == "keys" else TEXTS[kind]())
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.button(QDialogButtonBox.StandardButton.Close).setToolTip("Close this text (Esc)")
         buttons.rejected.connect(self.reject)
@@ -112,6 +127,10 @@ class HelpDialog(QDialog):
         layout.addWidget(buttons)
         wanted = QSize(520, 300) if kind == "about" else QSize(720, 600)
         self.resize(wanted.boundedTo(self.screen().availableSize() * PART_OF_SCREEN))
+
+
+def _key(action: QAction) -> str:
+    return action.shortcut().toString(QKeySequence.SequenceFormat.NativeText)
 
 
 def _shown(key: str) -> str:

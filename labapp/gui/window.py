@@ -402,7 +402,7 @@ class MainWindow(QMainWindow):
 
     def show_help(self, kind: str) -> None:
         """Show the guide, the keys or what the program is."""
-        HelpDialog(kind, self).show()
+        HelpDialog(kind, self, self.page).show()
 
     def show_log_folder(self) -> None:
         """Open the folder with the log."""

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
-from PySide6.QtGui import QKeySequence
-from PySide6.QtWidgets import QApplication
+from PySide6.QtGui import QAction, QKeySequence
+from PySide6.QtWidgets import QApplication, QWidget
+from pytestqt.qtbot import QtBot
 
 from labapp.gui.actions import ACTIONS, MENUS
-from labapp.gui.help import TEXTS
+from labapp.gui.help import TEXTS, keys
 from labapp.gui.steps import STEPS
+from labapp.gui.views import picture, plots, view3d
 from labapp.gui.window import MainWindow
 
 
@@ -48,9 +50,24 @@ def test_without_a_session_only_what_is_of_use_is_enabled(window: MainWindow):
 
 
 def test_help_names_every_step_and_key(qapp: QApplication):
-    guide, keys = TEXTS["guide"](), TEXTS["keys"]()
+    guide, told = TEXTS["guide"](), TEXTS["keys"]()
     for step in STEPS:
         assert step.title in guide
     for action in ACTIONS:
         if action.key:
-            assert QKeySequence(action.key).toString() in keys
+            assert QKeySequence(action.key).toString() in told
+
+
+def test_the_keys_of_the_page_in_view_and_of_drawings_are_told(qtbot: QtBot) -> None:
+    page = QWidget()
+    qtbot.addWidget(page)
+    page.setAccessibleName("Dots")
+    action = QAction("Row left", page)
+    action.setShortcut(QKeySequence("Ctrl+Left"))
+    action.setToolTip("Shift the row (Ctrl+Left)")
+    page.addAction(action)
+    told = keys(page)
+    assert "This page: Dots" in told
+    assert "<b>Row left</b></td><td>Shift the row</td>" in told
+    for words in (picture.KEYS, view3d.KEYS_TOLD, plots.KEYS):
+        assert words in keys()
