@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.special import fdtrc
+from scipy.special import chdtri, fdtrc, stdtrit
 
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.values import FloatArray, freeze
@@ -29,9 +29,14 @@ FEWEST_ON_AXIS, FEWEST_MARKS = 4, 9
 LARGEST_CHANCE = 0.001
 """A homography is doubted while noise alone gains as much with a larger probability than this."""
 
+WHAT_MATTERS_MM = 0.5
+"""A map that may err more where dots land is said to."""
+
 AFFINE = (0, 1, 2, 3, 4, 5)
 PERSPECTIVE = ((6,), (7,), (6, 7))
 """Entries of the matrix, row by row, that make it affine; and perspective along X′, Z′, both."""
+
+HELP = "set the camera square, or put marks farther out on the plate"
 
 FIELD = 1.5
 """Dots land within the square from O′ whose side is this many times the longer axis."""
@@ -104,6 +109,11 @@ class MarkFits:
     ----------
     affine, homography
         The fits; None for a homography that the marks cannot tell.
+    whole
+        The homography with perspective along both axes, also where less is used: what the marks
+        leave open; None if they are too few.
+    corner_mm
+        X′ = Z′ of the far corner of where dots land, mm.
     chance
         How probable it is that noise alone gains as much by perspective as was gained (F-test).
     affine_error_mm, homography_error_mm
@@ -116,6 +126,8 @@ class MarkFits:
 
     affine: MarkFit
     homography: MarkFit | None
+    whole: MarkFit | None
+    corner_mm: float
     chance: float
     affine_error_mm: float
     homography_error_mm: float
@@ -134,6 +146,44 @@ class MarkFits:
         if fit is None:
             raise ValueError(f"these marks give no {model}")
         return fit
+
+    def bound_mm(self, used: ImageCalibration) -> float:
+        """How far a map may err at the far corner: 95 % bound, mm; NaN if nothing tells.
+
+        The truth is a homography, with perspective along both axes, as uncertain as its fit to the
+        marks: what they leave open counts in full, whichever map is used.
+        """
+        if self.whole is None:
+            return float("nan")
+        corner = np.full((1, 2), self.corner_mm)
+        seen = self.whole.calibration.to_image(corner)
+        slope = used.jacobian(seen)[0]
+        off = (used.to_plane(seen) - corner)[0]
+        # Scatter along an axis is itself known from the few residuals there only.
+        wider = stdtrit(self.whole.spare[:, 0].sum(), 0.975) / 1.96
+        covariance = wider**2 * slope @ self.whole.covariance_px2(corner) @ slope.T
+        # |off + noise|² is nearly c·χ²(n) with its mean and variance (Satterthwaite 1946).
+        mean = off @ off + np.trace(covariance)
+        spread = 2 * np.sum(covariance**2) + 4 * off @ covariance @ off
+        n = 2 * mean**2 / max(spread, 1e-300)
+        return float(np.sqrt(mean * chdtri(n, 0.05) / n)) if n < 1e6 else float(np.sqrt(mean))
+
+    def bound_words(self, used: ImageCalibration) -> tuple[str, ...]:
+        """How far a map may err where dots land, and what helps where that matters."""
+        bound, whole = self.bound_mm(used), self.whole
+        if whole is None:
+            return (f"nothing tells how far the camera looks askew: {HELP}",)
+        corner = f"{self.corner_mm:.0f}, {self.corner_mm:.0f} mm"
+        told = f"± {bound:.2g} mm at the plate's far corner (X′, Z′ = {corner}; 95 %)"
+        if bound <= WHAT_MATTERS_MM:
+            return (told,)
+        if self.best == "homography" and bound > 1.5 * self.bound_mm(
+            self.of("homography").calibration
+        ):
+            return told, "the homography would leave less: the marks show perspective"
+        on_x, on_z = np.diag(whole.covariance)[list(PERSPECTIVE[-1])]
+        axis, way = ("O′Z′", "up or down") if on_z > on_x else ("O′X′", "from the side")
+        return told, f"the marks on {axis} cannot tell how far the camera looks {way}: {HELP}"
 
 
 def root_mean_square(offsets: FloatArray) -> float:
@@ -171,7 +221,8 @@ def fit_marks(
             f"{on_x} marks on O′X′ and {on_z} on O′Z′, O′ included, are too few to tell "
             f"perspective: {FEWEST_ON_AXIS} on each and {FEWEST_MARKS} in all are needed"
         )
-        return MarkFits(affine, None, 1.0, np.nan, np.nan, "affine", reason)
+        corner = FIELD * float(np.abs(plane_mm).max())
+        return MarkFits(affine, None, None, corner, 1.0, np.nan, np.nan, "affine", reason)
     whiten = _by_scatter(plane_mm, image_px, noise, affine)
     affine, *fits = (_fit(plane_mm, image_px, AFFINE + more, whiten) for more in ((), *PERSPECTIVE))
     return _chosen(affine, fits, float(np.abs(plane_mm).max()))
@@ -215,7 +266,8 @@ def _chosen(affine: MarkFit, fits: list[MarkFit], axis_mm: float) -> MarkFits:
         reason = f"No perspective is seen: noise alone gains as much in {chance:.0%} of pictures"
     else:
         reason = f"There is perspective, but the marks tell it too poorly: {here}"
-    return MarkFits(affine, homography, chance, affine_error, error, best, reason)
+    whole, corner, errors = fits[2], FIELD * axis_mm, (affine_error, error)
+    return MarkFits(affine, homography, whole, corner, chance, *errors, best, reason)
 
 
 def _chance(smaller: MarkFit, larger: MarkFit) -> float:

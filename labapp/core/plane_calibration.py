@@ -167,13 +167,17 @@ class PlaneCalibration:
         ValueError
             If the three points lie on one line, or the marks do not give the model.
         """
-        if self.model == "three points":
-            return ImageCalibration.from_three_points(
-                self.origin_px, self.x_axis_px, self.x_axis_mm, self.z_axis_px, self.z_axis_mm
-            )
-        if self.fits is None:
+        if self.model != "three points" and self.fits is None:
             raise ValueError(f"without marks there is no {self.model}")
-        return self.fits.of(self.model).calibration
+        # As the set-up's keys give it, to the last digit: what is proposed is what is used.
+        if self.model == "homography":
+            assert self.fits is not None
+            matrix = self.fits.of(self.model).calibration.matrix
+            return ImageCalibration(matrix / matrix[2, 2])
+        origin, on_x, on_z = (_pair(point) for point in self.points_px)
+        return ImageCalibration.from_three_points(
+            origin, on_x, self.x_axis_mm, on_z, self.z_axis_mm
+        )
 
     @property
     def setup_keys(self) -> dict[str, object]:
@@ -181,8 +185,7 @@ class PlaneCalibration:
         names = ("origin_px", "x_axis_px", "z_axis_px")
         lengths = {"x_axis_mm": self.x_axis_mm, "z_axis_mm": self.z_axis_mm}
         if self.model == "homography":
-            matrix = self.image_calibration.matrix
-            rows = (matrix / matrix[2, 2]).tolist()
+            rows = self.image_calibration.matrix.tolist()
             return {**dict.fromkeys((*names, *lengths)), "homography": rows}
         points = dict(zip(names, self.points_px.tolist(), strict=True))
         return {**points, **lengths, "homography": None}
@@ -201,7 +204,12 @@ class PlaneCalibration:
             if fit is not None
         ]
         why = self.fits.reason if self.model == self.fits.best else "chosen by hand"
-        return [*lines, f"used       {self.model}, {len(self.marks)} marks. {why}"]
+        lines.append(f"used       {self.model}, {len(self.marks)} marks. {why}")
+        return [*lines, *(f"{'error':<10} {words}" for words in self.bound_words())]
+
+    def bound_words(self) -> tuple[str, ...]:
+        """How far the model may err where dots land; nothing without marks."""
+        return () if self.fits is None else self.fits.bound_words(self.image_calibration)
 
     def with_scale(self, factor: float) -> PlaneCalibration:
         """The same picture of a target that is larger by a factor."""

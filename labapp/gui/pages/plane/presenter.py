@@ -190,7 +190,11 @@ def why(found: PlaneCalibration | None) -> str:
         return ""
     if found.fits is None:
         return "Only the three points are used: tick marks were not found, or points were moved"
-    return f"{found.fits.reason}."
+    return "\n".join((f"{found.fits.reason}.", *(f"{words}." for words in _capital(found))))
+
+
+def _capital(found: PlaneCalibration) -> list[str]:
+    return [words[0].upper() + words[1:] for words in found.bound_words()]
 
 
 @dataclass(frozen=True)
@@ -251,7 +255,7 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
         values = [*shown.px_per_mm, shown.angle_deg]
     note = "From this session's calibration" if session.plane_calibration else "As entered"
     return tuple(
-        ResultRow(name, value, None, unit, 3 if unit == "px/mm" else 2, note)
+        ResultRow(name, value, None, unit, 4 if unit == "px/mm" else 3, note)
         for (name, unit), value in zip(names, values, strict=True)
     )
 
