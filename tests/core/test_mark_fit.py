@@ -130,6 +130,20 @@ def test_the_marks_are_not_biased() -> None:
 # --- marks as numbers -------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("view", [(1e6, 0, 0), (800, 12, -15), (450, -18, 8), (600, 30, 0)])
+def test_the_error_far_from_the_marks_is_within_its_bound(view: tuple[float, float, float]) -> None:
+    matrix, rng = pinhole(*view), np.random.default_rng(6121)
+    within = []
+    for _ in range(60):
+        fits = noisy(matrix, rng)
+        used, corner = fits.of(fits.best).calibration, np.full((1, 2), fits.corner_mm)
+        error = np.linalg.norm(used.to_plane(seen(matrix, corner)) - corner)
+        within.append(error <= fits.bound_mm(used))
+        told = " ".join(fits.bound_words(used))
+        assert ("cannot tell" in told or "would leave less" in told) == (fits.bound_mm(used) > 0.5)
+    assert np.mean(within) >= 0.9
+
+
 def test_marks_without_noise_give_the_map_back() -> None:
     matrix = pinhole(500, 12, -17)
     fits = fit_marks(MARKS_MM, seen(matrix, MARKS_MM))
