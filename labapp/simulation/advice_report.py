@@ -100,28 +100,39 @@ def _row(what: str, one: Candidate, error_mm: float) -> tuple[Cell, ...]:
 
 
 def cost_table(advice: Advice) -> Table:
-    """What each mm and degree away costs: how much more error, and what breaks first either way."""
+    """What each mm and degree away costs on the mean, as far as all is kept, and what breaks."""
     rows: list[tuple[Cell, ...]] = []
     for sweep in advice.sweeps:
-        words, unit = WORDS[sweep.name]
         own = int(np.argmin(np.abs(sweep.value - getattr(advice.best.place, sweep.name))))
+        # From one pool to the next which rays come back changes: a short way's slope is luck.
+        short = np.ptp(sweep.value) / 2 / max(len(sweep.value) - 1, 1)
         for way in (-1, 1):
-            path = range(own + way, len(sweep.value) if way > 0 else -1, way)
-            kept = [k for k in path if not any(sweep.breaks(n) for n in path if way * (n - k) <= 0)]
-            wrong = next((k for k in path if sweep.breaks(k)), None)
-            more: Cell = None
-            if path:
-                near = path[0]
-                apart = abs(sweep.value[near] - sweep.value[own])
-                more = float(1000 * (sweep.error_mm[near] - sweep.error_mm[own]) / apart)
-            last = float(sweep.value[kept[-1]]) if kept else float(sweep.value[own])
-            first = None if wrong is None else float(sweep.value[wrong])
-            names = [] if wrong is None else sweep.breaks(wrong)
-            broken = "; ".join(CONSTRAINTS[name][0] for name in names)
-            rows.append((words, unit, "less" if way < 0 else "more", more, last, first, broken))
+            path = list(range(own + way, len(sweep.value) if way > 0 else -1, way))
+            broken = [k for k in path if sweep.breaks(k)]
+            kept = path[: path.index(broken[0])] if broken else path
+            far = [k for k in path if abs(sweep.value[k] - sweep.value[own]) >= short]
+            end = next((k for k in reversed(kept) if k in far), far[0] if far else None)
+            more = None
+            if end is not None:
+                apart = abs(sweep.value[end] - sweep.value[own])
+                more = float(1000 * (sweep.error_mm[end] - sweep.error_mm[own]) / apart)
+            wrong = broken[0] if broken else None
+            rows.append(
+                (
+                    *WORDS[sweep.name],
+                    "less" if way < 0 else "more",
+                    more,
+                    float(sweep.value[kept[-1] if kept else own]),
+                    None if wrong is None else float(sweep.value[wrong]),
+                    "; ".join(CONSTRAINTS[name][0] for name in sweep.breaks(wrong))
+                    if wrong is not None
+                    else "",
+                )
+            )
     return Table(
         "cost",
-        "Cost of each mm and degree away from the recommended set-up",
+        "Cost of each mm and degree away from the recommended set-up, µm of error; kept and broken "
+        "where it was looked at",
         (
             "quantity",
             "unit",

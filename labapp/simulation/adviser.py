@@ -295,7 +295,7 @@ class _Search:
 
     def sweeps(self, best: Candidate, scale: float) -> tuple[Sweep, ...]:
         tasks = [
-            (self.expected, self.limits, best, name, self.samples[0], self.effort.sweep)
+            (self.expected, self.limits, best, name, self.samples[1], self.effort.sweep)
             for name in MOVED
         ]
         found = in_parallel(_swept, tasks, "a mm or a degree away", self.progress, self.workers)

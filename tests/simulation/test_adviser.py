@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from labapp.simulation.adviser import Advice, Effort, advise, constraint_words
+from labapp.simulation.advice_report import cost_table
+from labapp.simulation.adviser import Advice, Effort, Sweep, advise, constraint_words
 from labapp.simulation.adviser_check import Check, check, check_text
 from labapp.simulation.bench_limits import BenchLimits, LaserPlace, Place
 from labapp.simulation.expected_pools import ExpectedPools
@@ -167,6 +168,20 @@ def test_sweeps_tell_where_a_set_up_breaks(advice: Advice) -> None:
         assert sweep.error_mm[own] == pytest.approx(advice.error_mm)
         assert sweep.breaks(own) == ()
     assert "across" in names["s_mm"].breaks(0)
+
+
+def test_cost_of_a_mm_is_the_slope_of_its_curve(advice: Advice) -> None:
+    best = replace(advice.best, place=Place(30.0, 30.0, 60.0, 50.0, 0.0))
+    value, error = np.array([40.0, 50.0, 60.0, 70.0]), np.array([5.0, 4.0, 3.0, 2.5]) / 1000
+    fine, bad = dict(advice.best.margins), {**advice.best.margins, "spacing": -1.0}
+    sweep = Sweep("plane_mm", value, error, (bad, fine, fine, fine))
+    table = cost_table(replace(advice, best=best, sweeps=(sweep,)))
+    less, more = (dict(zip(table.columns, row, strict=True)) for row in table.rows)
+    assert less["more_error_um_per_unit"] == pytest.approx(0.1)
+    assert (less["kept_to"], less["broken_at"]) == (50, 40)
+    assert less["what_breaks"] == "neighbouring dots apart"
+    assert more["more_error_um_per_unit"] == pytest.approx(-0.05)
+    assert (more["kept_to"], more["broken_at"]) == (70, None)
 
 
 def test_where_nothing_is_possible_it_says_what_stands_in_the_way() -> None:
