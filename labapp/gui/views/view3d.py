@@ -277,9 +277,10 @@ class OffscreenView(View3d):
         self._at = QPointF()
 
     def _new_plotter(self) -> Any:
-        import pyvista
+        # Not `pyvista.Plotter`: it is not waited for while another thread loads it.
+        from pyvista.plotting import Plotter
 
-        plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(self._pixels()))
+        plotter: Any = Plotter(off_screen=True, window_size=list(self._pixels()))
         plotter.disable_anti_aliasing()
         plotter.render_window.SetMultiSamples(0)
         return plotter
