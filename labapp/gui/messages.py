@@ -37,7 +37,11 @@ class ElidedLabel(QLabel):
 
     def minimumSizeHint(self) -> QSize:
         """Room for a word."""
-        return QSize(40, super().minimumSizeHint().height())
+        return QSize(40, self.sizeHint().height())
+
+    def sizeHint(self) -> QSize:
+        """One line, however many the text has."""
+        return QSize(super().sizeHint().width(), self.fontMetrics().height())
 
     def paintEvent(self, _event: QPaintEvent) -> None:
         """Draw as much as there is room for."""

@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QByteArray, QSize, Qt, QTimer, QUrl
-from PySide6.QtGui import (
-    QCloseEvent,
-    QDesktopServices,
-    QDragEnterEvent,
-    QDropEvent,
-    QKeyEvent,
-)
+from PySide6.QtGui import QCloseEvent, QDesktopServices, QDragEnterEvent, QDropEvent, QKeyEvent
 from PySide6.QtWidgets import (
     QApplication,
     QDockWidget,
@@ -67,6 +61,9 @@ LAYOUT_VERSION = 1
 SIZE_PX = (1600, 1000)
 PART_OF_SCREEN = 0.92
 """Size at the first start, and the most of the screen that it takes."""
+
+PAGE_PX = 336
+"""Least height of a page: with all panels 492, of the 512 that 768 are at 150 %."""
 
 
 class MainWindow(QMainWindow):
@@ -123,6 +120,7 @@ class MainWindow(QMainWindow):
     def _make_views(self) -> None:
         self.welcome = Welcome(self.workspace)
         self.stack = QStackedWidget()
+        self.stack.setMinimumHeight(PAGE_PX)  # else hidden pages could make the window grow
         self.stack.addWidget(self.welcome)
         self.setCentralWidget(self.stack)
         self.step_list = StepList(self._steps)
@@ -422,6 +420,7 @@ class MainWindow(QMainWindow):
                 restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
         if self.preferences.layout:
             self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
+            self._wanted["log"] = False  # what was said then is not said now
 
     def remember(self, preferences: Preferences) -> None:
         """Keep preferences for the next start."""
