@@ -299,11 +299,11 @@ class MainWindow(QMainWindow):
             self._show_session()
         else:
             self._show_frames()
-            self.side_panel.show_state(self._states[self.page.key])
+            self.side_panel.show_state(self.page.state(self._states[self.page.key]))
 
     def _show_page(self) -> None:
         if self.page is not None and self.workspace.session is not None:
-            self.side_panel.show_state(self._states[self.page.key])
+            self.side_panel.show_state(self.page.state(self._states[self.page.key]))
             self.workspace.tried(self.page.refresh)
 
     def _frame_changed(self, frame: int) -> None:

@@ -157,7 +157,7 @@ def export(
     choice: ExportChoice,
     *,
     image_of: Callable[[int], GreyImage] | None = None,
-    extras: Mapping[str, bytes] | None = None,
+    extras: Mapping[str, Callable[[], bytes]] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[ExportedFile, ...]:
     """Write results into a folder: all of them, or nothing and what was there stays.
@@ -178,7 +178,8 @@ def export(
     image_of
         Reads a frame's grey levels; needed for pictures of frames.
     extras
-        Further files, name → content: a report.
+        Further files, name → what makes its content, once it is sure that the folder can be
+        written: a report.
     progress
         Called with the number of frames done, those of a film counted again; may raise to stop.
 
@@ -199,8 +200,9 @@ def export(
         raise InputError(target, "pictures", "frames", "a recording that can be read")
     with _told(target, ROOM), _beside(target) as part:
         files = _Files(part)
-        for name, content in (extras or {}).items():
-            files.add(name, content)
+        for name, content_of in (extras or {}).items():
+            files.new(name)
+            files.add(name, content_of())
         progress = progress or (lambda _: None)
         summary, extent = _write_results(
             files, measured, calibration, provenance, choice, image_of, progress

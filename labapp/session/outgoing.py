@@ -33,11 +33,10 @@ def export_session(
     before = len(numbers) * report
     total = before + len(numbers) * (2 if "film" in choice.pictures else 1)
     told = progress or (lambda done, total: None)
-    extras = {}
-    if report:
-        extras["report.pdf"] = report_pdf(
-            session, scheme, numbers, progress=lambda done: told(done, total)
-        )
+
+    def made() -> bytes:
+        return report_pdf(session, scheme, numbers, progress=lambda done: told(done, total))
+
     return export(
         folder,
         _Measured(session, scheme, numbers),
@@ -45,7 +44,7 @@ def export_session(
         _provenance(session, scheme, numbers),
         choice,
         image_of=lambda number: session.frame(number).image,
-        extras=extras,
+        extras={"report.pdf": made} if report else None,
         progress=lambda done: told(before + done, total),
     )
 

@@ -212,15 +212,29 @@ def test_pictures_of_frames_need_the_recording(run: Run, tmp_path: Path) -> None
 
 
 def test_further_files_come_along(run: Run, tmp_path: Path) -> None:
-    run(tmp_path / "out", extras={"report.pdf": b"%PDF"})
+    run(tmp_path / "out", extras={"report.pdf": lambda: b"%PDF"})
     assert (tmp_path / "out" / "report.pdf").read_bytes() == b"%PDF"
     assert verify_export(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize("place", ["/proc/nope", "file/out", "mine"])
+def test_a_folder_that_cannot_be_written_is_refused_first(
+    run: Run, tmp_path: Path, place: str
+) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    prepared, measured = mock.Mock(return_value=b""), mock.MagicMock()
+    with pytest.raises(InputError):
+        run(tmp_path / place, extras={"report.pdf": prepared}, measured=measured)
+    prepared.assert_not_called()
+    measured.__iter__.assert_not_called()
 
 
 @pytest.mark.parametrize("name", ["../a.pdf", "/a.pdf", "", ".", "a/b", ".part", "measures.csv"])
 def test_further_files_have_names_of_their_own(run: Run, tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError):
-        run(tmp_path / "out", extras={name: b""})
+        run(tmp_path / "out", extras={name: bytes})
     assert list(tmp_path.iterdir()) == []
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from PySide6.QtGui import QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
+from labapp.gui.steps import State
 from labapp.gui.workspace import Workspace
 
 
@@ -43,6 +44,10 @@ class Page(QWidget):
 
     def refresh(self) -> None:
         """Show what the session holds now; ``workspace.session`` is not None."""
+
+    def state(self, found: State) -> State:
+        """How far the step is, as the session has it or as only the page knows."""
+        return found
 
     def leave(self) -> None:
         """The page goes out of view, or the window closes: stop what only it needs."""

@@ -29,6 +29,7 @@ from labapp.gui.pages.capture.presenter import (
     refusal,
     size_in_words,
 )
+from labapp.gui.steps import Mark, State
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 
@@ -129,6 +130,9 @@ def made(workspace: Workspace) -> CapturePage:
     return page
 
 
+NOTHING = State(Mark.READY, "No recording yet")
+
+
 @pytest.fixture
 def page(qtbot: QtBot, tmp_path: Path) -> CapturePage:
     workspace = Workspace()
@@ -145,9 +149,11 @@ def session_of(page: CapturePage) -> Session:
 def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
     assert page.picture_view.picture is None
     assert not page.choice_group.isVisibleTo(page.panel)
+    assert page.state(NOTHING) is NOTHING
     page.take(stack)
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
     assert session_of(page).recording is None
+    assert "press Import" in page.state(NOTHING).why
     first = page.picture_view.picture
     page.slider.setValue(7)
     qtbot.waitUntil(lambda: "frame 7" in page.title.text())
@@ -165,6 +171,7 @@ def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) ->
     assert page.workspace.frame == 2
     assert page.told_group.isVisibleTo(page.panel)
     assert not page.choice_group.isVisibleTo(page.panel)
+    assert page.state(NOTHING) is NOTHING
 
 
 def test_an_import_that_is_cancelled_leaves_the_session_as_it_was(

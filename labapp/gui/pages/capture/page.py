@@ -32,6 +32,7 @@ from labapp.gui.pages.capture.presenter import (
     refusal,
 )
 from labapp.gui.pages.page import Page
+from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.views.picture import PictureView
@@ -100,6 +101,13 @@ class CapturePage(Page):
         self._show_recording(recording)
         self._show_import()
         self._look()
+
+    def state(self, found: State) -> State:
+        """How far the step is: a recording may be chosen that the session does not have yet."""
+        session = self.workspace.session
+        if self.preview is None or session is None or session.recording is not None:
+            return found
+        return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
 
     def leave(self) -> None:
         """Judge no frame that nobody sees."""
@@ -242,6 +250,7 @@ class CapturePage(Page):
             self.source_words.setText(f"{path.name}\n{told}")
             self._show_import()
             self._look()
+            self.workspace.changed.emit()
 
         self._opening = self.workspace.tasks.start(
             f"Opening {path.name}", lambda _: Preview(path), opened
@@ -301,6 +310,7 @@ class CapturePage(Page):
         """Look at the session's frames again; nothing is imported."""
         self._drop_preview()
         self.refresh()
+        self.workspace.changed.emit()
 
     def find_recording(self) -> None:
         """Ask where a missing recording is now."""

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QSize, Qt, QTimer
-from PySide6.QtGui import QAction, QGuiApplication, QKeySequence, QPixmap, QResizeEvent
+from PySide6.QtGui import QAction, QGuiApplication, QKeySequence, QPalette, QPixmap, QResizeEvent
 from PySide6.QtWidgets import (
     QBoxLayout,
     QFileDialog,
@@ -17,6 +17,7 @@ from PySide6.QtWidgets import (
     QMenu,
     QSplitter,
     QStackedWidget,
+    QStyleOptionToolButton,
     QToolButton,
     QVBoxLayout,
     QWidget,
@@ -171,7 +172,8 @@ class SurfacePage(Page):
         self.copy = _tool("Copy", "Copy the 3-D picture to the clipboard", self.copy_picture)
         self.save = _tool("Save …", "Save the 3-D picture as PNG (Ctrl+Shift+P)", self.save_picture)
         self.save.setShortcut(QKeySequence("Ctrl+Shift+P"))
-        self.comparing = _tool("Compare", "Put two schemes side by side", self._toggle_compare)
+        what = "Put two schemes side by side, or show one again"
+        self.comparing = _tool("Compare", what, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
         for button in (self.copy, self.save, self.comparing):
             line.addWidget(button)
@@ -340,8 +342,23 @@ class _Tools(QWidget):
         return QSize(widest, self._box.sizeHint().height())
 
 
-def _tool(words: str, what: str, work: Callable[[], None]) -> QToolButton:
-    button = QToolButton()
+class _Toggle(QToolButton):
+    """A button that is seen to be pressed: Fusion hardly darkens it."""
+
+    def initStyleOption(self, option: QStyleOptionToolButton) -> None:
+        super().initStyleOption(option)
+        if self.isChecked():
+            colours = option.palette
+            colours.setColor(QPalette.ColorRole.Button, colours.color(QPalette.ColorRole.Highlight))
+            text = colours.color(QPalette.ColorRole.HighlightedText)
+            colours.setColor(QPalette.ColorRole.ButtonText, text)
+            option.palette = colours
+
+
+def _tool(
+    words: str, what: str, work: Callable[[], None], button: QToolButton | None = None
+) -> QToolButton:
+    button = button or QToolButton()
     button.setText(words)
     button.setToolTip(what)
     button.setAccessibleName(words)
