@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from labapp.core.pipeline import Settings, measure
 from labapp.media import open_source
 from labapp.session.scenario import read_scenario
-from labapp.session.setup import read_setup
+from labapp.session.setup import parse_setup, read_setup
 from labapp.session.simulate import simulate
 from labapp.simulation.pools import Wave
 from labapp.simulation.torch import ConeTorch
@@ -186,6 +187,20 @@ def test_what_is_simulated_can_be_measured_and_every_label_is_right(
     size, measured = rows(out / "truth.csv")[0], rows(results / "measures.csv")[0]
     which = "depth_mm" if kind == "concave" else "height_mm"
     assert float(measured[which]) == pytest.approx(float(size[which]), rel=0.1)
+
+
+@pytest.mark.parametrize("number", [15, 20])
+def test_rings_on_a_pool_do_not_lead_to_rays_a_row_off(number: int) -> None:
+    # All labels were a row off in the one, five of the rim were wrong in the other.
+    scenario = read_scenario(EXAMPLES / "mode_02.toml")
+    setup, frame = parse_setup(scenario.setup, "setup"), scenario.recording.frame(number)
+    found = measure(frame.image, setup.rig, setup.calibration, Settings())
+    assert found.status in ("ok", "no-match")
+    if found.match is not None:
+        assert found.dots is not None
+        i, j = found.match.ray.T - 1
+        off = found.dots.image_px[found.match.dot] - frame.dot_px[i, j]
+        assert np.hypot(*off.T).max() < 1.5
 
 
 # --- what a scenario says -----------------------------------------------------------------------

@@ -107,7 +107,7 @@ class MatchSettings:
 
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
     margin: float = 14.0
-    stray: tuple[int, float] = (5, 0.06)
+    stray: tuple[int, float] = (4, 0.02)
     missed: tuple[int, float] = (2, 0.06)
 
     @property
@@ -300,7 +300,7 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     that was followed from the wrong hole may lead to almost the right place.
     """
     best = min(found, key=lambda hypothesis: hypothesis.cost)
-    for _ in range(3):
+    while True:  # each round is cheaper than the one before
         neighbours = [h for labels in moved(scene, best.labels) if (h := weigh(scene, labels))]
         nearest = min(neighbours, key=lambda h: h.cost, default=best)
         better = pursue(scene, nearest.labels) if nearest.cost < best.cost else None
