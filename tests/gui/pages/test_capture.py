@@ -53,6 +53,7 @@ def test_what_would_be_imported(stack: Path, copy_sample) -> None:
         "12 of 12 frames; without a frame rate there are no times"
     )
     assert choice_in_words(preview, Choice(0, 11, 2, 100.0)).endswith("0.120 s at 100 frames/s")
+    assert choice_in_words(preview, Choice(0, 11, 2, 1.0)).endswith("12.000 s at 1 frame/s")
     seen = preview.look(3, DotSettings())
     assert seen.image is not None
     assert seen.image.shape == (40, 50)
