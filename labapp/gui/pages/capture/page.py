@@ -10,6 +10,7 @@ from PySide6.QtWidgets import (
     QCheckBox,
     QFileDialog,
     QFormLayout,
+    QGridLayout,
     QHBoxLayout,
     QLabel,
     QProgressBar,
@@ -124,12 +125,17 @@ class CapturePage(Page):
         if recording is None or recording == self._told:
             return
         self._told = recording
-        while self.told.rowCount():
-            self.told.removeRow(0)
-        for name, words in recording_in_words(recording):
-            self.told.addRow(f"{name}:", _words(words))
-        for sentence in recording.warnings:
-            self.told.addRow(_words(f"⚠ {sentence}"))
+        while self.told.count():
+            item = self.told.takeAt(0)
+            widget = None if item is None else item.widget()
+            if widget is not None:
+                widget.deleteLater()
+        rows = recording_in_words(recording)
+        for row, (name, words) in enumerate(rows):
+            self.told.addWidget(QLabel(f"{name}:"), row, 0)
+            self.told.addWidget(_words(words), row, 1)
+        for row, sentence in enumerate(recording.warnings, len(rows)):
+            self.told.addWidget(_words(f"⚠ {sentence}"), row, 0, 1, 2)
 
     def _show_import(self) -> None:
         working = self._importing in self.workspace.tasks.active
@@ -352,9 +358,8 @@ class CapturePage(Page):
         self._make_choice()
         self._make_exposure()
         self.told_group, layout = _group("What was read")
-        self.told = QFormLayout()
-        self.told.setRowWrapPolicy(QFormLayout.RowWrapPolicy.DontWrapRows)
-        self.told.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+        self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
+        self.told.setColumnStretch(1, 1)
         layout.addLayout(self.told)
         self.panel_layout.addWidget(self.told_group)
         self._make_camera()
