@@ -123,7 +123,8 @@ def _even(heights: npt.NDArray[Any], spacing_mm: float | None) -> Grid:
 
 def _npz(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
     del spacing_mm
-    with np.load(path, allow_pickle=False) as kept:
+    # Opened here: numpy leaves a file open that begins like an archive and is none.
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
         lacking = {"x_mm", "y_mm", "z_mm"} - set(kept.files)
         if lacking:
             raise _Unreadable(f"no {', '.join(sorted(lacking))}", "x_mm, y_mm and z_mm")
