@@ -34,7 +34,8 @@ def test_what_a_version_wrote_is_read(path: Path, tmp_path: Path, read_only: boo
             assert result.measurement.measures is not None
             assert result.measurement.measures.height_mm == pytest.approx(0.91, rel=0.1)
             assert result.measurement.reconstruction is not None
-            assert result.stale == ("the dots or rows were corrected",)
+            # Defaults may have changed since, which a result says too.
+            assert "the dots or rows were corrected" in result.stale
         correction = session.correction(0)
         assert correction is not None
         assert correction.lattice.reference is None

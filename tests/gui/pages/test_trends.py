@@ -38,7 +38,7 @@ def test_the_course_of_the_sample(gtaw: Path) -> None:
     assert all(len(curve.key) == 30 for curve in shown.curves)
     mean, span = shown.rows[4:6]
     assert mean.texts == ("Height", "0.293", "0.019", "mm")  # §7.3: 0.294 ± 0.019
-    assert span.texts[1] == "0.255 … 0.323"
+    assert span.texts[1] == "0.256 … 0.323"
     assert shown.words == "30 of 30 frames count"
     assert shown.spectrum == ()
     assert shown.signals_words.startswith("None.")
