@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED
 from labapp.session.schema import VERSION
 from labapp.session.session import Session
 
@@ -34,8 +35,8 @@ def test_what_a_version_wrote_is_read(path: Path, tmp_path: Path, read_only: boo
             assert result.measurement.measures is not None
             assert result.measurement.measures.height_mm == pytest.approx(0.91, rel=0.1)
             assert result.measurement.reconstruction is not None
-            # Defaults may have changed since, which a result says too.
-            assert "the dots or rows were corrected" in result.stale
+            # It was measured with the defaults of its time, which are others now.
+            assert result.stale == (SETTINGS_CHANGED, CORRECTION_CHANGED)
         correction = session.correction(0)
         assert correction is not None
         assert correction.lattice.reference is None
