@@ -143,6 +143,8 @@ def _setup_lines(lacks: list[str]) -> list[tuple[str, str]]:
 
 
 def _recording_lines(recording: dict[str, Any] | None) -> list[tuple[str, str]]:
+    from labapp.media.base import rate_in_words
+
     if recording is None:
         return [("recording", "none imported yet")]
     where = "in the session itself" if recording["embedded"] else recording["path"]
@@ -153,7 +155,7 @@ def _recording_lines(recording: dict[str, Any] | None) -> list[tuple[str, str]]:
         (
             "",
             f"{several(recording['frames'], 'frame')}, of which {start}:{stop}:{step}; "
-            f"{'no time base' if rate is None else f'{rate:g} frames/s'}; "
+            f"{'no time base' if rate is None else rate_in_words(rate)}; "
             f"{'' if recording['frame_exact'] else 'not '}frame-exact",
         ),
         *(("", f"warning: {warning}") for warning in recording["warnings"]),

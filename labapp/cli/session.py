@@ -153,6 +153,7 @@ def import_recording(
     ] = False,
 ) -> None:
     """Take in a recording: read it through, check it, and say what was read."""
+    from labapp.media.base import rate_in_words
     from labapp.session.session import Session
 
     with Session.open(file) as session:
@@ -168,7 +169,7 @@ def import_recording(
             time_base = "none: give --frame-rate, or the frames have no times"
         else:
             whose = "as given" if found.rate_is_given else "the recording's own"
-            time_base = f"{found.frame_rate_hz:g} frames/s, {whose}"
+            time_base = f"{rate_in_words(found.frame_rate_hz)}, {whose}"
         exact = "frame-exact" if found.frame_exact else INEXACT
         typer.echo(f"{recording.name}: {found.description}")
         typer.echo(

@@ -20,7 +20,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from labapp.errors import InputError
-from labapp.media.base import Frame, FrameSource, check_index
+from labapp.media.base import Frame, FrameSource, check_index, rate_in_words
 from labapp.media.ffv1 import slices_whole
 from labapp.media.luminance import bit_depth_of, grey_of
 from labapp.media.packets import (
@@ -383,7 +383,7 @@ class VideoSource(FrameSource):
                 CODECS.get(codec, codec.upper()),
                 f"{columns}×{rows} px",
                 f"{bit_depth_of(frame)} bit {colour}",
-                *([] if rate is None else [f"{rate:.6g} frames/s"]),
+                *([] if rate is None else [rate_in_words(rate)]),
             ]
         )
 

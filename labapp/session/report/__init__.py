@@ -12,6 +12,7 @@ import scipy
 
 import labapp
 from labapp.errors import InputError
+from labapp.media.base import rate_in_words
 from labapp.session.error_budget import laser_in_use, plane_in_use
 from labapp.session.report import data, figures
 from labapp.session.report.data import Told, number, with_unit
@@ -139,7 +140,6 @@ def _recording(story: Story, session: Session) -> None:
     start, stop, step = recording.selected
     used = f"{len(session.frames)} of {recording.frames}: {start} to {stop - 1}"
     rate = recording.frame_rate_hz
-    frames = "frame" if rate == 1 else "frames"
     source = "given at import" if recording.rate_is_given else "the recording's own"
     exact = "yes, checked at import" if recording.frame_exact else "no"
     story.listing(
@@ -149,7 +149,7 @@ def _recording(story: Story, session: Session) -> None:
             ("size", f"{recording.size} bytes"),
             ("SHA-256", recording.sha256),
             ("frames used", used + (f", in steps of {step}" if step > 1 else "")),
-            ("frame rate", "unknown" if rate is None else f"{rate:.6g} {frames}/s ({source})"),
+            ("frame rate", "unknown" if rate is None else f"{rate_in_words(rate)} ({source})"),
             ("frame-exact", exact),
             ("kept in the session", "yes, lossless" if recording.embedded else "no"),
             ("imported", recording.imported.replace("T", " ")),

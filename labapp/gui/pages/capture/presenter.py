@@ -13,6 +13,7 @@ from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.gui.steps import recording_gone
 from labapp.media import GreyImage, open_source
+from labapp.media.base import rate_in_words
 from labapp.session.record import Recording
 from labapp.session.session import Session
 
@@ -191,9 +192,7 @@ def choice_in_words(preview: Preview, choice: Choice) -> str:
     rate = choice.rate_hz or preview.frame_rate_hz
     if rate is None:
         return f"{told}; without a frame rate there are no times"
-    return (
-        f"{told}, {choice.count * choice.every / rate:.3f} s at {rate:g} frame{'s' * (rate != 1)}/s"
-    )
+    return f"{told}, {choice.count * choice.every / rate:.3f} s at {rate_in_words(rate)}"
 
 
 def refusal(session: Session | None, choice: Choice | None, working: bool) -> str:
@@ -219,7 +218,7 @@ def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
     which += f", every {step}." * (step > 1)
     given = " (entered)" if recording.rate_is_given else ""
     rate = recording.frame_rate_hz
-    base = f"{rate:g} frame{'s' * (rate != 1)}/s{given}" if rate is not None else "none"
+    base = f"{rate_in_words(rate)}{given}" if rate is not None else "none"
     exact = "frame-exact" if recording.frame_exact else "not frame-exact: wrong frames are refused"
     return (
         ("File", Path(recording.path).name),

@@ -1,0 +1,22 @@
+from __future__ import annotations
+
+import pytest
+
+from labapp.media.base import rate_in_words
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "words"),
+    [
+        (1.0, "1 frame/s"),
+        (60.0, "60 frames/s"),
+        (0.5, "0.5 frames/s"),
+        (30000 / 1001, "29.97 frames/s"),
+        (60000 / 1001, "59.94 frames/s"),
+        (0.999999, "1 frame/s"),
+        (22_000.4, "22000 frames/s"),
+        (1_234_567.0, "1234567 frames/s"),
+    ],
+)
+def test_a_frame_rate_is_told_with_sensible_digits(rate_hz: float, words: str) -> None:
+    assert rate_in_words(rate_hz) == words
