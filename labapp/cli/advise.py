@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from labapp.cli.analyze import _begin, _draw, _progress, _write
-from labapp.cli.shared import NOTHING
+from labapp.cli.shared import NOTHING, progress_told, results_folder, write_figure, write_file
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,10 +84,10 @@ def _advised(
     from labapp.simulation import adviser, adviser_check
     from labapp.simulation.advice_report import advice_text, cost_table
 
-    folder = _begin(out)
+    folder = results_folder(out)
     assert folder is not None
     effort = adviser.QUICK if quick else adviser.Effort()
-    with _progress() as progress:
+    with progress_told() as progress:
         advice = adviser.advise(expected, limits, effort, seed, progress)
         typer.echo(advice_text(advice))
         _keep(folder, advice)
@@ -96,7 +95,7 @@ def _advised(
             typer.echo("\n" + cost_table(advice).markdown())
         if check and advice.possible:
             told = adviser_check.check_text(adviser_check.check(advice, progress=progress))
-            _write(folder / "check.txt", told.encode() + b"\n")
+            write_file(folder / "check.txt", told.encode() + b"\n")
             typer.echo(told)
     typer.echo(f"Tables and picture are in {folder.absolute()}")
     return advice.possible
@@ -125,9 +124,9 @@ def _keep(folder: Path, advice: Advice) -> None:
 
     tables = [cost_table(advice)] if advice.possible else []
     words = "\n\n".join([advice_text(advice), *(table.markdown() for table in tables)])
-    _write(folder / "advice.md", words.encode() + b"\n")
-    _write(folder / "advice.csv", advice_table(advice).csv().encode())
-    _draw(folder, "advice", advice_picture(advice), "png")
+    write_file(folder / "advice.md", words.encode() + b"\n")
+    write_file(folder / "advice.csv", advice_table(advice).csv().encode())
+    write_figure(folder, "advice", advice_picture(advice), "png")
     if advice.possible:
         text = (
             "# Recommended by labapp advise. Set the bench up so, then measure where it really\n"
@@ -135,7 +134,7 @@ def _keep(folder: Path, advice: Advice) -> None:
             "# [image_calibration] is missing until calibrate plane writes it.\n\n"
         )
         path = folder / "setup.toml"
-        _write(path, updated_setup(text, path, _setup_values(advice)).encode())
+        write_file(path, updated_setup(text, path, _setup_values(advice)).encode())
 
 
 def _setup_values(advice: Advice) -> dict[str, dict[str, Any]]:

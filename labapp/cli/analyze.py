@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
-from labapp.cli.shared import INTERRUPTED, note, progress_bar
+from labapp.cli.shared import progress_told, results_folder, write_figure, write_file
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from rich.progress import TaskID
-
     from labapp.core.reconstruction import Scheme
     from labapp.simulation.error_analysis import ErrorSurvey
     from labapp.simulation.parallel import Progress
@@ -50,15 +46,15 @@ def positioning(out: Out = None, tables: Tables = False, picture: Format = "png"
 
     placements = found.coverage()
     made = (*found.blocking_tables(), found.clearance_table(), found.coverage_table(placements))
-    folder = _begin(out, tables)
+    folder = results_folder(out, tables)
     _give(folder, made, tables)
     if folder is not None:
         from labapp.simulation import pictures
 
-        _draw(folder, "figure_4_11_coverage", pictures.coverage_picture(placements), picture)
+        write_figure(folder, "figure_4_11_coverage", pictures.coverage_picture(placements), picture)
         rig = found.positioning_rig(30.0)
         side = pictures.positioning_picture(rig, 6.0, 6.0, 0.3)
-        _draw(folder, "figure_4_7_positioning", side, picture)
+        write_figure(folder, "figure_4_7_positioning", side, picture)
 
 
 @app.command()
@@ -67,14 +63,14 @@ def correspondence(out: Out = None, tables: Tables = False, picture: Format = "p
     from labapp.simulation import correspondence_table as found
 
     made = found.correspondence_tables()
-    folder = _begin(out, tables)
+    folder = results_folder(out, tables)
     _give(folder, made, tables)
     if folder is not None:
         from labapp.simulation import pictures
 
         for name, title, radius, depth in found.EXAMPLES:
             seen = found.cap_reflections(radius, depth)
-            _draw(folder, name, pictures.correspondence_picture(seen, title), picture)
+            write_figure(folder, name, pictures.correspondence_picture(seen, title), picture)
 
 
 @app.command()
@@ -111,9 +107,9 @@ def errors(
     """
     asked = _chosen("part", part, PARTS)
     schemes = cast("tuple[Scheme, ...]", _chosen("scheme", scheme, SCHEMES))
-    folder = _begin(out)
+    folder = results_folder(out)
     assert folder is not None
-    with _progress() as progress:
+    with progress_told() as progress:
         kinds = [kind for kind in ("CE", "LE", "ME") if kind in asked]
         _surveys(folder, kinds, schemes, step, progress, picture)
         if "measurement" in asked:
@@ -144,8 +140,8 @@ def budget(
     from labapp.simulation.setup_budget import budget_table, setup_budget
 
     bench, pool = _bench(setup), _pool(width, length, height)
-    folder = _begin(out)
-    with _progress() as progress:
+    folder = results_folder(out)
+    with progress_told() as progress:
         _give(folder, [budget_table(setup_budget(bench, pool, progress))], True)
 
 
@@ -175,8 +171,8 @@ def _surveys(
         done.append(error_analysis.survey(kind, schemes, step, progress=progress))
         tables = [make(done) for make in (error_analysis.error_table, error_analysis.are_table)]
         _give(folder, [*tables, error_analysis.cap_table(done)])
-        _draw(folder, f"figure_8_{error}_{kind}", pictures.error_picture(done[-1]), picture)
-        _draw(folder, f"figure_8_{are}_{kind}_are", pictures.are_picture(done[-1]), picture)
+        write_figure(folder, f"figure_8_{error}_{kind}", pictures.error_picture(done[-1]), picture)
+        write_figure(folder, f"figure_8_{are}_{kind}_are", pictures.are_picture(done[-1]), picture)
     if done:
         _print(tables)
 
@@ -191,7 +187,7 @@ def _measurement(
     )
     _give(folder, [image_error.thumb_tack_table(found[0], schemes)], True)
     frame = image_error.rendered(image_error.TACK, image_error.TACK_RIG, 0)
-    _draw(folder, "figure_8_2_thumb_tack", pictures.frame_picture(frame), picture)
+    write_figure(folder, "figure_8_2_thumb_tack", pictures.frame_picture(frame), picture)
 
 
 def _images(folder: Path, schemes: tuple[Scheme, ...], frames: int, progress: Progress) -> None:
@@ -223,7 +219,7 @@ def _parameters(
         values = {str(one): 100 * found[surface, one].contribution[:, 0] for one in schemes}
         label = f"standard uncertainty of the height, {surface} 6 mm × 0.3 mm (%)"
         drawn = pictures.bars_picture(names, values, label)
-        _draw(folder, f"parameter_deviation_{surface}", drawn, picture)
+        write_figure(folder, f"parameter_deviation_{surface}", drawn, picture)
     _give(folder, [deviation.deviation_table(found)], True)
 
 
@@ -253,28 +249,13 @@ def _pool(width: float, length: float, height: float) -> Pool:
         raise InputError("--height", "height", height, f"a pool that can be: {error}") from error
 
 
-def _begin(out: Path | None, tables: bool = True) -> Path | None:
-    """The folder for the results, made if it is not there."""
-    if out is None:
-        if not tables:
-            raise InputError("--out", "folder", "none", "one for tables and pictures, or --tables")
-        return None
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / ".write").touch()
-        (out / ".write").unlink()
-    except OSError as error:
-        raise InputError(out, "--out", error.strerror, "a folder that can be written") from error
-    return out
-
-
 def _give(folder: Path | None, tables: Iterable[Table], shown: bool = False) -> None:
     """Write tables, and print them."""
     tables = list(tables)
     for table in tables:
         if folder is not None:
-            _write(folder / f"{table.name}.csv", table.csv().encode())
-            _write(folder / f"{table.name}.md", table.markdown().encode())
+            write_file(folder / f"{table.name}.csv", table.csv().encode())
+            write_file(folder / f"{table.name}.md", table.markdown().encode())
     if shown:
         _print(tables)
 
@@ -282,36 +263,3 @@ def _give(folder: Path | None, tables: Iterable[Table], shown: bool = False) -> 
 def _print(tables: Iterable[Table]) -> None:
     for table in tables:
         typer.echo(table.markdown())
-
-
-def _draw(folder: Path, name: str, figure: Figure, kind: str) -> None:
-    from labapp.simulation.pictures import as_bytes
-
-    _write(folder / f"{name}.{kind}", as_bytes(figure, kind))
-
-
-def _write(path: Path, content: bytes) -> None:
-    from labapp.session.files import write_whole
-
-    try:
-        write_whole(path, content)
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "one that can be written") from error
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """Show progress on stderr; Ctrl-C leaves what was written and says so."""
-    with progress_bar() as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def tell(what: str, done: int, count: int) -> None:
-            if what not in tasks:
-                tasks[what] = bar.add_task(what, total=count)
-            bar.update(tasks[what], completed=done)
-
-        try:
-            yield tell
-        except KeyboardInterrupt:
-            note(bar.console, "stopped: the tables and pictures that were finished are kept")
-            raise typer.Exit(INTERRUPTED) from None

@@ -1,4 +1,4 @@
-"""What commands share: exit codes, the progress bar, what they tell of frames and results."""
+"""What commands share: exit codes, progress, what they tell of frames and results, and files."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.progress import TaskID
+
     from labapp.core.pipeline import Measurement
     from labapp.session.session import Session
     from labapp.session.summary import Summary
+    from labapp.simulation import parallel
 
 INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 130, 3, 2, 1
 """Exit codes; 0 is done. `NOTHING`: done, but nothing was measured, or a session is not whole."""
@@ -156,3 +160,65 @@ def _stale(session: Session) -> set[tuple[int, str]]:
 def _results(results: Collection[tuple[int, str]]) -> str:
     frames = {frame for frame, _ in results}
     return f"{several(len(results), 'result')} ({frames_text(frames)})"
+
+
+def results_folder(out: Path | None, tables: bool = True) -> Path | None:
+    """The folder for tables and pictures, made if it is not there; None where none is asked for.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written, or there is to be neither a folder nor printed ``tables``.
+    """
+    if out is None:
+        if not tables:
+            raise InputError("--out", "folder", "none", "one for tables and pictures, or --tables")
+        return None
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / ".write").touch()
+        (out / ".write").unlink()
+    except OSError as error:
+        raise InputError(out, "--out", error.strerror, "a folder that can be written") from error
+    return out
+
+
+def write_figure(folder: Path, name: str, figure: Figure, kind: str) -> None:
+    """Write a picture, PNG or SVG."""
+    from labapp.simulation.plotting import as_bytes
+
+    write_file(folder / f"{name}.{kind}", as_bytes(figure, kind))
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file whole, in place of what was there.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    from labapp.session.files import write_whole
+
+    try:
+        write_whole(path, content)
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "one that can be written") from error
+
+
+@contextmanager
+def progress_told() -> Iterator[parallel.Progress]:
+    """Show progress on stderr; Ctrl-C leaves what was written and says so."""
+    with progress_bar() as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(what: str, done: int, count: int) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=count)
+            bar.update(tasks[what], completed=done)
+
+        try:
+            yield tell
+        except KeyboardInterrupt:
+            note(bar.console, "stopped: the tables and pictures that were finished are kept")
+            raise typer.Exit(INTERRUPTED) from None

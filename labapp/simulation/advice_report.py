@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from labapp.simulation.adviser import MOVED, Advice, Candidate, constraint_words
 from labapp.simulation.bench_limits import CONSTRAINTS
 from labapp.simulation.forward import trace
-from labapp.simulation.pictures import INCHES, STYLE
+from labapp.simulation.plotting import INCHES, STYLE, new_figure
 from labapp.simulation.tables import Cell, Table
 
 WORDS = {
@@ -149,7 +149,7 @@ def cost_table(advice: Advice) -> Table:
 def advice_picture(advice: Advice) -> Figure:
     """Draw the bench from the side, where the laser may stand, and what a mm or degree costs."""
     with rc_context(STYLE):
-        figure = Figure(figsize=(INCHES, INCHES * 1.15), layout="constrained")
+        figure = new_figure(INCHES, INCHES * 1.15)
         plots = figure.subplot_mosaic(
             [["side"] * 6, ["map"] * 2 + ["a"] * 2 + ["b"] * 2, ["c"] * 2 + ["d"] * 2 + ["e"] * 2],
             height_ratios=[1.4, 1, 1],

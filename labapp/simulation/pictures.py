@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import colorsys
-import io
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -17,22 +14,10 @@ from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.simulation.error_analysis import ErrorSurvey
 from labapp.simulation.forward import Reflections
+from labapp.simulation.plotting import INCHES, STYLE, new_figure, row_colour
 from labapp.simulation.positioning import Fate, SideView, side_view
 from labapp.simulation.positioning_tables import Coverage
 from labapp.simulation.render import Frame
-
-INCHES, DPI = 6.7, 120
-
-STYLE = {
-    "font.family": "DejaVu Sans",
-    "font.size": 7.5,
-    "axes.linewidth": 0.6,
-    "axes.edgecolor": "0.3",
-    "lines.linewidth": 0.8,
-    "savefig.facecolor": "white",
-    # The same picture is the same file.
-    "svg.hashsalt": "labapp",
-}
 
 COLOURS = {"irs": "#c05a00", "ers": "#1b4f8a", "fit": "#1b7a3d"}
 MARKERS = {"irs": "s", "ers": "o", "fit": "^"}
@@ -44,25 +29,10 @@ FATES = {
 }
 
 
-def as_bytes(figure: Figure, kind: str) -> bytes:
-    """A figure as PNG or SVG, the same each time."""
-    content = io.BytesIO()
-    with rc_context(STYLE):
-        metadata = {"Software": None} if kind == "png" else {"Date": None}
-        figure.savefig(content, format=kind, dpi=DPI, metadata=metadata)
-    return content.getvalue()
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
 def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: float) -> Figure:
     """Fig. 4-7 … 4-9: the central rays by way of a flat, a convex and a concave pool, L1 and L2."""
     with rc_context(STYLE):
-        figure = _figure(INCHES * 0.7, 6.4)
+        figure = new_figure(INCHES * 0.7, 6.4)
         plots = figure.subplots(3, sharex=True, sharey=True)
         for plot, name, height in zip(
             plots, ("flat", "convex", "concave"), (0.0, height_mm, -height_mm), strict=True
@@ -104,7 +74,7 @@ def _draw_side(plot: Any, view: SideView) -> None:
 def coverage_picture(placements: Sequence[Coverage], plane_mm: float = 101.6) -> Figure:
     """Fig. 4-11: the dots on the plane at several distances of it."""
     with rc_context(STYLE):
-        figure = _figure(INCHES, INCHES)
+        figure = new_figure(INCHES, INCHES)
         for plot, one in zip(figure.subplots(2, 2).ravel(), placements, strict=True):
             plot.add_patch(Rectangle((0, 0), plane_mm, plane_mm, fc="none", ec="k", lw=1))
             plot.plot(*one.plane_mm[one.on_plane].T, "o", ms=2.5, color="#1b4f8a")
@@ -123,11 +93,11 @@ def correspondence_picture(seen: Reflections, title: str) -> Figure:
     """
     markers = "os^vD<>p*"
     with rc_context(STYLE):
-        figure = _figure(INCHES, 3.4)
+        figure = new_figure(INCHES, 3.4)
         plane, pool = figure.subplots(1, 2)
         for row in range(len(seen.lit)):
             columns = np.flatnonzero(seen.lit[row] & np.isfinite(seen.plane_mm[row]).all(axis=-1))
-            colour = _row_colour(row)
+            colour = row_colour(row)
             for plot, places in ((plane, seen.plane_mm[row]), (pool, seen.point_mm[row, :, :2])):
                 plot.plot(*places[columns].T, "-", lw=0.4, color=colour)
                 for column in columns:
@@ -144,10 +114,6 @@ def _on_work_piece(plot: Any, s_mm: float = 1e4) -> None:
     """Label an open plane's axes from the torch's middle and the work piece."""
     for axis in (plot.xaxis, plot.yaxis):
         axis.set_major_formatter(lambda value, _: f"{value - s_mm:g}")
-
-
-def _row_colour(row: int) -> tuple[float, float, float]:
-    return colorsys.hsv_to_rgb(row * 0.381966 % 1, 0.9, 0.65)
 
 
 def error_picture(survey: ErrorSurvey) -> Figure:
@@ -167,7 +133,7 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
     """A plot for each error and each kind of surface; full lines D = B/20, dashed D = B/10."""
     size = np.array([(cap.footprint.width_mm, cap.peak_mm) for cap in survey.caps])
     with rc_context(STYLE):
-        figure = _figure(INCHES, 4.5)
+        figure = new_figure(INCHES, 4.5)
         plots = figure.subplots(2, 2, sharex=True, sharey="row")
         for line, (error, label, scale) in zip(plots, rows, strict=True):
             for plot, sign in zip(line, (1, -1), strict=True):
@@ -207,7 +173,7 @@ def _capped(plot: Any, survey: ErrorSurvey, error: str, scale: float) -> None:
 def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str) -> Figure:
     """Contributions of several quantities as bars, a colour a scheme."""
     with rc_context(STYLE):
-        figure = _figure(INCHES, 0.32 * len(names) + 0.8)
+        figure = new_figure(INCHES, 0.32 * len(names) + 0.8)
         plot = figure.subplots()
         at, thick = np.arange(len(names)), 0.8 / len(values)
         for k, (scheme, each) in enumerate(values.items()):
@@ -224,7 +190,7 @@ def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str
 def frame_picture(frame: Frame) -> Figure:
     """A rendered frame as a negative, rings where its dots truly are."""
     with rc_context(STYLE):
-        figure = _figure(INCHES / 2, INCHES / 2 * frame.image.shape[0] / frame.image.shape[1])
+        figure = new_figure(INCHES / 2, INCHES / 2 * frame.image.shape[0] / frame.image.shape[1])
         plot = figure.subplots()
         low, high = np.percentile(frame.image, [1, 99.8])
         plot.imshow(frame.image, cmap="gray_r", vmin=low, vmax=max(high, low + 1))

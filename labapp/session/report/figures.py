@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import colorsys
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from labapp.core.measures import surface_mesh
@@ -22,18 +18,7 @@ from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.media import GreyImage
 from labapp.session.report.layout import DPI
-
-INCHES = 6.7
-"""Width of a page's text."""
-
-STYLE = {
-    "font.family": "DejaVu Sans",
-    "font.size": 7.5,
-    "axes.linewidth": 0.6,
-    "axes.edgecolor": "0.3",
-    "lines.linewidth": 0.8,
-    "savefig.facecolor": "white",
-}
+from labapp.simulation.plotting import INCHES, STYLE, as_bytes, new_figure, row_colour
 
 STATES = {
     "measured": {"marker": "o", "color": "#1b4f8a", "markerfacecolor": "#1b4f8a"},
@@ -78,7 +63,7 @@ def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
     low, high = min(plane.origin_mm[1], top[1]) - 8, laser[1] + 12
     floor, roof = -9.0, max(top[2], laser[2], 3 * rig.electrode.height_mm) + 7
     with rc_context(STYLE):
-        figure = _figure(INCHES, min(INCHES * (roof - floor) / (high - low) + 0.45, 4.5))
+        figure = new_figure(INCHES, min(INCHES * (roof - floor) / (high - low) + 0.45, 4.5))
         view = figure.subplots()
         view.axhspan(floor, 0, color="0.9", lw=0)
         view.axhline(0, color="0.3", lw=0.8)
@@ -93,7 +78,7 @@ def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
         _label_rig(view, rig, top)
         view.set(xlim=(low, high), ylim=(floor, roof), aspect="equal")
         view.set(xlabel="Y, welding direction (mm)", ylabel="Z (mm)")
-        return _png(figure)
+        return as_bytes(figure, dpi=DPI)
 
 
 def _draw_ray(view: Any, rig: Rig, direction: FloatArray, *, central: bool) -> None:
@@ -147,7 +132,7 @@ def target_picture(image: GreyImage, found: PlaneCalibration) -> bytes:
     box = np.clip([low - margin, high + margin], -0.5, np.array(image.shape[::-1]) - 0.5)
     wide, tall = box[1] - box[0]
     with rc_context(STYLE):
-        figure = _figure(INCHES * 0.85, float(np.clip(INCHES * 0.8 * tall / wide, 1.5, 4.5)))
+        figure = new_figure(INCHES * 0.85, float(np.clip(INCHES * 0.8 * tall / wide, 1.5, 4.5)))
         view = figure.subplots()
         view.imshow(image, cmap="gray", interpolation="antialiased")
         for name, end, tip, colour in zip(
@@ -169,7 +154,7 @@ def target_picture(image: GreyImage, found: PlaneCalibration) -> bytes:
             va="top",
         )
         view.set(xlim=box[:, 0], ylim=box[::-1, 1], xlabel="u (px)", ylabel="v (px)")
-        return _png(figure)
+        return as_bytes(figure, dpi=DPI)
 
 
 def trends(axis: FloatArray, label: str, series: list[Series], states: list[str]) -> bytes:
@@ -185,14 +170,14 @@ def trends(axis: FloatArray, label: str, series: list[Series], states: list[str]
         Which of `STATES` each frame has; what is in none is not drawn.
     """
     with rc_context(STYLE):
-        figure = _figure(INCHES, 1.2 * len(series) + 0.4)
+        figure = new_figure(INCHES, 1.2 * len(series) + 0.4)
         plots = figure.subplots(len(series), sharex=True, squeeze=False)[:, 0]
         for plot, one in zip(plots, series, strict=True):
             _draw_trend(plot, axis, one, states)
         plots[-1].set_xlabel(label)
         handles, names = plots[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside upper right", ncols=len(names), frameon=False)
-        return _png(figure)
+        return as_bytes(figure, dpi=DPI)
 
 
 def _draw_trend(plot: Any, axis: FloatArray, series: Series, states: list[str]) -> None:
@@ -235,7 +220,7 @@ def dots_picture(image: GreyImage | None, measurement: Measurement) -> bytes:
     box = (u.min() - 45, u.max() + 25, v.max() + 18, v.min() - 22)
     tall = INCHES * (box[2] - box[3]) / (box[1] - box[0])
     with rc_context(STYLE):
-        figure = _figure(INCHES, float(np.clip(tall + 0.3, 1.5, 5.0)))
+        figure = new_figure(INCHES, float(np.clip(tall + 0.3, 1.5, 5.0)))
         view = figure.subplots()
         if image is not None:
             low, high = np.percentile(image, [1, 99.8])
@@ -244,7 +229,7 @@ def dots_picture(image: GreyImage | None, measurement: Measurement) -> bytes:
         first: dict[int, tuple[float, float]] = {}
         for k, (x, y) in enumerate(dots.image_px):
             ray = rays.get(k)
-            colour = "0.6" if ray is None else _row_colour(int(ray[0]))
+            colour = "0.6" if ray is None else row_colour(int(ray[0]))
             view.plot(x, y, "o", ms=6.5, mfc="none", mec=colour, mew=0.8)
             if ray is None:
                 continue
@@ -252,10 +237,10 @@ def dots_picture(image: GreyImage | None, measurement: Measurement) -> bytes:
             view.annotate(str(ray[1]), (x, y), (0, 4.2), ha="center", **at)
             first[int(ray[0])] = min(first.get(int(ray[0]), (x, y)), (x, y))
         for row, place in first.items():
-            at = {"textcoords": "offset points", "color": _row_colour(row), "fontsize": 5.5}
+            at = {"textcoords": "offset points", "color": row_colour(row), "fontsize": 5.5}
             view.annotate(f"row {row}", place, (-6, 0), ha="right", va="center", **at)
         view.set(xlim=box[:2], ylim=box[2:], aspect="equal", xlabel="u (px)", ylabel="v (px)")
-        return _png(figure)
+        return as_bytes(figure, dpi=DPI)
 
 
 def height_map(measurement: Measurement) -> bytes:
@@ -271,7 +256,7 @@ def height_map(measurement: Measurement) -> bytes:
     with rc_context(STYLE):
         wide = INCHES * 0.55
         ratio = np.ptp(outline[:, 1]) / np.ptp(outline[:, 0])
-        figure = _figure(wide, float(np.clip((wide - 1.1) * ratio + 0.5, 2.0, 3.3)))
+        figure = new_figure(wide, float(np.clip((wide - 1.1) * ratio + 0.5, 2.0, 3.3)))
         view = figure.subplots()
         flat = np.ptp(z) < 1e-6
         levels = [z.min() - 1e-3, z.max() + 1e-3] if flat else 14
@@ -283,7 +268,7 @@ def height_map(measurement: Measurement) -> bytes:
         view.plot(size.peak_x_mm, size.peak_y_mm, "^", color="#d02020", ms=5)
         view.set(aspect="equal", xlabel="X (mm)", ylabel="Y, welding direction (mm)")
         figure.colorbar(heights, ax=view, label="height (mm)", shrink=0.85)
-        return _png(figure)
+        return as_bytes(figure, dpi=DPI)
 
 
 def dots_compared(measurement: Measurement) -> bytes:
@@ -298,19 +283,19 @@ def dots_compared(measurement: Measurement) -> bytes:
     computed = seen + found.residual_mm[known]
     with rc_context(STYLE):
         tall = 1.0 if not len(seen) else np.ptp(seen[:, 1]) / max(np.ptp(seen[:, 0]), 1e-9)
-        figure = _figure(INCHES * 0.8, float(np.clip(INCHES * 0.8 * tall + 0.6, 1.6, 5.0)))
+        figure = new_figure(INCHES * 0.8, float(np.clip(INCHES * 0.8 * tall + 0.6, 1.6, 5.0)))
         view = figure.subplots()
         view.plot(*seen.T, "o", ms=5, mfc="none", mec="k", mew=0.7, label="captured")
         view.plot(*computed.T, "x", ms=4, color="#c01030", mew=0.8, label="computed")
         view.set(aspect="equal", xlabel="X′ (mm)", ylabel="Z′ (mm)")
         figure.legend(loc="outside upper right", ncols=2, frameon=False)
-        return _png(figure)
+        return as_bytes(figure, dpi=DPI)
 
 
 def positions(axis: FloatArray, label: str, places: Mapping[str, FloatArray]) -> bytes:
     """The pool's centre and peak over time, X above Y (Fig. 7-15)."""
     with rc_context(STYLE):
-        figure = _figure(INCHES, 2.3)
+        figure = new_figure(INCHES, 2.3)
         plots = figure.subplots(2, sharex=True)
         for (name, place), look in zip(places.items(), ("k+-", "r^-"), strict=True):
             for plot, values in zip(plots, place.T, strict=True):
@@ -321,22 +306,4 @@ def positions(axis: FloatArray, label: str, places: Mapping[str, FloatArray]) ->
         plots[-1].set_xlabel(label)
         handles, names = plots[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside upper right", ncols=2, frameon=False)
-        return _png(figure)
-
-
-def _row_colour(row: int) -> tuple[float, float, float]:
-    """A colour that is dark enough on white and differs most between neighbouring rows."""
-    return colorsys.hsv_to_rgb(row * 0.381966 % 1, 0.9, 0.65)
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    content = io.BytesIO()
-    # Without the name of the program that drew it: the same figure is the same bytes.
-    figure.savefig(content, format="png", dpi=DPI, metadata={"Software": None})
-    return content.getvalue()
+        return as_bytes(figure, dpi=DPI)
