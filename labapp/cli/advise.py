@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING, progress_told, results_folder, write_figure, write_file
+from labapp.cli.shared import NOTHING, progress_told, results_folder, write_file
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
-    from labapp.simulation.adviser import Advice
     from labapp.simulation.bench_limits import BenchLimits
     from labapp.simulation.expected_pools import ExpectedPools
 
@@ -81,6 +80,7 @@ def _advised(
     expected: ExpectedPools, limits: BenchLimits, out: Path, quick: bool, check: bool, seed: int
 ) -> bool:
     """Search, tell and write; whether any set-up is possible."""
+    from labapp.session.advice import advice_files
     from labapp.simulation import adviser, adviser_check
     from labapp.simulation.advice_report import advice_text, cost_table
 
@@ -90,7 +90,8 @@ def _advised(
     with progress_told() as progress:
         advice = adviser.advise(expected, limits, effort, seed, progress)
         typer.echo(advice_text(advice))
-        _keep(folder, advice)
+        for name, content in advice_files(advice).items():
+            write_file(folder / name, content)
         if advice.possible:
             typer.echo("\n" + cost_table(advice).markdown())
         if check and advice.possible:
@@ -111,52 +112,3 @@ def _span(option: str, text: str | None) -> list[float] | None:
     except ValueError as error:
         expected = "two numbers A:B, from the smaller to the larger"
         raise InputError(option, "range", text, expected) from error
-
-
-def _keep(folder: Path, advice: Advice) -> None:
-    from labapp.session.setup import updated_setup
-    from labapp.simulation.advice_report import (
-        advice_picture,
-        advice_table,
-        advice_text,
-        cost_table,
-    )
-
-    tables = [cost_table(advice)] if advice.possible else []
-    words = "\n\n".join([advice_text(advice), *(table.markdown() for table in tables)])
-    write_file(folder / "advice.md", words.encode() + b"\n")
-    write_file(folder / "advice.csv", advice_table(advice).csv().encode())
-    write_figure(folder, "advice", advice_picture(advice), "png")
-    if advice.possible:
-        text = (
-            "# Recommended by labapp advise. Set the bench up so, then measure where it really\n"
-            "# stands: labapp calibrate laser and labapp calibrate plane, both with --setup.\n"
-            "# [image_calibration] is missing until calibrate plane writes it.\n\n"
-        )
-        path = folder / "setup.toml"
-        write_file(path, updated_setup(text, path, _setup_values(advice)).encode())
-
-
-def _setup_values(advice: Advice) -> dict[str, dict[str, Any]]:
-    place, limits = advice.best.place, advice.limits
-    pattern = limits.pattern
-    return {
-        "laser": {
-            "projection_angle_deg": round(place.projection_angle_deg, 2),
-            "distance_mm": round(place.distance_mm, 2),
-        },
-        "pattern": {
-            "rows": pattern.rows,
-            "columns": pattern.columns,
-            "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
-            "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
-        },
-        "electrode": {"height_mm": limits.electrode_mm},
-        "imaging_plane": {
-            "distance_mm": round(place.plane_mm, 2),
-            "s_mm": round(place.s_mm, 2),
-            "h_mm": round(place.h_mm, 2),
-            "width_mm": limits.plate_mm[0],
-            "height_mm": limits.plate_mm[1],
-        },
-    }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from labapp.gui.focus import go_to_part
 from labapp.gui.steps import STEPS
+from labapp.gui.tools import show_tool
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
@@ -56,7 +57,7 @@ class Action:
     begins: bool = False
 
 
-MENUS = ("&File", "&Edit", "&Steps", "F&rames", "&View", "&Help")
+MENUS = ("&File", "&Edit", "&Steps", "F&rames", "&View", "&Tools", "&Help")
 
 RECENT = "recent"
 """The submenu of recent sessions stands after the action of the name `open`."""
@@ -434,6 +435,17 @@ VIEW = (
     ),
 )
 
+TOOLS = (
+    Action(
+        "adviser",
+        "&Tools",
+        "Configuration &adviser …",
+        "Ctrl+Shift+A",
+        "Where laser and imaging plane should stand for the pools that are expected",
+        lambda window: show_tool(window, "adviser"),
+    ),
+)
+
 HELP = (
     Action(
         "guide",
@@ -470,4 +482,4 @@ HELP = (
     ),
 )
 
-ACTIONS: tuple[Action, ...] = (*FILE, *EDIT, *STEP_ACTIONS, *FRAMES, *VIEW, *HELP)
+ACTIONS: tuple[Action, ...] = (*FILE, *EDIT, *STEP_ACTIONS, *FRAMES, *VIEW, *TOOLS, *HELP)

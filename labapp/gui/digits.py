@@ -113,3 +113,26 @@ def as_csv(rows: Iterable[ResultRow]) -> str:
 def _quoted(cell: str) -> str:
     quoted = cell.replace('"', '""')
     return f'"{quoted}"' if any(mark in cell for mark in ',"\n') else cell
+
+
+UNITS = {"mm": "mm", "deg": "°", "px": "px", "pct": "%", "um per unit": "µm per mm or °"}
+"""How the name of a table's column ends, and the unit that it means."""
+
+
+def heading(column: str) -> str:
+    """A column's name in words: ``kept_to`` is "kept to", ``height_mm`` is "height, mm"."""
+    words = column.replace("_", " ")
+    for ending, unit in UNITS.items():
+        if words.endswith(f" {ending}"):
+            return f"{words.removesuffix(ending).rstrip()}, {unit}"
+    return words
+
+
+def cell_text(cell: str | float | None) -> str:
+    """A cell of a table: three significant digits, no more than there are."""
+    if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
+        return NOTHING
+    if isinstance(cell, float):
+        place = 2 - math.floor(math.log10(abs(cell))) if cell else 0
+        return plain(cell, max(0, place))
+    return str(cell)

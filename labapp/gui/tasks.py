@@ -40,13 +40,16 @@ class Control:
         Where what happens goes.
     reached
         How far the work is: done, and in all.
+    stage
+        What of it is being done; empty where it has no parts.
     """
 
     events: queue.SimpleQueue[tuple[str, Any]] = field(default_factory=queue.SimpleQueue)
     reached: tuple[int, int] = (0, 0)
+    stage: str = ""
     cancelled: threading.Event = field(default_factory=threading.Event)
 
-    def progress(self, done: int, total: int) -> None:
+    def progress(self, done: int, total: int, stage: str = "") -> None:
         """Say how far the work is.
 
         Raises
@@ -55,7 +58,7 @@ class Control:
             If the operator has cancelled it.
         """
         self.check()
-        self.reached = done, total
+        self.reached, self.stage = (done, total), stage
 
     def part(self, value: object) -> None:
         """Hand over a part of the result: it reaches ``on_part`` on the GUI thread."""

@@ -12,6 +12,7 @@ from PySide6.QtCore import QByteArray, QSize, Qt, QTimer, QUrl
 from PySide6.QtGui import QCloseEvent, QDesktopServices, QDragEnterEvent, QDropEvent, QKeyEvent
 from PySide6.QtWidgets import (
     QApplication,
+    QDialog,
     QDockWidget,
     QMainWindow,
     QStackedWidget,
@@ -351,6 +352,8 @@ class MainWindow(QMainWindow):
             self.say("This step has no table")
             return
         table = next((each for each in tables if each.hasFocus()), tables[0])
+        from labapp.gui.views.tables import table_text
+
         QApplication.clipboard().setText(table_text(table))
         self.say("The table is on the clipboard")
 
@@ -453,6 +456,8 @@ class MainWindow(QMainWindow):
 
     def closeEvent(self, event: QCloseEvent) -> None:
         """Stop all work, remember the layout and close the session."""
+        for beside in self.findChildren(QDialog):
+            beside.close()
         self.timeline.set_playing(False)
         self._show_docks(everywhere=True)
         self.remember(
@@ -481,17 +486,6 @@ def first_step(session: Session) -> str:
         measured = any(status != "" for status in session.overview().status)
         return "surface" if measured else "dots"
     return "capture" if states(session)["setup"].why == "Complete" else "setup"
-
-
-def table_text(table: QTableView) -> str:
-    """What a table shows, tabs between its columns, its header first."""
-    model = table.model()
-    columns = [n for n in range(model.columnCount()) if not table.isColumnHidden(n)]
-    rows = [[model.headerData(n, Qt.Orientation.Horizontal) for n in columns]]
-    for row in range(model.rowCount()):
-        if not table.isRowHidden(row):
-            rows.append([model.index(row, n).data() for n in columns])
-    return "\n".join("\t".join("" if v is None else str(v) for v in cells) for cells in rows)
 
 
 def _text(held: QByteArray) -> str:

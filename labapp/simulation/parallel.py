@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -14,6 +14,9 @@ from threadpoolctl import threadpool_limits
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+POLL_S = 0.2
+"""So often is told how far it is, done or not: who is told may end it."""
 
 Progress = Callable[[str, int, int], None]
 """Told what is being done, how many steps of it are done and how many there are."""
@@ -42,28 +45,37 @@ def in_parallel(
     Raises
     ------
     KeyboardInterrupt
-        On Ctrl-C, once the tasks being done are; the others are not begun.
+        On Ctrl-C. This, and what ``progress`` raises, ends the tasks being done.
     """
     tasks = list(tasks)
     tell = progress or (lambda *_: None)
     tell(what, 0, len(tasks))
-    workers = min(workers or os.cpu_count() or 1, len(tasks))
+    workers = workers or os.cpu_count() or 1
     results = []
-    if workers <= 1:
+    if workers <= 1 or not tasks:
         with threadpool_limits(1, "blas"):
             for task in tasks:
                 results.append(function(task))
                 tell(what, len(results), len(tasks))
         return results
     pool = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), initializer=threadpool_limits, initargs=(1,)
+        min(workers, len(tasks)),
+        multiprocessing.get_context("spawn"),
+        initializer=threadpool_limits,
+        initargs=(1,),
     )
     try:
         with deaf():
             futures = [pool.submit(function, task) for task in tasks]
         for future in futures:
+            while not wait([future], POLL_S).done:
+                tell(what, len(results), len(tasks))
             results.append(future.result())
             tell(what, len(results), len(tasks))
+    except BaseException:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()  # a task can take a minute
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
     return results

@@ -19,6 +19,7 @@ import labapp
 from labapp.gui.actions import MENUS
 from labapp.gui.help import TITLES
 from labapp.gui.pages import PAGES
+from labapp.gui.tools import TOOLS
 from tests.conftest import Run
 
 GUI = Path(labapp.__file__).parent / "gui"
@@ -145,7 +146,7 @@ def test_every_question_for_a_file_and_every_other_question_has_a_picture(
 
 @pytest.mark.xvfb
 def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
-    """`HelpDialog` is the only one of the app's own; it has a picture for each of its texts."""
+    """The app's own have pictures: each text of the help, each tool."""
     own = {
         node.name
         for path in GUI.rglob("*.py")
@@ -153,8 +154,8 @@ def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
         if isinstance(node, ast.ClassDef)
         and any(isinstance(base, ast.Name) and base.id == "QDialog" for base in node.bases)
     }
-    assert own == {"HelpDialog"}
-    for kind in TITLES:
+    assert own == {"HelpDialog", "ToolWindow"}
+    for kind in (*TITLES, *TOOLS):
         assert named(taken, f"dialog-{kind}")
 
 

@@ -23,7 +23,8 @@ from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.recent import look_at
 from labapp.gui.step_list import StepList, mark_icon
 from labapp.gui.steps import STEPS, Mark, states
-from labapp.gui.window import MainWindow, first_step, table_text, title
+from labapp.gui.views.tables import table_text
+from labapp.gui.window import MainWindow, first_step, title
 from labapp.gui.workspace import Workspace
 from labapp.session.copies import copy_sample as copied_sample
 from labapp.session.copies import copy_session

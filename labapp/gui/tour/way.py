@@ -13,9 +13,20 @@ from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.plane import PlanePage
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.pages.surface import SurfacePage
+from labapp.gui.tools.adviser import AdviserWindow
 from labapp.gui.tour.bench import CROSS_MM, places
 from labapp.gui.tour.hands import CTRL, Hands, give
 from labapp.session.session import Session
+
+SMALL_QUESTION = {
+    "pools.width_mm": (6.5, 6.5),
+    "pools.length_mm": (7.0, 7.0),
+    "pools.height_mm": (0.2, 0.21),
+    "bench.projection_angle_deg": (26.0, 26.0),
+    "bench.distance_mm": (40.0, 40.0),
+    "bench.plane_distance_mm": (60.0, 65.0),
+}
+"""Of the adviser: field → least and most."""
 
 FRAMES = 6
 """So many are imported: enough to see, soon measured."""
@@ -51,6 +62,7 @@ def go_through(hands: Hands, folder: Path) -> None:
     _trends(hands, files)
     _export(hands, files)
     _menus(hands)
+    _adviser(hands)
     _misnumber(hands)
     _blocked(hands, folder / "blocked")
     _moved(hands, folder / "blocked")
@@ -214,6 +226,21 @@ def _export(hands: Hands, files: Path) -> None:
 def _menus(hands: Hands) -> None:
     for menu in hands.window.menuBar().actions():
         hands.menu(menu.text().replace("&", ""))
+
+
+def _adviser(hands: Hands) -> None:
+    """Ask for little: one place of the laser, found in seconds."""
+    hands.do("adviser")
+    tool = hands.window.findChild(AdviserWindow)
+    assert tool is not None
+    for key, ends in SMALL_QUESTION.items():
+        tool.ranges[key].set_value(ends)
+    tool.effort.set_value("quick")
+    tool.start()
+    hands.wait(lambda: not tool.working, "the advice")
+    hands.picture("dialog-adviser")
+    hands.asked("save-advice", lambda: hands.press("Save the advice …"))
+    tool.close()
 
 
 def _misnumber(hands: Hands) -> None:

@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
+from labapp.gui.tools import show_tool
 from labapp.gui.views.bench import BenchView
 from labapp.gui.views.fields import FieldForm, NumberField, ResultTable, TextField
 from labapp.gui.workspace import Workspace
@@ -179,9 +180,25 @@ class SetupPage(Page):
         form.add_heading("Expected pool")
         for entry in POOL:
             self._add_noted(form, entry)
+        form.add_wide(
+            _buttons(
+                (
+                    "Advise …",
+                    "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
+                    self._advise,
+                )
+            )
+        )
         self.table = ResultTable("What the bench lets through")
         form.add_wide(self.table)
         return form
+
+    def _advise(self) -> None:
+        window = self.window()
+        from labapp.gui.window import MainWindow  # which loads the pages
+
+        if isinstance(window, MainWindow):
+            show_tool(window, "adviser")
 
     def _add_rig(self, form: FieldForm, entry: Entry) -> None:
         field = _number(entry)

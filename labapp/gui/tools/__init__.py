@@ -1,0 +1,28 @@
+"""The tools: windows beside the main one, each a view and its presenter, loaded when first opened.
+
+A tool's window is kept when it is closed: what it found is there when it is opened again.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from labapp.gui.tools.tool import ToolWindow
+    from labapp.gui.window import MainWindow
+
+TOOLS = {"adviser": "AdviserWindow"}
+"""Module here → the window in it."""
+
+
+def show_tool(window: MainWindow, key: str) -> ToolWindow:
+    """Bring a tool's window into view; it is made when it is first asked for."""
+    from PySide6.QtWidgets import QDialog
+
+    tool: ToolWindow | None = window.findChild(QDialog, f"tool-{key}")  # type: ignore[assignment]
+    if tool is None:
+        made: ToolWindow = getattr(importlib.import_module(f"{__name__}.{key}"), TOOLS[key])(window)
+        tool = made
+    tool.open_beside()
+    return tool

@@ -1,0 +1,218 @@
+"""The configuration adviser's window: pools and bench at the left, the advice at the right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtWidgets import QFileDialog, QLabel, QScrollArea, QTabWidget, QVBoxLayout, QWidget
+
+from labapp.gui.tasks import Control
+from labapp.gui.tools import advising
+from labapp.gui.tools.tool import ToolWindow, told
+from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.ranges import RangeField
+from labapp.gui.views.sheet import Sheet
+from labapp.gui.views.tables import CellTable
+from labapp.session.advice import advice_files
+from labapp.session.advice_keys import parse_question
+from labapp.session.files import write_whole
+from labapp.simulation.advice_report import cost_table
+from labapp.simulation.adviser import QUICK, Advice, Effort, advise
+
+if TYPE_CHECKING:
+    from labapp.gui.window import MainWindow
+
+RANGES = (
+    ("pools.width_mm", "Width", "mm", 1, 50, 0.1, "Of the pools, along X"),
+    ("pools.length_mm", "Length", "mm", 1, 50, 0.1, "Of the pools, along Y"),
+    ("pools.height_mm", "Height or depth", "mm", 0.01, 10, 0.01, "Of the pools, above 0"),
+    ("bench.projection_angle_deg", "Laser, angle", "°", 5, 80, 1, "Where the laser can stand"),
+    ("bench.distance_mm", "Laser, distance", "mm", 10, 500, 1, "Where the laser can stand"),
+    ("bench.plane_distance_mm", "Plane, distance", "mm", 10, 1000, 1, "Where it can stand"),
+    ("bench.s_mm", "Plane, s", "mm", -500, 500, 1, "How far to the left O′ can be"),
+    ("bench.h_mm", "Plane, h", "mm", -500, 500, 1, "How high O′ can be"),
+)
+NUMBERS = (
+    ("pools.shift_mm", "Off the electrode", 0, 5, 0.1, "How far a pool's middle is off it at most"),
+    ("bench.width_mm", "Plane's width", 10, 1000, 1, "Along O′X′"),
+    ("bench.height_mm", "Plane's height", 10, 1000, 1, "Along O′Z′"),
+    ("bench.edge_mm", "Edge", 0, 50, 0.5, "Dots stay so far within the plane's edges"),
+    ("bench.electrode_height_mm", "Electrode height", 0, 50, 0.5, "Work piece to the tip"),
+)
+
+
+class AdviserWindow(ToolWindow):
+    """Asks for pools and limits, searches, and offers what it found to the session."""
+
+    key = "adviser"
+    title = "Configuration adviser"
+
+    def __init__(self, window: MainWindow) -> None:
+        self.advice: Advice | None = None
+        self.files: dict[str, bytes] = {}
+        self._basis: object = None
+        self._asked: advising.Values = {}
+        super().__init__(window)
+        self.ranges: dict[str, RangeField] = {}
+        self.numbers: dict[str, NumberField] = {}
+        self._make_form()
+        self._make_results()
+        self.save_button = self.add_button(
+            "Save the advice …",
+            "Write words, tables, picture and set-up file to a folder",
+            self._choose,
+        )
+        self.use_button = self.add_button(
+            "Use these",
+            "Put this set-up into the session's; undo brings the old one back",
+            self.use,
+        )
+        self.start_button = self.add_button(
+            "Advise", "Search for the set-up with the least error of the height", self.start
+        )
+        self.show_state()
+
+    def _make_form(self) -> None:
+        kinds = (("convex", "convex"), ("concave", "concave"))
+        self.kind = ChoiceField("Kind", kinds, tooltip="Above the work piece, or below it")
+        efforts = (("thorough", "thorough, some minutes"), ("quick", "quick, a tenth of that"))
+        self.effort = ChoiceField("Search", efforts, tooltip="Quick: the error is known to a fifth")
+        self.form.add_heading("Expected pools: least, most")
+        self.form.add(self.kind)
+        for key, label, unit, lowest, highest, step, tip in RANGES:
+            if key == "bench.projection_angle_deg":
+                self.form.add_heading("The bench's limits: least, most")
+            self.ranges[key] = RangeField(
+                label, unit, lowest=lowest, highest=highest, step=step, tooltip=tip
+            )
+            self.form.add(self.ranges[key])
+        self.form.add_heading("Fixed")
+        for key, label, lowest, highest, step, tip in NUMBERS:
+            self.numbers[key] = NumberField(
+                label, "mm", lowest=lowest, highest=highest, step=step, tooltip=tip
+            )
+            self.form.add(self.numbers[key])
+        self.form.add(self.effort)
+
+    def _make_results(self) -> None:
+        self.headline = QLabel("Enter pools and limits, then press Advise.")
+        self.headline.setWordWrap(True)
+        self.table = ResultTable("Recommended set-up, and what it keeps")
+        self.costs = CellTable("What each mm and degree away costs")
+        self.costs.setMinimumHeight(200)
+        self.sheet = Sheet("Bench, places of the laser, and cost curves")
+        self.words = QWidget()
+        column = QVBoxLayout(self.words)
+        for widget in (self.headline, self.table, self.costs):
+            column.addWidget(widget)
+        column.addStretch(1)
+        area = QScrollArea()
+        area.setWidget(self.words)
+        area.setWidgetResizable(True)
+        self.tabs = QTabWidget()
+        self.tabs.tabBar().setAccessibleName("Parts of the advice")
+        self.tabs.addTab(area, "Advice")
+        self.tabs.addTab(self.sheet, "Picture")
+        area.setAccessibleName("Advice")
+        area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
+        self.results.addWidget(self.tabs)
+        for widget in (self.table, self.costs):
+            widget.hide()
+
+    # --- asking ------------------------------------------------------------------------------
+
+    def prefill(self) -> None:
+        """Take pool and rig from the session, where they are others than last time."""
+        values = self.workspace.tried(lambda: advising.question(self.workspace.session))
+        if values is None or values == self._basis:
+            return
+        self._basis = values
+        self._asked = {table: dict(keys) for table, keys in values.items()}
+        self.kind.set_value(values["pools"]["kind"])
+        for key, field in self.ranges.items():
+            table, _, name = key.partition(".")
+            field.set_value(tuple(values[table][name]))
+        for key, number in self.numbers.items():
+            table, _, name = key.partition(".")
+            number.set_value(values[table][name])
+
+    def values(self) -> advising.Values:
+        """What is asked now."""
+        values = {table: dict(keys) for table, keys in self._asked.items()}
+        values["pools"]["kind"] = self.kind.value()
+        for key, field in self.ranges.items():
+            table, _, name = key.partition(".")
+            field.flush()
+            values[table][name] = list(field.value())
+        for key, number in self.numbers.items():
+            table, _, name = key.partition(".")
+            number.flush()
+            values[table][name] = number.value()
+        return values
+
+    def start(self) -> None:
+        """Search, in the background."""
+        asked = self.workspace.tried(lambda: parse_question(self.values(), "the adviser"))
+        if asked is None:
+            return
+        effort = QUICK if self.effort.value() == "quick" else Effort()
+
+        def work(control: Control) -> tuple[Advice, dict[str, bytes]]:
+            advice = advise(*asked, effort, progress=told(control))
+            return advice, advice_files(advice)
+
+        self.begin("Advising", work, lambda found: self.show_advice(*found))
+
+    # --- what was found ------------------------------------------------------------------------
+
+    def show_advice(self, advice: Advice, files: dict[str, bytes]) -> None:
+        """Show an advice and what of it can be saved."""
+        self.advice, self.files = advice, files
+        words = advising.headline(advice)
+        self.headline.setText(words)
+        self.table.set_rows(advising.rows(advice))
+        self.table.show()
+        self.costs.setVisible(advice.possible)
+        if advice.possible:
+            self.costs.show_table(cost_table(advice))
+        self.sheet.show_png(files["advice.png"], words)
+        self.say("Done")
+        self.show_state()
+
+    def show_state(self) -> None:
+        """Enable what is of use now."""
+        if not hasattr(self, "start_button"):
+            return
+        session, advice = self.workspace.session, self.advice
+        writable = session is not None and not session.read_only
+        self.start_button.setEnabled(not self.working)
+        self.use_button.setEnabled(writable and advice is not None and advice.possible)
+        self.save_button.setEnabled(bool(self.files))
+
+    def use(self) -> None:
+        """Put the set-up into the session's."""
+        advice = self.advice
+        if advice is not None and self.workspace.attempt(lambda s: advising.use(s, advice)):
+            self.workspace.said.emit(
+                "The advised set-up is in: measure in steps 2 and 3 where it really stands", False
+            )
+
+    def save(self, folder: Path) -> None:
+        """Write the files that the command writes."""
+        files = self.files
+
+        def write() -> None:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, content in files.items():
+                write_whole(folder / name, content)
+
+        if self.tried(write):
+            self.say(f"Saved in {folder}")
+
+    def _choose(self) -> None:
+        session = self.workspace.session
+        start = Path.home() if session is None else session.path.parent
+        name = QFileDialog.getExistingDirectory(self, "Save the advice in", str(start))
+        if name:
+            self.save(Path(name))

@@ -1,0 +1,116 @@
+"""What the adviser's window asks and shows, and what it puts into a session: without Qt."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from labapp.gui.digits import ResultRow
+from labapp.gui.pages.setup.presenter import rig
+from labapp.session.advice import advised_setup
+from labapp.session.session import Session
+from labapp.simulation.advice_report import WORDS
+from labapp.simulation.adviser import Advice
+from labapp.simulation.bench_limits import CONSTRAINTS, BenchLimits
+from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
+
+USUAL_HEIGHT_MM = 0.25
+
+ABOUT = 0.1
+"""Pools are expected within so much of the size that the session has."""
+
+Values = dict[str, dict[str, Any]]
+"""Table → key → value, as `advice_keys.parse_question` takes them."""
+
+
+def question(session: Session | None) -> Values:
+    """What to ask: the session's expected pool and rig, within a usual bench's limits."""
+    record = None if session is None else session.record
+    width = (record and record.expected_width_mm) or USUAL_WIDTH_MM
+    length = (record and record.expected_length_mm) or USUAL_LENGTH_MM
+    height = (record and record.expected_height_mm) or USUAL_HEIGHT_MM
+    usual = BenchLimits()
+    values: Values = {
+        "pools": {
+            "kind": "convex" if height > 0 else "concave",
+            "width_mm": _about(width),
+            "length_mm": _about(length),
+            "height_mm": _about(abs(height)),
+            "shift_mm": 0.3,
+        },
+        "bench": {
+            "projection_angle_deg": list(usual.angle_deg),
+            "distance_mm": list(usual.distance_mm),
+            "plane_distance_mm": list(usual.plane_mm),
+            "s_mm": list(usual.s_mm),
+            "h_mm": list(usual.h_mm),
+            "width_mm": usual.plate_mm[0],
+            "height_mm": usual.plate_mm[1],
+            "edge_mm": usual.edge_mm,
+            "electrode_height_mm": usual.electrode_mm,
+        },
+    }
+    found = None if session is None else rig(session)
+    if found is not None:
+        bench, pattern = values["bench"], found.pattern
+        for key, value in (
+            ("projection_angle_deg", found.laser.projection_angle_deg),
+            ("distance_mm", found.laser.distance_mm),
+            ("plane_distance_mm", -float(found.imaging_plane.origin_mm[1])),
+        ):
+            bench[key] = [min(bench[key][0], value), max(bench[key][1], value)]
+        bench["width_mm"] = found.imaging_plane.width_mm
+        bench["height_mm"] = found.imaging_plane.height_mm
+        bench["electrode_height_mm"] = found.electrode.height_mm
+        values["pattern"] = {
+            "rows": pattern.rows,
+            "columns": pattern.columns,
+            "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
+            "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
+        }
+    return values
+
+
+def _about(size_mm: float) -> list[float]:
+    return [round(size_mm * (1 - ABOUT), 3), round(size_mm * (1 + ABOUT), 3)]
+
+
+def headline(advice: Advice) -> str:
+    """The advice in a sentence, or why there is none."""
+    if advice.possible:
+        height = advice.expected.mean_height_mm
+        share = 100 * advice.error_mm / height
+        return (
+            f"Expect a mean height error of {1000 * advice.error_mm:.2f} ± "
+            f"{1000 * advice.sigma_mm:.2f} µm, {share:.2g} % of {height:.3g} mm."
+        )
+    broken = [CONSTRAINTS[name][0] for name, margin in advice.best.margins.items() if margin < 0]
+    return (
+        f"No set-up is possible within these limits, because of: {'; '.join(broken)}. "
+        "The one below comes nearest. Widen the limits, or expect smaller pools."
+    )
+
+
+def rows(advice: Advice) -> tuple[ResultRow, ...]:
+    """The set-up, and by how much it keeps what it must."""
+    place = [
+        ResultRow(words, float(getattr(advice.best.place, name)), unit=unit, decimals=2)
+        for name, (words, unit) in WORDS.items()
+    ]
+    kept = [
+        ResultRow(
+            CONSTRAINTS[name][0],
+            margin,
+            unit=CONSTRAINTS[name][1],
+            decimals=1,
+            note="By how much it is kept; below 0 it is not",
+        )
+        for name, margin in advice.best.margins.items()
+    ]
+    return (*place, *kept)
+
+
+def use(session: Session, advice: Advice) -> None:
+    """Put the recommended set-up into a session's, as one step; the plane stands upright then."""
+    values = advised_setup(advice)
+    values["imaging_plane"] |= {"pitch_deg": None, "yaw_deg": None}
+    session.update_setup(values, "advised set-up")

@@ -1,0 +1,215 @@
+"""What every tool's window has: a form, results, work that is told of and can be stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from PySide6.QtCore import QSize, Qt
+from PySide6.QtGui import QCloseEvent
+from PySide6.QtWidgets import (
+    QDialog,
+    QFrame,
+    QHBoxLayout,
+    QProgressBar,
+    QPushButton,
+    QScrollArea,
+    QVBoxLayout,
+)
+
+from labapp.gui.messages import PROBLEM, ElidedLabel
+from labapp.gui.tasks import Control, Task, Tasks
+from labapp.gui.views.fields import FieldForm
+from labapp.simulation.parallel import Progress
+
+if TYPE_CHECKING:
+    from labapp.gui.window import MainWindow
+
+SIZE_PX = (1120, 700)
+PART_OF_SCREEN = 0.9
+FORM_PX = 336
+"""Width of the form: two numbers beside their name."""
+
+
+class ToolWindow(QDialog):
+    """A window with a form at the left, results at the right and buttons below.
+
+    Closing it stops its work, and keeps what it shows.
+
+    Parameters
+    ----------
+    window
+        The app's window: its session, and where it tells.
+
+    Attributes
+    ----------
+    key, title, hint
+        In code; for the operator; what it is for.
+    workspace
+        What is open.
+    tasks
+        The tool's own work.
+    form, results
+        Where the tool puts its fields, and what it found.
+    """
+
+    key = ""
+    title = ""
+    hint = ""
+
+    def __init__(self, window: MainWindow) -> None:
+        super().__init__(window)
+        self.workspace = window.workspace
+        self.tasks = Tasks(self)
+        self._task: Task | None = None
+        self.setObjectName(f"tool-{self.key}")
+        self.setWindowTitle(self.title)
+        self.setWindowFlag(Qt.WindowType.WindowMaximizeButtonHint)
+        self.form = FieldForm()
+        self.results = QVBoxLayout()
+        self.message = ElidedLabel()
+        self.message.setAccessibleName("Last message")
+        self.bar = QProgressBar()
+        self.bar.setFixedWidth(180)
+        self.bar.setFormat("%v of %m")
+        self.bar.setAccessibleName("Progress")
+        self.buttons = QHBoxLayout()
+        self.cancel_button = self.add_button(
+            "Cancel", "Stop the work; what is finished is kept (Esc)", self.cancel
+        )
+        self.close_button = self.add_button(
+            "Close", "Close this window and stop its work; what it found is kept", self.close
+        )
+        self._lay_out()
+        for signal in (self.tasks.changed, self.tasks.progressed):
+            signal.connect(self._show_progress)
+        self.tasks.failed.connect(lambda _, why: self.say(why, True))
+        self.workspace.opened.connect(self.show_state)
+        self.workspace.changed.connect(self.show_state)
+        self.workspace.said.connect(self._heard)
+        self._show_progress()
+        room = self.screen().availableSize() * PART_OF_SCREEN
+        self.resize(QSize(*SIZE_PX).boundedTo(room))
+
+    def _lay_out(self) -> None:
+        side = QScrollArea()
+        side.setWidget(self.form)
+        side.setWidgetResizable(True)
+        side.setFrameShape(QFrame.Shape.NoFrame)
+        side.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        side.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        side.setFixedWidth(FORM_PX + side.verticalScrollBar().sizeHint().width())
+        self.form.setContentsMargins(0, 0, 8, 0)
+        middle = QHBoxLayout()
+        middle.addWidget(side)
+        middle.addLayout(self.results, 1)
+        state = QHBoxLayout()
+        state.addWidget(self.message, 1)
+        state.addWidget(self.bar)
+        layout = QVBoxLayout(self)
+        layout.addLayout(middle, 1)
+        layout.addLayout(state)
+        layout.addLayout(self.buttons)
+        self.buttons.insertStretch(0, 1)
+
+    def add_button(self, words: str, tip: str, do: Callable[[], object]) -> QPushButton:
+        """Put a button before those that are there."""
+        button = QPushButton(words)
+        button.setToolTip(tip)
+        button.setAutoDefault(False)  # Enter finishes a field
+        button.clicked.connect(lambda *_: do())
+        self.buttons.insertWidget(0, button)
+        return button
+
+    # --- what tools say for themselves ---------------------------------------------------------
+
+    def prefill(self) -> None:
+        """Put what the session holds into the form, where that is another than last time."""
+
+    def show_state(self) -> None:
+        """Enable what is of use now."""
+
+    # --- showing, closing ----------------------------------------------------------------------
+
+    def open_beside(self) -> None:
+        """Come into view, in front, with what the session holds."""
+        self.prefill()
+        self.show_state()
+        self.show()
+        self.raise_()
+        self.activateWindow()
+
+    def reject(self) -> None:
+        """Esc: stop the work under way; without any close the window."""
+        if self.tasks.active:
+            self.cancel()
+        else:
+            super().reject()
+
+    def closeEvent(self, event: QCloseEvent) -> None:
+        """Stop the work."""
+        if self.tasks.active:
+            self.tasks.cancel_all()
+            self.say("Stopped")
+        super().closeEvent(event)
+
+    # --- work ----------------------------------------------------------------------------------
+
+    @property
+    def working(self) -> bool:
+        """Whether work is under way."""
+        return bool(self.tasks.active)
+
+    def begin(
+        self,
+        title: str,
+        work: Callable[[Control], Any],
+        done: Callable[[Any], None],
+        part: Callable[[Any], None] | None = None,
+    ) -> None:
+        """Begin work, one at a time; see `Tasks.start`."""
+        if not self.working:
+            self.say(f"{title} …")
+            self._task = self.tasks.start(title, work, done, part)
+
+    def cancel(self) -> None:
+        """Ask the work to stop."""
+        for task in self.tasks.active:
+            task.cancel()
+        self._show_progress()
+
+    def say(self, text: str, problem: bool = False) -> None:
+        """Tell something on the line below."""
+        self.message.setText(f"{PROBLEM} {text}" if problem else text)
+
+    def tried(self, work: Callable[[], object]) -> bool:
+        """Do something short; a refusal is said in words, and False."""
+        return self.workspace.tried(lambda: (work(),)) is not None
+
+    def _heard(self, text: str, problem: bool) -> None:
+        """What is said behind this window is said here too."""
+        if self.isVisible():
+            self.say(text, problem)
+
+    def _show_progress(self) -> None:
+        task, active = self._task, self.working
+        self.bar.setVisible(active)
+        self.cancel_button.setEnabled(active)
+        self.show_state()
+        if task is None:
+            return
+        stopping = task.control.cancelled.is_set()
+        if active:
+            stage = "stopping" if stopping else task.control.stage
+            self.say(f"{task.title}: {stage} …" if stage else f"{task.title} …")
+            self.bar.setRange(0, task.total)
+            self.bar.setValue(task.done)
+        else:
+            self._task = None
+            if stopping:
+                self.say("Stopped")
+
+
+def told(control: Control) -> Progress:
+    """How work of `labapp.simulation` tells how far it is, and hears of a cancel."""
+    return lambda what, done, total: control.progress(done, total, what)

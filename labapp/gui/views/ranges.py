@@ -1,0 +1,75 @@
+"""A field for a range: the least and the most of a quantity beside each other."""
+
+from __future__ import annotations
+
+from PySide6.QtWidgets import QHBoxLayout, QWidget
+
+from labapp.gui.views.fields import Field, NumberField
+
+
+class RangeField(Field):
+    """Two numbers with one unit; ``edited`` gives both.
+
+    Parameters
+    ----------
+    label, unit, tooltip
+        What it is; its unit; what it does.
+    lowest, highest, step, decimals
+        Of either, as in `NumberField`.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        unit: str = "",
+        *,
+        lowest: float,
+        highest: float,
+        step: float = 1.0,
+        decimals: int = 2,
+        tooltip: str = "",
+    ) -> None:
+        self.least, self.most = (
+            NumberField(
+                f"{label}, {end}",
+                unit,
+                lowest=lowest,
+                highest=highest,
+                step=step,
+                decimals=decimals,
+                tooltip=f"{tooltip}: {end}",
+            )
+            for end in ("least", "most")
+        )
+        pair = QWidget()
+        line = QHBoxLayout(pair)
+        line.setContentsMargins(0, 0, 0, 0)
+        for field in (self.least, self.most):
+            field.unit.hide()  # said once, after both
+            line.addWidget(field, 1)
+            field.edited.connect(self._tell)
+        super().__init__(label, pair, tooltip, unit)
+        pair.setFocusProxy(self.least)
+
+    def value(self) -> tuple[float, float]:
+        """Least and most."""
+        return self.least.value() or 0.0, self.most.value() or 0.0
+
+    def set_value(self, ends: tuple[float, float]) -> None:
+        """Show another range; tells nobody."""
+        self.least.set_value(ends[0])
+        self.most.set_value(ends[1])
+        self._judge()
+
+    def flush(self) -> None:
+        """Finish an edit under way, as leaving the field does."""
+        self.least.flush()
+        self.most.flush()
+
+    def _tell(self) -> None:
+        self._judge()
+        self.edited.emit(self.value())
+
+    def _judge(self) -> None:
+        least, most = self.value()
+        self.set_problem("The smaller number comes first" if least > most else "")

@@ -1,0 +1,142 @@
+"""The adviser's window: what it asks, that it gives what the command gives, undo, cancel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QPushButton
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.tools import advising
+from labapp.gui.tools.adviser import AdviserWindow
+from labapp.gui.window import MainWindow
+from labapp.session.advice_keys import parse_question
+from labapp.session.session import Session
+from tests.conftest import Run
+from tests.gui.conftest import CopySample
+
+TIMEOUT = 120_000
+
+SMALL = {
+    "pools.width_mm": (6.5, 6.5),
+    "pools.length_mm": (7.0, 7.0),
+    "pools.height_mm": (0.2, 0.21),
+    "bench.projection_angle_deg": (26.0, 26.0),
+    "bench.distance_mm": (40.0, 40.0),
+    "bench.plane_distance_mm": (60.0, 65.0),
+}
+
+
+@pytest.fixture
+def adviser(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> AdviserWindow:
+    """The adviser's window beside a session, asked for little."""
+    assert window.files.open(copy_sample("gtaw"))
+    window.menus.do("adviser")
+    tool = window.findChild(AdviserWindow)
+    assert tool is not None
+    qtbot.waitUntil(tool.isVisible)
+    for key, ends in SMALL.items():
+        tool.ranges[key].set_value(ends)
+    tool.effort.set_value("quick")
+    return tool
+
+
+def click(button: QPushButton) -> None:
+    QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+
+
+def test_the_question_is_the_sessions_pool_and_rig(copy_sample: CopySample):
+    with Session.open(copy_sample("gtaw")) as session:
+        values = advising.question(session)
+        expected, limits = parse_question(values, "here")
+    assert expected.width_mm == pytest.approx((0.9 * 6.7, 1.1 * 6.7))
+    assert expected.kind == "convex"
+    assert limits.angle_deg == (25.0, 35.0)
+    assert limits.pattern.rows == 19
+    parse_question(advising.question(None), "here")
+
+
+def test_it_gives_what_the_command_gives_and_undo_takes_it_back(
+    adviser: AdviserWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
+):
+    session = adviser.workspace.session
+    assert session is not None
+    before = session.setup_text
+    click(adviser.start_button)
+    assert not adviser.start_button.isEnabled()
+    qtbot.waitUntil(lambda: adviser.advice is not None, timeout=TIMEOUT)
+    adviser.save(tmp_path / "window")
+    values = adviser.values()
+    lines = []
+    for table, keys in values.items():
+        lines.append(f"[{table}]")
+        lines += [f"{key} = {str(value).replace(chr(39), chr(34))}" for key, value in keys.items()]
+    lines = [line if "kind" not in line else 'kind = "convex"' for line in lines]
+    question = tmp_path / "question.toml"
+    question.write_text("\n".join(lines), "utf-8")
+    code, _, err = labapp("advise", question, "--quick", "--out", tmp_path / "command")
+    assert code == 0, err
+    names = sorted(path.name for path in (tmp_path / "command").iterdir())
+    assert names == ["advice.csv", "advice.md", "advice.png", "setup.toml"]
+    for name in names:
+        made = (tmp_path / "window" / name).read_bytes()
+        assert made == (tmp_path / "command" / name).read_bytes(), name
+    click(adviser.use_button)
+    laser = session.setup.rig.laser
+    assert (laser.projection_angle_deg, laser.distance_mm) == (26.0, 40.0)
+    assert session.setup_text != before
+    adviser.workspace.undo()
+    assert session.setup_text == before
+    adviser.costs.copy_csv()
+    assert QApplication.clipboard().text().startswith("quantity,unit,way")
+
+
+def test_the_impossible_is_said_in_words(adviser: AdviserWindow, qtbot: QtBot):
+    adviser.ranges["pools.height_mm"].set_value((0.5, 0.6))
+    click(adviser.start_button)
+    qtbot.waitUntil(lambda: adviser.advice is not None, timeout=TIMEOUT)
+    assert "No set-up is possible" in adviser.headline.text()
+    assert "dots on the plate" in adviser.headline.text()
+    assert not adviser.use_button.isEnabled()
+
+
+def test_a_wrong_question_is_refused_and_nothing_begins(adviser: AdviserWindow):
+    adviser.ranges["pools.width_mm"].set_value((8.0, 6.0))
+    click(adviser.start_button)
+    assert not adviser.working
+    assert "pools.width_mm" in adviser.message.text()
+
+
+@pytest.mark.parametrize("how", ["escape", "close", "app"])
+def test_it_can_be_stopped(adviser: AdviserWindow, window: MainWindow, qtbot: QtBot, how: str):
+    adviser.effort.set_value("thorough")
+    click(adviser.start_button)
+    qtbot.waitUntil(lambda: adviser.bar.maximum() > 0)
+    if how == "escape":
+        QTest.keyClick(adviser, Qt.Key.Key_Escape)
+        assert adviser.isVisible()
+    elif how == "close":
+        click(adviser.close_button)
+        assert not adviser.isVisible()
+    else:
+        window.close()
+    qtbot.waitUntil(lambda: not adviser.working)
+    assert adviser.advice is None
+    assert adviser.message.text() == "Stopped"
+
+
+def test_the_set_up_page_leads_to_it(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):
+    assert window.files.open(copy_sample("gtaw"))
+    window.show_step("setup")
+    window.page.tabs.setCurrentIndex(2)  # type: ignore[union-attr]
+    button = next(b for b in window.findChildren(QPushButton) if b.text() == "Advise …")
+    click(button)
+    tool = window.findChild(AdviserWindow)
+    assert tool is not None
+    qtbot.waitUntil(tool.isVisible)
+    click(tool.close_button)
+    window.menus.do("adviser")
+    assert len(window.findChildren(AdviserWindow)) == 1
