@@ -19,7 +19,7 @@ from PySide6.QtGui import (
     QKeySequence,
     QPalette,
 )
-from PySide6.QtWidgets import QFrame, QLabel, QScrollArea, QSizePolicy, QVBoxLayout
+from PySide6.QtWidgets import QFrame, QGraphicsItem, QLabel, QScrollArea, QSizePolicy, QVBoxLayout
 
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in_words
@@ -106,7 +106,7 @@ class PlotStack(Plotted):
         if not same:
             self._lay_out()
         for plot, curve in zip(self._plots, curves, strict=True):
-            plot.show_curve(curve, self.palette())
+            plot.show_curve(curve)
         if not same:
             self.fit()
         self._show_legend()
@@ -188,7 +188,8 @@ class PlotStack(Plotted):
         look = self.palette()
         self.canvas.setBackground(look.color(Role.Base))
         for plot, curve in zip(self._plots, self.curves, strict=True):
-            plot.show_curve(curve, look)
+            plot.dress(curve, look)
+            plot.show_curve(curve)
 
     def _show_legend(self) -> None:
         marks = {
@@ -280,7 +281,10 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         if over is not None:
             self.setXLink(over)
         for side in ("left", "bottom"):
-            self.getAxis(side).enableAutoSIPrefix(False)
+            axis = self.getAxis(side)
+            axis.enableAutoSIPrefix(False)
+            # Its grid is half of what drawing costs, and stepping moves only the upright line.
+            axis.setCacheMode(QGraphicsItem.CacheMode.DeviceCoordinateCache)
         self.getAxis("left").setWidth(AXIS_WIDTH)
         # Above the plot: beside a low one its name would be cut off.
         self.titleLabel.setVisible(True)
@@ -300,11 +304,10 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             item.hide()
         box.sigXRangeChanged.connect(lambda *_: self._show_points())
 
-    def show_curve(self, curve: Curve, look: QPalette) -> None:
-        """Show a curve in the colours of a palette."""
-        self._curve, self._look = curve, look
+    def dress(self, curve: Curve, look: QPalette) -> None:
+        """Take a palette's colours and a curve's title: an axis is drawn anew, which is dear."""
+        self._look = look
         accent, text = look.color(Role.Accent), look.color(Role.Text)
-        faint = _faint(accent, 110)
         for side in ("left", "bottom"):
             axis = self.getAxis(side)
             axis.setPen(look.color(Role.Mid))
@@ -315,17 +318,22 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         if self.getAxis("bottom").labelText:
             self.setLabel("bottom", self.getAxis("bottom").labelText, color=text.name())
         self.showGrid(x=True, y=True, alpha=0.18)
-        self.line.setPen(pg.mkPen(faint if len(curve.key) else accent, width=1))
-        self.line.setData(curve.x, curve.y)
+        line = _faint(accent, 110) if len(curve.key) else accent
+        self.line.setPen(pg.mkPen(line, width=1))
         self.bars.setPen(pg.mkPen(_faint(accent, 150), width=1))
         self.level.setPen(pg.mkPen(_faint(text, 150), width=1, style=Qt.PenStyle.DashLine))
-        self.level.setVisible(bool(np.isfinite(curve.level)))
-        if np.isfinite(curve.level):
-            self.level.setValue(curve.level)
         self.current.setPen(pg.mkPen(accent, width=1.5))
         self.cross.setPen(pg.mkPen(_faint(text, 90), width=1))
         if curve.from_zero:
             self.getViewBox().setLimits(yMin=0)
+
+    def show_curve(self, curve: Curve) -> None:
+        """Show a curve."""
+        self._curve = curve
+        self.line.setData(curve.x, curve.y)
+        self.level.setVisible(bool(np.isfinite(curve.level)))
+        if np.isfinite(curve.level):
+            self.level.setValue(curve.level)
         self._show_points()
 
     def mark_place(self, x: float | None) -> None:
