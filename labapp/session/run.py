@@ -118,14 +118,20 @@ def measure_each(
             future.cancel()
 
 
+NICE = 10
+"""So much a process that measures gives way to the window, where the system knows of it."""
+
+
 def measuring_pool(workers: int) -> ProcessPoolExecutor:
     """Processes that measure: a window stays quick while they do."""
     spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, spawn, initializer=_end_with_parent)
+    return ProcessPoolExecutor(workers, spawn, initializer=_begin_to_measure)
 
 
-def _end_with_parent() -> None:
-    """End this process when the program that it measures for is gone, killed even."""
+def _begin_to_measure() -> None:
+    """Give way to the window; end when the program that it measures for is gone, killed even."""
+    if hasattr(os, "nice"):
+        os.nice(NICE)
     parent = multiprocessing.parent_process()
 
     def wait() -> None:

@@ -278,13 +278,15 @@ class CapturePage(Page):
             return
 
         def work(control: Control) -> Recording:
-            return session.import_recording(
+            recording = session.import_recording(
                 preview.path,
                 choice.frames,
                 frame_rate_hz=choice.rate_hz,
                 embed=choice.embed,
                 progress=control.progress,
             )
+            session.overview()  # looked up here: the window would wait for it
+            return recording
 
         def done(recording: Recording) -> None:
             if self.workspace.session is not session:
