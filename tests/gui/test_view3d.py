@@ -127,7 +127,7 @@ def test_keys_look_from_the_top_the_side_and_the_front(
     assert np.argmax(np.abs(way)) == axis
     assert way[axis] * sign > 0
     assert np.abs(np.delete(way, axis)).max() < 1e-6 * abs(way[axis])
-    assert view.camera[4]  # without perspective
+    assert view.camera[5]  # without perspective
 
 
 def test_a_view_looks_from_where_another_does(view: View3d, qtbot: QtBot) -> None:

@@ -68,8 +68,8 @@ ON_THE_PROCESSOR = (
 
 NOTHING_HERE = "The 3-D view needs OpenGL, which cannot be used here. All figures are measured."
 
-Camera = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float, bool]
-"""Position, focal point, up, parallel scale, whether it is without perspective."""
+Camera = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float, float, bool]
+"""Position, focal point, up, view angle, parallel scale, whether it is without perspective."""
 
 
 class View3d(Drawn):
@@ -140,7 +140,8 @@ class View3d(Drawn):
         camera = self._drawing.plotter.camera
         return (
             *(tuple(camera.position), tuple(camera.focal_point), tuple(camera.up)),
-            *(float(camera.parallel_scale), bool(camera.parallel_projection)),
+            *(float(camera.view_angle), float(camera.parallel_scale)),
+            bool(camera.parallel_projection),
         )
 
     def set_camera(self, camera: Camera) -> None:
@@ -205,7 +206,7 @@ class View3d(Drawn):
         assert self._drawing is not None
         held = self._drawing.plotter.camera
         held.position, held.focal_point, held.up = camera[:3]
-        held.parallel_scale, held.parallel_projection = camera[3:]
+        held.view_angle, held.parallel_scale, held.parallel_projection = camera[3:]
         self._drawing.plotter.renderer.ResetCameraClippingRange()
 
     def _pixels(self) -> tuple[int, int]:

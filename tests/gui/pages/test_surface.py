@@ -229,9 +229,11 @@ def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None
     assert difference.scene.diverging
     assert first.scene.limits == second.scene.limits
     first.turn(40, 10)
-    assert second.camera == first.camera
+    assert second.camera == first.camera == difference.camera
     second.look("side")
     assert first.camera == second.camera
+    difference.zoom(1.5)
+    assert first.camera == second.camera == difference.camera
     before = compare.words.text()
     compare.second.choice.set_value("irs-opa")
     compare.second.choice.edited.emit("irs-opa")
@@ -242,6 +244,26 @@ def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None
     assert "IRS" in compare.words.text()
     page.comparing.click()
     assert page.view.scene is not None
+
+
+def test_a_narrow_canvas_shows_one_part_at_a_time(page: SurfacePage) -> None:
+    page.resize(420, 500)
+    assert page.canvas_parts.isVisibleTo(page)
+    assert page.view.isVisibleTo(page)
+    assert not page.plan.isVisibleTo(page)
+    page.canvas_parts.setCurrentIndex(1)
+    assert not page.view.isVisibleTo(page)
+    assert page.plan.isVisibleTo(page)
+    page.comparing.click()
+    seen = page.compare
+    seen.parts.setCurrentIndex(2)
+    assert seen.table.isVisibleTo(page)
+    assert not any(view.isVisibleTo(page) for view in seen.views)
+    page.comparing.click()
+    page.resize(1400, 900)
+    assert not page.canvas_parts.isVisibleTo(page)
+    assert page.view.isVisibleTo(page)
+    assert page.dots.isVisibleTo(page)
 
 
 def test_every_control_can_be_named_and_reached(page: SurfacePage) -> None:

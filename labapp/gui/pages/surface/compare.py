@@ -6,7 +6,6 @@ from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import (
     QAbstractItemView,
-    QGridLayout,
     QHBoxLayout,
     QHeaderView,
     QLabel,
@@ -21,6 +20,7 @@ from labapp.gui.pages.surface.comparison import Comparison, compared, other_sche
 from labapp.gui.pages.surface.presenter import SCHEMES, Options
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField
+from labapp.gui.views.parts import PartsBar
 from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.workspace import Workspace
 
@@ -28,7 +28,7 @@ COLUMNS = ("", "First", "Second", "Difference", "Unit")
 
 
 class CompareView(QWidget):
-    """The frame in view by two schemes; the cameras of the two turn together.
+    """The frame in view by two schemes; the cameras of all views turn together.
 
     Parameters
     ----------
@@ -48,29 +48,38 @@ class CompareView(QWidget):
         self.workspace = workspace
         self.first, self.second = (_SchemeBox(order) for order in ("First", "Second"))
         self.difference = make_view3d("Difference of the two surfaces")
-        self.difference.look("top")
         self.words = QLabel()
         self.words.setWordWrap(True)
         self.table = _table()
         self._options = Options()
         self._shown_for: object = None
         self._task: Task | None = None
-        self.first.view.camera_changed.connect(self.second.view.set_camera)
-        self.second.view.camera_changed.connect(self.first.view.set_camera)
+        for view in self.views:
+            for other in self.views:
+                if other is not view:
+                    view.camera_changed.connect(other.set_camera)
         for box in (self.first, self.second):
             box.choice.edited.connect(lambda _: self.refresh(self._options))
-        layout = QGridLayout(self)
+        figures = QWidget()
+        column = QVBoxLayout(figures)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.addWidget(self.words)
+        column.addWidget(self.table, 1)
+        surfaces = _side_by_side(self.first, self.second)
+        below = _side_by_side(self.difference, figures)
+        self.parts = PartsBar(
+            "What is seen of the comparison",
+            {
+                "Surfaces": (surfaces,),
+                "Difference": (below, self.difference),
+                "Figures": (below, figures),
+            },
+        )
+        layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
-        below = QVBoxLayout()
-        below.addWidget(self.words)
-        below.addWidget(self.table, 1)
-        layout.addWidget(self.first, 0, 0)
-        layout.addWidget(self.second, 0, 1)
-        layout.addWidget(self.difference, 1, 0)
-        layout.addLayout(below, 1, 1)
-        for k in (0, 1):
-            layout.setRowStretch(k, 1)
-            layout.setColumnStretch(k, 1)
+        layout.addWidget(self.parts)
+        layout.addWidget(surfaces, 1)
+        layout.addWidget(below, 1)
 
     @property
     def views(self) -> tuple[View3d, View3d, View3d]:
@@ -137,8 +146,9 @@ class CompareView(QWidget):
         self._make_room()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Have all figures be seen where there is the height for it."""
+        """Have all figures be seen where there is room for it."""
         super().resizeEvent(event)
+        self.parts.fit(self)
         self._make_room()
 
     def _make_room(self) -> None:
@@ -146,6 +156,16 @@ class CompareView(QWidget):
         header = self.table.horizontalHeader().sizeHint().height()
         wanted = rows + header + 2 * self.table.frameWidth()
         self.table.setMinimumHeight(min(wanted, self.height() * 2 // 5))
+
+
+def _side_by_side(*widgets: QWidget) -> QWidget:
+    """Widgets of equal width."""
+    row = QWidget()
+    line = QHBoxLayout(row)
+    line.setContentsMargins(0, 0, 0, 0)
+    for widget in widgets:
+        line.addWidget(widget, 1)
+    return row
 
 
 class _SchemeBox(QWidget):
@@ -180,6 +200,7 @@ def _table() -> QTableWidget:
     table.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
     header = table.horizontalHeader()
     header.setHighlightSections(False)
-    header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-    header.setStretchLastSection(True)
+    for column, of_numbers in enumerate((False, True, True, True, False)):
+        mode = QHeaderView.ResizeMode
+        header.setSectionResizeMode(column, mode.Stretch if of_numbers else mode.ResizeToContents)
     return table

@@ -38,6 +38,7 @@ from labapp.gui.pages.surface.presenter import (
     shown,
 )
 from labapp.gui.views.fields import ChoiceField, NumberField
+from labapp.gui.views.parts import PartsBar
 from labapp.gui.views.view3d import make_view3d
 from labapp.gui.workspace import Workspace
 from labapp.session.heights import profile
@@ -113,7 +114,25 @@ class SurfacePage(Page):
         whole.setStretchFactor(1, 3)
         whole.setSizes([500, 300])
         whole.setChildrenCollapsible(False)
-        return whole
+        self.canvas_parts = PartsBar(
+            "What is seen of the surface",
+            {
+                "3-D": (left, self.view),
+                "Section": (left, below, right, self.plan),
+                "Dots": (right, self.dots),
+            },
+        )
+        canvas = QWidget()
+        layout = QVBoxLayout(canvas)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self.canvas_parts)
+        layout.addWidget(whole, 1)
+        return canvas
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Show parts of a narrow canvas one at a time."""
+        super().resizeEvent(event)
+        self.canvas_parts.fit(self)
 
     def _section_fields(self) -> QWidget:
         self.angle = NumberField(

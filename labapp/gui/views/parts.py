@@ -1,0 +1,47 @@
+"""A canvas of several parts: all at once where there is room, else one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from PySide6.QtWidgets import QTabBar, QWidget
+
+NARROW = 100
+"""A canvas on which fewer letters stand beside each other is narrow: a small screen at 150 %."""
+
+
+class PartsBar(QTabBar):
+    """Chooses what is seen of a narrow canvas; on a wide one it is not there.
+
+    Parameters
+    ----------
+    name
+        What is chosen, for a screen reader.
+    parts
+        Its widgets by the part's name; a widget may be in several parts.
+    """
+
+    def __init__(self, name: str, parts: Mapping[str, Sequence[QWidget]]) -> None:
+        super().__init__()
+        self._parts = list(parts.values())
+        self._is_narrow = False
+        self.setAccessibleName(name)
+        self.setDrawBase(False)
+        for part in parts:
+            self.addTab(part)
+        self.currentChanged.connect(lambda _: self._show())
+        self.hide()
+
+    def fit(self, canvas: QWidget) -> None:
+        """Follow a canvas that has become narrow or wide."""
+        is_narrow = canvas.width() < NARROW * self.fontMetrics().averageCharWidth()
+        if is_narrow != self._is_narrow:
+            self._is_narrow = is_narrow
+            self.setVisible(is_narrow)
+            self._show()
+
+    def _show(self) -> None:
+        chosen = self._parts[self.currentIndex()]
+        for part in self._parts:
+            for widget in part:
+                widget.setVisible(not self._is_narrow or widget in chosen)
