@@ -353,26 +353,13 @@ class Hands:
 
     def popup(self, menu: QMenu, name: str, show: Callable[[], object]) -> None:
         """Show a menu, take its picture, and close it; ``show`` may return only when it is."""
-        closed: list[Exception | None] = []
-        look = QTimer()
 
-        def attend() -> None:
-            if menu.isVisible():
-                look.stop()
-                try:
-                    self.picture(f"menu-{name}")
-                    closed.append(None)
-                except Exception as error:
-                    closed.append(error)
-                QTest.keyClick(menu, Qt.Key.Key_Escape)
-                menu.close()
+        def see(menu: QMenu) -> None:
+            self.picture(f"menu-{name}")
+            QTest.keyClick(menu, Qt.Key.Key_Escape)
+            menu.close()
 
-        look.timeout.connect(attend)
-        look.start(LOOK_MS)
-        show()
-        self.wait(lambda: closed, f"the menu {name}")
-        if closed[0] is not None:
-            raise closed[0]
+        self._meet(f"the menu {name}", show, lambda: menu if menu.isVisible() else None, see)
 
     def asked(
         self, name: str, do: Callable[[], object], answer: Callable[[QDialog], object] | None = None
@@ -388,37 +375,56 @@ class Hands:
         answer
             Answers it; without one it is given up by Escape.
         """
+        began = QElapsedTimer()
+        began.start()
+
+        def there() -> QDialog | None:
+            dialog = QApplication.activeModalWidget()
+            if isinstance(dialog, QDialog) and (_is_filled(dialog) or began.hasExpired(LONGEST_MS)):
+                return dialog
+            return None
+
+        def see(dialog: QDialog) -> None:
+            if not _is_filled(dialog):
+                raise self.fail(f"“{dialog.windowTitle()}” never shows what it is about")
+            if name:
+                self.picture(f"dialog-{name}")
+            if answer is None:
+                QTest.keyClick(dialog, Qt.Key.Key_Escape)
+            else:
+                answer(dialog)
+            if dialog.isVisible():
+                raise self.fail(f"“{dialog.windowTitle()}” stays open")
+
+        self._meet(f"the dialog {name}", do, there, see)
+
+    def _meet(
+        self,
+        what: str,
+        do: Callable[[], object],
+        there: Callable[[], T | None],
+        see: Callable[[T], None],
+    ) -> None:
+        """Do what opens something over the window; see to that, when it is there, from within."""
         ended: list[Exception | None] = []
         look = QTimer()
 
         def attend() -> None:
-            dialog = QApplication.activeModalWidget()
-            late = began.hasExpired(LONGEST_MS)
-            if not isinstance(dialog, QDialog) or not (late or _is_filled(dialog)):
+            over = there()
+            if over is None:
                 return
             look.stop()
             try:
-                if late:
-                    raise self.fail(f"“{dialog.windowTitle()}” never shows what it is about")
-                if name:
-                    self.picture(f"dialog-{name}")
-                if answer is None:
-                    QTest.keyClick(dialog, Qt.Key.Key_Escape)
-                else:
-                    answer(dialog)
-                if dialog.isVisible():
-                    raise self.fail(f"“{dialog.windowTitle()}” stays open")
+                see(over)
                 ended.append(None)
             except Exception as error:
                 ended.append(error)
-                dialog.reject()
+                over.close()
 
-        began = QElapsedTimer()
-        began.start()
         look.timeout.connect(attend)
         look.start(LOOK_MS)
         do()
-        self.wait(lambda: ended, f"the dialog {name}")
+        self.wait(lambda: ended, what)
         if ended[0] is not None:
             raise ended[0]
 
