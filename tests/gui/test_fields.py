@@ -8,6 +8,7 @@ from PySide6.QtGui import QGuiApplication
 
 from labapp.gui.digits import NOTHING, ResultRow, as_csv, entered, parsed, plain, rounded
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable, TextField
+from labapp.gui.views.path_field import PathField, PathLine
 
 
 @pytest.mark.parametrize(
@@ -181,6 +182,46 @@ def test_words_are_told_when_they_are_finished(qtbot, lines):
     qtbot.keyClick(field.editor, Qt.Key.Key_Return, Qt.KeyboardModifier.ControlModifier)
     field.flush()
     assert told == ["steel"]
+
+
+def test_a_long_path_shows_both_ends_until_it_is_edited(qtbot):
+    field = PathField("Folder", tooltip="Where to")
+    qtbot.addWidget(field)
+    field.resize(240, 40)
+    field.show()
+    line = field.editor
+    assert isinstance(line, PathLine)
+    line.clearFocus()
+    field.set_value("/data/out")
+    assert line.shown() == "/data/out"
+    as_ever = line.grab().toImage()
+    path = "/data/" + "very long names of days/" * 6 + "pool-17"
+    field.set_value(path)
+    shown = line.shown()
+    assert "…" in shown
+    assert shown.startswith("/data/")
+    assert shown.endswith("pool-17")
+    assert line.grab().toImage() != as_ever
+    assert field.value() == path
+    for told in (line.toolTip(), line.accessibleDescription()):
+        assert path in told
+        assert "Where to" in told
+    # Both of these begin and end alike: whoever looks sees the same, at the same place.
+    seen = line.grab().toImage()
+    field.set_value(path.replace("days/very", "days/VERY", 5))
+    assert line.grab().toImage() == seen
+    line.setFocus()
+    qtbot.waitUntil(line.hasFocus)
+    assert line.shown() == field.value()
+    edited = []
+    field.edited.connect(edited.append)
+    qtbot.keyClick(line, Qt.Key.Key_End)
+    qtbot.keyClicks(line, "b")
+    qtbot.keyClick(line, Qt.Key.Key_Return)
+    assert len(edited) == 1
+    assert edited[0].endswith("pool-17b")
+    field.set_value("")
+    assert line.toolTip() == "Where to"
 
 
 def test_a_choice_is_told_by_its_key_and_kept_when_others_are_offered(qtbot):

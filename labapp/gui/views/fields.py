@@ -251,12 +251,22 @@ class TextField(Field):
         How many are shown; with more than one, Enter begins another and Ctrl+Enter finishes.
     placeholder
         Shown while it is empty.
+    line
+        Takes the keys if there is one line; None for a plain one.
     """
 
     def __init__(
-        self, label: str, *, tooltip: str = "", lines: int = 1, placeholder: str = ""
+        self,
+        label: str,
+        *,
+        tooltip: str = "",
+        lines: int = 1,
+        placeholder: str = "",
+        line: QLineEdit | None = None,
     ) -> None:
-        self._edit: QLineEdit | _Paragraphs = QLineEdit() if lines == 1 else _Paragraphs(lines)
+        self._edit: QLineEdit | _Paragraphs = (
+            line or QLineEdit() if lines == 1 else _Paragraphs(lines)
+        )
         super().__init__(label, self._edit, tooltip)
         self._edit.setPlaceholderText(placeholder)
         self._told = ""

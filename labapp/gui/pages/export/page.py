@@ -37,7 +37,8 @@ from labapp.gui.pages.export.presenter import (
 )
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, TextField
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.meshes import SMALLEST_SPACING_MM
 from labapp.session.session import Session
@@ -278,7 +279,7 @@ class ExportPage(Page):
         for one in (self.view, self.picture_size, self.rate):
             form.add(one)
         self.panel_layout.addWidget(form)
-        self.folder = TextField(
+        self.folder = PathField(
             "Folder",
             tooltip="Where to: a new or empty folder, or an earlier export, which is replaced",
         )
