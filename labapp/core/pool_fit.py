@@ -24,7 +24,7 @@ from labapp.core.optics import (
     surface_normal,
 )
 from labapp.core.rig import Rig
-from labapp.core.spline import SplineBasis, SplineSurface, fit_slopes
+from labapp.core.spline import SlopeFit, SplineBasis, SplineSurface, fit_slopes
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
 REACH = 2.5
@@ -123,8 +123,8 @@ class FittedPool:
     ----------
     surface
         The surface, z = 0 at the boundary.
-    covariance
-        Of the spline coefficients, the level left out, shape (splines, splines), mm².
+    slopes
+        What the slopes gave in the last round, up to the level.
     level
         The level and its uncertainty.
     points_mm
@@ -136,7 +136,7 @@ class FittedPool:
     """
 
     surface: SplineSurface
-    covariance: FloatArray
+    slopes: SlopeFit
     level: Level
     points_mm: FloatArray
     residual_mm: FloatArray
@@ -144,6 +144,11 @@ class FittedPool:
 
     def __post_init__(self) -> None:
         freeze(self)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the spline coefficients, the level left out, shape (splines, splines), mm²."""
+        return self.slopes.covariance
 
 
 def fit_pool(
@@ -204,7 +209,7 @@ def fit_pool(
     residual = predict_dots(surface, points, rays, rig) - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
-    return FittedPool(surface, fitted.covariance, level, points, residual, moved)
+    return FittedPool(surface, fitted, level, points, residual, moved)
 
 
 def landing_spacing(landing_mm: FloatArray) -> FloatArray:
@@ -273,9 +278,22 @@ def _rim_level(surface: SplineSurface, points: FloatArray, rim: BoolArray) -> Le
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
 _BLUR_PRIOR = 1.2
 
+# So many factors of at most 2 have a product that is a number still.
+_FACTORS = 1000
+
 # How deep a rear may lie, mm, and how often one lies below the work piece at all.
 _DROPS = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
 _SINKS = 0.2
+
+
+def _doubt(inside: FloatArray) -> FloatArray:
+    """Σ log(1 + exp(−x)) along the first axis."""
+    apart = np.abs(inside)
+    total = 0.5 * (apart - inside).sum(axis=0)
+    apart = 1.0 + np.exp(-apart)
+    for start in range(0, len(apart), _FACTORS):
+        total += np.log(apart[start : start + _FACTORS].prod(axis=0))
+    return np.asarray(total)
 
 
 def find_level(
@@ -311,11 +329,11 @@ def find_level(
     rise = np.maximum(rise, np.median(rise) / 4)
     scan = np.linspace((-height).min(), (-height).max(), 300)
     best_loss, shift, sign = np.inf, 0.0, 1
-    for trial in (1, -1):
-        inside = trial * witness[:, None] * (height[:, None] + scan) / rise[:, None]
-        loss = np.logaddexp(0.0, -4.0 * inside).sum(axis=0)
-        if loss.min() < best_loss:
-            best_loss, shift, sign = loss.min(), scan[np.argmin(loss)], trial
+    inside = witness[:, None] * (height[:, None] + scan) / rise[:, None]
+    loss = _doubt(4.0 * inside)
+    for trial, doubt in ((1, loss), (-1, loss + 4.0 * inside.sum(axis=0))):
+        if doubt.min() < best_loss:
+            best_loss, shift, sign = doubt.min(), scan[np.argmin(doubt)], trial
     near = np.abs(height + shift) < 3.0 * rise
     shifts = shift + np.linspace(-1.0, 1.0, 121) * np.median(rise)
     y = landing_mm[:, 1]
@@ -328,7 +346,7 @@ def find_level(
     for k, depth in enumerate(drops):
         over = height[near] - Rear(depth, start, end).height(y[near])
         inside = sign * witness[near, None] * (over[:, None] + shifts) / rise[near, None]
-        log_likelihood[k] = [-np.logaddexp(0.0, -inside / s).sum(axis=0) for s in _BLURS]
+        log_likelihood[k] = [-_doubt(inside / s) for s in _BLURS]
     log_posterior = log_likelihood - _BLUR_PRIOR * np.log(_BLURS)[:, None]
     log_posterior[1:] += np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1))
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)

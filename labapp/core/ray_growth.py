@@ -175,8 +175,6 @@ class Prediction:
         Reflection points, shape (m, 3), mm.
     plane_mm
         Dots, IPCS, shape (m, 2), mm.
-    covariance_mm2
-        Of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm².
     spacing_mm
         Distance from each to the next predicted dot, shape (m,), mm.
     """
@@ -184,8 +182,14 @@ class Prediction:
     at: IntArray
     points_mm: FloatArray
     plane_mm: FloatArray
-    covariance_mm2: FloatArray
     spacing_mm: FloatArray
+
+    def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
+        """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
+        basis, (x, y) = pool.surface.basis, self.points_mm[:, :2].T
+        slopes = np.stack([basis.matrix(x, y, 1, 0), basis.matrix(x, y, 0, 1)], axis=1)
+        moved = np.linalg.inv(slope_of_dot(self.points_mm, self.plane_mm, rig)) @ slopes
+        return np.asarray(moved @ pool.covariance @ np.swapaxes(moved, -1, -2))
 
 
 def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
@@ -266,11 +270,7 @@ def predict(scene: Scene, pool: FittedPool, where: BoolArray) -> Prediction:
     spacing = np.full(len(plane), np.inf)
     if len(plane) > 1:
         spacing = cKDTree(plane).query(plane, k=2)[0][:, 1]
-    basis, (x, y) = pool.surface.basis, points[:, :2].T
-    slopes = np.stack([basis.matrix(x, y, 1, 0), basis.matrix(x, y, 0, 1)], axis=1)
-    moved = np.linalg.inv(slope_of_dot(points, plane, scene.rig)) @ slopes
-    covariance = moved @ pool.covariance @ np.swapaxes(moved, -1, -2)
-    return Prediction(at, points, plane, covariance, spacing)
+    return Prediction(at, points, plane, spacing)
 
 
 def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedPool) -> BoolArray:
@@ -306,7 +306,7 @@ def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
     if len(far.at) == 0:
         return matched
     offset = scene.plane_mm[:, None] - far.plane_mm
-    uncertain = CAUTION**2 * far.covariance_mm2
+    uncertain = CAUTION**2 * far.covariance_mm2(pool, scene.rig)
     spread = scene.covariance_mm2[:, None] + uncertain + MODEL_MM**2 * np.eye(2)
     distance = np.einsum("nma,nmab,nmb->nm", offset, np.linalg.inv(spread), offset)
     surprise = distance + np.log(np.linalg.det(spread))

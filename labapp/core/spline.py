@@ -10,12 +10,45 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 
 DEGREE = 3
+
+# The four cubic splines over one cell, as polynomials of the place t in it, 0 … 1: row k holds the
+# coefficients of tᵏ. The next tables are their derivatives by t.
+_CUBICS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+_PIECES = [_CUBICS]
+for _ in range(DEGREE):
+    _PIECES.append(np.vstack([_PIECES[-1][1:] * [[1], [2], [3]], np.zeros((1, 4))]))
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a `SplineBasis` that n points lie in.
+
+    Parameters
+    ----------
+    splines
+        The 4 × 4 splines that are not zero in each, as columns of `SplineBasis.matrix`, x first,
+        shape (n, 16).
+    power
+        Powers 0 … 3 of the place in the cell along x and along y, shape (2, n, 4).
+    step_mm
+        Size of a cell along x and along y, shape (2,), mm.
+    """
+
+    splines: IntArray
+    power: FloatArray
+    step_mm: FloatArray
+
+    def values(self, dx: int = 0, dy: int = 0) -> FloatArray:
+        """Value (or derivative) of those splines, shape (n, 16)."""
+        along_x = self.power[0] @ (_PIECES[dx] / self.step_mm[0] ** dx)
+        along_y = self.power[1] @ (_PIECES[dy] / self.step_mm[1] ** dy)
+        product = along_x[:, :, None] * along_y[:, None, :]
+        return np.asarray(product.reshape(-1, (DEGREE + 1) ** 2))
 
 
 @dataclass(frozen=True)
@@ -60,18 +93,35 @@ class SplineBasis:
         return np.array([self.x_knots[-DEGREE - 1], self.y_knots[-DEGREE - 1]])
 
     @cached_property
-    def _splines(self) -> tuple[BSpline, BSpline]:
-        nx, ny = self.shape
-        return (
-            BSpline(self.x_knots, np.eye(nx), DEGREE),
-            BSpline(self.y_knots, np.eye(ny), DEGREE),
+    def step_mm(self) -> FloatArray:
+        """Distance between knots along x and along y, shape (2,), mm."""
+        return np.array(
+            [np.ptp(knots) / (len(knots) - 1) for knots in (self.x_knots, self.y_knots)]
         )
+
+    def cells(self, x_mm: FloatArray, y_mm: FloatArray) -> Cells:
+        """Find the cells of points, each shape (n,); the outermost go on beyond the rectangle."""
+        nx, ny = self.shape
+        place = (np.stack([x_mm, y_mm]) - self.low_mm[:, None]) / self.step_mm[:, None]
+        last = np.array([[nx - DEGREE - 1], [ny - DEGREE - 1]])
+        first = np.clip(np.floor(place), 0, last).astype(np.int64)
+        t = place - first
+        square = t * t
+        power = np.stack([np.ones_like(t), t, square, square * t], axis=-1)
+        return Cells((first[0] * ny + first[1])[:, None] + self._corner, power, self.step_mm)
+
+    @cached_property
+    def _corner(self) -> IntArray:
+        """Columns of a cell's splines over that of its first one, shape (16,)."""
+        side = np.arange(DEGREE + 1)
+        return (side[:, None] * self.shape[1] + side).ravel()
 
     def matrix(self, x_mm: FloatArray, y_mm: FloatArray, dx: int = 0, dy: int = 0) -> FloatArray:
         """Value (or derivative) of every spline at n points, shape (n, splines)."""
-        along_x, along_y = self._splines
-        product = along_x(x_mm, dx)[:, :, None] * along_y(y_mm, dy)[:, None, :]
-        return np.asarray(product.reshape(len(product), product.shape[1] * product.shape[2]))
+        cells = self.cells(np.asarray(x_mm, float), np.asarray(y_mm, float))
+        matrix = np.zeros((len(cells.splines), self.shape[0] * self.shape[1]))
+        np.put_along_axis(matrix, cells.splines, cells.values(dx, dy), axis=1)
+        return matrix
 
     def contains(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
         """Whether points lie in the rectangle, of their shape."""
@@ -82,13 +132,17 @@ class SplineBasis:
     def roughness(self) -> FloatArray:
         """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc, shape (splines, splines)."""
         grams = []
-        for spline, knots in zip(self._splines, (self.x_knots, self.y_knots), strict=True):
-            node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
-            start, step = knots[DEGREE : -DEGREE - 1], knots[1] - knots[0]
-            at = (start[:, None] + (node + 1) / 2 * step).ravel()
-            each = np.tile(weight * step / 2, len(start))
-            parts = [spline(at, order) for order in range(DEGREE + 1)]
-            grams.append([(part * each[:, None]).T @ part for part in parts])
+        node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
+        power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
+        for count, step in zip(self.shape, self.step_mm, strict=True):
+            gram = np.zeros((DEGREE + 1, count, count))
+            for order, pieces in enumerate(_PIECES):
+                part = power @ (pieces / step**order)
+                within = (part * (weight * step / 2)[:, None]).T @ part
+                for cell in range(count - DEGREE):
+                    own = slice(cell, cell + DEGREE + 1)
+                    gram[order, own, own] += within
+            grams.append(gram)
         x, y = grams
         return np.asarray(
             np.kron(x[3], y[0])
@@ -116,22 +170,23 @@ class SplineSurface:
     def __post_init__(self) -> None:
         freeze(self)
 
-    def _evaluate(self, x_mm: FloatArray, y_mm: FloatArray, dx: int, dy: int) -> FloatArray:
+    def _evaluate(self, x_mm: FloatArray, y_mm: FloatArray, *orders: tuple[int, int]) -> FloatArray:
+        """Value or derivatives (dx, dy) of the surface, shape (…, orders)."""
         x, y = np.asarray(x_mm, float), np.asarray(y_mm, float)
-        value = np.full(x.shape, np.nan)
         inside = self.basis.contains(x, y)
-        value[inside] = self.basis.matrix(x[inside], y[inside], dx, dy) @ self.coefficients
+        cells = self.basis.cells(x[inside], y[inside])
+        own = self.coefficients[cells.splines]
+        value = np.full((*x.shape, len(orders)), np.nan)
+        value[inside] = np.stack([(cells.values(*o) * own).sum(axis=-1) for o in orders], axis=-1)
         return value
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height z at (x, y), arrays of one shape, mm."""
-        return self._evaluate(x_mm, y_mm, 0, 0)
+        return self._evaluate(x_mm, y_mm, (0, 0))[..., 0]
 
     def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
-        return np.stack(
-            [self._evaluate(x_mm, y_mm, 1, 0), self._evaluate(x_mm, y_mm, 0, 1)], axis=-1
-        )
+        return self._evaluate(x_mm, y_mm, (1, 0), (0, 1))
 
     def raised(self, by_mm: float) -> SplineSurface:
         """Shift the whole surface up."""
@@ -146,12 +201,24 @@ class SlopeFit:
     ----------
     surface
         The surface, its mean height over the points 0.
-    covariance
-        Of its coefficients, the level left out, shape (splines, splines), mm².
+    factor
+        Upper triangular factor U, UᵀU the normal matrix, shape (splines, splines), mm⁻².
+    level
+        Mean value of each spline over the points, shape (splines,).
     """
 
     surface: SplineSurface
-    covariance: FloatArray
+    factor: FloatArray
+    level: FloatArray
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the coefficients, the level left out, shape (splines, splines), mm²."""
+        level, ones = self.level, np.ones(len(self.level))
+        covariance = cho_solve((self.factor, False), np.eye(len(ones)), check_finite=False)
+        # What the held level seems to know about itself is taken out again.
+        held = covariance - np.outer(ones, level @ covariance) - np.outer(covariance @ level, ones)
+        return np.asarray(held + (level @ covariance @ level) * np.outer(ones, ones))
 
 
 def fit_slopes(
@@ -177,21 +244,22 @@ def fit_slopes(
         Weight of the roughness, mm⁶: the area over which the third derivatives go together, over
         their expected variance.
     """
-    x, y = points_mm.T
-    by = np.stack([basis.matrix(x, y, 1, 0), basis.matrix(x, y, 0, 1)], axis=1)
-    factor = np.linalg.cholesky(weights)
-    white = np.einsum("nba,nbs->nas", factor, by).reshape(-1, by.shape[-1])
-    target = np.einsum("nba,nb->na", factor, slopes).ravel()
-    normal = white.T @ white + stiffness * basis.roughness
+    count = basis.shape[0] * basis.shape[1]
+    cells = basis.cells(*points_mm.T)
+    by = np.stack([cells.values(1, 0), cells.values(0, 1)], axis=1)
+    weighted = weights @ by
+    at = (cells.splines[:, :, None] * count + cells.splines[:, None, :]).ravel()
+    square = np.swapaxes(by, 1, 2) @ weighted
+    gram = np.bincount(at, square.ravel(), count * count).reshape(count, count)
+    normal = np.asarray(gram + stiffness * basis.roughness, float)
+    pull = np.einsum("nas,na->ns", weighted, slopes)
+    target = np.bincount(cells.splines.ravel(), pull.ravel(), count)
     # Slopes say nothing of the level: hold the mean height at 0, as firmly as the slopes hold.
-    level = basis.matrix(x, y).mean(axis=0)
-    scale = np.trace(normal) / len(normal)
-    normal += scale * np.outer(level, level) + 1e-11 * scale * np.eye(len(normal))
-    solver = cho_factor(normal)
-    coefficients = cho_solve(solver, white.T @ target)
-    covariance = cho_solve(solver, np.eye(len(normal)))
-    # What the held level seems to know about itself is taken out again.
-    ones = np.ones(len(normal))
-    held = covariance - np.outer(ones, level @ covariance) - np.outer(covariance @ level, ones)
-    covariance = held + (level @ covariance @ level) * np.outer(ones, ones)
-    return SlopeFit(SplineSurface(basis, coefficients - level @ coefficients), covariance)
+    level = np.bincount(cells.splines.ravel(), cells.values().ravel(), count) / len(points_mm)
+    scale = np.trace(normal) / count
+    normal += scale * np.outer(level, level)
+    normal[np.diag_indices(count)] += 1e-11 * scale
+    factor, _ = cho_factor(normal)
+    coefficients = cho_solve((factor, False), target, check_finite=False)
+    surface = SplineSurface(basis, coefficients - level @ coefficients)
+    return SlopeFit(surface, factor, level)
