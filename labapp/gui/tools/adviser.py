@@ -61,7 +61,7 @@ class AdviserWindow(ToolWindow):
         self.save_button = self.add_button(
             "Save the advice …",
             "Write words, tables, picture and set-up file to a folder",
-            self._choose,
+            self.choose_folder,
         )
         self.use_button = self.add_button(
             "Use these",
@@ -210,7 +210,8 @@ class AdviserWindow(ToolWindow):
         if self.tried(write):
             self.say(f"Saved in {folder}")
 
-    def _choose(self) -> None:
+    def choose_folder(self) -> None:
+        """Ask where to write the files."""
         session = self.workspace.session
         start = Path.home() if session is None else session.path.parent
         name = QFileDialog.getExistingDirectory(self, "Save the advice in", str(start))

@@ -18,16 +18,6 @@ from labapp.gui.tour.bench import CROSS_MM, places
 from labapp.gui.tour.hands import CTRL, Hands, give
 from labapp.session.session import Session
 
-SMALL_QUESTION = {
-    "pools.width_mm": (6.5, 6.5),
-    "pools.length_mm": (7.0, 7.0),
-    "pools.height_mm": (0.2, 0.21),
-    "bench.projection_angle_deg": (26.0, 26.0),
-    "bench.distance_mm": (40.0, 40.0),
-    "bench.plane_distance_mm": (60.0, 65.0),
-}
-"""Of the adviser: field → least and most."""
-
 FRAMES = 6
 """So many are imported: enough to see, soon measured."""
 
@@ -229,17 +219,12 @@ def _menus(hands: Hands) -> None:
 
 
 def _adviser(hands: Hands) -> None:
-    """Ask for little: one place of the laser, found in seconds."""
+    """What it asks; a search would take the tour's time."""
     hands.do("adviser")
     tool = hands.window.findChild(AdviserWindow)
     assert tool is not None
-    for key, ends in SMALL_QUESTION.items():
-        tool.ranges[key].set_value(ends)
-    tool.effort.set_value("quick")
-    tool.start()
-    hands.wait(lambda: not tool.working, "the advice")
     hands.picture("dialog-adviser")
-    hands.asked("save-advice", lambda: hands.press("Save the advice …"))
+    hands.asked("save-advice", tool.choose_folder)
     tool.close()
 
 
