@@ -62,6 +62,9 @@ BAR_WIDTH = 0.04
 BAR_NUMBERS_PX = 56
 """Width of the colour scale, a part of the picture's, and what its numbers take beside it."""
 
+FLAT = 1 / 8
+"""Axes less high than this part of their width have one number upwards: more would overlap."""
+
 EMPTY = np.empty((0, 3))
 
 
@@ -174,6 +177,7 @@ def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
         (-reach, reach),
         diverging=True,
         lines_mm={"boundary": _closed(one.boundary.points_mm)},
+        within_mm=one.boundary.points_mm,  # there are no vertices where the two do not overlap
     )
 
 
@@ -243,6 +247,7 @@ class Drawing:
 
     def __init__(self, plotter: Any) -> None:
         self.plotter = plotter
+        self.plotter.theme.allow_empty_mesh = True  # a frame may have no surface
         self._box = np.zeros((2, 3))
         self._stretch = np.ones(3)
         self._axes_actor: Any = None
@@ -329,6 +334,7 @@ class Drawing:
         title = scene.label.replace(" (", "\n(")  # narrow, to stay within the picture
         made_for = (scene.label, scene.diverging)
         if self._made_for.get("surface") != made_for:
+            self._made_for.pop("surface", None)  # what fails below is made another time
             for former in list(self.plotter.scalar_bars.keys()):
                 self.plotter.remove_scalar_bar(former, render=False)
             actor = self.plotter.add_mesh(
@@ -360,7 +366,7 @@ class Drawing:
             self._parts["surface"] = (mesh, actor)
             self._bar = self.plotter.scalar_bars[title]
             self._place_bar()
-            self._made_for["surface"] = made_for  # only now: what failed is made another time
+            self._made_for["surface"] = made_for
         held, actor = self._parts["surface"]
         if held is not mesh:
             held.ShallowCopy(mesh)
@@ -395,6 +401,8 @@ class Drawing:
         axes.bounds = (box * self._stretch).T.ravel().tolist()
         axes.n_xlabels, axes.n_ylabels = int(steps[0]) + 1, int(steps[1]) + 1
         axes.x_axis_range, axes.y_axis_range, axes.z_axis_range = map(tuple, box.T.tolist())
+        if np.ptp(box[:, 2]) * scene.exaggeration < FLAT * np.ptp(box[:, :2], axis=0).max():
+            axes.GetAxisLabels(2).SetValue(0, "")
         top = np.array([[0, 0, box[0, 2]], [0, 0, box[1, 2] + 0.5]]) * self._stretch
         mark = _polydata(top if scene.electrode else EMPTY, "lines", 2)
         self._put("electrode", mark, scene.foreground, line_width=1)

@@ -106,6 +106,19 @@ def test_a_difference_is_coloured_both_ways_alike(pool: Reconstruction) -> None:
     assert made.values.min() == pytest.approx(-0.05, abs=1e-6)
 
 
+def aside(pool: Reconstruction) -> Reconstruction:
+    """The same pool 10 mm farther along X: it does not overlap the first."""
+    way = np.array([10.0, 0.0, 0.0])
+    here = pool.boundary
+    moved = replace(here, center_mm=here.center_mm + way[:2], points_mm=here.points_mm + way)
+    return replace(pool, boundary=moved)
+
+
+def test_surfaces_that_do_not_overlap_have_no_difference_to_draw(pool: Reconstruction) -> None:
+    made = difference_scene(pool, aside(pool))
+    assert len(made.vertices_mm) == len(made.triangles) == len(made.values) == 0
+
+
 def test_what_is_not_known_of_a_surface_is_not_drawn(pool: Reconstruction) -> None:
     class Holed(FlatSurface):
         def height(self, x_mm: Any, y_mm: Any) -> Any:
@@ -209,6 +222,55 @@ def test_the_scale_says_what_the_colours_are(plotter: Any, pool: Reconstruction)
     for label in ("± (mm)", "height (mm)", "± (mm)"):
         drawing.update(replace(scene_of(pool), label=label))
         assert list(plotter.scalar_bars.keys()) == [label.replace(" (", "\n(")]
+
+
+def test_a_surface_that_failed_is_made_another_time(
+    plotter: Any, pool: Reconstruction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heights = scene_of(pool)
+    drawing = scenes.build_scene(plotter, heights)
+    wanted = seen(plotter)
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise ValueError("refused")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(plotter, "add_mesh", refused)
+        with pytest.raises(ValueError, match="refused"):
+            drawing.update(replace(heights, label="± (mm)"))
+    drawing.update(heights)
+    assert list(plotter.scalar_bars.keys()) == ["height\n(mm)"]
+    np.testing.assert_allclose(seen(plotter), wanted, atol=2)
+
+
+def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Reconstruction) -> None:
+    """As in a film whose first frame has none, or where two surfaces do not overlap."""
+
+    def coloured() -> np.ndarray:
+        picture = seen(plotter)
+        grey = np.ptp(picture, axis=2, keepdims=True) < 40  # axes and their names
+        return np.where(grey, 255, picture)
+
+    drawing = scenes.build_scene(plotter, difference_scene(pool, aside(pool)))
+    assert (coloured()[:, :380] == 255).all()
+    for scene in (difference_scene(pool, replace(pool, surface=FlatSurface(0.05))), scene_of(pool)):
+        drawing.update(scene)
+        drawing.look("free")
+        after = coloured()
+        assert (after[:, :380] != 255).any(axis=2).sum() > 10_000
+        plotter.clear()
+        drawing = scenes.build_scene(plotter, scene)
+        np.testing.assert_allclose(after, coloured(), atol=45)
+
+
+@pytest.mark.parametrize(("exaggeration", "labels"), [(1.0, ["", "0.3"]), (3.0, ["0.0", "0.3"])])
+def test_numbers_upwards_do_not_overlap(
+    plotter: Any, pool: Reconstruction, exaggeration: float, labels: list[str]
+) -> None:
+    drawing = scenes.build_scene(plotter, replace(scene_of(pool), exaggeration=4.0 - exaggeration))
+    drawing.update(replace(scene_of(pool), exaggeration=exaggeration))
+    seen(plotter)
+    assert plotter.renderer.cube_axes_actor.z_labels == labels
 
 
 def test_a_dark_window_has_a_dark_scene(plotter: Any, pool: Reconstruction) -> None:

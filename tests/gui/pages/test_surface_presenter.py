@@ -186,3 +186,18 @@ def test_why_nothing_can_be_measured(session: Session, copy_sample: CopySample) 
     (path.parent / "recording").rename(path.parent / "elsewhere")
     with Session.open(path) as lost:
         assert "is not where it was" in presenter.why_not(lost)
+
+
+def test_surfaces_that_do_not_overlap_are_said_to(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = session.result(3).measurement
+    here, way = found.reconstruction.boundary, np.array([100.0, 0.0, 0.0])
+    moved = replace(here, center_mm=here.center_mm + way[:2], points_mm=here.points_mm + way)
+    aside = replace(found, reconstruction=replace(found.reconstruction, boundary=moved))
+    one = {"fit": found, "ers": aside}
+    monkeypatch.setattr(comparison, "by_scheme", lambda _session, _frame, scheme: one[scheme])
+    made = comparison.compared(session, 3, ("fit", "ers"), Options())
+    assert made.difference is None
+    assert made.told == "Fit minus ERS, from the same dots: the two surfaces do not overlap."
+    assert made.rows

@@ -42,7 +42,7 @@ class Comparison:
     words
         Why not; empty where it does.
     difference
-        The first's surface coloured by how it differs; None without both.
+        The first's surface coloured by how it differs; None where they do not overlap.
     rows
         Figures of both and their difference.
     told
@@ -86,14 +86,15 @@ def compared(
         assert first.reconstruction is not None
         assert second.reconstruction is not None
         plain = difference_scene(first.reconstruction, second.reconstruction)
-        difference = replace(plain, exaggeration=options.exaggeration)
         rows = compared_rows(first.measures, second.measures)
         names = [SCHEMES[scheme].split(":")[0] for scheme in schemes]
-        largest = float(np.abs(plain.values).max(initial=0.0))
-        told = (
-            f"{names[0]} minus {names[1]}, from the same dots: "
-            f"the heights differ by {largest:.3f} mm at most."
-        )
+        told = f"{names[0]} minus {names[1]}, from the same dots: "
+        if len(plain.values):
+            difference = replace(plain, exaggeration=options.exaggeration)
+            largest = float(np.abs(plain.values).max())
+            told += f"the heights differ by {largest:.3f} mm at most."
+        else:
+            told += "the two surfaces do not overlap."
     return Comparison((scenes[0], scenes[1]), (words[0], words[1]), difference, rows, told)
 
 
