@@ -182,3 +182,20 @@ def test_a_frame_without_a_point_is_marked_where_it_is(view: PlotStack) -> None:
     assert low < -1.0 < 9.0 < high
     view.set_current(16)
     assert plot.current.value() == 1.6
+
+
+def test_nothing_stays_of_plots_that_were_taken_out(view: PlotStack, qtbot: QtBot) -> None:
+    """Shown long ago or from the first, the same curves look the same."""
+    six = [curve(name=name) for name in ("Width", "Length", "Height", "Depth", "Area", "ARE")]
+    for curves in (six, six[:4]):
+        view.show_curves(curves, TIME)
+        QTest.qWait(40)
+    fresh = PlotStack("Trends")
+    KEPT.append(fresh)
+    fresh.resize(view.size())
+    fresh.show_curves(six[:4], TIME)
+    fresh.show()
+    qtbot.waitExposed(fresh)
+    QTest.qWait(40)
+    assert view.grab().toImage() == fresh.grab().toImage()
+    fresh.hide()

@@ -170,6 +170,8 @@ class PlotStack(Plotted):
         copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
 
     def _lay_out(self) -> None:
+        for plot in self._plots:
+            plot.hide()  # one that is only taken out may still be drawn
         self.canvas.clear()
         self._plots = []
         for row in range(len(self.curves)):

@@ -129,6 +129,7 @@ class CapturePage(Page):
             item = self.told.takeAt(0)
             widget = None if item is None else item.widget()
             if widget is not None:
+                widget.hide()  # it is deleted only later
                 widget.deleteLater()
         rows = recording_in_words(recording)
         for row, (name, words) in enumerate(rows):
