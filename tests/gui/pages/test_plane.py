@@ -85,7 +85,7 @@ def test_the_model_is_proposed_with_its_reason_and_can_be_overridden() -> None:
     assert "No perspective" in presenter.why(askew(0.0))
     assert presenter.choices(SQUARE) == (("three points", "Three points"),)
     rows = {row.name: row.value for row in presenter.result(tilted).rows}
-    assert 0.03 < rows["Homography off by"] < 0.1 < rows["Affine off by"]
+    assert 0.03 < rows["Homography off"] < 0.1 < rows["Affine off"]
     used = presenter.with_model(tilted, "homography").image_calibration
     np.testing.assert_allclose(used.to_image(np.array([[100.0, 0.0]])), [[590.9, 363.6]], atol=0.3)
     by_hand = presenter.moved(tilted, 0, (51.0, 400.0))

@@ -163,7 +163,7 @@ def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:
                 f"{left_out:.3f} px"
             )
             value = root_mean_square(fit.residual_px)
-            rows.append(ResultRow(f"{name} off by", value, None, "px", 3, note))
+            rows.append(ResultRow(f"{name} off", value, None, "px", 3, note))
     return rows
 
 
