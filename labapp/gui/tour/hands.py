@@ -463,9 +463,11 @@ def _is_filled(dialog: QDialog) -> bool:
 
 
 def _over(window: MainWindow) -> list[QWidget]:
-    """Dialogs and menus that are open over the window."""
-    return [
+    """Dialogs and menus that are open over the window, the one to be answered last."""
+    over = [
         widget
         for widget in QApplication.topLevelWidgets()
         if widget is not window and widget.isVisible() and isinstance(widget, QDialog | QMenu)
     ]
+    uppermost = (QApplication.activeModalWidget(), QApplication.activePopupWidget())
+    return sorted(over, key=lambda widget: widget in uppermost)
