@@ -36,6 +36,7 @@ from labapp.gui.standing import DOUBTFUL, Standing, next_frame, standings
 from labapp.gui.step_list import SidePanel, StepList
 from labapp.gui.steps import STEPS, states
 from labapp.gui.theme import apply_theme
+from labapp.gui.views.tables import table_text
 from labapp.gui.views.timeline import Tick, Timeline
 from labapp.gui.workspace import Workspace
 from labapp.session.log import log_file
@@ -352,8 +353,6 @@ class MainWindow(QMainWindow):
             self.say("This step has no table")
             return
         table = next((each for each in tables if each.hasFocus()), tables[0])
-        from labapp.gui.views.tables import table_text
-
         QApplication.clipboard().setText(table_text(table))
         self.say("The table is on the clipboard")
 

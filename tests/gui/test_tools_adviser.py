@@ -10,6 +10,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
+from labapp.gui.pages.setup import SetupPage
 from labapp.gui.tools import advising
 from labapp.gui.tools.adviser import AdviserWindow
 from labapp.gui.window import MainWindow
@@ -131,7 +132,9 @@ def test_it_can_be_stopped(adviser: AdviserWindow, window: MainWindow, qtbot: Qt
 def test_the_set_up_page_leads_to_it(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):
     assert window.files.open(copy_sample("gtaw"))
     window.show_step("setup")
-    window.page.tabs.setCurrentIndex(2)  # type: ignore[union-attr]
+    page = window.page
+    assert isinstance(page, SetupPage)
+    page.tabs.setCurrentIndex(2)
     button = next(b for b in window.findChildren(QPushButton) if b.text() == "Advise …")
     click(button)
     tool = window.findChild(AdviserWindow)

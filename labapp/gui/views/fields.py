@@ -11,16 +11,13 @@ from typing import Any
 
 from PySide6.QtCore import QEvent, QObject, QSignalBlocker, Qt, QTimer, Signal
 from PySide6.QtGui import (
-    QAction,
     QFocusEvent,
     QGuiApplication,
     QKeyEvent,
-    QKeySequence,
     QValidator,
     QWheelEvent,
 )
 from PySide6.QtWidgets import (
-    QAbstractItemView,
     QAbstractSpinBox,
     QComboBox,
     QGridLayout,
@@ -30,13 +27,13 @@ from PySide6.QtWidgets import (
     QLineEdit,
     QPlainTextEdit,
     QSizePolicy,
-    QTableWidget,
     QTableWidgetItem,
     QVBoxLayout,
     QWidget,
 )
 
 from labapp.gui.digits import ResultRow, as_csv, as_text, entered, parsed
+from labapp.gui.views.tables import ReadTable
 
 STEP_PAUSE_MS = 300
 """Steps that follow each other faster than this are one edit."""
@@ -416,7 +413,7 @@ class FieldForm(QWidget):
         self._grid.addWidget(widget, self._grid.rowCount(), 0, 1, 2)
 
 
-class ResultTable(QTableWidget):
+class ResultTable(ReadTable):
     """Results: name, value, ±, unit. Copied as text (Ctrl+C) or CSV (its menu).
 
     Parameters
@@ -426,25 +423,16 @@ class ResultTable(QTableWidget):
     """
 
     def __init__(self, name: str) -> None:
-        super().__init__(0, 4)
+        super().__init__(name, "Ctrl+C copies it; right click to copy it as CSV")
         self.rows: tuple[ResultRow, ...] = ()
-        self.setAccessibleName(name)
-        self.setToolTip(f"{name}: Ctrl+C copies it; right click to copy it as CSV")
+        self.setColumnCount(4)
         self.setHorizontalHeaderLabels(["", "Value", "±", "Unit"])
-        self.verticalHeader().hide()
-        self.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
-        self.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
-        self.setTabKeyNavigation(False)
-        self.setShowGrid(False)
         self.setWordWrap(False)
         self.setTextElideMode(Qt.TextElideMode.ElideRight)
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        header = self.horizontalHeader()
-        header.setHighlightSections(False)
-        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        self._add_actions()
+        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        self.offer(("Copy table", self.copy_text), ("Copy table as CSV", self.copy_csv))
         self.set_rows(())
 
     def set_rows(self, rows: Iterable[ResultRow]) -> None:
@@ -478,13 +466,3 @@ class ResultTable(QTableWidget):
     def _chosen(self) -> list[ResultRow]:
         chosen = sorted({index.row() for index in self.selectedIndexes()})
         return [self.rows[k] for k in chosen] or list(self.rows)
-
-    def _add_actions(self) -> None:
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
-        for words, work in (("Copy table", self.copy_text), ("Copy table as CSV", self.copy_csv)):
-            action = QAction(words, self)
-            action.triggered.connect(work)
-            self.addAction(action)
-        copy = self.actions()[0]
-        copy.setShortcut(QKeySequence.StandardKey.Copy)
-        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)

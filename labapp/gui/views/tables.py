@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction, QGuiApplication, QKeySequence
@@ -15,10 +16,48 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import cell_text, heading
-from labapp.simulation.tables import Table
+
+if TYPE_CHECKING:
+    from labapp.simulation.tables import Table
 
 
-class CellTable(QTableWidget):
+class ReadTable(QTableWidget):
+    """A table to read: its rows are chosen whole, and copied by keys and menu.
+
+    Parameters
+    ----------
+    name
+        What it shows, for a screen reader.
+    copies
+        How it can be copied, for the tooltip.
+    """
+
+    def __init__(self, name: str, copies: str) -> None:
+        super().__init__()
+        self.setAccessibleName(name)
+        self.setToolTip(f"{name}: {copies}")
+        self.verticalHeader().hide()
+        self.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
+        self.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
+        self.setTabKeyNavigation(False)
+        self.setShowGrid(False)
+        header = self.horizontalHeader()
+        header.setHighlightSections(False)
+        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
+
+    def offer(self, *copies: tuple[str, Callable[[], None]]) -> None:
+        """Put ways to copy into the menu, by their words; Ctrl+C does the first."""
+        for words, work in copies:
+            action = QAction(words, self)
+            action.triggered.connect(work)
+            self.addAction(action)
+        first = self.actions()[0]
+        first.setShortcut(QKeySequence.StandardKey.Copy)
+        first.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+
+
+class CellTable(ReadTable):
     """A table of a simulation. Copied as text (Ctrl+C), CSV or Markdown (its menu).
 
     Parameters
@@ -28,32 +67,15 @@ class CellTable(QTableWidget):
     """
 
     def __init__(self, name: str) -> None:
-        super().__init__()
+        super().__init__(name, "Ctrl+C copies it; right click for CSV and Markdown")
         self.table: Table | None = None
-        self.setAccessibleName(name)
-        self.setToolTip(f"{name}: Ctrl+C copies it; right click for CSV and Markdown")
         self.setAccessibleDescription("Arrow keys move; Ctrl+C copies it")
-        self.verticalHeader().hide()
-        self.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
-        self.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
-        self.setTabKeyNavigation(False)
         self.setAlternatingRowColors(True)
-        self.setShowGrid(False)
-        header = self.horizontalHeader()
-        header.setHighlightSections(False)
-        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
-        for words, work in (
+        self.offer(
             ("Copy table", self.copy_text),
             ("Copy table as CSV", self.copy_csv),
             ("Copy table as Markdown", self.copy_markdown),
-        ):
-            action = QAction(words, self)
-            action.triggered.connect(work)
-            self.addAction(action)
-        copy = self.actions()[0]
-        copy.setShortcut(QKeySequence.StandardKey.Copy)
-        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+        )
 
     def show_table(self, table: Table, columns: Sequence[int] | None = None) -> None:
         """Show a table, or some of its columns."""
