@@ -10,7 +10,8 @@ from tests.benchmarks.pool_kinds import OTHERS, judge, scenarios
 from tests.conftest import Run
 
 # A frame takes seconds; all kinds, 30 frames each, are for `tests/benchmarks/pool_kinds.py`.
-KINDS = sorted(OTHERS.keys() | {"egg", "height_map", "mode_21", "travelling_21"})
+# Not `dent_and_wave` and `height_map`, whose first frame is refused: that would hold nothing.
+KINDS = sorted(OTHERS.keys() - {"dent_and_wave"} | {"egg", "mode_21", "travelling_21"})
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -22,8 +23,8 @@ def test_no_label_of_any_kind_of_pool_is_wrong(kind: str, labapp: Run, tmp_path:
         "reconstruct", out / "recording.avi", "--setup", out / "setup.toml", "--out", results,
         "--surfaces", "none",
     )  # fmt: skip
-    assert code in (0, 1)
+    assert code == 0
     verdict = judge(out, results)
     assert verdict.wrong == []
-    # A refusal is no wrong label, but an answer labels nearly all that shows.
+    assert verdict.statuses["ok"] == 1
     assert verdict.labelled >= 0.85 * verdict.shown
