@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
+import sqlite3
+import zlib
+from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from labapp.core.plane_calibration import PlaneCalibration
+from labapp.session.blobs import HEAD, MAGIC
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED
 from labapp.session.schema import VERSION
 from labapp.session.session import Session
@@ -44,3 +52,48 @@ def test_what_a_version_wrote_is_read(path: Path, tmp_path: Path, read_only: boo
         assert labels == ["experiment record", "setup", "correction"]
     if read_only:
         assert copy.read_bytes() == path.read_bytes()
+
+
+FOUND = PlaneCalibration(
+    *((50.0, 400.0), (380.0, 400.0), 55.0, (50.0, 250.0), 25.0),
+    sigma_px=(0.1, 0.2, 0.3),
+    threshold=14.0,
+)
+
+
+def without(blob: bytes, *fields: str) -> bytes:
+    """A plane calibration as it was written when it had no such fields yet."""
+    plain = zlib.decompress(blob[HEAD.size :])
+    length = int.from_bytes(plain[:4], "little")
+    tree = json.loads(plain[4 : 4 + length])
+    for field in fields:
+        del tree["PlanePicture"]["found"]["PlaneCalibration"][field]
+    text = json.dumps(tree, separators=(",", ":")).encode()
+    body = zlib.compress(len(text).to_bytes(4, "little") + text + plain[4 + length :])
+    return HEAD.pack(MAGIC, zlib.crc32(body)) + body
+
+
+def test_a_plane_calibration_from_before_marks_is_read(tmp_path: Path):
+    path = tmp_path / "old.labsession"
+    shutil.copyfile(WRITTEN[-1], path)
+    with Session.open(path) as session:
+        session.use_plane(FOUND, 10.0, np.zeros((480, 640), np.uint8))
+    with closing(sqlite3.connect(path)) as database, database:
+        where = "kind = 'plane-calibration'"
+        (blob,) = database.execute(f"SELECT content FROM document WHERE {where}").fetchone()
+        older = without(blob, "marks", "model")
+        content = hashlib.sha256(zlib.decompress(older[HEAD.size :])).hexdigest()
+        database.execute(
+            f"UPDATE document SET content = ?, sha256 = ? WHERE {where}", (older, content)
+        )
+        database.execute(f"UPDATE change_part SET after = ? WHERE {where}", (older,))
+    with Session.open(path) as session:
+        assert session.problems() == []
+        readings = session.plane_calibration
+        assert readings is not None
+        assert readings.found == FOUND
+        session.undo()
+        assert session.plane_calibration is None
+        session.redo()
+        assert session.plane_calibration == readings
+        assert session.problems() == []
