@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QCoreApplication, Qt
 from PySide6.QtGui import QGuiApplication
 
 from labapp.gui.digits import NOTHING, ResultRow, as_csv, entered, parsed, plain, rounded
@@ -274,3 +274,22 @@ def test_a_table_is_copied_as_text_and_as_csv(qtbot):
     assert "27.1234,0.031" in QGuiApplication.clipboard().text()
     table.set_rows([ResultRow("angle", 28.0, 0.031, "°")])
     assert table.rowCount() == 1
+
+
+@pytest.mark.parametrize("points", [9, 14])
+def test_no_name_is_cut_in_a_narrow_table(qtbot, points):
+    table = ResultTable("Plane")
+    qtbot.addWidget(table)
+    font = table.font()
+    font.setPointSize(points)
+    table.setFont(font)
+    names = ["Homography off by", "Angle", "Smallest of the two scales along the axes"]
+    table.set_rows([ResultRow(name, 12.345, 0.012, "px/mm") for name in names])
+    table.show()
+    for width, wrapped in ((1200, False), (300, True), (1200, False)):
+        table.resize(width, table.height())
+        QCoreApplication.processEvents()
+        heights = [table.rowHeight(k) for k in range(3)]
+        assert all(heights[k] >= table.sizeHintForRow(k) for k in range(3))
+        assert (heights[2] > 1.4 * heights[1]) == wrapped
+        assert table.viewport().height() >= sum(heights)

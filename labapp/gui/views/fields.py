@@ -427,11 +427,13 @@ class ResultTable(ReadTable):
         self.rows: tuple[ResultRow, ...] = ()
         self.setColumnCount(4)
         self.setHorizontalHeaderLabels(["", "Value", "±", "Unit"])
-        self.setWordWrap(False)
-        self.setTextElideMode(Qt.TextElideMode.ElideRight)
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        # The header tells of a width before the cells have it.
+        self._narrowed = QTimer(self, singleShot=True, interval=0)
+        self._narrowed.timeout.connect(self._fit_height)
+        self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
         self.offer(("Copy table", self.copy_text), ("Copy table as CSV", self.copy_csv))
         self.set_rows(())
 
@@ -450,6 +452,10 @@ class ResultTable(ReadTable):
                     self.setItem(k, column, item)
                 item.setText(text)
                 item.setToolTip(row.note or " ".join(row.texts))
+        self._fit_height()
+
+    def _fit_height(self) -> None:
+        """Give long names the lines that they take, and the table the height of all rows."""
         self.resizeRowsToContents()
         height = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
         height += sum(self.rowHeight(k) for k in range(len(self.rows)))
