@@ -380,10 +380,19 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, labapp: Run) -> No
     assert "expected a folder that can be written" in err
 
 
+HEEDING = """
+import signal, sys
+from labapp.cli import main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+main(sys.argv[1:])
+"""
+
+
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     path, out = scenario(tmp_path, frames="500"), tmp_path / "results" / "out"
     running = subprocess.Popen(
-        [sys.executable, "-m", "labapp", "simulate", path, "--out", out],
+        [sys.executable, "-c", HEEDING, "simulate", path, "--out", out],
         stderr=subprocess.PIPE,
         env={**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")},
         text=True,
