@@ -22,6 +22,7 @@ from labapp.core.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.media import GreyImage
+from labapp.session.drawing import VIEWS, Direction
 from labapp.session.files import as_bytes
 from labapp.session.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.session.hdf5 import Hdf5Writer
@@ -32,7 +33,6 @@ from labapp.session.pictures import (
     write_trend_picture,
 )
 from labapp.session.results import SURFACES, now, surface_files
-from labapp.session.scene import VIEWS, Direction
 from labapp.session.studio import PICTURE_PX, drawing_process, told
 from labapp.session.summary import Summary
 from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.errors import InputError
-from labapp.session.scene import Direction, Drawing, Scene, draw_without_display
+from labapp.session.drawing import Direction, Drawing, draw_without_display
+from labapp.session.scene import Scene
 
 PICTURE_PX = (1280, 720)
 """Width and height of a picture by default."""

@@ -20,7 +20,8 @@ import pyvista
 from labapp.core.boundary import Boundary
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.spline import SplineBasis, SplineSurface
-from labapp.session.scene import build_scene, scene_of
+from labapp.session.drawing import build_scene
+from labapp.session.scene import scene_of
 
 SIZE = (900, 600)
 SECONDS = 3.0

@@ -9,6 +9,7 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.surface import FlatSurface
+from labapp.session import drawing as draws
 from labapp.session import scene as scenes
 from labapp.session.heights import difference_at, profile, sigma_at
 from labapp.session.scene import difference_scene, rays_of, scene_of
@@ -134,12 +135,12 @@ def test_what_is_not_known_of_a_surface_is_not_drawn(pool: Reconstruction) -> No
     ("limits", "form"), [((0, 0.28), "%.2f"), ((0, 0.0028), "%.4f"), ((-5, 5), "%.0f")]
 )
 def test_the_labels_of_a_colour_scale_differ(limits: tuple[float, float], form: str) -> None:
-    assert scenes._label_format(limits) == form
+    assert draws._label_format(limits) == form
 
 
 def test_normals_point_up_and_stand_upright_on_the_surface(pool: Reconstruction) -> None:
     made = scene_of(pool)
-    normals = scenes._normals(made.vertices_mm, made.triangles)
+    normals = draws._normals(made.vertices_mm, made.triangles)
     # The centre's neighbours and the rim see facets of one side only.
     inner = np.hypot(*made.vertices_mm[:, :2].T) < 2.5
     x, y = made.vertices_mm[inner, :2].T
@@ -172,7 +173,7 @@ def amount(picture: np.ndarray, colour: str) -> int:
 
 
 def test_the_summit_is_yellow_and_the_rim_violet(plotter: Any, pool: Reconstruction) -> None:
-    scenes.build_scene(plotter, scene_of(pool)).look("top")
+    draws.build_scene(plotter, scene_of(pool)).look("top")
     picture = seen(plotter)
     bar = 400  # the colour scale stands to the right of it
     rows, columns = np.nonzero((picture[:, :bar].max(axis=2) - picture[:, :bar].min(axis=2)) > 60)
@@ -191,13 +192,13 @@ def test_parts_come_and_go_with_the_scene(plotter: Any, pool: Reconstruction) ->
     line = np.column_stack([np.linspace(-3, 3, 50), np.zeros(50), np.full(50, 0.35)])
     plain = replace(scene_of(pool), points_mm=np.empty((0, 3)))
     full = replace(plain, rays_mm=rays, lines_mm={**plain.lines_mm, "section": line})
-    drawing = scenes.build_scene(plotter, plain)
+    drawing = draws.build_scene(plotter, plain)
     before = seen(plotter)
     drawing.update(full)
     between = seen(plotter)
     drawing.update(plain)
     after = seen(plotter)
-    for colour in (scenes.COLOURS["incident"], scenes.COLOURS["section"]):
+    for colour in (draws.COLOURS["incident"], draws.COLOURS["section"]):
         assert amount(before, colour) < 20
         assert amount(between, colour) > 100
     np.testing.assert_array_equal(after, before)
@@ -206,19 +207,19 @@ def test_parts_come_and_go_with_the_scene(plotter: Any, pool: Reconstruction) ->
 def test_a_frame_takes_the_place_of_another(plotter: Any, pool: Reconstruction) -> None:
     """The same actors show it, and the picture is the one of a drawing made for it alone."""
     flat = scene_of(replace(pool, surface=FlatSurface(0.21)), limits=(0.0, 0.3))
-    drawing = scenes.build_scene(plotter, scene_of(pool, limits=(0.0, 0.3)))
+    drawing = draws.build_scene(plotter, scene_of(pool, limits=(0.0, 0.3)))
     first, actors = seen(plotter), list(plotter.renderer.actors)
     drawing.update(flat)
     assert list(plotter.renderer.actors) == actors
     moved = seen(plotter)
     assert (moved != first).any(axis=2).mean() > 0.05
     plotter.clear()
-    scenes.build_scene(plotter, flat)
+    draws.build_scene(plotter, flat)
     np.testing.assert_allclose(seen(plotter), moved, atol=2)
 
 
 def test_the_scale_says_what_the_colours_are(plotter: Any, pool: Reconstruction) -> None:
-    drawing = scenes.build_scene(plotter, scene_of(pool))
+    drawing = draws.build_scene(plotter, scene_of(pool))
     for label in ("± (mm)", "height (mm)", "± (mm)"):
         drawing.update(replace(scene_of(pool), label=label))
         assert list(plotter.scalar_bars.keys()) == [label.replace(" (", "\n(")]
@@ -228,7 +229,7 @@ def test_a_surface_that_failed_is_made_another_time(
     plotter: Any, pool: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heights = scene_of(pool)
-    drawing = scenes.build_scene(plotter, heights)
+    drawing = draws.build_scene(plotter, heights)
     wanted = seen(plotter)
 
     def refused(*_: Any, **__: Any) -> None:
@@ -251,7 +252,7 @@ def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Recons
         grey = np.ptp(picture, axis=2, keepdims=True) < 40  # axes and their names
         return np.where(grey, 255, picture)
 
-    drawing = scenes.build_scene(plotter, difference_scene(pool, aside(pool)))
+    drawing = draws.build_scene(plotter, difference_scene(pool, aside(pool)))
     assert (coloured()[:, :380] == 255).all()
     for scene in (difference_scene(pool, replace(pool, surface=FlatSurface(0.05))), scene_of(pool)):
         drawing.update(scene)
@@ -259,7 +260,7 @@ def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Recons
         after = coloured()
         assert (after[:, :380] != 255).any(axis=2).sum() > 10_000
         plotter.clear()
-        drawing = scenes.build_scene(plotter, scene)
+        drawing = draws.build_scene(plotter, scene)
         np.testing.assert_allclose(after, coloured(), atol=45)
 
 
@@ -267,14 +268,36 @@ def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Recons
 def test_numbers_upwards_do_not_overlap(
     plotter: Any, pool: Reconstruction, exaggeration: float, labels: list[str]
 ) -> None:
-    drawing = scenes.build_scene(plotter, replace(scene_of(pool), exaggeration=4.0 - exaggeration))
+    drawing = draws.build_scene(plotter, replace(scene_of(pool), exaggeration=4.0 - exaggeration))
     drawing.update(replace(scene_of(pool), exaggeration=exaggeration))
     seen(plotter)
     assert plotter.renderer.cube_axes_actor.z_labels == labels
 
 
+def test_axes_stay_while_pools_fill_them(plotter: Any, pool: Reconstruction) -> None:
+    def scaled(factor: float) -> scenes.Scene:
+        made = scene_of(pool)
+        return replace(made, vertices_mm=made.vertices_mm * factor)
+
+    def bounds(drawing: draws.Drawing, factor: float) -> tuple[float, ...]:
+        drawing.update(scaled(factor))
+        return tuple(plotter.renderer.cube_axes_actor.bounds)
+
+    steady = draws.build_scene(plotter, scaled(1.0), steady=True)
+    of_all = bounds(steady, 1.0)
+    assert bounds(steady, 0.9) == of_all
+    larger = bounds(steady, 1.4)
+    assert larger != of_all
+    assert bounds(steady, 1.0) != larger  # too small a pool in them
+    plotter.clear()
+    plotter.remove_bounds_axes()
+    alone = draws.build_scene(plotter, scaled(1.0))
+    assert bounds(alone, 1.0) == of_all
+    assert bounds(alone, 0.6) != of_all
+
+
 def test_a_dark_window_has_a_dark_scene(plotter: Any, pool: Reconstruction) -> None:
-    drawing = scenes.build_scene(plotter, scene_of(pool))
+    drawing = draws.build_scene(plotter, scene_of(pool))
     assert amount(seen(plotter), "#ffffff") > 60_000
     drawing.update(replace(scene_of(pool), background="#202020", foreground="#e0e0e0"))
     picture = seen(plotter)
@@ -288,7 +311,7 @@ def test_heights_are_drawn_as_told_and_the_axes_stay_true(
     def extent(exaggeration: float) -> float:
         plotter.clear()
         drawn = replace(scene_of(pool), exaggeration=exaggeration, electrode=False)
-        scenes.build_scene(plotter, drawn).look("front")
+        draws.build_scene(plotter, drawn).look("front")
         axes = plotter.renderer.cube_axes_actor
         assert axes.GetZAxisRange() == pytest.approx((0.0, 0.3))
         top, bottom = np.nonzero(amount_rows(seen(plotter)))[0][[0, -1]]

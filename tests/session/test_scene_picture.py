@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.session.scene import Scene, build_scene
+from labapp.session.drawing import build_scene
+from labapp.session.scene import Scene
 from tests.pictures import RENEW, Away, away, check_picture
 
 KEPT_PICTURE = Path(__file__).parent / "pictures" / "pool.png"

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from labapp.core.pipeline import Measurement
-from labapp.session.scene import Direction, scene_of
+from labapp.session.drawing import Direction
+from labapp.session.scene import scene_of
 from labapp.session.studio import draw_scene
 
 

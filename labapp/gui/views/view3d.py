@@ -32,7 +32,8 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.views.canvas import Drawn
-from labapp.session.scene import Direction, Drawing, Scene, build_scene, can_draw
+from labapp.session.drawing import Direction, Drawing, build_scene, can_draw
+from labapp.session.scene import Scene
 
 TURN_DEG = 10.0
 """An arrow key turns the scene so far."""
@@ -193,7 +194,7 @@ class View3d(Drawn):
             return False
         if self._drawing is None:
             self.window().installEventFilter(self)
-            self._drawing = build_scene(self._new_plotter(), self._scene)
+            self._drawing = build_scene(self._new_plotter(), self._scene, steady=True)
             if isinstance(self._wanted, str):
                 self._drawing.look(self._wanted)
             elif self._wanted is not None:

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.capture.presenter import size_in_words
+from labapp.session.drawing import Direction
 from labapp.session.export import (
     FILM_FILE,
     HDF5_FILE,
@@ -24,7 +25,6 @@ from labapp.session.film import UNTIMED_HZ, film_times
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.meshes import FORMATS, SPACING_MM
-from labapp.session.scene import Direction
 from labapp.session.session import Session
 from labapp.session.studio import PICTURE_PX
 

@@ -41,9 +41,9 @@ from labapp.gui.views.fields import ChoiceField, NumberField
 from labapp.gui.views.parts import PartsBar
 from labapp.gui.views.view3d import make_view3d
 from labapp.gui.workspace import Workspace
+from labapp.session.drawing import Direction
 from labapp.session.heights import profile
 from labapp.session.measured import scheme_name
-from labapp.session.scene import Direction
 
 LOOKS: dict[Direction, tuple[str, str]] = {
     "top": ("Top", "Look from the top (1 in the view)"),
