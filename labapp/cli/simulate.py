@@ -37,12 +37,12 @@ def simulate(
 
     read = read_scenario(scenario, frames, seed)
     count = len(read.recording.pools)
-    with progress_bar() as progress:
-        task = progress.add_task(scenario.name, total=count)
+    with progress_bar() as bar:
+        task = bar.add_task(scenario.name, total=count)
         try:
-            write(read, out, progress=lambda: progress.advance(task))
+            write(read, out, progress=lambda _, done, __: bar.update(task, completed=done))
         except KeyboardInterrupt:
-            note(progress.console, f"stopped: nothing is written in {out}")
+            note(bar.console, f"stopped: nothing is written in {out}")
             raise typer.Exit(INTERRUPTED) from None
     name = read.recording.file
     typer.echo(f"{several(count, 'frame')}, setup, calibration picture and truth are in {out}")

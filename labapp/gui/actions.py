@@ -437,6 +437,14 @@ VIEW = (
 
 TOOLS = (
     Action(
+        "simulator",
+        "&Tools",
+        "&Simulator …",
+        "Ctrl+Shift+M",
+        "Render a recording of a pool that is known, with the truth about every dot",
+        lambda window: show_tool(window, "simulator"),
+    ),
+    Action(
         "adviser",
         "&Tools",
         "Configuration &adviser …",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 import os
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -20,6 +19,7 @@ from labapp.errors import InputError
 from labapp.media import Frame, FrameSource
 from labapp.session.results import ResultsWriter
 from labapp.session.setup import Setup
+from labapp.simulation.parallel import NICE, begin_worker
 
 AHEAD = 8
 """So many frames are given to a pool before the first of them must be done."""
@@ -118,28 +118,10 @@ def measure_each(
             future.cancel()
 
 
-NICE = 10
-"""So much a process that measures gives way to the window, where the system knows of it."""
-
-
 def measuring_pool(workers: int) -> ProcessPoolExecutor:
     """Processes that measure: a window stays quick while they do."""
     spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, spawn, initializer=_begin_to_measure)
-
-
-def _begin_to_measure() -> None:
-    """Give way to the window; end when the program that it measures for is gone, killed even."""
-    if hasattr(os, "nice"):
-        os.nice(NICE)
-    parent = multiprocessing.parent_process()
-
-    def wait() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, name="parent", daemon=True).start()
+    return ProcessPoolExecutor(workers, spawn, initializer=begin_worker, initargs=(NICE,))
 
 
 def _begun(pool: Executor | None, given: tuple[Any, ...]) -> Future[Measurement]:

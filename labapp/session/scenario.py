@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import tomlkit
 
+import labapp
 from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
@@ -56,6 +57,18 @@ class Scenario:
     recording: Recording
     setup: str
     text: str
+
+    @property
+    def title(self) -> str:
+        """What the comment says that it begins with; empty without one."""
+        first = self.text.partition("\n")[0]
+        return first.lstrip("# ").rstrip(". \r") if first.startswith("#") else ""
+
+
+def shipped_scenarios() -> list[Path]:
+    """Those that come with the repository; none in an installed package."""
+    folder = Path(labapp.__file__).parents[1] / "resources" / "simulations"
+    return sorted(folder.glob("*.toml"))
 
 
 def read_scenario(

@@ -1,7 +1,11 @@
-"""Simulate a recording: a folder with it, its set-up, its calibration picture and its truth."""
+"""Simulate a recording: a folder with it, its set-up, its calibration picture and its truth.
+
+And a session of what was simulated.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -10,8 +14,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from labapp.errors import InputError
+from labapp.session.record import Record
 from labapp.session.scenario import Scenario
 from labapp.session.scenario_keys import RECORDINGS
+from labapp.session.session import Session
+from labapp.simulation.parallel import Progress
 
 SCENARIO = "scenario.toml"
 """The scenario itself, kept beside what was made of it; by it a former simulation is known."""
@@ -25,7 +32,7 @@ def simulate(
     scenario: Scenario,
     out: str | os.PathLike[str],
     workers: int | None = None,
-    progress: Callable[[], None] = lambda: None,
+    progress: Progress | None = None,
 ) -> None:
     """Render a scenario's recording into a folder, which is whole or not there.
 
@@ -40,7 +47,7 @@ def simulate(
     workers
         How many processes render; None: one a core. The result is the same.
     progress
-        Called after each frame.
+        Told of each frame, and while one is waited for; what it raises leaves nothing.
 
     Raises
     ------
@@ -80,3 +87,48 @@ def _check_replaceable(out: Path) -> None:
     if names and (foreign or SCENARIO not in names):
         found = f"holds {foreign[0]}" if foreign else f"holds no {SCENARIO}"
         raise InputError(out, "--out", found, OWN_FOLDER)
+
+
+def begin_session(
+    scenario: Scenario,
+    folder: Path,
+    path: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Make a session of a simulation: its set-up, its recording; nothing measured yet.
+
+    Parameters
+    ----------
+    scenario
+        What was simulated.
+    folder
+        Where to.
+    path
+        The session file.
+    progress
+        Told how much of the recording is imported; what it raises leaves no session.
+
+    Raises
+    ------
+    InputError
+        If the folder lacks the recording, or the session is there already or cannot be written; no
+        session is left then.
+    """
+    made, size = scenario.recording, scenario.recording.pools[0].size
+    height_mm = size.height_mm if size.height_mm >= -size.depth_mm else size.depth_mm
+    record = Record(
+        title=scenario.title or folder.name,
+        expected_width_mm=round(size.width_mm, 2),
+        expected_length_mm=round(size.length_mm, 2),
+        expected_height_mm=round(height_mm, 3),
+        notes=f"Simulated, seed {made.seed}; the truth is in {folder.name}.",
+    )
+    rate_hz = None if made.file.endswith(".avi") else made.frame_rate_hz
+    with contextlib.ExitStack() as on_failure:
+        session = Session.create(path, record)
+        on_failure.callback(path.unlink)
+        on_failure.callback(session.close)
+        session.set_setup(scenario.setup)
+        session.import_recording(folder / made.file, frame_rate_hz=rate_hz, progress=progress)
+        on_failure.pop_all()
+    session.close()

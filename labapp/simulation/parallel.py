@@ -1,13 +1,16 @@
-"""Many independent simulations on all cores."""
+"""Many independent simulations on all cores; and how a process begins that works for another."""
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -17,6 +20,15 @@ R = TypeVar("R")
 
 POLL_S = 0.2
 """So often is told how far it is, done or not: who is told may end it."""
+
+NICE = 10
+"""So much a process that works behind a window gives way to it."""
+
+_behind = ContextVar("behind", default=False)
+"""Whether what begins processes now works behind a window."""
+
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+"""The matrices are small: more threads than one get in each other's way."""
 
 Progress = Callable[[str, int, int], None]
 """Told what is being done, how many steps of it are done and how many there are."""
@@ -58,27 +70,78 @@ def in_parallel(
                 results.append(function(task))
                 tell(what, len(results), len(tasks))
         return results
-    pool = ProcessPoolExecutor(
-        min(workers, len(tasks)),
-        multiprocessing.get_context("spawn"),
-        initializer=threadpool_limits,
-        initargs=(1,),
-    )
-    try:
+    with processes(min(workers, len(tasks))) as pool:
         with deaf():
             futures = [pool.submit(function, task) for task in tasks]
         for future in futures:
-            while not wait([future], POLL_S).done:
-                tell(what, len(results), len(tasks))
-            results.append(future.result())
+            results.append(awaited(future, lambda: tell(what, len(results), len(tasks))))
             tell(what, len(results), len(tasks))
+    return results
+
+
+def awaited(future: Future[R], tell: Callable[[], None]) -> R:
+    """Result of a task in another process; ``tell`` is called meanwhile, and may end the wait."""
+    while not wait([future], POLL_S).done:
+        tell()
+    return future.result()
+
+
+@contextmanager
+def processes(
+    workers: int, become: Callable[..., None] | None = None, *given: object
+) -> Iterator[ProcessPoolExecutor]:
+    """Processes that work for this one; an exception ends what they are at.
+
+    Parameters
+    ----------
+    workers
+        How many.
+    become, given
+        What each calls first, and with what.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    begin = functools.partial(begin_worker, NICE if _behind.get() else 0, become, *given)
+    pool = ProcessPoolExecutor(workers, spawn, initializer=begin)
+    try:
+        yield pool
     except BaseException:
         for process in list((pool._processes or {}).values()):
             process.terminate()  # a task can take a minute
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-    return results
+
+
+def begin_worker(nice: int = 0, become: Callable[..., None] | None = None, *given: object) -> None:
+    """Begin a process that works for another one; see `processes`.
+
+    It gives way by ``nice``, where the system knows of it, computes in one thread, and ends when
+    the one that it works for is gone, killed even.
+    """
+    if hasattr(os, "nice"):
+        os.nice(nice)
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    threadpool_limits(1)  # of what is loaded already
+    parent = multiprocessing.parent_process()
+
+    def follow() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=follow, name="parent", daemon=True).start()
+    if become is not None:
+        become(*given)
+
+
+@contextmanager
+def behind_a_window() -> Iterator[None]:
+    """Have processes that are begun now, by this thread, give way to the window."""
+    former = _behind.set(True)
+    try:
+        yield
+    finally:
+        _behind.reset(former)
 
 
 @contextmanager

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import csv
-import multiprocessing
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -16,13 +15,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import tifffile
-from threadpoolctl import threadpool_limits
 
 from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
-from labapp.simulation.parallel import deaf
+from labapp.simulation.parallel import Progress, awaited, deaf, processes
 from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
 from labapp.simulation.target import Target, TargetLook, render_target
 from labapp.simulation.torch import Torch
@@ -158,7 +156,7 @@ class Recording:
         folder: Path,
         setup: str,
         workers: int = 1,
-        progress: Callable[[], None] = lambda: None,
+        progress: Progress | None = None,
     ) -> None:
         """Write recording, calibration picture, setup file and truth into ``folder``.
 
@@ -171,7 +169,7 @@ class Recording:
         workers
             How many processes render.
         progress
-            Called after each frame.
+            Told of each frame, and while one is waited for; what it raises ends the rendering.
 
         Raises
         ------
@@ -185,36 +183,36 @@ class Recording:
             _Table(folder / "truth.csv", self.truth_columns) as truth,
             _Table(folder / "dots_truth.csv", self.dot_columns) as dots,
         ):
+            done = 0
+
+            def tell() -> None:
+                if progress is not None:
+                    progress("frames", done, len(self.pools))
 
             def images() -> Iterator[Picture]:
-                for told in self._told(workers):
+                nonlocal done
+                for told in self._told(workers, tell):
                     truth.write([told.truth])
                     dots.write(told.dots)
                     yield told.image
-                    progress()
+                    done += 1
+                    tell()
 
             self._write_recording(folder / self.file, images())
 
-    def _told(self, workers: int) -> Iterator[_Told]:
-        """Every frame in its order."""
+    def _told(self, workers: int, tell: Callable[[], None]) -> Iterator[_Told]:
+        """Every frame in its order; ``tell`` is called while one is waited for."""
         numbers = iter(range(len(self.pools)))
         if workers == 1:
             yield from (_tell(self, number) for number in numbers)
             return
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, context, _become_worker, (self,)) as processes:
+        with processes(workers, _become_worker, self) as pool:
             waiting: deque[Future[_Told]] = deque()
-            try:
-                with deaf():
-                    waiting += (
-                        processes.submit(_work, n) for n in islice(numbers, workers + AHEAD)
-                    )
-                while waiting:
-                    yield waiting.popleft().result()
-                    waiting += (processes.submit(_work, n) for n in islice(numbers, 1))
-            finally:
-                for future in waiting:
-                    future.cancel()
+            with deaf():
+                waiting += (pool.submit(_work, n) for n in islice(numbers, workers + AHEAD))
+            while waiting:
+                yield awaited(waiting.popleft(), tell)
+                waiting += (pool.submit(_work, n) for n in islice(numbers, 1))
 
     def _write_recording(self, path: Path, images: Iterator[Picture]) -> None:
         if path.suffix == ".tif":
@@ -270,7 +268,6 @@ _rendered: Recording
 def _become_worker(recording: Recording) -> None:
     global _rendered  # noqa: PLW0603 - set once, where the process begins
     _rendered = recording
-    threadpool_limits(1)
 
 
 def _work(number: int) -> _Told:

@@ -19,7 +19,7 @@ from labapp.session.session import Session
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
 
-TIMEOUT = 120_000
+TIMEOUT = 300_000
 
 SMALL = {
     "pools.width_mm": (6.5, 6.5),

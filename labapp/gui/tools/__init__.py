@@ -12,7 +12,10 @@ if TYPE_CHECKING:
     from labapp.gui.tools.tool import ToolWindow
     from labapp.gui.window import MainWindow
 
-TOOLS = {"adviser": "AdviserWindow"}
+TOOLS = {
+    "simulator": "SimulatorWindow",
+    "adviser": "AdviserWindow",
+}
 """Module here → the window in it."""
 
 

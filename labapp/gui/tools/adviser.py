@@ -16,7 +16,6 @@ from labapp.gui.views.sheet import Sheet
 from labapp.gui.views.tables import CellTable
 from labapp.session.advice import advice_files
 from labapp.session.advice_keys import parse_question
-from labapp.session.files import write_whole
 from labapp.simulation.advice_report import cost_table
 from labapp.simulation.adviser import QUICK, Advice, Effort, advise
 
@@ -50,7 +49,6 @@ class AdviserWindow(ToolWindow):
 
     def __init__(self, window: MainWindow) -> None:
         self.advice: Advice | None = None
-        self.files: dict[str, bytes] = {}
         self._basis: object = None
         self._asked: advising.Values = {}
         super().__init__(window)
@@ -198,22 +196,8 @@ class AdviserWindow(ToolWindow):
                 "The advised set-up is in: measure in steps 2 and 3 where it really stands", False
             )
 
-    def save(self, folder: Path) -> None:
-        """Write the files that the command writes."""
-        files = self.files
-
-        def write() -> None:
-            folder.mkdir(parents=True, exist_ok=True)
-            for name, content in files.items():
-                write_whole(folder / name, content)
-
-        if self.tried(write):
-            self.say(f"Saved in {folder}")
-
     def choose_folder(self) -> None:
         """Ask where to write the files."""
-        session = self.workspace.session
-        start = Path.home() if session is None else session.path.parent
-        name = QFileDialog.getExistingDirectory(self, "Save the advice in", str(start))
+        name = QFileDialog.getExistingDirectory(self, "Save the advice in", self.folder_near)
         if name:
             self.save(Path(name))

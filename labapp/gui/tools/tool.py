@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from PySide6.QtCore import QSize, Qt
@@ -15,12 +16,14 @@ from PySide6.QtWidgets import (
     QPushButton,
     QScrollArea,
     QVBoxLayout,
+    QWidget,
 )
 
 from labapp.gui.messages import PROBLEM, ElidedLabel
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.views.fields import FieldForm
-from labapp.simulation.parallel import Progress
+from labapp.session.files import write_whole
+from labapp.simulation.parallel import Progress, behind_a_window
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
@@ -51,6 +54,8 @@ class ToolWindow(QDialog):
         The tool's own work.
     form, results
         Where the tool puts its fields, and what it found.
+    files
+        What it found as files: name → content.
     """
 
     key = ""
@@ -61,6 +66,7 @@ class ToolWindow(QDialog):
         super().__init__(window)
         self.workspace = window.workspace
         self.tasks = Tasks(self)
+        self.files: dict[str, bytes] = {}
         self._task: Task | None = None
         self.setObjectName(f"tool-{self.key}")
         self.setWindowTitle(self.title)
@@ -92,14 +98,18 @@ class ToolWindow(QDialog):
         self.resize(QSize(*SIZE_PX).boundedTo(room))
 
     def _lay_out(self) -> None:
+        column = QWidget()
+        high = QVBoxLayout(column)
+        high.setContentsMargins(0, 0, 8, 0)
+        high.addWidget(self.form)
+        high.addStretch(1)
         side = QScrollArea()
-        side.setWidget(self.form)
+        side.setWidget(column)
         side.setWidgetResizable(True)
         side.setFrameShape(QFrame.Shape.NoFrame)
         side.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         side.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         side.setFixedWidth(FORM_PX + side.verticalScrollBar().sizeHint().width())
-        self.form.setContentsMargins(0, 0, 8, 0)
         middle = QHBoxLayout()
         middle.addWidget(side)
         middle.addLayout(self.results, 1)
@@ -114,12 +124,13 @@ class ToolWindow(QDialog):
 
     def add_button(self, words: str, tip: str, do: Callable[[], object]) -> QPushButton:
         """Put a button before those that are there."""
-        button = QPushButton(words)
-        button.setToolTip(tip)
-        button.setAutoDefault(False)  # Enter finishes a field
-        button.clicked.connect(lambda *_: do())
+        button = _button(words, tip, do)
         self.buttons.insertWidget(0, button)
         return button
+
+    def add_to_form(self, words: str, tip: str, do: Callable[[], object]) -> None:
+        """Put a button below the fields that are there."""
+        self.form.add_wide(_button(words, tip, do))
 
     # --- what tools say for themselves ---------------------------------------------------------
 
@@ -168,15 +179,37 @@ class ToolWindow(QDialog):
         part: Callable[[Any], None] | None = None,
     ) -> None:
         """Begin work, one at a time; see `Tasks.start`."""
+
+        def behind(control: Control) -> Any:
+            with behind_a_window():
+                return work(control)
+
         if not self.working:
             self.say(f"{title} …")
-            self._task = self.tasks.start(title, work, done, part)
+            self._task = self.tasks.start(title, behind, done, part)
 
     def cancel(self) -> None:
         """Ask the work to stop."""
         for task in self.tasks.active:
             task.cancel()
         self._show_progress()
+
+    @property
+    def folder_near(self) -> str:
+        """Where a question for a folder begins."""
+        session = self.workspace.session
+        return str(Path.home() if session is None else session.path.parent)
+
+    def save(self, folder: Path) -> None:
+        """Write what was found, as the command does; each file is whole."""
+
+        def write() -> None:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, content in self.files.items():
+                write_whole(folder / name, content)
+
+        if self.tried(write):
+            self.say(f"Saved in {folder}")
 
     def say(self, text: str, problem: bool = False) -> None:
         """Tell something on the line below."""
@@ -208,6 +241,14 @@ class ToolWindow(QDialog):
             self._task = None
             if stopping:
                 self.say("Stopped")
+
+
+def _button(words: str, tip: str, do: Callable[[], object]) -> QPushButton:
+    button = QPushButton(words)
+    button.setToolTip(tip)
+    button.setAutoDefault(False)  # Enter finishes a field
+    button.clicked.connect(lambda *_: do())
+    return button
 
 
 def told(control: Control) -> Progress:

@@ -1,0 +1,97 @@
+"""What the simulator's window offers and shows of a scenario: without Qt."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from labapp.core.values import FloatArray
+from labapp.gui.digits import ResultRow
+from labapp.session.scenario import Scenario, read_scenario, shipped_scenarios
+from labapp.simulation.recording import RecordedFrame
+
+
+@dataclass(frozen=True)
+class Preview:
+    """A scenario with its first frame.
+
+    Parameters
+    ----------
+    scenario
+        As it was read, with one frame.
+    frames
+        How many it asks for itself.
+    frame
+        The first one, with its truth.
+    """
+
+    scenario: Scenario
+    frames: int
+    frame: RecordedFrame
+
+    @property
+    def dots_px(self) -> FloatArray:
+        """(u, v) of the dots that are in the picture, shape (n, 2)."""
+        return self.frame.dot_px[self.frame.shown]
+
+
+def preview(path: Path, seed: int | None) -> Preview:
+    """Render the first frame of a scenario.
+
+    Parameters
+    ----------
+    path
+        The scenario.
+    seed
+        None: its own.
+
+    Raises
+    ------
+    InputError
+        As `read_scenario`.
+    """
+    scenario = read_scenario(path, 1, seed)
+    frames = tomllib.loads(scenario.text.lstrip("\ufeff"))["recording"]["frames"]
+    return Preview(scenario, frames, scenario.recording.frame(0))
+
+
+def choices(own: Path | None) -> list[tuple[str, str]]:
+    """(path, words) of the scenarios to choose from: the operator's own first, if there is one."""
+    paths = [own] if own is not None and own not in shipped_scenarios() else []
+    return [(str(path), path.stem.replace("_", " ")) for path in (*paths, *shipped_scenarios())]
+
+
+def new_folder(parent: Path, scenario: Path) -> Path:
+    """A folder for a simulation that is not there yet."""
+    folder, number = parent / scenario.stem, 1
+    while folder.exists():
+        number += 1
+        folder = parent / f"{scenario.stem} {number}"
+    return folder
+
+
+def rows(shown: Preview, frames: int) -> tuple[ResultRow, ...]:
+    """What is known of a scenario's first frame, and of a recording of so many."""
+    recording, frame = shown.scenario.recording, shown.frame
+    size, seen = frame.pool.size, frame.reflections
+    free = seen.lit & ~seen.blocked
+    rate = recording.frame_rate_hz or 0.0
+    wide, high = recording.view.width_px, recording.view.height_px
+    counts = (
+        ("Dots in the picture", frame.shown, "dots"),
+        ("Rays that meet the pool", seen.lit, "rays"),
+        ("Hidden by the torch", seen.lit & seen.blocked, "rays"),
+        ("Meet the pool twice", free & seen.hits_again, "rays"),
+    )
+    return (
+        ResultRow("Pool's width", size.width_mm, unit="mm"),
+        ResultRow("Pool's length", size.length_mm, unit="mm"),
+        ResultRow("Highest point", size.height_mm, unit="mm"),
+        ResultRow("Lowest point", size.depth_mm, unit="mm"),
+        *(ResultRow(name, float(of.sum()), unit=unit, decimals=0) for name, of, unit in counts),
+        ResultRow("Frame rate", rate, unit="Hz", decimals=1),
+        ResultRow("Recording lasts", frames / rate if rate else None, unit="s", decimals=2),
+        ResultRow("Frame", f"{wide} × {high}", unit="px"),
+        ResultRow("Recording", recording.file),
+    )

@@ -1,0 +1,255 @@
+"""The simulator's window: a scenario at the left, its first frame with true dots at the right."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pyqtgraph as pg
+from PySide6.QtGui import QCloseEvent
+from PySide6.QtWidgets import QFileDialog, QLabel
+
+from labapp.gui.dialogs import new_path
+from labapp.gui.tasks import Control, Tasks
+from labapp.gui.tools import simulating
+from labapp.gui.tools.simulating import Preview
+from labapp.gui.tools.tool import ToolWindow, told
+from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.path_field import PathField
+from labapp.gui.views.picture import PictureView
+from labapp.session.scenario import Scenario, read_scenario
+from labapp.session.simulate import begin_session, simulate
+
+if TYPE_CHECKING:
+    from labapp.gui.window import MainWindow
+
+RING, RING_PX = "#2fd39b", 15
+"""Round the true dots: a colour of the dots page; points of the screen."""
+
+
+class SimulatorWindow(ToolWindow):
+    """Shows a scenario, writes its recording with the truth, and opens that as a session.
+
+    Attributes
+    ----------
+    preview
+        The scenario that is shown; None until its first frame is drawn.
+    made
+        The scenario that was written last, and where to.
+    """
+
+    key = "simulator"
+    title = "Simulator"
+
+    def __init__(self, window: MainWindow) -> None:
+        self.preview: Preview | None = None
+        self.made: tuple[Scenario, Path] | None = None
+        self._own: Path | None = None
+        self._proposed = ""
+        self._turn = threading.Lock()
+        super().__init__(window)
+        self._window = window
+        self.previews = Tasks(self)
+        self._make_form()
+        self._make_results()
+        self.previews.failed.connect(lambda _, why: self._show_refusal(why))
+        self.open_button = self.add_button(
+            "Open as a new session",
+            "Make a session of the recording that was written, with its set-up, and open it",
+            self.open_session,
+        )
+        self.start_button = self.add_button(
+            "Simulate", "Write recording and truth to the folder", self.start
+        )
+        self.show_state()
+
+    def _make_form(self) -> None:
+        self.scenario = ChoiceField(
+            "Scenario", simulating.choices(None), tooltip="The pool, the bench and the camera"
+        )
+        self.scenario.edited.connect(lambda _: self.show_scenario())
+        self.words = QLabel()
+        self.words.setWordWrap(True)
+        self.frames = NumberField(
+            "Frames", lowest=1, highest=1_000_000, decimals=0, tooltip="How many are rendered"
+        )
+        self.frames.edited.connect(lambda _: self._show_rows())
+        self.seed = NumberField(
+            "Seed",
+            lowest=0,
+            highest=2**31 - 1,
+            decimals=0,
+            tooltip="Source of noise and chance: the same gives the same frames",
+        )
+        self.seed.edited.connect(lambda seed: self._draw(int(seed)))
+        self.folder = PathField(
+            "Folder", tooltip="Where to: a new or empty folder, or a former simulation's"
+        )
+        self.table = ResultTable("What is known of the first frame")
+        self.form.add(self.scenario)
+        self.form.add_wide(self.words)
+        self.add_to_form(
+            "Own scenario …", "Take a scenario of your own (TOML)", self.choose_scenario
+        )
+        for field in (self.frames, self.seed, self.folder):
+            self.form.add(field)
+        self.add_to_form(
+            "Choose a folder …", "The simulation goes into a new one in it", self.choose_folder
+        )
+        self.form.add_heading("First frame")
+        self.form.add_wide(self.table)
+
+    def _make_results(self) -> None:
+        self.picture = PictureView("First frame with its true dots ringed")
+        self._rings = pg.ScatterPlotItem(
+            size=RING_PX, pxMode=True, pen=pg.mkPen(RING, width=1.2), brush=None
+        )
+        self.picture.add(self._rings)
+        self.results.addWidget(self.picture)
+
+    # --- what is to be simulated ---------------------------------------------------------------
+
+    def prefill(self) -> None:
+        """Propose a folder at the first time; draw what is chosen where it is not drawn."""
+        if not self._proposed:
+            self._propose(self._window.preferences.folder)
+        if self.preview is None and not self.previews.active:
+            self.show_scenario()
+
+    def show_scenario(self) -> None:
+        """Draw the scenario that is chosen, with the seed and as many frames as it asks for."""
+        if self.folder.value() == self._proposed:
+            self._propose(Path(self._proposed).parent)
+        self._draw(None)
+
+    def take(self, path: Path) -> None:
+        """Choose a scenario of the operator's own."""
+        self._own = path
+        self.scenario.set_choices(simulating.choices(path))
+        self.scenario.set_value(str(path))
+        self.show_scenario()
+
+    def choose_scenario(self) -> None:
+        """Ask for a scenario."""
+        name, _ = QFileDialog.getOpenFileName(
+            self, "Choose a scenario", str(self._window.preferences.folder), "Scenarios (*.toml)"
+        )
+        if name:
+            self.take(Path(name))
+
+    def choose_folder(self) -> None:
+        """Ask where the simulation goes."""
+        start = str(Path(self.folder.value()).parent)
+        name = QFileDialog.getExistingDirectory(self, "Put the simulation in", start)
+        if name:
+            self._propose(Path(name))
+
+    def _propose(self, parent: Path) -> None:
+        folder = simulating.new_folder(parent, Path(self.scenario.value() or "simulation"))
+        self._proposed = str(folder)
+        self.folder.set_value(self._proposed)
+
+    # --- its first frame -----------------------------------------------------------------------
+
+    def _draw(self, seed: int | None) -> None:
+        """Draw the first frame in the background; what was asked for last is shown."""
+        path = self.scenario.value()
+        for task in self.previews.active:
+            task.cancel()
+        self.preview = None
+        if not path:
+            self._show_refusal("No scenario comes with this installation: choose one of your own")
+            return
+
+        def work(control: Control) -> Preview:
+            with self._turn:
+                control.check()
+                found = simulating.preview(Path(path), seed)
+                control.check()
+            return found
+
+        self.previews.start("Drawing the first frame", work, lambda found: self._show(found, seed))
+        self.show_state()
+
+    def _show(self, found: Preview, seed: int | None) -> None:
+        self.preview = found
+        if seed is None:
+            self.frames.set_value(found.frames)
+            self.seed.set_value(found.scenario.recording.seed)
+        self.words.setText(found.scenario.title)
+        self.picture.show_picture(found.frame.image)
+        self._rings.setData(*found.dots_px.T)
+        dots = len(found.dots_px)
+        self.picture.describe(f"{found.scenario.title}: {dots} dots, each ringed where it truly is")
+        self._show_rows()
+        self.show_state()
+
+    def _show_refusal(self, why: str) -> None:
+        self.words.setText("")
+        self._rings.setData([], [])
+        self.picture.show_picture(None, why)
+        self._show_rows()
+        self.show_state()
+
+    def _show_rows(self) -> None:
+        frames = int(self.frames.value() or 1)
+        self.table.set_rows(() if self.preview is None else simulating.rows(self.preview, frames))
+
+    # --- writing, opening ----------------------------------------------------------------------
+
+    def show_state(self) -> None:
+        """Enable what is of use now."""
+        if hasattr(self, "start_button"):
+            self.start_button.setEnabled(not self.working and self.preview is not None)
+            self.open_button.setEnabled(not self.working and self.made is not None)
+
+    def start(self) -> None:
+        """Write recording and truth, in the background; the folder is whole or not there."""
+        for field in (self.frames, self.seed, self.folder):
+            field.flush()
+        path, seed = Path(self.scenario.value()), int(self.seed.value() or 0)
+        frames = int(self.frames.value() or 1)
+        if not self.folder.value().strip():
+            self.say("Enter a folder first, or choose one", True)
+            return
+        folder = Path(self.folder.value().strip()).expanduser().absolute()
+
+        def work(control: Control) -> Scenario:
+            scenario = read_scenario(path, frames, seed)
+            simulate(scenario, folder, progress=told(control))
+            return scenario
+
+        self.begin("Simulating", work, lambda scenario: self._written(scenario, folder))
+
+    def _written(self, scenario: Scenario, folder: Path) -> None:
+        self.made = scenario, folder
+        count = len(scenario.recording.pools)
+        self.say(f"{count} frame{'s' * (count != 1)}, set-up and truth are in {folder}")
+        preferences = self._window.preferences
+        self._window.remember(replace(preferences, last_folder=str(folder.parent)))
+        self.show_state()
+
+    def open_session(self) -> None:
+        """Make a session of what was written last, in its folder, and open it."""
+        if self.made is None:
+            return
+        scenario, folder = self.made
+        path = new_path(folder, folder.name)
+
+        def work(control: Control) -> Path:
+            begin_session(scenario, folder, path, control.progress)
+            return path
+
+        self.begin("Importing", work, self._open)
+
+    def _open(self, path: Path) -> None:
+        if self._window.files.open(path):
+            self._propose(path.parent.parent)  # the next one does not replace what is open
+            self.close()
+
+    def closeEvent(self, event: QCloseEvent) -> None:
+        """Stop drawing, too."""
+        self.previews.cancel_all()
+        super().closeEvent(event)

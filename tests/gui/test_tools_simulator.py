@@ -1,0 +1,179 @@
+"""The simulator's window: the first frame, the command's files, cancel, a session of its own."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QPushButton
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.tools import simulating
+from labapp.gui.tools.simulator import SimulatorWindow
+from labapp.gui.window import MainWindow
+from labapp.session.scenario import shipped_scenarios
+from tests.conftest import Run
+
+TIMEOUT = 300_000
+
+
+@pytest.fixture
+def simulator(window: MainWindow, qtbot: QtBot) -> SimulatorWindow:
+    """The simulator's window, its first scenario drawn."""
+    window.menus.do("simulator")
+    tool = window.findChild(SimulatorWindow)
+    assert tool is not None
+    qtbot.waitUntil(lambda: tool.preview is not None, timeout=TIMEOUT)
+    return tool
+
+
+def choose(tool: SimulatorWindow, name: str, qtbot: QtBot) -> Path:
+    """Choose a shipped scenario, and wait until it is drawn."""
+    path = next(path for path in shipped_scenarios() if path.stem == name)
+    tool.scenario.set_value(str(path))
+    tool.scenario.edited.emit(str(path))
+    assert not tool.start_button.isEnabled()
+    qtbot.waitUntil(lambda: tool.preview is not None, timeout=TIMEOUT)
+    return path
+
+
+def click(button: QPushButton) -> None:
+    QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+
+
+def test_it_shows_the_first_frame_with_its_true_dots(
+    simulator: SimulatorWindow, qtbot: QtBot, labapp: Run, tmp_path: Path
+):
+    path = choose(simulator, "mode_11", qtbot)
+    assert (simulator.frames.value(), simulator.seed.value()) == (30, 5007)
+    assert simulator.words.text() == "Sloshes to and fro along the weld: mode (1, 1)"
+    assert labapp("simulate", path, "--out", tmp_path / "out", "--frames", 1)[0] == 0
+    with (tmp_path / "out" / "dots_truth.csv").open(encoding="utf-8") as file:
+        lines = [row for row in csv.DictReader(file) if row["visible"] == "1"]
+    true = np.array([[float(row["u_px"]), float(row["v_px"])] for row in lines])
+    ringed = np.column_stack(simulator._rings.getData())
+    np.testing.assert_allclose(ringed, true, atol=6e-4)
+    assert f"{len(true)} dots" in simulator.picture.accessibleDescription()
+    told = {row.name: row for row in simulator.table.rows}
+    assert told["Dots in the picture"].value == len(true)
+    assert told["Recording lasts"].texts[1:] == ("0.50", "", "s")
+    before = simulator.picture.picture
+    simulator.seed.set_value(1)
+    simulator.seed.edited.emit(1)
+    qtbot.waitUntil(lambda: simulator.preview is not None, timeout=TIMEOUT)
+    assert (simulator.picture.picture != before).mean() > 0.3
+    assert simulator.seed.value() == 1
+
+
+def test_it_writes_what_the_command_writes_and_opens_it(
+    simulator: SimulatorWindow, window: MainWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
+):
+    path = choose(simulator, "low_rear", qtbot)
+    out = tmp_path / "window" / "low_rear"
+    simulator.frames.set_value(3)
+    simulator.seed.set_value(8)
+    simulator.folder.editor.setText(str(out))
+    assert not simulator.open_button.isEnabled()
+    click(simulator.start_button)
+    qtbot.waitUntil(lambda: simulator.made is not None, timeout=TIMEOUT)
+    assert "3 frames" in simulator.message.text()
+    given = ("--frames", 3, "--seed", 8)
+    assert labapp("simulate", path, "--out", tmp_path / "command", *given)[0] == 0
+    names = sorted(file.name for file in (tmp_path / "command").iterdir())
+    assert names == sorted(file.name for file in out.iterdir())
+    for name in names:
+        assert (tmp_path / "command" / name).read_bytes() == (out / name).read_bytes(), name
+    click(simulator.open_button)
+    qtbot.waitUntil(lambda: window.workspace.session is not None, timeout=TIMEOUT)
+    session = window.workspace.session
+    assert session is not None
+    assert session.path == out / "low_rear.labsession"
+    assert session.setup_text == (out / "setup.toml").read_text("utf-8")
+    assert session.frames.tolist() == [0, 1, 2]
+    assert session.record.title == "The tail ends below the work piece (§7.2)"
+    assert session.record.expected_width_mm == pytest.approx(6.66, rel=0.1)
+    assert not simulator.isVisible()
+    for _, result in session.measure([0]):
+        assert result.status == "ok"
+
+
+def test_a_stack_gets_its_time_base(simulator: SimulatorWindow, window: MainWindow,
+                                    qtbot: QtBot, tmp_path: Path):  # fmt: skip
+    shipped = next(path for path in shipped_scenarios() if path.stem == "cap")
+    own = tmp_path / "stack.toml"
+    own.write_text(shipped.read_text("utf-8") + 'format = "tif"\n', "utf-8")
+    simulator.take(own)
+    qtbot.waitUntil(lambda: simulator.preview is not None, timeout=TIMEOUT)
+    simulator.frames.set_value(2)
+    simulator.folder.editor.setText(str(tmp_path / "out"))
+    click(simulator.start_button)
+    qtbot.waitUntil(lambda: simulator.made is not None, timeout=TIMEOUT)
+    click(simulator.open_button)
+    qtbot.waitUntil(lambda: window.workspace.session is not None, timeout=TIMEOUT)
+    session = window.workspace.session
+    assert session is not None
+    assert session.frame(1).time_s == pytest.approx(1 / 60)
+
+
+def test_what_is_wrong_is_said_and_nothing_is_written(
+    simulator: SimulatorWindow, qtbot: QtBot, tmp_path: Path
+):
+    own = tmp_path / "own.toml"
+    own.write_text("[pool]\nshape = 'eg'\n", "utf-8")
+    simulator.take(own)
+    qtbot.waitUntil(lambda: "pool.shape" in simulator.picture.accessibleDescription())
+    assert not simulator.start_button.isEnabled()
+    assert simulator.table.rows == ()
+    choose(simulator, "cap", qtbot)
+    mine = tmp_path / "folder"
+    mine.mkdir()
+    (mine / "mine.txt").write_text("mine")
+    simulator.folder.editor.setText(str(mine))
+    click(simulator.start_button)
+    qtbot.waitUntil(lambda: "holds mine.txt" in simulator.message.text(), timeout=TIMEOUT)
+    assert [path.name for path in mine.iterdir()] == ["mine.txt"]
+    assert not simulator.open_button.isEnabled()
+
+
+@pytest.mark.parametrize("how", ["escape", "close", "app"])
+def test_it_can_be_stopped_and_leaves_nothing(
+    simulator: SimulatorWindow, window: MainWindow, qtbot: QtBot, tmp_path: Path, how: str
+):
+    simulator.frames.set_value(5000)
+    (tmp_path / "results").mkdir()
+    simulator.folder.editor.setText(str(tmp_path / "results" / "out"))
+    click(simulator.start_button)
+    qtbot.waitUntil(lambda: simulator.bar.value() > 0, timeout=TIMEOUT)
+    if how == "escape":
+        QTest.keyClick(simulator, Qt.Key.Key_Escape)
+        assert simulator.isVisible()
+    elif how == "close":
+        click(simulator.close_button)
+        assert not simulator.isVisible()
+    else:
+        window.close()
+    qtbot.waitUntil(lambda: not simulator.working, timeout=TIMEOUT)
+    assert list((tmp_path / "results").iterdir()) == []
+    assert simulator.made is None
+
+
+def test_the_scenario_chosen_last_is_shown(simulator: SimulatorWindow, qtbot: QtBot):
+    for path in shipped_scenarios()[:6]:
+        simulator.scenario.set_value(str(path))
+        simulator.scenario.edited.emit(str(path))
+    qtbot.waitUntil(lambda: simulator.preview is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: not simulator.previews.active, timeout=TIMEOUT)
+    assert simulator.preview is not None
+    assert simulator.preview.scenario.text == path.read_text("utf-8")
+
+
+def test_a_folder_is_proposed_that_is_not_there_yet(tmp_path: Path):
+    scenario = tmp_path / "egg.toml"
+    assert simulating.new_folder(tmp_path, scenario) == tmp_path / "egg"
+    (tmp_path / "egg").mkdir()
+    (tmp_path / "egg 2").mkdir()
+    assert simulating.new_folder(tmp_path, scenario) == tmp_path / "egg 3"

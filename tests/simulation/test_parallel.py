@@ -1,0 +1,80 @@
+"""Processes that work for another one: they give way, and end with it, or when they are told to."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from labapp.simulation.parallel import NICE, behind_a_window, in_parallel
+
+BUSY = """
+import sys, time
+from labapp.simulation.parallel import in_parallel
+if __name__ == "__main__":
+    in_parallel(time.sleep, [600, 600], "asleep", lambda *_: print(flush=True), workers=2)
+"""
+
+
+def test_they_give_way_to_a_window_and_use_one_thread() -> None:
+    own = os.nice(0)
+    with behind_a_window():
+        assert in_parallel(os.nice, [0, 0, 0], workers=2) == [min(own + NICE, 19)] * 3
+    assert in_parallel(os.nice, [0, 0], workers=2) == [own] * 2
+    assert in_parallel(os.getenv, ["OMP_NUM_THREADS"] * 2, workers=2) == ["1", "1"]
+
+
+def test_what_progress_raises_ends_them() -> None:
+    def stop(_what: str, done: int, _total: int) -> None:
+        if multiprocessing.active_children():
+            raise InterruptedError(done)
+
+    with pytest.raises(InterruptedError):
+        in_parallel(time.sleep, [600, 600], "asleep", stop, workers=2)
+    assert not multiprocessing.active_children()
+
+
+def test_they_end_when_who_they_work_for_is_killed(tmp_path: Path) -> None:
+    program = tmp_path / "busy.py"
+    program.write_text(BUSY, "utf-8")
+    until = time.monotonic() + 120
+    with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE) as running:
+        assert running.stdout is not None
+        while len(workers := spawned(running.pid)) < 2:
+            assert running.stdout.readline()
+            assert time.monotonic() < until
+        running.send_signal(signal.SIGKILL)
+    while any(is_there(pid) for pid in workers):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def stat(pid: int) -> list[str]:
+    """State, parent … of a process, as Linux tells; empty if it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
+def is_there(pid: int) -> bool:
+    return stat(pid)[:1] not in ([], ["Z"])
+
+
+def spawned(parent: int) -> list[int]:
+    """Those that a process has spawned to work for it, and that have begun."""
+    pids = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
+    return [
+        pid
+        for pid in pids
+        if stat(pid)[1:2] == [str(parent)]
+        and b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        and Path(f"/proc/{pid}/task").is_dir()
+        and len(list(Path(f"/proc/{pid}/task").iterdir())) > 1  # one of them follows the parent
+    ]
