@@ -52,6 +52,9 @@ LOOKS: dict[Direction, tuple[str, str]] = {
     "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
 }
 
+CHARTS_SOON_MS = 20
+"""Charts are drawn after the 3-D view, not in one go with it: the window stays quick."""
+
 CHARTS_REST_MS = 250
 """Charts are drawn no more often: they cost more than the 3-D view does."""
 
@@ -81,7 +84,6 @@ class SurfacePage(Page):
         self._charts_due: Callable[[], None] | None = None
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)
-        self._rest.setInterval(CHARTS_REST_MS)
         self._rest.timeout.connect(self._show_charts)
         self.stack = QStackedWidget()
         self.stack.addWidget(self._single())
@@ -282,14 +284,14 @@ class SurfacePage(Page):
 
         self._charts_due = show_charts
         if not self._rest.isActive():
-            self._show_charts()
+            self._rest.start(CHARTS_SOON_MS)
 
     def _show_charts(self) -> None:
         """Bring the charts up to date; when frames rush by, every so often and at last."""
         if self._charts_due is not None:
             self._charts_due()
             self._charts_due = None
-            self._rest.start()
+            self._rest.start(CHARTS_REST_MS)
 
     def _show_options(self) -> None:
         self.colour.set_value(self.options.colour)
@@ -306,12 +308,12 @@ class SurfacePage(Page):
 
     def _set(self, **changed: object) -> None:
         self.options = replace(self.options, **changed)  # type: ignore[arg-type]
-        self._rest.stop()  # what the hand does is seen at once
         self._show_options()
         if self.stack.currentWidget() is self.compare:
             self.compare.refresh(self.options)
         else:
             self._show_surface()
+            self._show_charts()  # what the hand does is seen at once
 
     def _enter_section(self, _: object) -> None:
         self._set_section(float(self.angle.value() or 0.0), float(self.offset.value() or 0.0))
