@@ -97,19 +97,20 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
     image = np.asarray(frame, np.float32)
     if image.ndim != 2 or min(image.shape) < 8 or not np.ptp(image) > 0:
         raise CannotMeasure("no-dots", "the frame is blank or too small to hold a dot")
-    size = settings.size_px or _estimate_size(image)
-    band = _band_pass(image, size)
-    noise = _local_noise(image, size)
-    floor = settings.threshold * _band_noise(band, noise, size)
-    v, u = _local_maxima(band, floor, size)
+    size = settings.size_px or estimate_size(image)
+    band = band_pass(image, size)
+    noise = local_noise(image, size)
+    floor = settings.threshold * band_noise(band, noise, size)
+    v, u = local_maxima(band, floor, size)
     keep = _dot_like(image, band, u, v, size)
     u, v = u[keep], v[keep]
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
     bright = band[v, u].astype(float)
-    keep = bright >= settings.contrast * _typical(bright)
-    keep[keep] = _first_of_each(u[keep], v[keep], size)
-    return _describe(image, band, noise, u[keep], v[keep], size, settings.speckle_px)
+    keep = bright >= settings.contrast * typical(bright)
+    keep[keep] = first_of_each(u[keep], v[keep], size)
+    light = light_of(image, size)
+    return describe(light, band, noise, u[keep], v[keep], size, settings.speckle_px)
 
 
 FAINT = 3.0
@@ -141,10 +142,10 @@ def dot_at(
     """
     image = np.asarray(frame, np.float32)
     size = settings.size_px or float(np.median(others.size_px) if len(others) else 0.0)
-    size = size or _estimate_size(image)
-    band = _band_pass(image, size)
-    noise = _local_noise(image, size)
-    v, u = _local_maxima(band, FAINT * _band_noise(band, noise, size), size)
+    size = size or estimate_size(image)
+    band = band_pass(image, size)
+    noise = local_noise(image, size)
+    v, u = local_maxima(band, FAINT * band_noise(band, noise, size), size)
     away = np.hypot(u - u_px, v - v_px)
     taken = np.full(len(u), np.inf)
     if len(others) and len(u):
@@ -160,7 +161,7 @@ def dot_at(
     limit = np.array(image.shape[::-1]) - 1
     known = np.clip(np.rint(others.image_px), 0, limit).astype(np.int64)
     u, v = np.append(known[:, 0], u[k]), np.append(known[:, 1], v[k])
-    every = _describe(image, band, noise, u, v, size, settings.speckle_px)
+    every = describe(light_of(image, size), band, noise, u, v, size, settings.speckle_px)
     return Dots(*(getattr(every, column.name)[-1:] for column in fields(every)))
 
 
@@ -168,14 +169,15 @@ def dot_at(
 _SCALES_PX = 0.75 * 2 ** (np.arange(15) / 4)
 
 
-def _typical(brightness: FloatArray) -> float:
+def typical(brightness: FloatArray) -> float:
     """Half of all the light is in dots brighter than this: many faint specks do not move it."""
     order = np.sort(brightness)
     light = np.cumsum(order)
     return float(order[np.searchsorted(light, 0.5 * light[-1])])
 
 
-def _gauss(image: Grey, sigma: float) -> Grey:
+def gauss(image: Grey, sigma: float) -> Grey:
+    """Blur by a Gaussian of the given standard deviation, px."""
     blurred = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
     return np.asarray(blurred, np.float32)
 
@@ -195,25 +197,25 @@ def _noise_gain(size: float) -> float:
     return float(1 / np.sqrt(power))
 
 
-def _band_pass(image: Grey, size: float) -> Grey:
+def band_pass(image: Grey, size: float) -> Grey:
     """Difference of Gaussians that answers most to a Gaussian dot of the given size."""
-    return _gauss(image, 0.8 * size) - _gauss(image, 1.6 * size)
+    return gauss(image, 0.8 * size) - gauss(image, 1.6 * size)
 
 
-def _estimate_size(image: Grey) -> float:
+def estimate_size(image: Grey) -> float:
     """Standard deviation of the frame's dots, px: the scale at which most of its blobs peak.
 
     A blob is a maximum over place and scale of the scale-normalised band-pass. Hot pixels peak
     at the smallest scale and gradients at the largest, so those two do not vote.
     """
-    stack = np.stack([_band_pass(image, s) for s in _SCALES_PX])
+    stack = np.stack([band_pass(image, s) for s in _SCALES_PX])
     best = stack.max(axis=0)
     votes = np.zeros(len(_SCALES_PX))
     noise = 1.4826 * np.median(
         np.abs(stack - np.median(stack, axis=(1, 2), keepdims=True)), axis=(1, 2)
     )
     for k in range(1, len(_SCALES_PX) - 1):
-        v, u = _local_maxima(stack[k], 8.0 * noise[k] + 1e-6, _SCALES_PX[k])
+        v, u = local_maxima(stack[k], 8.0 * noise[k] + 1e-6, _SCALES_PX[k])
         here = stack[k - 1 : k + 2, v, u]
         peak = (here[1] >= here[0]) & (here[1] > here[2]) & (here[1] >= 0.5 * best[v, u])
         strength = here[1][peak]
@@ -227,7 +229,7 @@ def _estimate_size(image: Grey) -> float:
     return float(np.exp(log_size))
 
 
-def _local_noise(image: Grey, size: float) -> Grey:
+def local_noise(image: Grey, size: float) -> Grey:
     """Standard deviation of the camera's noise round each pixel, grey levels.
 
     Taken from a difference that smooth structure, dots included, does not pass (Immerkær 1996),
@@ -250,7 +252,7 @@ def _local_noise(image: Grey, size: float) -> Grey:
     return np.asarray(1.4826 * cv2.resize(medians, (width, height)), np.float32)
 
 
-def _band_noise(band: Grey, noise: Grey, size: float) -> Grey:
+def band_noise(band: Grey, noise: Grey, size: float) -> Grey:
     """Standard deviation of the noise in the band-passed frame.
 
     White noise passes the band with a known gain. Noise with grain (compression, a soft sensor)
@@ -262,15 +264,20 @@ def _band_noise(band: Grey, noise: Grey, size: float) -> Grey:
     return np.asarray(np.maximum(white * min(max(1.0, excess), 3.0), floor), np.float32)
 
 
-def _local_maxima(band: Grey, floor: Grey | float, size: float) -> tuple[IntArray, IntArray]:
+def peak_disc(size: float) -> npt.NDArray[np.uint8]:
+    """Pixels round a peak that none of may be brighter: a mask, shape (side, side)."""
     reach = 2 * max(1, round(1.2 * size)) + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    peak = (band >= cv2.dilate(band, disc)) & (band > floor)
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)), np.uint8)
+
+
+def local_maxima(band: Grey, floor: Grey | float, size: float) -> tuple[IntArray, IntArray]:
+    """Rows and columns of the pixels above ``floor`` that none nearby is brighter than."""
+    peak = (band >= cv2.dilate(band, peak_disc(size))) & (band > floor)
     v, u = np.nonzero(peak)
     return v.astype(np.int64), u.astype(np.int64)
 
 
-def _first_of_each(u: IntArray, v: IntArray, size: float) -> BoolArray:
+def first_of_each(u: IntArray, v: IntArray, size: float) -> BoolArray:
     """One of several pixels that share a peak: the top of a dot may be flat."""
     place = np.stack([u, v], axis=1)
     keep = np.ones(len(u), bool)
@@ -288,18 +295,32 @@ def _dot_like(
     size: float,
 ) -> BoolArray:
     """Not a hot pixel: those answer more to a much finer band than to the dots' own."""
-    fine = _band_pass(image, max(0.4, size / 3.0))
+    fine = band_pass(image, hot_scale(size))
     strongest = np.asarray(cv2.dilate(fine, np.ones((3, 3), np.uint8)))
-    return np.asarray(strongest[v, u] < 1.6 * band[v, u])
+    return np.asarray(strongest[v, u] < HOT * band[v, u])
 
 
-def _describe(
-    image: Grey, band: Grey, noise: Grey, u: IntArray, v: IntArray, size: float, speckle_px: float
+HOT = 1.6
+"""A hot pixel answers so many times more to the finer band."""
+
+
+def hot_scale(size: float) -> float:
+    """Size of dot whose band a hot pixel answers to, px."""
+    return max(0.4, size / 3.0)
+
+
+def light_of(image: Grey, size: float) -> Grey:
+    """Light above its surroundings, hardly blurred: what centroids are weighted by."""
+    return np.asarray(np.maximum(gauss(image, 0.5 * size) - gauss(image, 3.0 * size), 0.0))
+
+
+def describe(
+    light: Grey, band: Grey, noise: Grey, u: IntArray, v: IntArray, size: float, speckle_px: float
 ) -> Dots:
     """Centroid, its uncertainty, size, peak and signal-to-noise of each peak.
 
-    The centroid is weighted by the light above its surroundings under a Gaussian window, which is
-    moved onto the centroid it gives until it stays.
+    The centroid is weighted by the light above its surroundings (`light_of`) under a Gaussian
+    window, which is moved onto the centroid it gives until it stays.
     """
     width = 1.1 * np.full(len(u), size)
     if len(u) > 1:  # a window that ends half-way to the next dot keeps its light out
@@ -308,8 +329,8 @@ def _describe(
         width = np.minimum(width, np.maximum(0.275 * nearest, 0.75))
     margin = int(np.ceil(2.2 * size)) + 1
     across = np.arange(-margin, margin + 1.0)
-    light = np.pad(np.maximum(_gauss(image, 0.5 * size) - _gauss(image, 3.0 * size), 0.0), margin)
-    views = np.lib.stride_tricks.sliding_window_view(light, (len(across), len(across)))
+    framed = cv2.copyMakeBorder(light, *(margin,) * 4, cv2.BORDER_CONSTANT)
+    views = np.lib.stride_tricks.sliding_window_view(framed, (len(across), len(across)))
     patches = views[v, u].astype(float)
     offset = np.zeros((2, len(u)))
     for _ in range(4):

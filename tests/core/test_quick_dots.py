@@ -1,0 +1,56 @@
+"""Quick dots are the default detector's: the same ones, at the same places, of the same light."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from labapp.core.dots import BandPassSettings, band_pass_dots
+from labapp.core.quick_dots import Exposure, quick_dots
+from labapp.core.values import CannotMeasure, FloatArray
+
+SIZE_PX = 2.0
+SHAPE = (480, 320)
+
+
+def frame(place: FloatArray, rng: np.random.Generator, hot: int = 0) -> FloatArray:
+    """Gaussian dots of 40 grey levels at places (u, v) in noise of 1.5, and hot pixels."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    image = 20.0 + 10.0 * v / SHAPE[0] + rng.normal(0.0, 1.5, SHAPE)
+    for at in place:
+        image += 40.0 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * SIZE_PX**2))
+    image[rng.integers(0, SHAPE[0], hot), rng.integers(0, SHAPE[1], hot)] += 120.0
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def places(rng: np.random.Generator) -> FloatArray:
+    u, v = np.meshgrid(np.arange(20.0, 310.0, 17.0), np.arange(20.0, 470.0, 24.0))
+    return np.stack([u.ravel(), v.ravel()], axis=-1) + rng.uniform(-3, 3, (u.size, 2))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_dots_of_the_next_frame_are_those_of_the_default_detector(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, true = frame(places(rng), rng), places(rng)
+    exposure = Exposure.of(first, BandPassSettings())
+    after = frame(true, rng, hot=6)
+    quick = quick_dots(after, exposure, BandPassSettings())
+    slow = band_pass_dots(after, BandPassSettings(size_px=exposure.size_px))
+    assert len(quick) == len(slow) >= len(true) - 1  # a hot pixel may hit a dot
+    away, own = cKDTree(quick.image_px).query(slow.image_px)
+    assert np.quantile(away / slow.u_sigma_px, 0.95) < 0.1
+    assert (away / slow.u_sigma_px).max() < 1.0
+    np.testing.assert_allclose(quick.snr[own], slow.snr, rtol=0.25)  # noise of another frame
+    np.testing.assert_allclose(quick.size_px[own], slow.size_px, rtol=0.1)
+    off = cKDTree(true).query(quick.image_px)[0]
+    assert np.sqrt(np.mean(off**2)) < np.sqrt(2) * 0.08
+
+
+def test_a_frame_without_dots_has_none() -> None:
+    rng = np.random.default_rng(5)
+    exposure = Exposure.of(frame(places(rng), rng), BandPassSettings())
+    for dark in (frame(np.zeros((0, 2)), rng, hot=4), np.zeros(SHAPE, np.uint8)):
+        with pytest.raises(CannotMeasure) as answer:
+            quick_dots(dark, exposure, BandPassSettings())
+        assert answer.value.status == "no-dots"
