@@ -452,6 +452,14 @@ TOOLS = (
         "Where laser and imaging plane should stand for the pools that are expected",
         lambda window: show_tool(window, "adviser"),
     ),
+    Action(
+        "analysis",
+        "&Tools",
+        "&Error analysis …",
+        "Ctrl+Shift+E",
+        "How large the error is, and what makes it: the budget of a set-up, and chapter 8",
+        lambda window: show_tool(window, "analysis"),
+    ),
 )
 
 HELP = (

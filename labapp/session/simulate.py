@@ -82,7 +82,8 @@ def _check_replaceable(out: Path) -> None:
         return
     if not out.is_dir():
         raise InputError(out, "--out", "is a file", OWN_FOLDER)
-    names = {path.name for path in out.iterdir()}
+    # The lock of a session that is no longer there is nobody's.
+    names = {path.name for path in out.iterdir() if path.suffix != ".lock"}
     foreign = sorted(names - FILES - set(RECORDINGS.values()))
     if names and (foreign or SCENARIO not in names):
         found = f"holds {foreign[0]}" if foreign else f"holds no {SCENARIO}"

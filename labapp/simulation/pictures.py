@@ -20,6 +20,7 @@ from labapp.simulation.positioning_tables import Coverage
 from labapp.simulation.render import Frame
 
 COLOURS = {"irs": "#c05a00", "ers": "#1b4f8a", "fit": "#1b7a3d"}
+COLOURS |= {"predicted": "#8ab0d8", "simulated": "#1b4f8a"}
 MARKERS = {"irs": "s", "ers": "o", "fit": "^"}
 FATES = {
     Fate.CAUGHT: "#1b7a3d",
@@ -171,14 +172,14 @@ def _capped(plot: Any, survey: ErrorSurvey, error: str, scale: float) -> None:
 
 
 def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str) -> Figure:
-    """Contributions of several quantities as bars, a colour a scheme."""
+    """Contributions of several quantities as bars, a colour for each of `COLOURS`."""
     with rc_context(STYLE):
         figure = new_figure(INCHES, 0.32 * len(names) + 0.8)
         plot = figure.subplots()
         at, thick = np.arange(len(names)), 0.8 / len(values)
-        for k, (scheme, each) in enumerate(values.items()):
+        for k, (name, each) in enumerate(values.items()):
             where = at + (k - (len(values) - 1) / 2) * thick
-            plot.barh(where, each, thick, color=COLOURS[scheme], label=scheme)
+            plot.barh(where, each, thick, color=COLOURS[name], label=name)
         plot.set_yticks(at, names)
         plot.invert_yaxis()
         plot.set_xlabel(label)

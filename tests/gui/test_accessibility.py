@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 from PySide6.QtCore import Qt, QTimer
@@ -35,8 +37,12 @@ from labapp.gui import dialogs
 from labapp.gui.actions import ACTIONS
 from labapp.gui.help import HelpDialog
 from labapp.gui.steps import STEPS
+from labapp.gui.tools import TOOLS
+from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.views.canvas import Drawn, Plotted
 from labapp.gui.window import MainWindow
+from labapp.session.analysis import Made
+from labapp.simulation.tables import Table
 from tests.gui.conftest import CopySample
 
 Role = QAccessible.Role
@@ -302,6 +308,53 @@ def test_the_help_by_keyboard(window: MainWindow, kind: str, qtbot: QtBot):
     check_round(dialog)
     QTest.keyClick(dialog, Qt.Key.Key_Escape)
     assert not dialog.isVisible()
+
+
+@pytest.mark.parametrize("key", TOOLS)
+def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
+    opened.menus.do(key)
+    tool = opened.findChild(ToolWindow, f"tool-{key}")
+    assert tool is not None
+    qtbot.waitUntil(tool.isActiveWindow)
+    FILL[key](tool, qtbot)
+    reached = check_round(tool)
+    assert tool.start_button in reached
+    assert all(each.window() is tool for each in reached)
+    tool.resize(819, 460)  # 1366 × 768 at 150 %
+    QTest.qWait(20)
+    assert (tool.width(), tool.height()) == (819, 460)
+    for button in tool.findChildren(QAbstractButton):
+        if button.isVisible() and button.text():
+            assert button.width() >= button.sizeHint().width() - 1, button.text()
+    QTest.keyClick(tool, Qt.Key.Key_Escape)
+    assert not tool.isVisible()
+
+
+def fill_simulator(tool: Any, qtbot: QtBot) -> None:
+    """Its first frame is drawn; something was written."""
+    qtbot.waitUntil(lambda: tool.preview is not None, timeout=60_000)
+    tool.made = tool.preview.scenario, Path("here")
+    tool.show_state()
+
+
+def fill_adviser(tool: Any, qtbot: QtBot) -> None:
+    """It has an advice: that nothing is possible is found soonest."""
+    for key, ends in (("pools.height_mm", (0.5, 0.6)), ("bench.distance_mm", (40.0, 40.0))):
+        tool.ranges[key].set_value(ends)
+    tool.effort.set_value("quick")
+    tool.start()
+    qtbot.waitUntil(lambda: tool.advice is not None, timeout=300_000)
+    tool.costs.show_table(Table("costs", "Costs", ("quantity", "cost_um"), (("s", 1.0),)))
+    tool.costs.show()
+
+
+def fill_analysis(tool: Any, qtbot: QtBot) -> None:
+    """A part is done."""
+    table = Table("error_budget", "Budget", ("source", "predicted_pct"), (("dots", 1.0),))
+    tool.show_part(Made((table,), {}, (table,)))
+
+
+FILL = {"simulator": fill_simulator, "adviser": fill_adviser, "analysis": fill_analysis}
 
 
 def test_the_question_whether_to_open_read_only(window: MainWindow, copy_sample: CopySample):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 TOOLS = {
     "simulator": "SimulatorWindow",
     "adviser": "AdviserWindow",
+    "analysis": "AnalysisWindow",
 }
 """Module here → the window in it."""
 

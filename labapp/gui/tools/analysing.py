@@ -1,0 +1,71 @@
+"""What the window of the error analysis offers, and in which words it shows what came out."""
+
+from __future__ import annotations
+
+import re
+
+from labapp.errors import InputError
+from labapp.session.analysis import SCHEMES
+from labapp.session.session import Session
+
+BUDGET = "budget"
+
+PARTS = (
+    (
+        BUDGET,
+        "Error budget of the set-up",
+        "What each source does to the height of the expected pool, with fit",
+    ),
+    ("CE", "CE: configuration (a minute)", "28 caps, the laser where it stood in §8.3.1"),
+    (
+        "LE",
+        "LE: system limitation (10 min)",
+        "The least error of the caps with the laser at 25° to 35° and 25 to 35 mm",
+    ),
+    ("ME", "ME: methodology (10 min)", "The same as LE with 39 × 39 rays, 0.385° apart"),
+    ("measurement", "Thumb tack of §8.2 (a minute)", "Rendered frames of it, measured"),
+    ("images", "Image processing (minutes)", "Rendered frames of the 28 caps, measured"),
+    (
+        "parameters",
+        "Parameter deviation (minutes)",
+        "What the calibration's uncertainties do, one by one and by Monte Carlo",
+    ),
+)
+"""What can be worked out: key, words, and what it is."""
+
+SCHEME_CHOICES = (("", "all three"), *((scheme, scheme) for scheme in SCHEMES))
+
+OPENED, USUAL = "opened", "usual"
+SETUPS = ((OPENED, "of the session"), (USUAL, "of §8.3.1, 4″ plane"))
+
+USUAL_MM = (6.0, 7.0, 0.3)
+"""Width, length and height of a pool where none is expected."""
+
+
+def has_setup(session: Session | None) -> bool:
+    """Whether a session has a set-up that is complete."""
+    try:
+        return session is not None and bool(session.setup)
+    except InputError:
+        return False
+
+
+def expected_mm(session: Session | None) -> tuple[float, float, float]:
+    """Width, length and height of the pool that a session expects, or the usual ones."""
+    if session is None:
+        return USUAL_MM
+    record = session.record
+    noted = (record.expected_width_mm, record.expected_length_mm, record.expected_height_mm)
+    width, length, height = (one or usual for one, usual in zip(noted, USUAL_MM, strict=True))
+    return width, length, height
+
+
+def in_words(name: str) -> str:
+    """Name of a table or picture in words: ``figure_8_6_CE`` is "Figure 8-6: CE"."""
+    stem, _, kind = name.partition(".")
+    figure = re.fullmatch(r"figure_(\d+)_(\d+)_(.+)", stem)
+    words = (figure[3] if figure else stem).replace("_", " ")
+    words = re.sub(r"\bare\b", "ARE", words)
+    if figure:
+        return f"Figure {figure[1]}-{figure[2]}: {words}"
+    return f"{words[:1].upper()}{words[1:]}" + (", picture" if kind else "")

@@ -1,0 +1,238 @@
+"""The error analysis: what to work out at the left, tables and pictures at the right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QCheckBox, QFileDialog, QLabel, QStackedWidget
+
+from labapp.gui.tasks import Control
+from labapp.gui.tools import analysing
+from labapp.gui.tools.analysing import BUDGET, OPENED, PARTS, USUAL
+from labapp.gui.tools.tool import ToolWindow, told
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.sheet import Sheet
+from labapp.gui.views.tables import CellTable
+from labapp.session.analysis import (
+    SCHEMES,
+    Made,
+    Question,
+    analyze_budget,
+    analyze_errors,
+    expected_pool,
+)
+from labapp.simulation.tables import Table
+
+if TYPE_CHECKING:
+    from labapp.gui.window import MainWindow
+    from labapp.session.setup import Setup
+    from labapp.simulation.pools import Pool
+
+SIZES = (
+    ("width", "Width", 1.0, 30.0, 0.1, "Of the expected pool, along X"),
+    ("length", "Length", 1.0, 30.0, 0.1, "Of the expected pool, along Y"),
+    ("height", "Height", -30.0, 30.0, 0.01, "Of the expected pool; below 0 for a hollow"),
+)
+
+
+class AnalysisWindow(ToolWindow):
+    """Works out parts of chapter 8 and the budget of a set-up, and shows each when it is done.
+
+    Attributes
+    ----------
+    tables, pictures
+        What the last run gave, by name.
+    """
+
+    key = "analysis"
+    title = "Error analysis"
+
+    def __init__(self, window: MainWindow) -> None:
+        self.tables: dict[str, Table] = {}
+        self.pictures: dict[str, bytes] = {}
+        self._anew = False
+        self._basis: object = None
+        super().__init__(window)
+        self._make_form()
+        self._make_results()
+        self.save_button = self.add_button(
+            "Save the results …",
+            "Write all tables (CSV, Markdown) and pictures to a folder",
+            self.choose_folder,
+        )
+        self.start_button = self.add_button(
+            "Work out", "Work out what is ticked; each part is shown when it is done", self.start
+        )
+        self.show_state()
+
+    def _make_form(self) -> None:
+        self.form.add_heading("What is worked out")
+        self.parts: dict[str, QCheckBox] = {}
+        for key, words, tip in PARTS:
+            box = QCheckBox(words)
+            box.setToolTip(tip)
+            box.setAccessibleDescription(tip)
+            box.setChecked(key == BUDGET)
+            box.toggled.connect(lambda _: self.show_state())
+            self.parts[key] = box
+            self.form.add_wide(box)
+        self.form.add_heading("Of the budget")
+        self.setup = ChoiceField("Set-up", analysing.SETUPS, tooltip="Whose errors are added up")
+        self.form.add(self.setup)
+        self.sizes: dict[str, NumberField] = {}
+        for key, label, lowest, highest, step, tip in SIZES:
+            self.sizes[key] = NumberField(
+                label, "mm", lowest=lowest, highest=highest, step=step, tooltip=tip
+            )
+            self.form.add(self.sizes[key])
+        self.form.add_heading("Of the other parts")
+        self.scheme = ChoiceField(
+            "Schemes", analysing.SCHEME_CHOICES, tooltip="By which schemes; the budget is of fit"
+        )
+        self.step = NumberField(
+            "LE, ME: step",
+            "° and mm",
+            lowest=0.25,
+            highest=10,
+            step=0.25,
+            tooltip="Between the laser's places: half of it takes four times as long",
+        )
+        self.frames = NumberField(
+            "Frames of each",
+            lowest=1,
+            highest=1000,
+            decimals=0,
+            tooltip="Of the thumb tack, and of each cap in image processing",
+        )
+        self.draws = NumberField(
+            "Draws", lowest=10, highest=100_000, step=100, decimals=0,
+            tooltip="Of the calibration, in parameter deviation",
+        )  # fmt: skip
+        usual = Question()
+        for field, value in (
+            (self.step, usual.step),
+            (self.frames, usual.frames),
+            (self.draws, usual.draws),
+        ):
+            field.set_value(value)
+        for one in (self.scheme, self.step, self.frames, self.draws):
+            self.form.add(one)
+
+    def _make_results(self) -> None:
+        self.which = ChoiceField("Shown", tooltip="Tables and pictures that are done")
+        self.which.edited.connect(lambda _: self._show_chosen())
+        line = FieldForm()
+        line.add(self.which)
+        self.words = QLabel(
+            "Tick what is to be worked out, then press Work out. All of it is simulated; the "
+            "calibration is taken to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
+        )
+        self.words.setWordWrap(True)
+        self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
+        self.table = CellTable("Table of the error analysis")
+        self.sheet = Sheet("Picture of the error analysis")
+        self.stack = QStackedWidget()
+        for widget in (self.table, self.sheet):
+            self.stack.addWidget(widget)
+        self.results.addWidget(line)
+        self.results.addWidget(self.words)
+        self.results.addWidget(self.stack, 1)
+        self.stack.hide()
+        self._line = line
+        line.hide()
+
+    # --- what is to be worked out --------------------------------------------------------------
+
+    def prefill(self) -> None:
+        """Take pool and set-up from the session, where they are others than last time."""
+        session = self.workspace.session
+        sizes = self.workspace.tried(lambda: analysing.expected_mm(session)) or analysing.USUAL_MM
+        basis = (analysing.has_setup(session), sizes)
+        if basis == self._basis:
+            return
+        self._basis = basis
+        self.setup.set_value(OPENED if basis[0] else USUAL)
+        for field, value in zip(self.sizes.values(), sizes, strict=True):
+            field.set_value(value)
+
+    def start(self) -> None:
+        """Work out what is ticked, in the background, one part after the other."""
+        for field in (*self.sizes.values(), self.step, self.frames, self.draws):
+            field.flush()
+        ticked = tuple(key for key, box in self.parts.items() if box.isChecked())
+        scheme = self.scheme.value()
+        question = Question(
+            parts=tuple(key for key in ticked if key != BUDGET),
+            schemes=tuple(one for one in SCHEMES if scheme in ("", one)),
+            step=float(self.step.value() or 0),
+            frames=int(self.frames.value() or 0),
+            draws=int(self.draws.value() or 0),
+        )
+        budget = self.workspace.tried(self._budget) if BUDGET in ticked else None
+        if BUDGET in ticked and budget is None:
+            return
+
+        def work(control: Control) -> None:
+            if budget is not None:
+                control.part(analyze_budget(*budget, told(control)))
+            for made in analyze_errors(question, told(control)):
+                control.part(made)
+
+        self._anew = True
+        self.begin("Working out", work, lambda _: self.say("Done"), self.show_part)
+
+    def _budget(self) -> tuple[Setup | None, Pool]:
+        """Set-up and pool of the budget, as they are asked for."""
+        session = self.workspace.session
+        pool = expected_pool(*(float(field.value() or 0) for field in self.sizes.values()))
+        if self.setup.value() == USUAL:
+            return None, pool
+        if session is None:
+            raise ValueError("no session is open: open one, or take the set-up of §8.3.1")
+        return session.setup, pool
+
+    # --- what came out -------------------------------------------------------------------------
+
+    def show_part(self, made: Made) -> None:
+        """Show what a part gave; what an earlier run gave goes with the first one."""
+        if self._anew:
+            self.tables, self.pictures, self.files = {}, {}, {}
+            self._anew = False
+        self.tables |= {table.name: table for table in made.tables}
+        self.pictures |= made.pictures
+        self.files |= made.files
+        names = (*self.tables, *self.pictures)
+        self.which.set_choices([(name, analysing.in_words(name)) for name in names])
+        self.which.set_value(made.tables[0].name)
+        for widget in (self._line, self.stack):
+            widget.show()
+        self._show_chosen()
+        self.show_state()
+
+    def _show_chosen(self) -> None:
+        name = self.which.value()
+        if name in self.tables:
+            self.words.setText(self.tables[name].caption)
+            self.table.show_table(self.tables[name])
+            self.stack.setCurrentWidget(self.table)
+        else:
+            words = analysing.in_words(name)
+            self.words.setText(words)
+            self.sheet.show_png(self.pictures[name], words)
+            self.stack.setCurrentWidget(self.sheet)
+
+    def show_state(self) -> None:
+        """Enable what is of use now."""
+        if not hasattr(self, "start_button"):
+            return
+        ticked = any(box.isChecked() for box in self.parts.values())
+        self.start_button.setEnabled(ticked and not self.working)
+        self.save_button.setEnabled(bool(self.files))
+
+    def choose_folder(self) -> None:
+        """Ask where to write the files."""
+        name = QFileDialog.getExistingDirectory(self, "Save the results in", self.folder_near)
+        if name:
+            self.save(Path(name))

@@ -1,0 +1,191 @@
+"""The window of the error analysis: the command's files, part by part, cancel, copies."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QPushButton
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.tools import analysing
+from labapp.gui.tools.analysis import AnalysisWindow
+from labapp.gui.window import MainWindow
+from labapp.session.analysis import PARTS
+from labapp.session.session import Session
+from labapp.simulation import error_analysis, setup_budget
+from tests.conftest import Run
+from tests.gui.conftest import CopySample
+
+TIMEOUT = 300_000
+
+
+@pytest.fixture
+def analysis(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> AnalysisWindow:
+    """The window beside a session; few pools and caps, worked out here."""
+    caps = error_analysis.caps_8_3_1()[2::14]
+    monkeypatch.setattr(error_analysis, "caps_8_3_1", lambda: caps)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    monkeypatch.setattr(setup_budget, "POOLS", 2)
+    monkeypatch.setattr(setup_budget, "MOVED_POOLS", 1)
+    assert window.files.open(copy_sample("gtaw"))
+    window.menus.do("analysis")
+    tool = window.findChild(AnalysisWindow)
+    assert tool is not None
+    qtbot.waitUntil(tool.isVisible)
+    return tool
+
+
+def click(button: QPushButton) -> None:
+    QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+
+
+def tick(tool: AnalysisWindow, *keys: str) -> None:
+    for key, box in tool.parts.items():
+        box.setChecked(key in keys)
+
+
+def work_out(tool: AnalysisWindow, qtbot: QtBot) -> None:
+    click(tool.start_button)
+    assert tool.working
+    qtbot.waitUntil(lambda: not tool.working, timeout=TIMEOUT)
+    assert tool.message.text() == "Done"
+
+
+def check_same(window: Path, command: Path) -> None:
+    names = sorted(path.name for path in command.iterdir())
+    assert sorted(path.name for path in window.iterdir()) == names
+    for name in names:
+        assert (window / name).read_bytes() == (command / name).read_bytes(), name
+
+
+def test_the_budget_is_that_of_the_sessions_set_up(
+    analysis: AnalysisWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
+):
+    session = analysis.workspace.session
+    assert session is not None
+    assert [field.value() for field in analysis.sizes.values()] == [6.7, 7.4, 0.3]
+    work_out(analysis, qtbot)
+    analysis.save(tmp_path / "window")
+    setup = tmp_path / "setup.toml"
+    setup.write_text(session.setup_text, "utf-8")
+    size = ("--width", "6.7", "--length", "7.4", "--height", "0.3")
+    code, told, _ = labapp(
+        "analyze", "budget", "--setup", setup, *size, "--out", tmp_path / "command"
+    )
+    assert code == 0
+    check_same(tmp_path / "window", tmp_path / "command")
+    assert set(analysis.files) == {"error_budget.csv", "error_budget.md", "error_budget.png"}
+    assert analysis.words.text() in told
+    shown = analysis.table
+    assert shown.horizontalHeaderItem(1).text() == "predicted, %"
+    assert shown.item(shown.rowCount() - 1, 0).text() == "everything"
+    shown.copy_csv()
+    made = (tmp_path / "command" / "error_budget.csv").read_text("utf-8")
+    assert QApplication.clipboard().text() == made
+    analysis.which.set_value("error_budget.png")
+    analysis.which.edited.emit("error_budget.png")
+    assert analysis.stack.currentWidget() is analysis.sheet
+    analysis.sheet.copy_picture()
+    assert QApplication.clipboard().image().width() > 600
+
+
+def test_parts_are_those_of_the_command(
+    analysis: AnalysisWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
+):
+    assert tuple(analysis.parts) == (analysing.BUDGET, *PARTS)
+    tick(analysis, "CE", "LE", "parameters")
+    analysis.scheme.set_value("ers")
+    analysis.step.set_value(10)
+    analysis.draws.set_value(10)
+    work_out(analysis, qtbot)
+    analysis.save(tmp_path / "window")
+    given = ("--part", "CE", "--part", "LE", "--part", "parameters", "--scheme", "ers")
+    given += ("--step", "10", "--draws", "10")
+    assert labapp("analyze", "errors", "--out", tmp_path / "command", *given)[0] == 0
+    check_same(tmp_path / "window", tmp_path / "command")
+    words = [analysis.which.editor.itemText(n) for n in range(analysis.which.editor.count())]
+    assert words == [
+        "Errors", "ARE", "Errors by cap", "Parameter deviation", "Figure 8-6: CE",
+        "Figure 8-7: CE ARE", "Figure 8-8: LE", "Figure 8-9: LE ARE",
+        "Parameter deviation convex, picture", "Parameter deviation concave, picture",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("how", ["escape", "close", "app"])
+def test_a_cancel_keeps_what_is_finished(
+    analysis: AnalysisWindow,
+    window: MainWindow,
+    qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+    how: str,
+):
+    gate, survey = threading.Event(), error_analysis.survey
+
+    def slow(kind, *given, **more):  # type: ignore[no-untyped-def]
+        if kind == "LE":
+            gate.wait(60)
+        return survey(kind, *given, **more)
+
+    monkeypatch.setattr(error_analysis, "survey", slow)
+    tick(analysis, "CE", "LE")
+    analysis.scheme.set_value("ers")
+    click(analysis.start_button)
+    qtbot.waitUntil(lambda: "errors" in analysis.tables, timeout=TIMEOUT)
+    threading.Timer(0.1, gate.set).start()
+    if how == "escape":
+        QTest.keyClick(analysis, Qt.Key.Key_Escape)
+    elif how == "close":
+        click(analysis.close_button)
+    else:
+        window.close()
+    qtbot.waitUntil(lambda: not analysis.working, timeout=TIMEOUT)
+    assert [row[0] for row in analysis.tables["errors"].rows[::3]] == ["CE-D", "CE-B"]
+    assert analysis.message.text() == "Stopped"
+    assert analysis.save_button.isEnabled()
+    assert analysis.isVisible() == (how == "escape")
+
+
+def test_what_is_ticked_last_takes_the_place_of_what_was_before(
+    analysis: AnalysisWindow, qtbot: QtBot
+):
+    work_out(analysis, qtbot)
+    tick(analysis)
+    assert not analysis.start_button.isEnabled()
+    tick(analysis, "CE")
+    analysis.scheme.set_value("ers")
+    work_out(analysis, qtbot)
+    assert "error_budget" not in analysis.tables
+    assert "error_budget.csv" not in analysis.files
+
+
+def test_what_cannot_be_is_refused(analysis: AnalysisWindow, window: MainWindow, tmp_path: Path):
+    analysis.sizes["height"].set_value(0.001)
+    click(analysis.start_button)
+    assert not analysis.working
+    assert "expected 0.01 to 30 mm" in analysis.message.text()
+    window.menus.do("close")
+    analysis.sizes["height"].set_value(0.3)
+    click(analysis.start_button)
+    assert not analysis.working
+    assert "no session is open" in analysis.message.text()
+    assert window.workspace.create(tmp_path / "empty.labsession")
+    click(analysis.start_button)
+    assert not analysis.working
+    assert "missing" in analysis.message.text()
+
+
+def test_without_a_set_up_it_begins_with_that_of_the_text(copy_sample: CopySample, tmp_path: Path):
+    assert not analysing.has_setup(None)
+    assert analysing.expected_mm(None) == (6.0, 7.0, 0.3)
+    with Session.create(tmp_path / "new.labsession") as session:
+        assert not analysing.has_setup(session)
+        assert analysing.expected_mm(session) == (6.0, 7.0, 0.3)
+    with Session.open(copy_sample("thumb_tack")) as session:
+        assert analysing.has_setup(session)
+        assert analysing.expected_mm(session) == (9.75, 9.75, 0.91)
