@@ -20,7 +20,7 @@ from labapp.media.video import VideoSource
 __all__ = ["Frame", "FrameSource", "GreyImage", "open_source"]
 
 VIDEO_SUFFIXES = frozenset(
-    ".avi .mkv .mp4 .m4v .mov .mpg .mpeg .ts .wmv .asf .webm .ogv .flv .mxf .dv .gif".split()
+    ".avi .mkv .mp4 .m4v .mov .nut .mpg .mpeg .ts .wmv .asf .webm .ogv .flv .mxf .dv .gif".split()
 )
 RECORDING_SUFFIXES = VIDEO_SUFFIXES | {".cine", ".npy", ".npz"} | PHOTRON_SUFFIXES
 

@@ -1,0 +1,299 @@
+"""GenICam cameras, GigE Vision and USB3 Vision, through Aravis."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import time
+from ctypes import byref, c_int, c_size_t
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from labapp.media.base import GreyImage
+from labapp.media.cameras.base import (
+    BrokenFrame,
+    Camera,
+    CameraError,
+    CameraFrame,
+    CameraInfo,
+    CameraLost,
+    CameraSettings,
+    Limits,
+    Range,
+    Trigger,
+    check_settings,
+)
+from labapp.media.cameras.genicam import ControlLost, aravis
+
+PREFIX = "aravis:"
+
+BUFFERS = 32
+"""Frames that the driver can fill while nobody reads."""
+
+KINDS = {"GigEVision": "GigE Vision", "USB3Vision": "USB3 Vision", "Fake": "Aravis's own"}
+
+DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
+"""Pixel formats that are read, in the camera's own name, and their bits."""
+
+BROKEN = {
+    2: "the rest of it did not come in time",
+    3: "packets of it are missing",
+    4: "its packets were numbered wrongly",
+    5: "it is larger than was said",
+    7: "it was broken off",
+}
+"""What is wrong with a frame, by Aravis's status."""
+
+SOURCES: dict[Trigger, bytes] = {"software": b"Software", "line": b"Line1"}
+"""The triggers, by GenICam's names."""
+
+LARGEST_SHORT_ID = 0xFFFF
+"""GigE Vision numbers frames from 1 to this and begins again, unless it has 64 bits for it."""
+
+
+def find_genicam() -> list[CameraInfo]:
+    """Cameras that Aravis sees; about a second.
+
+    Raises
+    ------
+    CameraError
+        If Aravis is not installed.
+    """
+    arv = aravis().arv
+    arv.arv_update_device_list()
+    found = []
+    for k in range(arv.arv_get_n_devices()):
+        texts = (
+            getattr(arv, f"arv_get_device_{name}")(k)
+            for name in ("id", "vendor", "model", "protocol")
+        )
+        id_, vendor, model, protocol = ((text or b"").decode(errors="replace") for text in texts)
+        kind = KINDS.get(protocol, protocol)
+        found.append(CameraInfo(f"{PREFIX}{id_}", f"{vendor} {model}".strip(), kind))
+    return found
+
+
+class GenicamCamera(Camera):
+    """A GenICam camera that is open; see `Camera`.
+
+    Parameters
+    ----------
+    info
+        One of `find_genicam`.
+
+    Raises
+    ------
+    CameraError
+        If it is not there, is used by another program, or gives no grey pictures.
+    """
+
+    def __init__(self, info: CameraInfo) -> None:
+        self.info = info
+        self._aravis = aravis()
+        try:
+            self._camera = self._aravis.open(info.id.removeprefix(PREFIX))
+        except CameraError as error:
+            raise CameraLost(f"{info.name} cannot be opened: {error}") from error
+        self._stream: _Stream | None = None
+        self._is_lost = False
+        self._hook = 0
+        self._on_lost = ControlLost(self._note_loss)
+        try:
+            self._hook = self._aravis.when_lost(self._camera, self._on_lost)
+            self._check_control()
+            self.bit_depth = self._choose_format()
+            for name in ("exposure", "gain"):
+                self._switch_auto_off(name)
+            self.limits = self._limits()
+        except BaseException:
+            self.close()
+            raise
+
+    # --- settings -----------------------------------------------------------------------------
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What it is set to, as it says itself."""
+        limits = self.limits
+        sides = [c_int() for _ in range(4)]
+        self._ask("get_region", *map(byref, sides))
+        u, v, width, height = (side.value for side in sides)
+        return CameraSettings(
+            exposure_us=self._ask("get_exposure_time") if limits.exposure_us else None,
+            gain_db=self._ask("get_gain") if limits.gain_db else None,
+            rate_hz=self._ask("get_frame_rate") if limits.rate_hz else None,
+            region=(u, v, width, height),
+            trigger=self._trigger(),
+        )
+
+    def apply(self, wanted: CameraSettings) -> CameraSettings:
+        """Set what is wanted; see `Camera.apply`."""
+        if self._stream is not None:
+            raise CameraError(f"{self.info.name} is running: stop it before it is set")
+        check_settings(self.info, self.limits, wanted)
+        if wanted.region is not None:
+            self._ask("set_region", *wanted.region)
+        if wanted.trigger == "free":
+            self._ask("clear_triggers")
+        elif wanted.trigger is not None:
+            self._ask("set_trigger", SOURCES[wanted.trigger])
+        if wanted.exposure_us is not None:
+            self._ask("set_exposure_time", wanted.exposure_us)
+        if wanted.gain_db is not None:
+            self._ask("set_gain", wanted.gain_db)
+        if wanted.rate_hz is not None:
+            self._ask("set_frame_rate", wanted.rate_hz)
+        return self.settings
+
+    def _limits(self) -> Limits:
+        def span(name: str, feature: str) -> Range | None:
+            if not self._ask(f"is_{feature}_available"):
+                return None
+            return Range(*self._aravis.pair(self._camera, f"get_{name}_bounds"))
+
+        triggers: list[Trigger] = ["free"]
+        if self._ask("is_feature_available", b"TriggerMode"):
+            if self._ask("is_software_trigger_supported"):
+                triggers.append("software")
+            triggers.append("line")
+        width, _ = self._aravis.pair(self._camera, "get_width_bounds")
+        height, _ = self._aravis.pair(self._camera, "get_height_bounds")
+        return Limits(
+            exposure_us=span("exposure_time", "exposure_time"),
+            gain_db=span("gain", "gain"),
+            rate_hz=span("frame_rate", "frame_rate"),
+            sensor=self._aravis.pair(self._camera, "get_sensor_size"),
+            least_region=(width, height),
+            triggers=tuple(triggers),
+        )
+
+    def _trigger(self) -> Trigger:
+        if "line" not in self.limits.triggers or self._ask("get_string", b"TriggerMode") != b"On":
+            return "free"
+        source = self._ask("get_string", b"TriggerSource")
+        return "software" if source == SOURCES["software"] else "line"
+
+    def _choose_format(self) -> int:
+        """Bits of the pixel format: the camera's own where it is grey, else that with 8 bits."""
+        name = self._ask("get_pixel_format_as_string").decode()
+        if name not in DEPTHS:
+            try:
+                self._ask("set_pixel_format_from_string", b"Mono8")
+            except CameraError as error:
+                words = f"{self.info.name} gives {name} and no grey pictures (Mono8)"
+                raise CameraError(words) from error
+            name = "Mono8"
+        return DEPTHS[name]
+
+    def _switch_auto_off(self, name: str) -> None:
+        if self._ask(f"is_{name}_auto_available"):
+            self._ask(f"set_{'exposure_time' if name == 'exposure' else name}_auto", 0)
+
+    def _check_control(self) -> None:
+        arv = self._aravis.arv
+        if arv.arv_camera_is_gv_device(self._camera):
+            device = arv.arv_camera_get_device(self._camera)
+            if not arv.arv_gv_device_is_controller(device):
+                raise CameraError(f"{self.info.name} is used by another program: close that")
+
+    def _ask(self, name: str, *given: object) -> Any:
+        if self._is_lost:
+            raise CameraLost(f"{self.info.name} does not answer any more")
+        return self._aravis.ask(self._camera, name, *given)
+
+    # --- frames -------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Let frames come."""
+        if self._stream is not None:
+            return
+        self._ask("set_acquisition_mode", 0)
+        stream = self._ask("create_stream", None, None)
+        for _ in range(BUFFERS):
+            buffer = self._aravis.arv.arv_buffer_new_allocate(self._ask("get_payload"))
+            self._aravis.arv.arv_stream_push_buffer(stream, buffer)
+        self._stream = _Stream(stream)
+        self._ask("start_acquisition")
+
+    def read(self, timeout_s: float) -> CameraFrame | None:
+        """Wait for the next frame; see `Camera.read`."""
+        stream, arv = self._stream, self._aravis.arv
+        if stream is None:
+            raise CameraError(f"{self.info.name} was not started")
+        buffer = arv.arv_stream_timeout_pop_buffer(stream.handle, round(timeout_s * 1e6))
+        if not buffer:
+            if self._is_lost:
+                raise CameraLost(f"{self.info.name} does not answer any more")
+            return None
+        try:
+            status = arv.arv_buffer_get_status(buffer)
+            if status != 0:
+                raise BrokenFrame(BROKEN.get(status, f"its status is {status}"))
+            number = stream.number(arv.arv_buffer_get_frame_id(buffer))
+            clock = arv.arv_buffer_get_timestamp(buffer)
+            time_s = (clock or arv.arv_buffer_get_system_timestamp(buffer)) / 1e9
+            return CameraFrame(number, time_s, time.monotonic(), self._image(buffer))
+        finally:
+            arv.arv_stream_push_buffer(stream.handle, buffer)
+
+    def _image(self, buffer: int) -> GreyImage:
+        """Copy the levels out of a buffer."""
+        arv, size = self._aravis.arv, c_size_t()
+        place = arv.arv_buffer_get_data(buffer, byref(size))
+        rows = arv.arv_buffer_get_image_height(buffer)
+        columns = arv.arv_buffer_get_image_width(buffer)
+        kind = np.dtype(np.uint8 if self.bit_depth <= 8 else np.uint16)
+        needed = rows * columns * kind.itemsize
+        if not place or size.value < needed:
+            raise BrokenFrame(f"it has {size.value} bytes, not {needed}")
+        content = ctypes.string_at(place, needed)
+        return np.frombuffer(content, kind).reshape(rows, columns)
+
+    def trigger(self) -> None:
+        """Take a frame now."""
+        self._ask("software_trigger")
+
+    @property
+    def dropped(self) -> int:
+        """None: the frames' numbers show all that is lost."""
+        return 0
+
+    def stop(self) -> None:
+        """Let no more frames come."""
+        stream, self._stream = self._stream, None
+        if stream is None:
+            return
+        with contextlib.suppress(CameraError):  # it may be gone
+            self._ask("stop_acquisition")
+        self._aravis.release(stream.handle)
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self.stop()
+        camera, self._camera = self._camera, 0
+        if camera:
+            if self._hook:
+                self._aravis.unhook(camera, self._hook)
+            self._aravis.release(camera)
+
+    def _note_loss(self, *_: object) -> None:
+        """Called in a thread of Aravis when the camera is gone."""
+        self._is_lost = True
+
+
+@dataclass
+class _Stream:
+    """Frames that come, and what is known of their numbers."""
+
+    handle: int
+    turns: int = 0
+    last: int = -1
+
+    def number(self, frame_id: int) -> int:
+        """Number of a frame that goes on where 16 bits begin anew."""
+        if frame_id < self.last <= LARGEST_SHORT_ID and self.last - frame_id > LARGEST_SHORT_ID / 2:
+            self.turns += 1
+        self.last = frame_id
+        return frame_id + self.turns * LARGEST_SHORT_ID

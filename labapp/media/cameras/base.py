@@ -1,0 +1,274 @@
+"""A camera: what it is, what can be set, and its frames as they come.
+
+Every back-end gives the same: `Camera`. What keeps one going whatever it does is `feed.Feed`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from types import TracebackType
+from typing import Any, Literal, Protocol, Self
+
+from labapp.core.values import freeze
+from labapp.errors import InputError
+from labapp.media.base import GreyImage
+
+Trigger = Literal["free", "software", "line"]
+"""When a frame is taken: at the camera's own rate, when told to, at a signal on its input."""
+
+Region = tuple[int, int, int, int]
+"""(u, v, width, height) of the part of the sensor that is read out, px."""
+
+NUMBERS = {"exposure_us": "µs", "gain_db": "dB", "rate_hz": "frames/s"}
+"""What is set by a number, and its unit."""
+
+
+class CameraError(Exception):
+    """A camera does not do what was asked; the message says what, and what to do about it."""
+
+
+class CameraLost(CameraError):
+    """The camera is gone, or no longer ours: nothing more comes until it is opened again."""
+
+
+class BrokenFrame(CameraError):
+    """A frame arrived that is not whole; the next may be."""
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A camera that was found.
+
+    Parameters
+    ----------
+    id
+        What it is opened by: "uvc:0", "aravis:Vendor-Serial", "simulated:cap.toml".
+    name
+        Maker and model, as it says itself.
+    kind
+        How it is connected: "USB video", "GigE Vision", "USB3 Vision", "simulated".
+    """
+
+    id: str
+    name: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Range:
+    """What a number may be set to: from ``lowest`` to ``highest``, both included."""
+
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What can be set on a camera; None for what cannot.
+
+    Parameters
+    ----------
+    exposure_us, gain_db, rate_hz
+        From where to where.
+    sensor
+        (width, height) of the whole picture, px.
+    least_region
+        (width, height) of the smallest region, px; None where no region can be set.
+    triggers
+        The triggers it knows, "free" among them.
+    """
+
+    exposure_us: Range | None = None
+    gain_db: Range | None = None
+    rate_hz: Range | None = None
+    sensor: tuple[int, int]
+    least_region: tuple[int, int] | None = None
+    triggers: tuple[Trigger, ...] = ("free",)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+    """What a camera is set to, or is to be; None: unknown, or left as it is.
+
+    Parameters
+    ----------
+    exposure_us
+        How long light is gathered for a frame, µs.
+    gain_db
+        Amplification, dB (of USB video the driver's own number).
+    rate_hz
+        Frames a second.
+    region
+        See `Region`.
+    trigger
+        See `Trigger`.
+    """
+
+    exposure_us: float | None = None
+    gain_db: float | None = None
+    rate_hz: float | None = None
+    region: Region | None = None
+    trigger: Trigger | None = None
+
+    def asked(self) -> dict[str, Any]:
+        """What is not left as it is, by name."""
+        found = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class CameraFrame:
+    """A frame as a camera gave it.
+
+    Parameters
+    ----------
+    number
+        The camera's own count; a gap tells of frames that were lost on the way.
+    time_s
+        The camera's clock, s; by the computer's where the camera has none.
+    arrived_s
+        `time.monotonic` when it was here, s.
+    image
+        Grey levels, shape (rows, columns), uint8 or uint16, read-only.
+    """
+
+    number: int
+    time_s: float
+    arrived_s: float
+    image: GreyImage = field(repr=False)
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+class Camera(Protocol):
+    """A camera that is open. Used by one thread at a time.
+
+    Attributes
+    ----------
+    info
+        Which it is.
+    limits
+        What can be set.
+    bit_depth
+        Significant bits of a grey level.
+    """
+
+    info: CameraInfo
+    limits: Limits
+    bit_depth: int
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What it is set to, as the camera says: it rounds, and one setting bounds another."""
+        ...
+
+    def apply(self, wanted: CameraSettings) -> CameraSettings:
+        """Set what is not None in ``wanted``; not while frames come.
+
+        Returns
+        -------
+        CameraSettings
+            What it is set to now.
+
+        Raises
+        ------
+        InputError
+            If a value is out of range or cannot be set; nothing is changed then.
+        CameraError
+            If the camera refuses.
+        """
+        ...
+
+    def start(self) -> None:
+        """Let frames come, numbered from any number on."""
+        ...
+
+    def read(self, timeout_s: float) -> CameraFrame | None:
+        """Wait for the next frame; None when none came in time.
+
+        Raises
+        ------
+        BrokenFrame
+            If one came that is not whole.
+        CameraLost
+            If none will come any more.
+        """
+        ...
+
+    def trigger(self) -> None:
+        """Take a frame now; with the trigger "software" only."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """Frames since `start` that camera or driver had no room for and no number shows."""
+        ...
+
+    def stop(self) -> None:
+        """Let no more frames come; settings may be changed then. Twice does no harm."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the camera. Closing twice does no harm."""
+        ...
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def check_settings(info: CameraInfo, limits: Limits, wanted: CameraSettings) -> None:
+    """Refuse what a camera cannot be set to.
+
+    Raises
+    ------
+    InputError
+        That names every such setting.
+    """
+    problems = []
+    for name, unit in NUMBERS.items():
+        value, span = getattr(wanted, name), getattr(limits, name)
+        if value is None:
+            continue
+        if span is None:
+            problems.append(_cannot(info, name, value))
+        elif not span.lowest <= value <= span.highest:
+            bounds = f"from {span.lowest:.6g} to {span.highest:.6g} ({unit})"
+            problems.append(InputError(info.id, name, value, bounds))
+    if wanted.trigger is not None and wanted.trigger not in limits.triggers:
+        known = "one of " + ", ".join(limits.triggers)
+        problems.append(InputError(info.id, "trigger", wanted.trigger, known))
+    problems += _check_region(info, limits, wanted.region)
+    if problems:
+        raise InputError.gather(problems)
+
+
+def _check_region(info: CameraInfo, limits: Limits, region: Region | None) -> list[InputError]:
+    if region is None:
+        return []
+    if limits.least_region is None:
+        if region == (0, 0, *limits.sensor):
+            return []
+        return [_cannot(info, "region", region)]
+    u, v, width, height = region
+    least, sensor = limits.least_region, limits.sensor
+    fits = min(u, v) >= 0 and u + width <= sensor[0] and v + height <= sensor[1]
+    if fits and width >= least[0] and height >= least[1]:
+        return []
+    right = (
+        f"(u, v, width, height) within {sensor[0]}×{sensor[1]} px, "
+        f"at least {least[0]}×{least[1]} px"
+    )
+    return [InputError(info.id, "region", region, right)]
+
+
+def _cannot(info: CameraInfo, name: str, value: object) -> InputError:
+    return InputError(info.id, name, value, f"nothing: {info.name} does not let it be set")

@@ -1,0 +1,275 @@
+"""A camera that is simulated: any pictures at any rate, and every fault that a real one has.
+
+What it is plugged into is a `SimulatedDevice`, which goes on while cameras are opened and closed.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from labapp.media.base import GreyImage
+from labapp.media.cameras.base import (
+    BrokenFrame,
+    Camera,
+    CameraError,
+    CameraFrame,
+    CameraInfo,
+    CameraLost,
+    CameraSettings,
+    Limits,
+    Range,
+    check_settings,
+)
+
+BUFFERED = 64
+"""Frames that wait for their reader; more are dropped, as a driver does."""
+
+LEAST_SIDE = 16
+
+HIGHEST_HZ = 10_000.0
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong by itself; everything random follows from the seed.
+
+    Parameters
+    ----------
+    garbage
+        Part of the frames that arrive cut off, of another size or of another type, 0 … 1.
+    dropped
+        Part of the frames that never arrive, 0 … 1.
+    unplug_every, unplugged_s
+        After so many frames the cable is out for so long, s; 0: never.
+    stall_every, stalled_s
+        After so many frames none come for so long, s; 0: never.
+    seed
+        Of what is random.
+    """
+
+    garbage: float = 0.0
+    dropped: float = 0.0
+    unplug_every: int = 0
+    unplugged_s: float = 0.2
+    stall_every: int = 0
+    stalled_s: float = 0.5
+    seed: int = 0
+
+
+class SimulatedDevice:
+    """A camera on the bench that is not there.
+
+    Parameters
+    ----------
+    name
+        What to call it; its id is "simulated:" and that.
+    picture
+        Frame k, shape (rows, columns), uint8 or uint16; called by the thread that reads, at the
+        camera's rate, with k = 0, 1, 2 …
+    bit_depth
+        Significant bits of a grey level.
+    rate_hz
+        Frames a second at first.
+    faults
+        What goes wrong by itself.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        picture: Callable[[int], GreyImage],
+        *,
+        bit_depth: int = 8,
+        rate_hz: float = 60.0,
+        faults: Faults | None = None,
+    ) -> None:
+        self.info = CameraInfo(f"simulated:{name}", f"simulated {name}", "simulated")
+        self.picture = picture
+        self.bit_depth = bit_depth
+        self.faults = faults or Faults()
+        rows, columns = picture(0).shape
+        self.sensor = (columns, rows)
+        self.settings = CameraSettings(rate_hz=rate_hz, region=(0, 0, columns, rows))
+        self.taken = 0
+        """Frames exposed since it was made; what is drawn from the seed is told by this number."""
+        self.disconnects = 0
+        self._unplugged_until_s = 0.0
+        self._stalled_until_s = 0.0
+
+    def open(self) -> SimulatedCamera:
+        """Open it as a camera.
+
+        Raises
+        ------
+        CameraLost
+            If it is unplugged.
+        """
+        if not self.plugged:
+            raise CameraLost(f"{self.info.name} is not connected")
+        return SimulatedCamera(self)
+
+    @property
+    def plugged(self) -> bool:
+        """Whether its cable is in."""
+        return time.monotonic() >= self._unplugged_until_s
+
+    @property
+    def stalled_s(self) -> float:
+        """How much longer no frame comes, s."""
+        return max(0.0, self._stalled_until_s - time.monotonic())
+
+    def unplug(self, seconds: float = float("inf")) -> None:
+        """Pull its cable, for so long."""
+        self.disconnects += 1
+        self._unplugged_until_s = time.monotonic() + seconds
+
+    def plug(self) -> None:
+        """Put its cable back."""
+        self._unplugged_until_s = 0.0
+
+    def stall(self, seconds: float) -> None:
+        """Let no frame come for so long."""
+        self._stalled_until_s = time.monotonic() + seconds
+
+    def expose(self) -> tuple[GreyImage, Literal["", "lost", "cut off"]]:
+        """Take the next frame, and what happens to it on its way."""
+        number, faults = self.taken, self.faults
+        self.taken += 1
+        u, v, width, height = self.settings.region or (0, 0, *self.sensor)
+        image = self.picture(number)[v : v + height, u : u + width]
+        if faults.unplug_every and self.taken % faults.unplug_every == 0:
+            self.unplug(faults.unplugged_s)
+        if faults.stall_every and self.taken % faults.stall_every == 0:
+            self.stall(faults.stalled_s)
+        if not (faults.garbage or faults.dropped):
+            return image, ""
+        lot, form = np.random.default_rng([faults.seed, number]).uniform(size=2)
+        if lot < faults.dropped:
+            return image, "lost"
+        if lot < faults.dropped + faults.garbage:
+            if form < 1 / 3:
+                return image, "cut off"
+            return (image[: height // 2] if form < 2 / 3 else image.astype(np.float32)), ""
+        return image, ""
+
+
+class SimulatedCamera(Camera):
+    """A `SimulatedDevice` that is open; see `Camera`."""
+
+    def __init__(self, device: SimulatedDevice) -> None:
+        self.info = device.info
+        self.bit_depth = device.bit_depth
+        self.limits = Limits(
+            rate_hz=Range(0.1, HIGHEST_HZ),
+            sensor=device.sensor,
+            least_region=(min(LEAST_SIDE, device.sensor[0]), min(LEAST_SIDE, device.sensor[1])),
+            triggers=("free", "software"),
+        )
+        self._device = device
+        self._begun_s: float | None = None
+        self._next = 0
+        self._pulled = threading.Semaphore(0)
+        self._overrun = 0
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What it is set to."""
+        return replace(self._device.settings, trigger=self._device.settings.trigger or "free")
+
+    def apply(self, wanted: CameraSettings) -> CameraSettings:
+        """Set what is wanted; see `Camera.apply`."""
+        if self._begun_s is not None:
+            raise CameraError(f"{self.info.name} is running: stop it before it is set")
+        check_settings(self.info, self.limits, wanted)
+        for name in ("exposure_us", "gain_db"):
+            assert getattr(wanted, name) is None  # no limits: refused above
+        self._device.settings = replace(self._device.settings, **wanted.asked())
+        return self.settings
+
+    def start(self) -> None:
+        """Let frames come."""
+        self._begun_s = time.monotonic()
+        self._next = self._overrun = 0
+
+    def read(self, timeout_s: float) -> CameraFrame | None:
+        """Wait for the next frame; see `Camera.read`."""
+        until_s = time.monotonic() + timeout_s
+        while True:
+            number = self._await(until_s)
+            if not self._device.plugged:
+                self._begun_s = None
+                raise CameraLost(f"{self.info.name} was unplugged")
+            if number is None:
+                return None
+            image, fate = self._device.expose()
+            if fate == "cut off":
+                raise BrokenFrame("it was cut off on its way")
+            if fate != "lost":
+                now_s = time.monotonic()
+                return CameraFrame(number, self._clock_s(number, now_s), now_s, image)
+
+    def trigger(self) -> None:
+        """Take a frame now."""
+        if self.settings.trigger != "software":
+            raise CameraError(f'{self.info.name} is not set to the trigger "software"')
+        self._pulled.release()
+
+    @property
+    def dropped(self) -> int:
+        """Frames its reader came too late for."""
+        return self._overrun
+
+    def stop(self) -> None:
+        """Let no more frames come."""
+        self._begun_s = None
+
+    def close(self) -> None:
+        """Let go of the device."""
+        self.stop()
+
+    def _await(self, until_s: float) -> int | None:
+        """Wait until the next frame is due; its number, None if it is due only later."""
+        if self._begun_s is None:
+            raise CameraError(f"{self.info.name} was not started")
+        if self.settings.trigger == "software":
+            left_s = max(0.0, until_s - time.monotonic())
+            number = self._next if self._pulled.acquire(timeout=left_s) else None
+        else:
+            number = self._await_due(until_s)
+        if number is not None:
+            self._next = number + 1
+        return number
+
+    def _await_due(self, until_s: float) -> int | None:
+        assert self._begun_s is not None
+        period_s = 1 / (self._device.settings.rate_hz or 1.0)
+        now_s = time.monotonic()
+        if (stalled_s := self._device.stalled_s) > 0:
+            time.sleep(max(0.0, min(stalled_s, until_s - now_s)))
+            # It did not count on meanwhile.
+            self._begun_s += time.monotonic() - now_s
+            return None
+        due_s = self._begun_s + self._next * period_s
+        late = int((now_s - due_s) / period_s)
+        if late > BUFFERED:
+            self._overrun += late
+            self._device.taken += late
+            self._begun_s += late * period_s
+        elif due_s > until_s:
+            time.sleep(max(0.0, until_s - now_s))
+            return None
+        elif due_s > now_s:
+            time.sleep(due_s - now_s)
+        return self._next
+
+    def _clock_s(self, number: int, now_s: float) -> float:
+        """When frame ``number`` was taken, s."""
+        if self.settings.trigger == "software" or self._begun_s is None:
+            return now_s
+        return self._begun_s + number / (self._device.settings.rate_hz or 1.0)

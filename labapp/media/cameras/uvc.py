@@ -1,0 +1,244 @@
+"""USB cameras that every system has a driver for (UVC, Video4Linux), through OpenCV."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from labapp.media.base import to_grey
+from labapp.media.cameras.base import (
+    BrokenFrame,
+    Camera,
+    CameraError,
+    CameraFrame,
+    CameraInfo,
+    CameraLost,
+    CameraSettings,
+    Limits,
+    Range,
+    check_settings,
+)
+from labapp.media.quiet import quiet_opencv
+
+PREFIX = "uvc:"
+
+KIND = "USB video"
+
+LISTED = Path("/sys/class/video4linux")
+
+EXPOSURE, GAIN = 0x009A0902, 0x00980913
+"""Controls by Video4Linux's numbers (linux/v4l2-controls.h)."""
+
+QUERY = struct.Struct("II32siiiiI8x")
+"""v4l2_queryctrl: id, type, name, least, most, step, usual, flags."""
+
+QUERY_CONTROL = 0xC0445624
+DISABLED = 0x0001
+
+EXPOSURE_UNIT_US = 100.0
+
+MANUAL = 1
+"""Of the exposure, in Video4Linux: nothing changes it but who sets it."""
+
+GREY_FORMATS = {"GREY": 8, "Y16 ": 16}
+"""Formats without colour, and their bits; of any other the luminance is taken."""
+
+HIGHEST_HZ = 1000.0
+
+Capture = Callable[[int], Any]
+"""Opens `cv2.VideoCapture` of a device's number."""
+
+Query = Callable[[int, int], Range | None]
+"""What a control of a device may be set to: (device's number, control)."""
+
+Present = Callable[[int], bool]
+"""Whether there is such a device."""
+
+
+def find_uvc(listed: Path = LISTED) -> list[CameraInfo]:
+    """Cameras that the system lists; of a camera's several devices the one with its pictures."""
+    found = []
+    for entry in sorted(listed.glob("video*"), key=lambda path: int(path.name[5:] or 0)):
+        with contextlib.suppress(OSError):
+            if (entry / "index").read_text().strip() == "0":
+                name = (entry / "name").read_text(errors="replace").strip()
+                found.append(CameraInfo(f"{PREFIX}{entry.name[5:]}", name, KIND))
+    return found
+
+
+def _captured(number: int) -> Any:
+    return cv2.VideoCapture(number, cv2.CAP_V4L2)
+
+
+def _is_present(number: int) -> bool:
+    return os.path.exists(f"/dev/video{number}")
+
+
+def query_control(number: int, control: int) -> Range | None:
+    """Ask the driver what a control may be set to; None where there is no such control."""
+    asked = QUERY.pack(control, 0, b"", 0, 0, 0, 0, 0)
+    try:
+        device = os.open(f"/dev/video{number}", os.O_RDWR | os.O_NONBLOCK)
+    except OSError:
+        return None
+    try:
+        fields = QUERY.unpack(fcntl.ioctl(device, QUERY_CONTROL, asked))
+    except OSError:
+        return None
+    finally:
+        os.close(device)
+    return None if fields[7] & DISABLED else Range(float(fields[3]), float(fields[4]))
+
+
+class UvcCamera(Camera):
+    """A USB camera that is open; see `Camera`.
+
+    Its driver numbers no frames: what is lost on the way does not show. OpenCV's own driver
+    chooses the nearest size and rate that the camera has.
+
+    Parameters
+    ----------
+    info
+        One of `find_uvc`.
+    capture, query, present
+        OpenCV and the driver; in tests others.
+
+    Raises
+    ------
+    CameraError
+        If it is not there, or not to be opened.
+    """
+
+    def __init__(
+        self,
+        info: CameraInfo,
+        capture: Capture = _captured,
+        query: Query = query_control,
+        present: Present = _is_present,
+    ) -> None:
+        quiet_opencv()
+        self.info = info
+        self._number = int(info.id.removeprefix(PREFIX))
+        self._present = present
+        self._capture = capture(self._number)
+        if not self._capture.isOpened():
+            raise CameraLost(self._why_closed())
+        self.bit_depth = self._choose_format()
+        exposure, gain = query(self._number, EXPOSURE), query(self._number, GAIN)
+        if exposure is not None:
+            self._set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
+            exposure = Range(
+                exposure.lowest * EXPOSURE_UNIT_US, exposure.highest * EXPOSURE_UNIT_US
+            )
+        self.limits = Limits(
+            exposure_us=exposure,
+            gain_db=gain,
+            rate_hz=Range(1.0, HIGHEST_HZ),
+            sensor=(self._get(cv2.CAP_PROP_FRAME_WIDTH), self._get(cv2.CAP_PROP_FRAME_HEIGHT)),
+        )
+        self._count = 0
+        self._running = False
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What it is set to, as its driver says."""
+        exposure = self._capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_US
+        rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
+        return CameraSettings(
+            exposure_us=exposure if self.limits.exposure_us else None,
+            gain_db=self._capture.get(cv2.CAP_PROP_GAIN) if self.limits.gain_db else None,
+            rate_hz=rate_hz if rate_hz > 0 else None,
+            region=(0, 0, *self.limits.sensor),
+            trigger="free",
+        )
+
+    def apply(self, wanted: CameraSettings) -> CameraSettings:
+        """Set what is wanted; see `Camera.apply`."""
+        if self._running:
+            raise CameraError(f"{self.info.name} is running: stop it before it is set")
+        check_settings(self.info, self.limits, wanted)
+        if wanted.rate_hz is not None:
+            self._set(cv2.CAP_PROP_FPS, wanted.rate_hz)
+        if wanted.exposure_us is not None:
+            self._set(cv2.CAP_PROP_EXPOSURE, round(wanted.exposure_us / EXPOSURE_UNIT_US))
+        if wanted.gain_db is not None:
+            self._set(cv2.CAP_PROP_GAIN, round(wanted.gain_db))
+        return self.settings
+
+    def start(self) -> None:
+        """Let frames come."""
+        self._running, self._count = True, 0
+
+    def read(self, timeout_s: float) -> CameraFrame | None:
+        """Wait for the next frame; see `Camera.read`.
+
+        OpenCV cannot be told how long: of a camera that is silent it waits for ten seconds.
+        """
+        if not self._running:
+            raise CameraError(f"{self.info.name} was not started")
+        begun_s = time.monotonic()
+        if not self._capture.grab():
+            if not self._present(self._number):
+                raise CameraLost(f"{self.info.name} was unplugged")
+            time.sleep(max(0.0, begun_s + timeout_s - time.monotonic()))
+            return None
+        arrived_s = time.monotonic()
+        number, self._count = self._count, self._count + 1
+        is_whole, image = self._capture.retrieve()
+        if not is_whole or image is None or image.size == 0:
+            raise BrokenFrame("it cannot be decoded")
+        stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+        time_s = stamp_ms / 1000 if stamp_ms > 0 else arrived_s
+        return CameraFrame(number, time_s, arrived_s, to_grey(image))
+
+    def trigger(self) -> None:
+        """Not possible."""
+        raise CameraError(f"{self.info.name} takes frames by itself only")
+
+    @property
+    def dropped(self) -> int:
+        """None that its driver would tell of."""
+        return 0
+
+    def stop(self) -> None:
+        """Let no more frames come."""
+        self._running = False
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self.stop()
+        self._capture.release()
+
+    def _get(self, name: int) -> int:
+        return round(float(self._capture.get(name)))
+
+    def _set(self, name: int, value: float) -> None:
+        if not self._capture.set(name, value):
+            raise CameraError(f"{self.info.name} refuses a setting that it says to have ({value})")
+
+    def _choose_format(self) -> int:
+        """Bits of the format: one without colour where the camera has it."""
+        for name, bits in GREY_FORMATS.items():
+            code = cv2.VideoWriter.fourcc(*name)
+            self._capture.set(cv2.CAP_PROP_FOURCC, code)
+            if self._get(cv2.CAP_PROP_FOURCC) == code:
+                self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+                return bits
+        return 8
+
+    def _why_closed(self) -> str:
+        device = f"/dev/video{self._number}"
+        if not self._present(self._number):
+            return f"{self.info.name} is not connected"
+        if not os.access(device, os.R_OK | os.W_OK):
+            join = "sudo usermod -aG video $USER"
+            return f"{device} may not be read: join the group that may ({join}) and log in anew"
+        return f"{self.info.name} is used by another program: close that"

@@ -1,0 +1,156 @@
+"""Writes frames as a video that loses nothing and is whole up to wherever it is cut off.
+
+NUT (docs/adr/0014): every frame is written at once, with its own time to the microsecond.
+"""
+
+from __future__ import annotations
+
+import errno
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal, Protocol, cast
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from av.video.stream import VideoStream
+
+from labapp.errors import InputError
+from labapp.media.base import GreyImage
+
+Codec = Literal["ffv1", "raw"]
+
+TICKS_HZ = 1_000_000
+
+BUFFER_BYTE = 1 << 22
+"""A frame that fits goes to the file in one piece."""
+
+FFV1 = {"level": "3", "slices": "4", "slicecrc": "1", "g": "1", "context": "0"}
+"""Every frame by itself, four slices for as many threads, each with a checksum."""
+
+
+class ByteFile(Protocol):
+    """What is written to: a file without a buffer of its own."""
+
+    def write(self, content: bytes) -> int:
+        """Write it, or raise OSError."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it."""
+        ...
+
+
+class NutWriter:
+    """A video in NUT that is being written.
+
+    Parameters
+    ----------
+    path
+        Where to; must not be there yet.
+    shape
+        (rows, columns) of every frame.
+    bit_depth
+        Significant bits of a grey level: to 8 uint8 is written, beyond uint16.
+    rate_hz
+        Frames a second, as the video's header has it; frames have times of their own.
+    codec
+        ``ffv1``: about half the size; ``raw``: the levels as they are.
+    threads
+        That encode.
+    file
+        What to write to, in place of a file at ``path``.
+
+    Raises
+    ------
+    InputError
+        If the file is there already or cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        shape: tuple[int, int],
+        bit_depth: int,
+        rate_hz: float,
+        codec: Codec = "ffv1",
+        threads: int = 2,
+        file: ByteFile | None = None,
+    ) -> None:
+        self.frames = 0
+        self._file = _made(path) if file is None else file
+        self._shape, self._top = shape, 2**bit_depth - 1
+        self._dtype = np.uint8 if bit_depth <= 8 else np.uint16
+        options = {"flush_packets": "1"}
+        self._container = av.open(
+            self._file, "w", format="nut", options=options, buffer_size=BUFFER_BYTE
+        )
+        rate = Fraction(rate_hz).limit_denominator(1000) or Fraction(1)
+        name = "ffv1" if codec == "ffv1" else "rawvideo"
+        stream = cast(VideoStream, self._container.add_stream(name, rate=rate))
+        stream.height, stream.width = shape
+        self._format = stream.pix_fmt = (
+            "gray" if bit_depth <= 8 else f"gray{_levels(bit_depth, codec)}le"
+        )
+        stream.time_base = stream.codec_context.time_base = Fraction(1, TICKS_HZ)
+        if codec == "ffv1":
+            # Golomb-Rice is the faster coder; it has 8 bits only.
+            coder = {"coder": "0" if bit_depth <= 8 else "1"}
+            stream.codec_context.options = FFV1 | coder
+            stream.codec_context.thread_count = threads
+        self._stream = stream
+        self._last = -1
+
+    def write(self, image: GreyImage, time_s: float) -> None:
+        """Write a frame; when this returns it is in the file.
+
+        Parameters
+        ----------
+        image
+            Grey levels of the right shape and type.
+        time_s
+            Since the first frame, s; one that is not later than that before counts as 1 µs later.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written: frames before it are whole.
+        ValueError
+            If it is of another shape or has levels of more bits.
+        """
+        if image.shape != self._shape or image.dtype != self._dtype or image.max() > self._top:
+            raise ValueError(f"a frame of {image.shape}, {image.dtype}, up to {image.max()}")
+        levels = np.ascontiguousarray(image)
+        frame = av.VideoFrame.from_ndarray(levels, format=self._format)
+        self._last = max(self._last + 1, round(time_s * TICKS_HZ))
+        frame.pts, frame.time_base = self._last, Fraction(1, TICKS_HZ)
+        for packet in self._stream.encode(frame):
+            self._container.mux(packet)
+        self.frames += 1
+
+    def close(self) -> None:
+        """End the video with an index, where that can be written.
+
+        Raises
+        ------
+        OSError
+            If it cannot: the video is whole without.
+        """
+        try:
+            self._container.close()
+        except FFmpegError as error:
+            raise OSError(errno.EIO, "the index at its end cannot be written") from error
+        finally:
+            self._file.close()
+
+
+def _levels(bit_depth: int, codec: Codec) -> int:
+    """Bits that FFmpeg stores for so many: it has none for each, and of raw ones reads 16 only."""
+    return 16 if codec == "raw" else next(n for n in (10, 12, 14, 16) if n >= bit_depth)
+
+
+def _made(path: Path) -> ByteFile:
+    try:
+        return path.open("xb", buffering=0)
+    except OSError as error:
+        raise InputError(path, "recording", error.strerror, "a file that can be made") from error

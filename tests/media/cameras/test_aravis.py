@@ -1,0 +1,149 @@
+"""GenICam cameras, against Aravis's own fake GigE Vision camera on the loopback."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filelock import FileLock
+
+from labapp.errors import InputError
+from labapp.media import open_source
+from labapp.media.cameras import (
+    CameraError,
+    CameraFrame,
+    CameraLost,
+    CameraSettings,
+    Feed,
+    aravis,
+    find_cameras,
+    genicam,
+    open_camera,
+)
+from labapp.media.recorder import Plan, Recorder
+from tests.conftest import lacks
+from tests.media.cameras.watching import Heard, wait_until
+
+FAKE = Path(__file__).with_name("fake_gige.py")
+ID = "aravis:Aravis-Fake-LAB1"
+
+Plug = Callable[[], subprocess.Popen[str]]
+
+
+@pytest.fixture
+def plug() -> Iterator[Plug]:
+    """Let a fake camera run; all that still do are killed at the end.
+
+    There is one address for it on a machine: tests in other processes wait.
+    """
+    try:
+        ctypes.CDLL(genicam.LIBRARY)
+    except OSError:
+        lacks(f"{genicam.LIBRARY} is not installed")
+    running: list[subprocess.Popen[str]] = []
+
+    def start() -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, FAKE, "127.0.0.1", "LAB1"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        running.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "running\n"
+        return process
+
+    with FileLock(Path(tempfile.gettempdir(), "labapp_fake_gige.lock")):
+        yield start
+        for process in running:
+            process.kill()
+            process.communicate()
+
+
+def test_it_is_discovered_streamed_recorded_killed_and_brought_back(
+    plug: Plug, tmp_path: Path
+) -> None:
+    fake = plug()
+    found, problems = find_cameras()
+    assert not problems
+    assert [(info.name, info.kind) for info in found if info.id == ID] == [
+        ("Aravis Fake", "GigE Vision")
+    ]
+    heard = Heard()
+    frames: list[CameraFrame] = []
+    wanted = CameraSettings(region=(0, 0, 128, 96), rate_hz=100, exposure_us=2000)
+    with (
+        Recorder(lambda: tmp_path / "run.nut", Plan(), 8, 100, heard.append) as recorder,
+        Feed(ID, lambda: open_camera(ID), recorder.take, heard.append, wanted) as running,
+    ):
+        take = recorder.trigger()
+        wait_until(lambda: running.counts.frames >= 50)
+        fake.kill()
+        wait_until(lambda: running.state == "lost", 60)
+        before = running.counts.frames
+        plug()
+        wait_until(lambda: running.counts.frames >= before + 50, 60)
+        frames.append(running.camera.read(1.0) or pytest.fail("no frame"))
+        settings = running.camera.settings
+    assert frames[0].image.shape == (96, 128)
+    assert (settings.region, settings.rate_hz) == ((0, 0, 128, 96), 100)
+    assert running.counts.lost == 1
+    said = heard.words()
+    assert "does not answer any more. Trying to get it back" in said
+    assert "it is back after" in said
+    # What came before and after is in one recording, with the time that it was away.
+    assert (take.trouble, take.lost) == ("", 0)
+    with open_source(take.path) as video:
+        assert len(video) == take.frames >= before + 50
+        times_s = [frame.time_s for frame in video if frame.time_s is not None]
+        assert video.frame(0).image.std() > 0
+    steps_s = np.diff(times_s)
+    assert (steps_s > 0).all()
+    assert np.median(steps_s) == pytest.approx(0.01, rel=0.1)
+    assert steps_s.max() > 1
+
+
+def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:
+    plug()
+    with open_camera(ID) as camera:
+        found = camera.apply(
+            CameraSettings(exposure_us=5000, gain_db=3, rate_hz=50, region=(16, 8, 256, 128))
+        )
+        assert found == CameraSettings(
+            exposure_us=5000, gain_db=3, rate_hz=50, region=(16, 8, 256, 128), trigger="free"
+        )
+        with pytest.raises(InputError, match=r"exposure_us: 1; expected from 10 to 1e\+07 \(µs\)"):
+            camera.apply(CameraSettings(exposure_us=1))
+        with pytest.raises(InputError, match="within 2048×2048 px"):
+            camera.apply(CameraSettings(region=(2000, 0, 100, 100)))
+        assert camera.apply(CameraSettings(trigger="software")).trigger == "software"
+        with pytest.raises(CameraError, match="used by another program"):
+            open_camera(ID)
+
+
+def test_a_camera_that_is_not_there_is_said_to_be_away(plug: Plug) -> None:
+    with pytest.raises(CameraLost, match="aravis:Nobody-1 is not connected"):
+        open_camera("aravis:Nobody-1")
+
+
+def test_without_aravis_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(genicam, "LIBRARY", "libaravis-of-no-system.so.9")
+    monkeypatch.setattr(aravis, "aravis", genicam.Aravis)
+    _, problems = find_cameras()
+    assert [problem.partition(":")[2] for problem in problems] == [
+        " sudo apt install --no-install-recommends libaravis-0.8-0"
+    ]
+
+
+def test_numbers_go_on_where_sixteen_bits_begin_anew() -> None:
+    stream = aravis._Stream(0)
+    ids = [65533, 65534, 65535, 1, 2, 4, 65535, 1]
+    found = [stream.number(id) - 65533 for id in ids]
+    assert found == [0, 1, 2, 3, 4, 6, 65537, 65538]

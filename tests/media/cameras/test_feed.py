@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from labapp.errors import InputError
+from labapp.media.cameras import (
+    CameraFrame,
+    CameraLost,
+    CameraSettings,
+    Faults,
+    Feed,
+    SimulatedDevice,
+    feed,
+)
+from tests.media.cameras.watching import Heard, number_in, numbered, wait_until
+
+LONG_AGO_S = 0.05
+"""In place of seconds: a camera is silent for so long before it is said."""
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Retry and notice at once."""
+    monkeypatch.setattr(feed, "RETRY_S", (0.01,))
+    monkeypatch.setattr(feed, "SILENT_S", LONG_AGO_S)
+    monkeypatch.setattr(feed, "HOPELESS_S", 0.2)
+    monkeypatch.setattr(feed, "WAIT_S", 0.01)
+
+
+def test_every_frame_is_handed_on_with_its_number_and_time() -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    frames: list[CameraFrame] = []
+    with Feed("test", device.open, frames.append) as running:
+        wait_until(lambda: len(frames) >= 100)
+        assert running.state == "running"
+    assert running.state == "ended"
+    assert [number_in(frame.image) for frame in frames] == list(range(len(frames)))
+    assert [frame.number for frame in frames] == list(range(len(frames)))
+    assert frames[0].time_s == 0
+    assert np.diff([frame.time_s for frame in frames]) == pytest.approx(1e-3)
+    assert running.counts == feed.Counts(len(frames), 0, 0, 0)
+
+
+def test_what_cannot_be_opened_or_set_at_first_is_refused() -> None:
+    device = SimulatedDevice("test", numbered)
+    with pytest.raises(InputError, match="rate_hz"):
+        Feed("test", device.open, print, settings=CameraSettings(rate_hz=-1))
+    device.unplug()
+    with pytest.raises(CameraLost, match="not connected"):
+        Feed("test", device.open, print)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_it_survives_fifty_disconnects_and_garbage_and_says_all_of_it() -> None:
+    faults = Faults(garbage=0.05, dropped=0.02, unplug_every=40, unplugged_s=0.01, seed=3)
+    device = SimulatedDevice("test", numbered, rate_hz=2000, faults=faults)
+    frames: list[CameraFrame] = []
+    heard = Heard()
+    wanted = CameraSettings(region=(0, 0, 32, 16))
+    with Feed("test", device.open, frames.append, heard.append, wanted) as running:
+        wait_until(lambda: device.disconnects >= 50)
+    counts = running.counts
+    taken = device.taken
+    assert counts.lost >= 49
+    assert counts.frames == len(frames)
+    # Nothing is made up and nothing is mixed up: each frame once, in order, whole, as it was set.
+    told = [number_in(frame.image) for frame in frames]
+    assert told == sorted(set(told))
+    assert {frame.image.shape for frame in frames} == {(16, 32)}
+    for frame in frames[::50]:
+        assert np.array_equal(frame.image, numbered(number_in(frame.image))[:16])
+    assert 0 < counts.broken < 0.08 * taken
+    # What was lost just before the cable came out no camera can tell of.
+    assert 0 <= taken - (counts.frames + counts.broken + counts.dropped) <= 60
+    assert (np.diff([frame.time_s for frame in frames]) > 0).all()
+    assert (np.diff([frame.number for frame in frames]) > 0).all()
+    said = heard.words()
+    assert said.count("was unplugged. Trying to get it back") == counts.lost
+    assert said.count("it is back after") >= counts.lost - 1
+    assert "not whole, left out" in said
+    assert "lost on the way" in said
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_camera_that_stalls_is_said_to_and_goes_on() -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    frames: list[CameraFrame] = []
+    heard = Heard()
+    with Feed("test", device.open, frames.append, heard.append) as running:
+        wait_until(lambda: bool(frames))
+        device.stall(0.15)
+        wait_until(lambda: running.state == "stalled")
+        seen = len(frames)
+        wait_until(lambda: len(frames) > seen)
+        assert running.counts.lost == 0
+    assert "still connected" in heard.words()
+    assert "frames come again" in heard.words()
+
+
+@pytest.mark.usefixtures("hasty")
+def test_one_that_stalls_for_ever_is_opened_anew() -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    frames: list[CameraFrame] = []
+    heard = Heard()
+    with Feed("test", device.open, frames.append, heard.append) as running:
+        wait_until(lambda: bool(frames))
+        device.stall(3600)
+        wait_until(lambda: running.counts.lost > 0)
+        device.stall(0)
+        seen = len(frames)
+        wait_until(lambda: len(frames) > seen)
+    assert "no frame came for" in heard.words()
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_camera_that_waits_for_a_trigger_does_not_stall() -> None:
+    device = SimulatedDevice("test", numbered)
+    frames: list[CameraFrame] = []
+    heard = Heard()
+    wanted = CameraSettings(trigger="software")
+    with Feed("test", device.open, frames.append, heard.append, wanted) as running:
+        time.sleep(5 * LONG_AGO_S)
+        assert running.state == "running"
+        running.camera.trigger()
+        wait_until(lambda: len(frames) == 1)
+    assert not heard
+
+
+@pytest.mark.usefixtures("hasty")
+def test_it_ends_while_its_camera_is_away() -> None:
+    device = SimulatedDevice("test", numbered)
+    running = Feed("test", device.open, lambda _: None)
+    device.unplug()
+    wait_until(lambda: running.state == "lost")
+    running.stop()
+    running.stop()
+    assert running.state == "ended"
+
+
+def test_a_fault_of_whoever_takes_frames_is_said_and_lets_go_of_the_camera() -> None:
+    device = SimulatedDevice("test", numbered)
+    heard = Heard()
+    closed = threading.Event()
+
+    def opened():
+        camera = device.open()
+        camera.close = closed.set
+        return camera
+
+    def refuse(_: CameraFrame) -> None:
+        raise RuntimeError("a fault")
+
+    with Feed("test", opened, refuse, heard.append) as running:
+        wait_until(lambda: running.state == "ended")
+    assert closed.is_set()
+    assert "a fault in the program ended its pictures" in heard.words()

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.errors import InputError
+from labapp.media.cameras import (
+    BrokenFrame,
+    CameraError,
+    CameraInfo,
+    CameraLost,
+    CameraSettings,
+    Range,
+    open_camera,
+    uvc,
+)
+
+INFO = CameraInfo("uvc:2", "A webcam", "USB video")
+
+GREY = cv2.VideoWriter.fourcc(*"GREY")
+YUYV = cv2.VideoWriter.fourcc(*"YUYV")
+
+
+class Driver:
+    """Stands in for `cv2.VideoCapture` on Video4Linux, as its source has it."""
+
+    def __init__(self, *, grey: bool = True, opens: bool = True) -> None:
+        self.values = {
+            cv2.CAP_PROP_FRAME_WIDTH: 640.0,
+            cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
+            cv2.CAP_PROP_FPS: 30.0,
+            cv2.CAP_PROP_EXPOSURE: 156.0,
+            cv2.CAP_PROP_GAIN: 4.0,
+            cv2.CAP_PROP_FOURCC: float(YUYV),
+        }
+        self.grey, self.opens = grey, opens
+        self.plugged = self.whole = True
+        self.silent = False
+
+    def isOpened(self) -> bool:  # noqa: N802 - OpenCV calls it so
+        return self.opens
+
+    def get(self, name: int) -> float:
+        return self.values.get(name, 0.0)
+
+    def set(self, name: int, value: float) -> bool:
+        if name == cv2.CAP_PROP_FOURCC and not (self.grey and value == GREY):
+            return False
+        if name == cv2.CAP_PROP_FPS:
+            value = min((10, 30, 60), key=lambda own: abs(own - value))
+        self.values[name] = float(value)
+        return True
+
+    def grab(self) -> bool:
+        self.values[cv2.CAP_PROP_POS_MSEC] = self.get(cv2.CAP_PROP_POS_MSEC) + 1000 / 30
+        return self.plugged and not self.silent
+
+    def retrieve(self):
+        if not self.whole:
+            return False, None
+        colour = self.get(cv2.CAP_PROP_CONVERT_RGB) == 0 and self.grey
+        return True, np.full((480, 640) if colour else (480, 640, 3), 7, np.uint8)
+
+    def release(self) -> None:
+        self.opens = False
+
+
+def opened(driver: Driver, **controls: Range) -> uvc.UvcCamera:
+    known = {uvc.EXPOSURE: controls.get("exposure"), uvc.GAIN: controls.get("gain")}
+    return uvc.UvcCamera(
+        INFO,
+        capture=lambda number: driver if number == 2 else None,
+        query=lambda number, control: known[control],
+        present=lambda number: driver.plugged,
+    )
+
+
+def test_what_it_can_be_set_to_comes_of_its_driver() -> None:
+    driver = Driver()
+    with opened(driver, exposure=Range(3, 2047), gain=Range(0, 100)) as camera:
+        assert camera.limits.exposure_us == Range(300, 204700)
+        assert camera.limits.gain_db == Range(0, 100)
+        assert camera.limits.sensor == (640, 480)
+        assert driver.values[cv2.CAP_PROP_AUTO_EXPOSURE] == uvc.MANUAL
+        found = camera.apply(CameraSettings(exposure_us=2040, gain_db=7.6, rate_hz=50))
+    # As the driver has it: 20 units of 100 µs, whole gains, the nearest rate.
+    assert (found.exposure_us, found.gain_db, found.rate_hz) == (2000, 8, 60)
+    assert found.region == (0, 0, 640, 480)
+
+
+def test_one_without_controls_says_so() -> None:
+    with opened(Driver()) as camera:
+        assert (camera.limits.exposure_us, camera.limits.gain_db) == (None, None)
+        with pytest.raises(InputError, match="exposure_us: 100; expected nothing: A webcam"):
+            camera.apply(CameraSettings(exposure_us=100))
+        with pytest.raises(InputError, match="region"):
+            camera.apply(CameraSettings(region=(0, 0, 320, 240)))
+        camera.apply(CameraSettings(region=(0, 0, 640, 480)))
+
+
+@pytest.mark.parametrize("grey", [True, False])
+def test_frames_are_grey_with_the_drivers_time(grey: bool) -> None:
+    with opened(Driver(grey=grey)) as camera:
+        assert camera.bit_depth == 8
+        camera.start()
+        frames = [camera.read(0.1) for _ in range(3)]
+    assert all(frame is not None for frame in frames)
+    assert [frame.number for frame in frames if frame] == [0, 1, 2]
+    assert np.diff([frame.time_s for frame in frames if frame]) == pytest.approx(1 / 30)
+    for frame in frames:
+        assert frame is not None
+        assert (frame.image.shape, frame.image.dtype) == ((480, 640), np.uint8)
+        assert (frame.image == 7).all()
+
+
+def test_silence_garbage_and_a_pulled_cable_are_told_apart() -> None:
+    driver = Driver()
+    with opened(driver) as camera:
+        with pytest.raises(CameraError, match="was not started"):
+            camera.read(0.01)
+        camera.start()
+        driver.silent = True
+        assert camera.read(0.01) is None
+        driver.silent, driver.whole = False, False
+        with pytest.raises(BrokenFrame):
+            camera.read(0.01)
+        driver.plugged = False
+        with pytest.raises(CameraLost, match="A webcam was unplugged"):
+            camera.read(0.01)
+
+
+def test_why_it_cannot_be_opened_is_said() -> None:
+    driver = Driver(opens=False)
+    driver.plugged = False
+    with pytest.raises(CameraLost, match="not connected"):
+        opened(driver)
+    with pytest.raises(CameraLost, match="is not connected"):
+        open_camera("uvc:77")
+
+
+@pytest.mark.parametrize("id", ["uvc:x", "webcam", "uvc:"])
+def test_an_id_of_no_camera_is_refused(id: str) -> None:
+    with pytest.raises(InputError, match="as labapp cameras lists them"):
+        open_camera(id)
+
+
+def test_the_system_lists_a_camera_once(tmp_path: Path) -> None:
+    for name, index, title in (
+        ("video0", "0", "Webcam"),
+        ("video1", "1", "Webcam"),
+        ("video10", "0", "Microscope"),
+        ("video2", "0", "Another"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "index").write_text(f"{index}\n")
+        (tmp_path / name / "name").write_text(f"{title}\n")
+    (tmp_path / "video3").mkdir()  # being unplugged
+    found = uvc.find_uvc(tmp_path)
+    assert [(info.id, info.name) for info in found] == [
+        ("uvc:0", "Webcam"),
+        ("uvc:2", "Another"),
+        ("uvc:10", "Microscope"),
+    ]
+    assert uvc.find_uvc(tmp_path / "nothing") == []
