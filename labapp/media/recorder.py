@@ -1,0 +1,442 @@
+"""Records what a camera gives: from some seconds before the trigger on, without waiting for a disk.
+
+Frames go through a queue to a thread that writes; queue and ring buffer share a bounded memory.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from labapp.errors import InputError
+from labapp.media.cameras.base import CameraFrame
+from labapp.media.events import Event, Kind, Say, Tally, silent
+from labapp.media.nut import Codec, NutWriter
+
+NOTES = ("time_s", "frame", "source", "kind", "what")
+"""Columns of the notes beside a recording."""
+
+FRAME_BYTE = 200
+"""What a frame takes in memory besides its levels, about."""
+
+RATE_HZ = 25.0
+"""Stands in the video's header where the camera does not say its rate."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What of a camera's frames is recorded.
+
+    Parameters
+    ----------
+    before_s
+        So much from before the trigger, s.
+    after_s
+        So long after it, s; None: until it is stopped.
+    every
+        Every n-th frame.
+    codec
+        ``raw``, or ``ffv1``: less than half the size, for some 4 ms of a core a frame of 640×480.
+    memory_mb
+        What frames that wait may take, MB: those from before the trigger, and those that the disk
+        had no time for yet.
+
+    Raises
+    ------
+    InputError
+        If one is out of range.
+    """
+
+    before_s: float = 0.0
+    after_s: float | None = None
+    every: int = 1
+    codec: Codec = "raw"
+    memory_mb: float = 512.0
+
+    def __post_init__(self) -> None:
+        problems = [
+            InputError("recording", name, value, expected)
+            for name, value, right, expected in (
+                ("before_s", self.before_s, 0 <= self.before_s <= 3600, "0 to 3600 (s)"),
+                ("after_s", self.after_s, (self.after_s or 0) >= 0, "0 or more (s), or None"),
+                ("every", self.every, self.every >= 1, "1 or more"),
+                ("codec", self.codec, self.codec in ("ffv1", "raw"), "ffv1 or raw"),
+                ("memory_mb", self.memory_mb, self.memory_mb >= 1, "1 or more (MB)"),
+            )
+            if not right
+        ]
+        if problems:
+            raise InputError.gather(problems)
+
+
+@dataclass(eq=False)
+class Take:
+    """One recording, from its trigger on.
+
+    Parameters
+    ----------
+    path
+        The video. Notes are beside it, see `notes`.
+
+    Attributes
+    ----------
+    frames
+        Written so far.
+    lost
+        Left out for want of room in memory, or of a disk.
+    trouble
+        Why writing ended early; empty if it did not.
+    finished
+        Set when nothing more is written.
+    """
+
+    path: Path
+    frames: int = 0
+    lost: int = 0
+    trouble: str = ""
+    finished: threading.Event = field(default_factory=threading.Event)
+    triggered_s: float = 0.0
+
+    @property
+    def summary(self) -> Event:
+        """What became of it."""
+        words = f"{self.frames} frames recorded" + f", {self.lost} lost" * (self.lost > 0)
+        return Event(self.path.name, "loss" if self.lost else "note", words)
+
+    @property
+    def notes(self) -> Path:
+        """Table of what happened meanwhile: trigger, marks, frames lost (CSV)."""
+        return self.path.with_name(f"{self.path.stem}-notes.csv")
+
+
+@dataclass(frozen=True)
+class _Note:
+    """A row of the notes."""
+
+    time_s: float
+    event: Event
+
+
+_Item = tuple[Take, CameraFrame | _Note | None]
+"""What is to be done for a recording: write a frame or a note, or end it."""
+
+
+class Recorder:
+    """Takes every frame of a camera and records those that are wanted.
+
+    `take` never waits; what the disk has no time for yet waits in memory, and only when that is
+    full frames are left out, which is said. The methods may be called from any thread.
+
+    Parameters
+    ----------
+    place
+        Gives the file of a recording that begins; must not be there yet.
+    plan
+        What is recorded.
+    bit_depth, rate_hz
+        Of the camera.
+    say
+        Called with what happens.
+    writer
+        Opens the file of a recording: (path, shape, bit_depth, rate_hz, codec).
+    """
+
+    def __init__(
+        self,
+        place: Callable[[], Path],
+        plan: Plan,
+        bit_depth: int,
+        rate_hz: float | None,
+        say: Say = silent,
+        writer: Callable[..., NutWriter] = NutWriter,
+    ) -> None:
+        self.plan = plan
+        self.takes: list[Take] = []
+        self._place = place
+        self._bit_depth = bit_depth
+        self._rate_hz = (rate_hz or RATE_HZ) / plan.every
+        self._say = say
+        self._open = writer
+        self._memory_byte = round(plan.memory_mb * 1e6)
+        self._turn = threading.Condition()
+        self._ring: deque[CameraFrame] = deque()
+        self._queue: deque[_Item] = deque()
+        self._held_byte = 0
+        self._newest_s = 0.0
+        self._running: Take | None = None
+        self._closing = self._is_short = self._is_behind = False
+        self._lost = Tally(self._tell_lost)
+        self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
+        self._thread.start()
+
+    # --- what is wanted -----------------------------------------------------------------------
+
+    @property
+    def running(self) -> Take | None:
+        """The recording that frames go into now."""
+        return self._running
+
+    @property
+    def waiting_mb(self) -> float:
+        """Memory that frames take now, MB."""
+        return self._held_byte / 1e6
+
+    def take(self, frame: CameraFrame) -> None:
+        """Take a frame of the camera; never waits."""
+        told: list[tuple[Kind, str]] = []
+        with self._turn:
+            self._newest_s = frame.time_s
+            if frame.number % self.plan.every or self._closing:
+                return
+            size = frame.image.nbytes + FRAME_BYTE
+            while self._ring and (
+                self._ring[0].time_s < frame.time_s - self.plan.before_s
+                or self._held_byte + size > self._memory_byte
+            ):
+                if self._ring[0].time_s >= frame.time_s - self.plan.before_s:
+                    told += self._ring_is_short(frame)
+                self._held_byte -= self._ring.popleft().image.nbytes + FRAME_BYTE
+            running = self._running
+            has_room = self._held_byte + size <= self._memory_byte
+            if running is None and has_room and self.plan.before_s > 0:
+                self._ring.append(frame)
+                self._held_byte += size
+            elif running is not None:
+                told += self._record(running, frame, size if has_room else None)
+        for kind, words in told:
+            self._say(Event("recording", kind, words))
+        self._lost.flush()
+
+    def trigger(self) -> Take:
+        """Begin a recording, with the frames of the seconds before; the one that runs if one does.
+
+        Raises
+        ------
+        InputError
+            If there is a file of that name already.
+        """
+        with self._turn:
+            if self._running is not None:
+                return self._running
+            path = self._apart(self._place())
+            take = self._running = Take(path, triggered_s=self._newest_s)
+            self.takes.append(take)
+            self._queue.extend((take, frame) for frame in self._ring)
+            count = len(self._ring)
+            self._ring.clear()
+            self._add_note(take, Event("recording", "note", f"trigger, {count} frames before it"))
+            self._turn.notify()
+        self._say(Event(path.name, "note", "recording"))
+        return take
+
+    def stop(self) -> None:
+        """End the recording that runs; what waits is still written."""
+        self._lost.flush(now=True)
+        with self._turn:
+            if self._running is not None:
+                self._end(self._running)
+
+    def note(self, event: Event) -> None:
+        """Keep what happened beside the recording that runs: a mark, a camera that was gone."""
+        with self._turn:
+            if self._running is not None:
+                self._add_note(self._running, event)
+                self._turn.notify()
+
+    def close(self) -> None:
+        """End the recording, and wait until all of it is written. Twice does no harm."""
+        self.stop()
+        with self._turn:
+            self._closing = True
+            self._turn.notify()
+        self._thread.join()
+        self._lost.flush(now=True)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # --- in the camera's thread ---------------------------------------------------------------
+
+    def _record(self, take: Take, frame: CameraFrame, size: int | None) -> list[tuple[Kind, str]]:
+        """Queue a frame of the recording that runs; ``size`` None: there is no room for it."""
+        told: list[tuple[Kind, str]] = []
+        after_s = self.plan.after_s
+        if after_s is not None and frame.time_s > take.triggered_s + after_s:
+            self._end(take)
+            return told
+        if take.trouble or size is None:
+            take.lost += 1
+            if not take.trouble:
+                self._lost.count()
+            return told
+        self._queue.append((take, frame))
+        self._held_byte += size
+        if not self._is_behind and self._held_byte > self._memory_byte / 2:
+            self._is_behind = True
+            megabytes = self._held_byte / 1e6
+            words = f"writing does not keep up: {megabytes:.0f} MB wait in memory"
+            told.append(("warning", words))
+        self._turn.notify()
+        return told
+
+    def _ring_is_short(self, frame: CameraFrame) -> list[tuple[Kind, str]]:
+        if self._is_short:
+            return []
+        self._is_short = True
+        kept_s = frame.time_s - self._ring[0].time_s
+        words = (
+            f"only {kept_s:.2f} s before the trigger are kept, not {self.plan.before_s:g} s: "
+            f"{self.plan.memory_mb:g} MB hold no more"
+        )
+        return [("warning", words)]
+
+    def _apart(self, path: Path) -> Path:
+        """Give a path, or one beside it where a recording of ours is about to be."""
+        own, wanted = {take.path for take in self.takes}, path
+        for number in itertools.count(2):
+            if path not in own:
+                break
+            path = wanted.with_stem(f"{wanted.stem}-{number}")
+        if path.exists():
+            raise InputError(path, "recording", "is there already", "another name")
+        return path
+
+    def _end(self, take: Take) -> None:
+        self._queue.append((take, None))
+        self._running = None
+        self._turn.notify()
+
+    def _add_note(self, take: Take, event: Event) -> None:
+        self._queue.append((take, _Note(self._newest_s, event)))
+
+    def _tell_lost(self, count: int) -> None:
+        are = "1 frame is" if count == 1 else f"{count} frames are"
+        event = Event("recording", "loss", f"{are} lost: the disk is too slow, memory is full")
+        self._say(event)
+        self.note(event)
+
+    # --- in the writer's thread ---------------------------------------------------------------
+
+    def _write_on(self) -> None:
+        video: _Video | None = None
+        while True:
+            with self._turn:
+                self._turn.wait_for(lambda: self._queue or self._closing)
+                if not self._queue:
+                    break
+                take, item = self._queue.popleft()
+            if video is None or video.take is not take:
+                video = _Video(take, self._new_video)
+            try:
+                video.do(item)
+            except Exception as error:
+                self._give_up(take, error)
+                if item is None:
+                    take.finished.set()
+            self._forget(item, take)
+
+    def _new_video(self, take: Take, shape: tuple[int, int]) -> NutWriter:
+        return self._open(take.path, shape, self._bit_depth, self._rate_hz, self.plan.codec)
+
+    def _forget(self, item: CameraFrame | _Note | None, take: Take) -> None:
+        """Give the memory of what was written free; say when all was caught up with."""
+        caught_up = False
+        with self._turn:
+            if isinstance(item, CameraFrame):
+                self._held_byte -= item.image.nbytes + FRAME_BYTE
+            if self._is_behind and self._held_byte < self._memory_byte / 8:
+                self._is_behind, caught_up = False, True
+        if caught_up:
+            self._say(Event("recording", "note", "writing has caught up"))
+        if item is None:
+            self._lost.flush(now=True)
+            self._say(take.summary)
+
+    def _give_up(self, take: Take, error: Exception) -> None:
+        """Say why no more of a recording can be written; what is there stays."""
+        if take.trouble:
+            take.lost += 1
+            return
+        if not isinstance(error, OSError | InputError):
+            logging.getLogger("labapp").exception("recording %s", take.path)
+        reason = error.strerror if isinstance(error, OSError) else error
+        take.trouble = f"cannot be written: {reason}"
+        words = f"{take.trouble}; the {take.frames} frames written so far are whole"
+        self._say(Event(take.path.name, "loss", words))
+
+
+class _Video:
+    """A recording's files while they are written."""
+
+    def __init__(self, take: Take, opened: Callable[[Take, tuple[int, int]], NutWriter]) -> None:
+        self.take = take
+        self._opened = opened
+        self._video: NutWriter | None = None
+        self._early: list[_Note] = []
+        """Notes from before the first frame, whose time they are told by."""
+        self._first_s = self._last_s = take.triggered_s
+
+    def do(self, item: CameraFrame | _Note | None) -> None:
+        """Write a frame or a note; None: end it."""
+        if isinstance(item, CameraFrame):
+            self._write(item)
+        elif item is None:
+            try:
+                self._note_early()
+                if self._video is not None:
+                    self._note(_Note(self._last_s, self.take.summary))
+                    self._video.close()
+            finally:
+                self.take.finished.set()
+        elif self._video is None:
+            self._early.append(item)
+        else:
+            self._note(item)
+
+    def _write(self, frame: CameraFrame) -> None:
+        if self.take.trouble:
+            raise OSError(0, self.take.trouble)
+        if self._video is None:
+            rows, columns = frame.image.shape
+            self._video = self._opened(self.take, (rows, columns))
+            self._first_s = frame.time_s
+            self._note_early()
+        self._video.write(frame.image, frame.time_s - self._first_s)
+        self.take.frames += 1
+        self._last_s = frame.time_s
+
+    def _note_early(self) -> None:
+        early, self._early = self._early, []
+        for note in early:
+            self._note(note)
+
+    def _note(self, note: _Note) -> None:
+        began = not self.take.notes.exists()
+        time_s = note.time_s - self._first_s
+        event = note.event
+        row = (f"{time_s:.6f}", self.take.frames, event.source, event.kind, event.words)
+        text = io.StringIO(newline="")
+        csv.writer(text, lineterminator="\n").writerows([NOTES, row] if began else [row])
+        with self.take.notes.open("a", encoding="utf-8", newline="") as file:
+            file.write(text.getvalue())
+
+
+def recording_path(folder: Path, stem: str) -> Path:
+    """A file, not there yet, for a recording that begins now: its name ends in date and time."""
+    begun = time.strftime("%Y-%m-%d-%H%M%S")
+    path, count = folder / f"{stem}-{begun}.nut", 1
+    while path.exists():
+        count += 1
+        path = folder / f"{stem}-{begun}-{count}.nut"
+    return path

@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import csv
+import errno
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from labapp.errors import InputError
+from labapp.media import open_source
+from labapp.media.cameras import CameraFrame, Faults, Feed, SimulatedDevice, feed
+from labapp.media.events import Event
+from labapp.media.nut import NutWriter
+from labapp.media.recorder import Plan, Recorder, Take, recording_path
+from labapp.session.session import Session
+from tests.media.cameras.watching import Heard, number_in, numbered, wait_until
+
+RATE_HZ = 100.0
+
+
+class Disk:
+    """A file that can be stalled, and refuse what is beyond its room."""
+
+    def __init__(self, path: Path, room: float = float("inf")) -> None:
+        self.file, self.room = path.open("xb", buffering=0), room
+        self.goes = threading.Event()
+        self.goes.set()
+
+    def write(self, content: bytes) -> int:
+        self.goes.wait()
+        if len(content) > self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.room -= len(content)
+        return self.file.write(content)
+
+    def close(self) -> None:
+        self.file.close()
+
+
+def frame(k: int) -> CameraFrame:
+    return CameraFrame(k, k / RATE_HZ, 0.0, numbered(k))
+
+
+def numbers(take: Take) -> list[int]:
+    """The numbers of the frames in a recording."""
+    with open_source(take.path) as video:
+        return [number_in(each.image) for each in video]
+
+
+def notes(take: Take) -> list[dict[str, str]]:
+    with take.notes.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Callable[..., Recorder]:
+    """A recorder of a camera of 100 frames/s: (plan's fields …, say, writer)."""
+
+    def begin(say: Callable[[Event], None] = lambda _: None, **given: object) -> Recorder:
+        writer = given.pop("writer", NutWriter)
+        place = partial(recording_path, tmp_path, "run")
+        return Recorder(place, Plan(**given), 8, RATE_HZ, say, writer)
+
+    return begin
+
+
+Start = Callable[..., Recorder]
+
+
+def test_it_records_from_before_the_trigger_to_after_it(start: Start) -> None:
+    with start(before_s=0.1, after_s=0.2) as recorder:
+        for k in range(200):
+            if k == 100:
+                take = recorder.trigger()
+            recorder.take(frame(k))
+    # The newest frame when it was triggered is 99: from 0.1 s before that to 0.2 s after it.
+    assert numbers(take) == list(range(89, 120))
+    assert (take.frames, take.lost, take.trouble) == (31, 0, "")
+    with open_source(take.path) as video:
+        assert video.frame(0).time_s == 0
+        assert video.frame(30).time_s == pytest.approx(0.30)
+        assert video.frame_rate_hz == RATE_HZ
+    row, last = notes(take)
+    assert last["what"] == "31 frames recorded"
+    assert row["what"] == "trigger, 11 frames before it"
+    assert float(row["time_s"]) == pytest.approx(0.1)
+
+
+def test_it_records_until_it_is_stopped_and_every_third_frame(start: Start) -> None:
+    with start(every=3) as recorder:
+        for k in range(10):
+            recorder.take(frame(k))
+        take = recorder.trigger()
+        assert recorder.trigger() is take  # one at a time
+        for k in range(10, 40):
+            recorder.take(frame(k))
+        recorder.stop()
+        for k in range(40, 60):
+            recorder.take(frame(k))
+        assert take.finished.wait(10)
+    assert numbers(take) == list(range(12, 40, 3))
+    with open_source(take.path) as video:
+        assert video.frame_rate_hz == pytest.approx(RATE_HZ / 3, rel=1e-3)
+
+
+def test_recordings_follow_each_other_in_files_of_their_own(start: Start) -> None:
+    with start(before_s=0.05, after_s=0.1) as recorder:
+        for k in range(100):
+            if k in (20, 60):
+                recorder.trigger()
+            recorder.take(frame(k))
+    first, second = recorder.takes
+    assert numbers(first) == list(range(14, 30))
+    assert numbers(second) == list(range(54, 70))
+    assert first.path != second.path
+
+
+def test_marks_and_what_happened_are_kept_beside_it(start: Start) -> None:
+    with start() as recorder:
+        recorder.note(Event("pedal", "note", "before there is a recording"))
+        take = recorder.trigger()
+        for k in range(10):
+            recorder.take(frame(k))
+            if k == 4:
+                recorder.note(Event("pedal", "note", 'mark, "here"'))
+    found = notes(take)
+    assert [row["what"] for row in found] == [
+        "trigger, 0 frames before it",
+        'mark, "here"',
+        "10 frames recorded",
+    ]
+    assert (found[1]["source"], found[1]["kind"]) == ("pedal", "note")
+    assert float(found[1]["time_s"]) == pytest.approx(0.04)
+    assert int(found[1]["frame"]) == 5
+
+
+def test_a_stalled_disk_loses_nothing_that_memory_has_room_for(
+    start: Start, tmp_path: Path
+) -> None:
+    disk = Disk(tmp_path / "disk.nut")
+    disk.goes.clear()
+    heard = Heard()
+    writer = partial(NutWriter, file=disk)
+    with start(heard.append, memory_mb=1, writer=writer) as recorder:
+        take = recorder.trigger()
+        for k in range(800):  # of 968 bytes in memory each
+            recorder.take(frame(k))
+        assert 0.5 < recorder.waiting_mb < 1
+        assert "writing does not keep up" in heard.words()
+        disk.goes.set()
+        wait_until(lambda: recorder.waiting_mb == 0)
+        assert "writing has caught up" in heard.words()
+    assert (take.frames, take.lost) == (800, 0)
+    with open_source(tmp_path / "disk.nut") as video:
+        assert [number_in(each.image) for each in video] == list(range(800))
+
+
+def test_what_memory_has_no_room_for_is_left_out_and_said(start: Start, tmp_path: Path) -> None:
+    disk = Disk(tmp_path / "disk.nut")
+    disk.goes.clear()
+    heard = Heard()
+    writer = partial(NutWriter, file=disk)
+    with start(heard.append, memory_mb=1, writer=writer) as recorder:
+        take = recorder.trigger()
+        for k in range(1500):
+            recorder.take(frame(k))
+            assert recorder.waiting_mb <= 1
+        disk.goes.set()
+        wait_until(lambda: recorder.waiting_mb == 0)
+        for k in range(1500, 1600):
+            recorder.take(frame(k))
+    with open_source(tmp_path / "disk.nut") as video:
+        found = [number_in(each.image) for each in video]
+    assert len(found) + take.lost == 1600
+    assert found == [*range(1500 - take.lost), *range(1500, 1600)]
+    said = [event.words for event in heard if event.kind == "loss"]
+    counted = [int(words.split()[0]) for words in said if "memory is full" in words]
+    assert sum(counted) == take.lost > 0
+    assert f"{take.lost} lost" in said[-1]
+    assert any("memory is full" in row["what"] for row in notes(take))
+
+
+def test_seconds_before_that_memory_does_not_hold_are_said(start: Start) -> None:
+    heard = Heard()
+    with start(heard.append, before_s=60, memory_mb=1) as recorder:
+        for k in range(2000):
+            recorder.take(frame(k))
+            assert recorder.waiting_mb <= 1
+        take = recorder.trigger()
+    assert numbers(take) == list(range(2000 - take.frames, 2000))
+    assert take.frames == 1_000_000 // (24 * 32 + 200)
+    assert heard.words().count("before the trigger are kept, not 60 s") == 1
+
+
+def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: Path) -> None:
+    disk = Disk(tmp_path / "disk.nut", room=20 * 24 * 32)
+    heard = Heard()
+    writer = partial(NutWriter, file=disk)
+    with start(heard.append, writer=writer) as recorder:
+        take = recorder.trigger()
+        for k in range(100):
+            recorder.take(frame(k))
+        wait_until(lambda: bool(take.trouble))
+    assert "No space left on device" in take.trouble
+    assert take.finished.is_set()
+    assert 10 < take.frames < 20
+    assert take.frames + take.lost == 100
+    with open_source(tmp_path / "disk.nut") as video:
+        assert [number_in(each.image) for each in video] == list(range(take.frames))
+    assert f"the {take.frames} frames written so far are whole" in heard.words()
+
+
+def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
+    heard = Heard()
+    place = partial(recording_path, tmp_path / "away", "run")
+    with Recorder(place, Plan(), 8, RATE_HZ, heard.append) as recorder:
+        take = recorder.trigger()
+        recorder.take(frame(0))
+        wait_until(lambda: bool(take.trouble))
+    assert "No such file or directory" in take.trouble
+
+
+def test_a_file_that_is_there_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "mine.nut").write_text("mine")
+    with Recorder(lambda: tmp_path / "mine.nut", Plan(), 8, RATE_HZ) as recorder:
+        with pytest.raises(InputError, match="is there already"):
+            recorder.trigger()
+        assert recorder.running is None
+    assert (tmp_path / "mine.nut").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("before_s", -1),
+        ("before_s", float("nan")),
+        ("after_s", -1),
+        ("every", 0),
+        ("codec", "h264"),
+        ("memory_mb", 0),
+    ],
+)
+def test_a_plan_that_cannot_be_is_refused(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"recording: {name}: "):
+        Plan(**{name: value})  # type: ignore[arg-type]
+
+
+def test_nothing_recorded_is_lost_through_unplugging_garbage_and_a_stalled_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed, "RETRY_S", (0.01,))
+    faults = Faults(garbage=0.01, unplug_every=30, unplugged_s=0.03, stall_every=400, seed=9)
+    device = SimulatedDevice("test", numbered, rate_hz=1000, faults=faults)
+    disk = Disk(tmp_path / "disk.nut")
+    heard = Heard()
+    handed: list[int] = []
+    writer = partial(NutWriter, file=disk)
+    with Recorder(
+        lambda: tmp_path / "run.nut", Plan(memory_mb=4), 8, 1000, heard.append, writer
+    ) as recorder:
+        take = recorder.trigger()
+
+        def hand_on(each: CameraFrame) -> None:
+            handed.append(number_in(each.image))
+            recorder.take(each)
+
+        def say(event: Event) -> None:
+            heard.append(event)
+            recorder.note(event)
+
+        with Feed("camera", device.open, hand_on, say) as running:
+            wait_until(lambda: device.disconnects >= 20)
+            disk.goes.clear()
+            wait_until(lambda: device.disconnects >= 40)
+            disk.goes.set()
+            wait_until(lambda: device.disconnects >= 50, 60)
+    assert take.lost == 0
+    assert take.frames == len(handed) == running.counts.frames
+    with open_source(tmp_path / "disk.nut") as video:
+        assert [number_in(each.image) for each in video] == handed
+        times_s = [each.time_s for each in video]
+    assert (np.diff(np.array(times_s, float)) > 0).all()
+    told = [row["what"] for row in notes(take)]
+    assert sum("was unplugged" in words for words in told) == running.counts.lost >= 45
+    assert sum("is back" in words for words in told) >= 45
+
+
+def test_a_recording_goes_into_a_session_as_it_is(start: Start, tmp_path: Path) -> None:
+    with start(before_s=1, codec="ffv1") as recorder:
+        for k in range(30):
+            recorder.take(frame(k))
+        take = recorder.trigger()
+    with Session.create(tmp_path / "run.labsession") as session:
+        recording = session.import_recording(take.path)
+        assert recording.frame_exact
+        assert recording.description.startswith("NUT, FFV1, 32×24 px, 8 bit grey")
+        assert session.frames.tolist() == list(range(30))
+        assert np.array_equal(session.frame(17).image, numbered(17))
+        assert session.frame(17).time_s == pytest.approx(0.17)
