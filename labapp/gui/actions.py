@@ -59,9 +59,6 @@ class Action:
 
 MENUS = ("&File", "&Edit", "&Steps", "F&rames", "&View", "&Tools", "&Help")
 
-RECENT = "recent"
-"""The submenu of recent sessions stands after the action of the name `open`."""
-
 FILE = (
     Action(
         "new",
@@ -435,31 +432,33 @@ VIEW = (
     ),
 )
 
-TOOLS = (
-    Action(
-        "simulator",
-        "&Tools",
-        "&Simulator …",
-        "Ctrl+Shift+M",
-        "Render a recording of a pool that is known, with the truth about every dot",
-        lambda window: show_tool(window, "simulator"),
-    ),
-    Action(
-        "adviser",
-        "&Tools",
-        "Configuration &adviser …",
-        "Ctrl+Shift+A",
-        "Where laser and imaging plane should stand for the pools that are expected",
-        lambda window: show_tool(window, "adviser"),
-    ),
-    Action(
-        "analysis",
-        "&Tools",
-        "&Error analysis …",
-        "Ctrl+Shift+E",
-        "How large the error is, and what makes it: the budget of a set-up, and chapter 8",
-        lambda window: show_tool(window, "analysis"),
-    ),
+
+def _show(key: str) -> Callable[[MainWindow], object]:
+    return lambda window: show_tool(window, key)
+
+
+TOOLS = tuple(
+    Action(name, "&Tools", text, key, tip, _show(name))
+    for name, text, key, tip in (
+        (
+            "simulator",
+            "&Simulator …",
+            "Ctrl+Shift+M",
+            "Render a recording of a pool that is known, with the truth about every dot",
+        ),
+        (
+            "adviser",
+            "Configuration &adviser …",
+            "Ctrl+Shift+A",
+            "Where laser and imaging plane should stand for the pools that are expected",
+        ),
+        (
+            "analysis",
+            "&Error analysis …",
+            "Ctrl+Shift+E",
+            "How large the error is, and what makes it: the budget of a set-up, and chapter 8",
+        ),
+    )
 )
 
 HELP = (

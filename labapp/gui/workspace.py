@@ -44,6 +44,8 @@ class Workspace(QObject):
         Another frame is in view.
     said
         Something for the operator to read: a sentence, and whether it is a problem.
+    asked
+        An action of the window's menus is wanted, by its name.
     """
 
     closing = Signal()
@@ -52,6 +54,7 @@ class Workspace(QObject):
     measured = Signal()
     frame_changed = Signal(int)
     said = Signal(str, bool)
+    asked = Signal(str)
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)

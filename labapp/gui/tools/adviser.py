@@ -5,7 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtWidgets import QFileDialog, QLabel, QScrollArea, QTabWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import (
+    QFileDialog,
+    QLabel,
+    QScrollArea,
+    QTableWidget,
+    QTabWidget,
+    QVBoxLayout,
+    QWidget,
+)
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
@@ -74,7 +82,7 @@ class AdviserWindow(ToolWindow):
     def _make_form(self) -> None:
         kinds = (("convex", "convex"), ("concave", "concave"))
         self.kind = ChoiceField("Kind", kinds, tooltip="Above the work piece, or below it")
-        efforts = (("thorough", "thorough, some minutes"), ("quick", "quick, a tenth of that"))
+        efforts = (("thorough", "thorough: minutes"), ("quick", "quick: a tenth of the time"))
         self.effort = ChoiceField("Search", efforts, tooltip="Quick: the error is known to a fifth")
         self.form.add_heading("Expected pools: least, most")
         self.form.add(self.kind)
@@ -96,14 +104,17 @@ class AdviserWindow(ToolWindow):
     def _make_results(self) -> None:
         self.headline = QLabel("Enter pools and limits, then press Advise.")
         self.headline.setWordWrap(True)
-        self.table = ResultTable("Recommended set-up, and what it keeps")
+        self.place = ResultTable("Recommended set-up")
+        self.kept = ResultTable("What it must keep, and by how much it does")
         self.costs = CellTable("What each mm and degree away costs")
-        self.costs.setMinimumHeight(200)
         self.sheet = Sheet("Bench, places of the laser, and cost curves")
         self.words = QWidget()
         column = QVBoxLayout(self.words)
-        for widget in (self.headline, self.table, self.costs):
-            column.addWidget(widget)
+        column.addWidget(self.headline)
+        self.groups = [_titled(table) for table in (self.place, self.kept, self.costs)]
+        for group in self.groups:
+            column.addWidget(group)
+            group.hide()
         column.addStretch(1)
         area = QScrollArea()
         area.setWidget(self.words)
@@ -115,8 +126,6 @@ class AdviserWindow(ToolWindow):
         area.setAccessibleName("Advice")
         area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
         self.results.addWidget(self.tabs)
-        for widget in (self.table, self.costs):
-            widget.hide()
 
     # --- asking ------------------------------------------------------------------------------
 
@@ -169,11 +178,13 @@ class AdviserWindow(ToolWindow):
         self.advice, self.files = advice, files
         words = advising.headline(advice)
         self.headline.setText(words)
-        self.table.set_rows(advising.rows(advice))
-        self.table.show()
-        self.costs.setVisible(advice.possible)
+        self.place.set_rows(advising.place_rows(advice))
+        self.kept.set_rows(advising.kept_rows(advice))
         if advice.possible:
             self.costs.show_table(cost_table(advice))
+            _fit_rows(self.costs)
+        for group, shown in zip(self.groups, (True, True, advice.possible), strict=True):
+            group.setVisible(shown)
         self.sheet.show_png(files["advice.png"], words)
         self.say("Done")
         self.show_state()
@@ -201,3 +212,25 @@ class AdviserWindow(ToolWindow):
         name = QFileDialog.getExistingDirectory(self, "Save the advice in", self.folder_near)
         if name:
             self.save(Path(name))
+
+
+def _titled(table: QWidget) -> QWidget:
+    """A table below its name, which is what a screen reader says of it."""
+    group = QWidget()
+    layout = QVBoxLayout(group)
+    layout.setContentsMargins(0, 6, 0, 0)
+    heading = QLabel(table.accessibleName())
+    font = heading.font()
+    font.setBold(True)
+    heading.setFont(font)
+    layout.addWidget(heading)
+    layout.addWidget(table)
+    return group
+
+
+def _fit_rows(table: QTableWidget) -> None:
+    """Make a table as high as its rows: what is around it scrolls."""
+    rows = sum(table.rowHeight(row) for row in range(table.rowCount()))
+    bar = table.horizontalScrollBar().sizeHint().height()
+    around = table.horizontalHeader().sizeHint().height() + 2 * table.frameWidth()
+    table.setFixedHeight(rows + bar + around)

@@ -90,23 +90,27 @@ def headline(advice: Advice) -> str:
     )
 
 
-def rows(advice: Advice) -> tuple[ResultRow, ...]:
-    """The set-up, and by how much it keeps what it must."""
-    place = [
-        ResultRow(words, float(getattr(advice.best.place, name)), unit=unit, decimals=2)
+def place_rows(advice: Advice) -> tuple[ResultRow, ...]:
+    """The set-up."""
+    place = advice.best.place
+    return tuple(
+        ResultRow(words, float(getattr(place, name)), unit=unit, decimals=2)
         for name, (words, unit) in WORDS.items()
-    ]
-    kept = [
+    )
+
+
+def kept_rows(advice: Advice) -> tuple[ResultRow, ...]:
+    """By how much the set-up keeps what it must."""
+    return tuple(
         ResultRow(
             CONSTRAINTS[name][0],
             margin,
             unit=CONSTRAINTS[name][1],
-            decimals=1,
+            decimals=1 if CONSTRAINTS[name][1] in ("mm", "px") else 0,
             note="By how much it is kept; below 0 it is not",
         )
         for name, margin in advice.best.margins.items()
-    ]
-    return (*place, *kept)
+    )
 
 
 def use(session: Session, advice: Advice) -> None:

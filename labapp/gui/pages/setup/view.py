@@ -20,7 +20,6 @@ from PySide6.QtWidgets import (
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
-from labapp.gui.tools import show_tool
 from labapp.gui.views.bench import BenchView
 from labapp.gui.views.fields import FieldForm, NumberField, ResultTable, TextField
 from labapp.gui.workspace import Workspace
@@ -185,20 +184,13 @@ class SetupPage(Page):
                 (
                     "Advise …",
                     "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
-                    self._advise,
+                    lambda: self.workspace.asked.emit("adviser"),
                 )
             )
         )
         self.table = ResultTable("What the bench lets through")
         form.add_wide(self.table)
         return form
-
-    def _advise(self) -> None:
-        window = self.window()
-        from labapp.gui.window import MainWindow  # which loads the pages
-
-        if isinstance(window, MainWindow):
-            show_tool(window, "adviser")
 
     def _add_rig(self, form: FieldForm, entry: Entry) -> None:
         field = _number(entry)
