@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from labapp.cli.shared import frames_text, measure_frames, several, told_effect
+from labapp.cli.shared import frames_text, measure_frames, told_effect
 from labapp.errors import InputError
+from labapp.words import several
 
 if TYPE_CHECKING:
     from labapp.core.correction import Correction

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from labapp.cli.shared import frames_text, several
+from labapp.cli.shared import frames_text
 from labapp.errors import InputError
+from labapp.words import several
 
 if TYPE_CHECKING:
     from labapp.session.session import Session

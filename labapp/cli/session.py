@@ -25,10 +25,10 @@ from labapp.cli.shared import (
     measure_frames,
     note,
     progress_bar,
-    several,
     told_effect,
 )
 from labapp.errors import InputError
+from labapp.words import several
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from labapp.errors import InputError
+from labapp.words import several
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,11 +64,6 @@ def failure(frame: int, measurement: Measurement) -> str:
 def command(name: str, file: Path) -> str:
     """Tell how to call a command on a session, for the shell: names may have spaces."""
     return f"labapp session {name} {shlex.quote(str(file))}"
-
-
-def several(count: int, thing: str) -> str:
-    """A number of things: "1 frame", "2 frames"."""
-    return f"{count} {thing}{'s' * (count != 1)}"
 
 
 def frames_text(frames: Collection[int]) -> str:

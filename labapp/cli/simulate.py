@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from labapp.cli.shared import INTERRUPTED, note, progress_bar, several
+from labapp.cli.shared import INTERRUPTED, note, progress_bar
+from labapp.words import several
 
 
 def simulate(

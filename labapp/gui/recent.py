@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from labapp.errors import InputError
+from labapp.words import several
 
 if TYPE_CHECKING:
     from labapp.media import GreyImage
@@ -64,8 +65,8 @@ def look_at(path: Path) -> Recent:
 def _counted(frames: int, measured: int) -> str:
     if not frames:
         return "no recording yet"
-    counted = f"{frames} frame{'s' * (frames != 1)}"
-    return f"{counted}, {'all' if measured == frames else measured or 'none'} measured"
+    some = "all" if measured == frames else measured or "none"
+    return f"{several(frames, 'frame')}, {some} measured"
 
 
 def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:

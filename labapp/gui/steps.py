@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from labapp.errors import InputError
+from labapp.words import several
 
 if TYPE_CHECKING:
     from labapp.session.measured import Overview
@@ -171,24 +172,32 @@ def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict
     without = int(((status != "") & (status != "ok")).sum())
     stale = int(seen.stale.sum())
     count = len(seen.frame)
-    capture = State(Mark.DONE, f"{count} frames")
+    capture = State(Mark.DONE, several(count, "frame"))
     if gone:
         capture = State(Mark.ATTENTION, gone)
     blocked = f"Set-up: {missing}" if missing else ""
     if blocked and not measured:
         surface = State(Mark.TODO, blocked)
     elif stale:
-        surface = State(Mark.ATTENTION, f"{stale} of {count} frames no longer stand: measure again")
+        surface = State(
+            Mark.ATTENTION, f"{stale} of {several(count, 'frame')} no longer stand: measure again"
+        )
     elif measured < count:
-        surface = State(Mark.READY, f"{count - measured} of {count} frames are not measured yet")
+        surface = State(
+            Mark.READY, f"{count - measured} of {several(count, 'frame')} not measured yet"
+        )
     else:
         bare = f", {without} without a surface" if without else ""
-        surface = State(Mark.DONE, f"All {count} frames are measured{bare}")
-    dots = State(Mark.READY if measured < count else Mark.DONE, "No frame is in doubt")
+        told = f"All {count} frames are" if count > 1 else "The frame is"
+        surface = State(Mark.DONE, f"{told} measured{bare}")
+    dots = State(Mark.READY, f"{several(count - measured, 'frame')} to be measured")
+    if measured == count:
+        dots = State(Mark.DONE, "The dots of all frames make a surface")
     if without:
-        dots = State(Mark.ATTENTION, f"{without} frames could not be measured: look at their dots")
+        missing = several(without, "frame")
+        dots = State(Mark.ATTENTION, f"{missing} could not be measured: look at their dots")
     results = (
-        State(Mark.READY, f"{measured} frames")
+        State(Mark.READY, several(measured, "frame"))
         if measured
         else State(Mark.TODO, "Measure some frames first")
     )

@@ -297,9 +297,9 @@ def _normals(vertices: FloatArray, triangles: IntArray) -> npt.NDArray[np.float3
 
 
 def _label_format(limits: tuple[float, float]) -> str:
-    """Digits that tell the labels of a colour scale apart."""
+    """Digits that tell the labels of a colour scale to a tenth of their distance."""
     step = max((limits[1] - limits[0]) / 4, 1e-9)
-    return f"%.{max(0, -int(np.floor(np.log10(step))))}f"
+    return f"%.{max(0, int(np.ceil(-np.log10(0.2 * step))))}f"
 
 
 def draw_without_display() -> None:

@@ -132,9 +132,10 @@ def test_what_is_not_known_of_a_surface_is_not_drawn(pool: Reconstruction) -> No
 
 
 @pytest.mark.parametrize(
-    ("limits", "form"), [((0, 0.28), "%.2f"), ((0, 0.0028), "%.4f"), ((-5, 5), "%.0f")]
+    ("limits", "form"),
+    [((0, 0.28), "%.2f"), ((0, 0.0028), "%.4f"), ((-5, 5), "%.1f"), ((-0.025, 0.025), "%.3f")],
 )
-def test_the_labels_of_a_colour_scale_differ(limits: tuple[float, float], form: str) -> None:
+def test_the_labels_of_a_colour_scale_are_true(limits: tuple[float, float], form: str) -> None:
     assert draws._label_format(limits) == form
 
 

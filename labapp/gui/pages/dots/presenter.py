@@ -23,6 +23,7 @@ from labapp.gui.tasks import Cancelled, Control
 from labapp.session.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
 from labapp.session.setup import parse_setup
+from labapp.words import several
 
 NO_PLACES: FloatArray = np.zeros((0, 2))
 
@@ -234,7 +235,7 @@ def sentence(seen: Shown) -> str:
         "found": "As found, not measured",
         "looked for": "",
     }[seen.origin]
-    words = f"{told}: {_several(len(dots), 'dot')} in {_several(rows, 'row')}"
+    words = f"{told}: {several(len(dots), 'dot')} in {several(rows, 'row')}"
     words += f", {doubtful} in doubt" if doubtful else ", none in doubt"
     if lattice.reference is None:
         words += ". The reference is not known"
@@ -361,7 +362,7 @@ def carry(session: Session, seen: Shown, most: int | None, control: Control) -> 
             stopped = f"stopped before frame {number}: {why}"
             break
         carried[number] = last = following
-    return Carried(carried, f"Carried on over {_several(len(carried), 'frame')}, {stopped}")
+    return Carried(carried, f"Carried on over {several(len(carried), 'frame')}, {stopped}")
 
 
 def _confirmed(seen: Shown) -> Correction:
@@ -441,7 +442,3 @@ def with_detector_value(
 def with_method(settings: Settings, method: Any) -> Settings:
     """The settings with another detector."""
     return replace(settings, dots=replace(settings.dots, method=method))
-
-
-def _several(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' * (count != 1)}"

@@ -27,6 +27,7 @@ from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.meshes import FORMATS, SPACING_MM
 from labapp.session.session import Session
 from labapp.session.studio import PICTURE_PX
+from labapp.words import several
 
 REPORT_FILE = "report.pdf"
 
@@ -231,10 +232,14 @@ def plan(session: Session, wish: Wish, frame: int) -> Plan:
     surfaces = int((measured & (status == "ok")).sum())
     notes = []
     if len(unmeasured):
-        notes.append(f"{_frames(len(unmeasured))} not measured by {_named(scheme)}: left out.")
+        notes.append(
+            f"{several(len(unmeasured), 'frame')} not measured by {_named(scheme)}: left out."
+        )
     if measured.any() and surfaces < measured.sum():
         without = int(measured.sum()) - surfaces
-        notes.append(f"{_frames(without)} without a surface: in the tables with the reason.")
+        notes.append(
+            f"{several(without, 'frame')} without a surface: in the tables with the reason."
+        )
     if "film" in wish.some("pictures") and surfaces:
         notes.append(film_note(seen.frame[measured], seen.time_s[measured], wish.film_rate_hz))
     frames = seen.frame[measured]
@@ -277,8 +282,8 @@ def _why_not(session: Session, wish: Wish, scheme: str, frames: IntArray, stale:
         result = session.result(int(stale[0]), scheme)
         why = " and ".join(result.stale) if result is not None else SETUP_CHANGED
         return (
-            f"{_frames(len(stale))} no longer stand{'s' * (len(stale) == 1)}, because {why}. "
-            "Measure again, or undo the change."
+            f"{several(len(stale), 'frame')} no longer stand{'s' * (len(stale) == 1)}, "
+            f"because {why}. Measure again, or undo the change."
         )
     if not wish.ticked - {"solid"}:
         return "Tick what you want to take along."
@@ -308,10 +313,6 @@ def _files(wish: Wish, count: int, surfaces: int) -> tuple[str, ...]:
         lines.append(FILM_FILE)
     lines += [HDF5_FILE] * ("hdf5" in wish.ticked) + [REPORT_FILE] * ("report" in wish.ticked)
     return (*lines, f"{MANIFEST}: source, set-up, versions, every file with its SHA-256")
-
-
-def _frames(count: int) -> str:
-    return f"{count} frame{'s' * (count != 1)}"
 
 
 def _named(scheme: str) -> str:

@@ -148,7 +148,6 @@ class PlanChart(Chart):
         self._telling = False
         self.plot.addItem(self._outline)
         self.plot.addItem(self._line)
-        self.say("Section: drag the line or its ends")
         self.paint()
 
     def show_pool(self, boundary: Boundary | None, section: tuple[float, float] | None) -> None:
@@ -156,7 +155,9 @@ class PlanChart(Chart):
         points = np.empty((0, 3)) if boundary is None else boundary.points_mm
         closed = np.vstack([points, points[:1]])
         self._outline.setData(closed[:, 0], closed[:, 1])
-        self._line.setVisible(section is not None and boundary is not None)
+        drawn = section is not None and boundary is not None
+        self._line.setVisible(drawn)
+        self.say("Section: drag the line or its ends" if drawn else "No section")
         if section is not None and boundary is not None and not self._telling:
             self._place(boundary, *section)
         if not self._telling:
