@@ -18,7 +18,16 @@ from scipy.spatial import cKDTree
 
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.dots import Dots
-from labapp.core.hypothesis import Hypothesis, from_grid, joined, moved, pursue, turned, weigh
+from labapp.core.hypothesis import (
+    Hypothesis,
+    from_grid,
+    joined,
+    moved,
+    pursue,
+    turned,
+    weigh,
+    with_rows_beyond,
+)
 from labapp.core.lattice import Lattice, Site, lattice_of_sites
 from labapp.core.orientation import ORIENTATIONS, Orientation, ways
 from labapp.core.quadric_search import search_quadrics
@@ -153,6 +162,7 @@ def match_rays(
     found = _by_grid(scene, lattice, orientations)
     if not any(_explains(scene, hypothesis) for hypothesis in found):
         found += _by_optics(scene, lattice, orientations)
+    found = with_rows_beyond(scene, found)
     # Followed to its end, a hypothesis may have come round to a correspondence not asked for.
     found = [hypothesis for hypothesis in found if hypothesis.orientation(scene) in orientations]
     if not found:

@@ -11,7 +11,17 @@ from scipy.spatial import cKDTree
 from labapp.core.lattice import Lattice, Site
 from labapp.core.orientation import Orientation, ways
 from labapp.core.pool_fit import FitSettings, FittedPool
-from labapp.core.ray_growth import UNLABELLED, Scene, blocked, grow_labels, predict, try_fit
+from labapp.core.ray_growth import (
+    NEAR,
+    UNLABELLED,
+    Scene,
+    blocked,
+    grow_labels,
+    predict,
+    surprises,
+    try_fit,
+    within_rings,
+)
 from labapp.core.values import BoolArray, CannotMeasure, IntArray
 
 MODEL_MM = 0.03
@@ -25,6 +35,9 @@ of them are put down to false dots."""
 
 STRAY, MISSED = 16.0, 12.0
 """What a dot without a ray, and a ray without its dot amid the others, cost in units of χ²."""
+
+LEAST_ROW = 3
+"""A dot or two beyond the last row may be false; so many where one surface has them are not."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +165,50 @@ def moved(scene: Scene, labels: IntArray) -> Iterator[IntArray]:
         shifted = _labelled(at + 1 + step, dot, labels.shape)
         shifted[scene.absent] = UNLABELLED
         yield shifted
+
+
+def with_rows_beyond(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
+    """Add what the cheapest hypothesis leads to if a row that its growth did not reach is begun.
+
+    Beyond the last row a surface may be so uncertain that several rays come into question for
+    every dot there; then `grow_labels` gives none of them a ray. Here each is tried, and what has
+    come of it is a hypothesis to be held against the others: a row given to the wrong rays costs
+    the dots of the rays that it jumps, or comes too near to another way to be told from it.
+    """
+    while found:
+        best = min(found, key=lambda hypothesis: hypothesis.cost)
+        wider = _rows_begun(scene, best) if best.stray >= LEAST_ROW else []
+        found = [*found, *wider]
+        if min((h.cost for h in wider), default=np.inf) >= best.cost:
+            break
+    return found
+
+
+def _rows_begun(scene: Scene, hypothesis: Hypothesis, most: int = 8) -> list[Hypothesis]:
+    """Give a dot without a ray to each ray that may have made it, and follow where that leads.
+
+    The ``most`` likeliest pairs are tried, less those that another one has led to. One dot can be
+    made to fit: `LEAST_ROW` dots more have to find their rays.
+    """
+    labels = hypothesis.labels
+    found: list[Hypothesis] = []
+    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels)
+    beyond = within_rings(labels, 2) & (labels == UNLABELLED) & ~scene.absent
+    rays = predict(scene, hypothesis.pool, beyond)
+    if len(stray) == 0 or len(rays.at) == 0:
+        return found
+    distance, _ = surprises(scene, hypothesis.pool, rays, stray)
+    for pair in np.argsort(distance, axis=None)[:most]:
+        dot, ray = (int(k) for k in np.unravel_index(pair, distance.shape))
+        at = tuple(rays.at[ray])
+        if distance[dot, ray] > NEAR or any(one.labels[at] == stray[dot] for one in found):
+            continue
+        more = labels.copy()
+        more[at] = stray[dot]
+        wider = pursue(scene, more)
+        if wider is not None and wider.count >= hypothesis.count + LEAST_ROW:
+            found.append(wider)
+    return found
 
 
 def turned(scene: Scene, labels: IntArray, before: Orientation, after: Orientation) -> IntArray:

@@ -288,10 +288,24 @@ def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedP
     return np.asarray(height > rig.electrode.height_mm - 0.3)
 
 
-def _around(labels: IntArray, rings: int) -> BoolArray:
+def within_rings(labels: IntArray, rings: int) -> BoolArray:
     """Labelled rays and their neighbours, so many rings of them."""
     ring = np.ones((3, 3), bool)
     return np.asarray(binary_dilation(labels != UNLABELLED, ring, iterations=rings))
+
+
+def surprises(
+    scene: Scene, pool: FittedPool, predicted: Prediction, dots: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """How far off dots, n of them, are from m predictions, and how unlikely that makes each pair.
+
+    Squared distances in σ², and −2 log likelihoods but for a constant, both of shape (n, m).
+    """
+    offset = scene.plane_mm[dots][:, None] - predicted.plane_mm
+    uncertain = CAUTION**2 * predicted.covariance_mm2(pool, scene.rig)
+    spread = scene.covariance_mm2[dots][:, None] + uncertain + MODEL_MM**2 * np.eye(2)
+    distance = np.einsum("nma,nmab,nmb->nm", offset, np.linalg.inv(spread), offset)
+    return distance, distance + np.log(np.linalg.det(spread))
 
 
 def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
@@ -302,14 +316,10 @@ def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
     dots of the next row but one come into question, nobody gets them.
     """
     matched = np.full(labels.shape, UNLABELLED, np.int64)
-    far = predict(scene, pool, _around(labels, 2))
+    far = predict(scene, pool, within_rings(labels, 2))
     if len(far.at) == 0:
         return matched
-    offset = scene.plane_mm[:, None] - far.plane_mm
-    uncertain = CAUTION**2 * far.covariance_mm2(pool, scene.rig)
-    spread = scene.covariance_mm2[:, None] + uncertain + MODEL_MM**2 * np.eye(2)
-    distance = np.einsum("nma,nmab,nmb->nm", offset, np.linalg.inv(spread), offset)
-    surprise = distance + np.log(np.linalg.det(spread))
+    distance, surprise = surprises(scene, pool, far, np.arange(len(scene.plane_mm)))
     ray = np.argmin(surprise, axis=1)
     dot = np.arange(len(ray))
     least = surprise[dot, ray]
@@ -319,7 +329,7 @@ def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
         if surprise.shape[axis] > 1:
             taken &= np.partition(rivals, 1, axis=axis).take(1, axis=axis) > least + CLEAR
     at = far.at[ray]
-    taken &= _around(labels, 1)[at[:, 0], at[:, 1]] & ~scene.absent[at[:, 0], at[:, 1]]
+    taken &= within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~scene.absent[at[:, 0], at[:, 1]]
     # Dots that run into each other have no place of their own.
     taken &= far.spacing_mm[ray] > scene.resolution_mm
     matched[at[taken, 0], at[taken, 1]] = dot[taken]
