@@ -26,6 +26,7 @@ from labapp.simulation.parameter_deviation import AxisPoints, KnownPool
 from labapp.simulation.pools import Pool, spherical_cap
 from labapp.simulation.render import Frame, Look, render
 from labapp.simulation.tables import Table
+from labapp.words import several
 
 TACK = spherical_cap(9.75, 0.91)
 """The thumb tack of §8.2."""
@@ -190,7 +191,8 @@ def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[Scheme] = 
             )
     return Table(
         "measurement_error",
-        f"Measurement error on the thumb tack of §8.2: exact reflections, and {len(frames)} frames",
+        f"Measurement error on the thumb tack of §8.2: exact reflections, and "
+        f"{several(len(frames), 'frame')}",
         ("scheme", "error", "exact", "frames_mean", "frames_worst", "frames_measured", "text"),
         tuple(rows),
     )

@@ -21,6 +21,7 @@ from labapp.gui.views.path_field import PathField
 from labapp.gui.views.picture import PictureView
 from labapp.session.scenario import Scenario, read_scenario
 from labapp.session.simulate import begin_session, simulate
+from labapp.words import several
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
@@ -225,8 +226,8 @@ class SimulatorWindow(ToolWindow):
 
     def _written(self, scenario: Scenario, folder: Path) -> None:
         self.made = scenario, folder
-        count = len(scenario.recording.pools)
-        self.say(f"{count} frame{'s' * (count != 1)}, set-up and truth are in {folder}")
+        frames = several(len(scenario.recording.pools), "frame")
+        self.say(f"{frames}, set-up and truth are in {folder}")
         preferences = self._window.preferences
         self._window.remember(replace(preferences, last_folder=str(folder.parent)))
         self.show_state()

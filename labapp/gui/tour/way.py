@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeVar
 
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
@@ -14,9 +15,14 @@ from labapp.gui.pages.plane import PlanePage
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.tools.adviser import AdviserWindow
+from labapp.gui.tools.analysis import AnalysisWindow
+from labapp.gui.tools.simulator import SimulatorWindow
+from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.tour.bench import CROSS_MM, places
 from labapp.gui.tour.hands import CTRL, Hands, give
 from labapp.session.session import Session
+
+T = TypeVar("T", bound=ToolWindow)
 
 FRAMES = 6
 """So many are imported: enough to see, soon measured."""
@@ -52,7 +58,9 @@ def go_through(hands: Hands, folder: Path) -> None:
     _trends(hands, files)
     _export(hands, files)
     _menus(hands)
+    _simulator(hands)
     _adviser(hands)
+    _analysis(hands)
     _misnumber(hands)
     _blocked(hands, folder / "blocked")
     _moved(hands, folder / "blocked")
@@ -218,14 +226,45 @@ def _menus(hands: Hands) -> None:
         hands.menu(menu.text().replace("&", ""))
 
 
+def _simulator(hands: Hands) -> None:
+    hands.do("step_setup")
+    tool = _tool(hands, "simulator", SimulatorWindow)
+    hands.wait(lambda: tool.preview, "the first frame of a scenario")
+    hands.asked("scenario", lambda: hands.press("Own scenario …"))
+    hands.asked("simulation-folder", lambda: hands.press("Choose a folder …"))
+    hands.enter("Frames", "2")
+    hands.press("Simulate")
+    hands.wait(lambda: tool.made, "the simulation to be written")
+    hands.picture("dialog-simulator")
+    tool.close()
+
+
 def _adviser(hands: Hands) -> None:
     """What it asks; a search would take the tour's time."""
-    hands.do("adviser")
-    tool = hands.window.findChild(AdviserWindow)
-    assert tool is not None
+    tool = _tool(hands, "adviser", AdviserWindow)
     hands.picture("dialog-adviser")
     hands.asked("save-advice", tool.choose_folder)
     tool.close()
+
+
+def _analysis(hands: Hands) -> None:
+    """The part that is done soonest."""
+    tool = _tool(hands, "analysis", AnalysisWindow)
+    for key in ("budget", "measurement"):
+        hands.press(tool.parts[key].text())
+    hands.enter("Frames of each", "1")
+    hands.press("Work out")
+    hands.wait(lambda: tool.files and not tool.working, "the thumb tack to be worked out")
+    hands.picture("dialog-analysis")
+    hands.asked("save-results", lambda: hands.press("Save the results …"))
+    tool.close()
+
+
+def _tool(hands: Hands, key: str, kind: type[T]) -> T:
+    hands.do(key)
+    tool = hands.window.findChild(kind)
+    assert tool is not None
+    return tool
 
 
 def _misnumber(hands: Hands) -> None:
