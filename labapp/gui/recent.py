@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,8 +54,7 @@ def look_at(path: Path) -> Recent:
         with Session.open(path, read_only=True) as session:
             title = session.record.title or path.stem
             frames = session.frames
-            measured = sum(status != "" for status in session.overview().status)
-            about = f"{changed:%Y-%m-%d %H:%M} · {_counted(len(frames), measured)}"
+            about = f"{changed:%Y-%m-%d %H:%M} · {_counted(session.overview().status)}"
             return Recent(path, title, about, _thumbnail(session, frames))
     except InputError as error:
         return Recent(path, path.stem, f"{error.field}: {error.value}", there=False)
@@ -62,11 +62,14 @@ def look_at(path: Path) -> Recent:
         return Recent(path, path.stem, str(error.strerror), there=False)
 
 
-def _counted(frames: int, measured: int) -> str:
-    if not frames:
+def _counted(statuses: Sequence[str]) -> str:
+    if not statuses:
         return "no recording yet"
-    some = "all" if measured == frames else measured or "none"
-    return f"{several(frames, 'frame')}, {some} measured"
+    measured = sum(status == "ok" for status in statuses)
+    without = sum(status not in ("", "ok") for status in statuses)
+    some = "all" if measured == len(statuses) else measured or "none"
+    told = f"{several(len(statuses), 'frame')}, {some} measured"
+    return f"{told}, {without} could not be" if without else told
 
 
 def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -108,10 +109,11 @@ def states(session: Session | None, seen: Overview | None = None) -> dict[str, S
         problems = error.problems
     missing = setup_to_do(problems)
     parts = {problem.field.partition(".")[0] for problem in problems}
+    laser_used, plane_used = calibrations_in_use(session)
     return {
         "setup": State(Mark.READY, missing) if missing else State(Mark.DONE, "Complete"),
-        "laser": _calibrated(session.laser_calibration is not None, "laser" in parts),
-        "plane": _calibrated(session.plane_calibration is not None, "image_calibration" in parts),
+        "laser": _calibrated(session.laser_calibration, laser_used, "laser" in parts),
+        "plane": _calibrated(session.plane_calibration, plane_used, "image_calibration" in parts),
         **_frame_states(session, missing, seen),
     }
 
@@ -150,9 +152,41 @@ def recording_gone(session: Session) -> str:
     return "" if missing is None else f"{missing.name} is not where it was: say where it is now"
 
 
-def _calibrated(done: bool, needed: bool) -> State:
-    if done:
+def calibrations_in_use(session: Session) -> tuple[bool, bool]:
+    """Whether the set-up has the laser, and the imaging plane, that the calibrations found.
+
+    False without a calibration, and where other values were entered after it.
+    """
+    keys = tomllib.loads(session.setup_text)
+    laser, plane = session.laser_calibration, session.plane_calibration
+    found = (
+        {}
+        if laser is None
+        else {
+            "projection_angle_deg": laser.found.angle_deg,
+            "distance_mm": laser.found.distance_mm,
+        }
+    )
+    return (
+        laser is not None and _entered(keys.get("laser"), found),
+        plane is not None and _entered(keys.get("image_calibration"), plane.found.setup_keys),
+    )
+
+
+def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
+    """Whether a section of the set-up holds what was found, but for rounding."""
+    try:
+        pairs = [(keys[name], value) for name, value in found.items() if value is not None]
+        return all(np.allclose(one, other, rtol=1e-6) for one, other in pairs)
+    except (KeyError, TypeError, ValueError):
+        return False
+
+
+def _calibrated(kept: object, used: bool, needed: bool) -> State:
+    if used:
         return State(Mark.DONE, "Calibrated")
+    if kept is not None:
+        return State(Mark.READY, "Other values were entered after the calibration")
     if needed:
         return State(Mark.READY, "Not calibrated yet, and no values were entered")
     return State(Mark.READY, "Not calibrated here: the values were entered")
@@ -187,12 +221,16 @@ def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict
             Mark.READY, f"{count - measured} of {several(count, 'frame')} not measured yet"
         )
     else:
-        bare = f", {without} without a surface" if without else ""
         told = f"All {count} frames are" if count > 1 else "The frame is"
-        surface = State(Mark.DONE, f"{told} measured{bare}")
+        if without:
+            told = f"{count - without} of {several(count, 'frame')} are"
+        missing = f", {without} could not be" if without else ""
+        surface = State(Mark.DONE, f"{told} measured{missing}")
     dots = State(Mark.READY, f"{several(count - measured, 'frame')} to be measured")
     if measured == count:
         dots = State(Mark.DONE, "The dots of all frames make a surface")
+    if stale:
+        dots = State(Mark.READY, f"{several(stale, 'frame')} to be measured again")
     if without:
         missing = several(without, "frame")
         dots = State(Mark.ATTENTION, f"{missing} could not be measured: look at their dots")

@@ -221,6 +221,6 @@ def in_words(error: Exception) -> str:
     log = logging.getLogger(NAME)
     if isinstance(error, InputError | CannotMeasure | ValueError):
         log.error("refused", exc_info=error)
-        return str(error)
+        return error.reason if isinstance(error, CannotMeasure) else str(error)
     log.error("fault", exc_info=error)
     return f"a fault in the program: {type(error).__name__}: {error}; details are in the log"

@@ -14,6 +14,7 @@ from pytestqt.qtbot import QtBot
 from labapp.core.laser_calibration import calibrate_laser
 from labapp.gui.pages.laser import LaserPage, presenter
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
+from labapp.gui.steps import states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 
@@ -101,6 +102,13 @@ def test_what_is_used_comes_back_with_its_readings(tmp_path: Path) -> None:
         angle, distance = (row.value for row in presenter.in_use(session))
         assert angle == pytest.approx(30.0, abs=0.01)
         assert distance == pytest.approx(90.0, abs=0.01)
+        assert all(row.sigma for row in presenter.in_use(session))
+        assert states(session)["laser"].why == "Calibrated"
+        session.update_setup({"laser": {"projection_angle_deg": 29.0}})
+        assert presenter.in_use(session)[0].texts[1:3] == ("29.000", "")
+        assert states(session)["laser"].why == "Other values were entered after the calibration"
+        session.undo()
+        assert states(session)["laser"].why == "Calibrated"
         session.undo()
         assert presenter.kept(session) is None
 

@@ -18,6 +18,7 @@ from labapp.core.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.gui.pages.plane import PlanePage, presenter
+from labapp.gui.steps import states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.simulation.target import Target, target_svg
@@ -85,7 +86,7 @@ def test_the_model_is_proposed_with_its_reason_and_can_be_overridden() -> None:
     assert "No perspective" in presenter.why(askew(0.0))
     assert presenter.choices(SQUARE) == (("three points", "Three points"),)
     rows = {row.name: row.value for row in presenter.result(tilted).rows}
-    assert 0.03 < rows["Homography off"] < 0.1 < rows["Affine off"]
+    assert 0.03 < rows["Homography residual"] < 0.1 < rows["Affine residual"]
     used = presenter.with_model(tilted, "homography").image_calibration
     np.testing.assert_allclose(used.to_image(np.array([[100.0, 0.0]])), [[590.9, 363.6]], atol=0.3)
     by_hand = presenter.moved(tilted, 0, (51.0, 400.0))
@@ -143,12 +144,17 @@ def test_what_is_in_use_is_told_whichever_form_it_has(tmp_path: Path) -> None:
         image = cv2.imread(str(GTAW / "calibration.png"), cv2.IMREAD_UNCHANGED)
         presenter.use(session, SQUARE, 10.0, image, "by hand")
         assert [row.value for row in presenter.in_use(session)] == pytest.approx([6, 6, 90])
+        sigmas = [row.sigma for row in presenter.in_use(session)]
+        assert sigmas == pytest.approx(SQUARE.scales_and_angle_sigma.tolist())
+        assert states(session)["plane"].why == "Calibrated"
         homography = SQUARE.image_calibration.matrix.tolist()
         points = dict.fromkeys(
             ("origin_px", "x_axis_px", "x_axis_mm", "z_axis_px", "z_axis_mm"), None
         )
         session.update_setup({"image_calibration": {**points, "homography": homography}})
         assert [row.value for row in presenter.in_use(session)] == pytest.approx([6, 6, 90])
+        assert [row.sigma for row in presenter.in_use(session)] == [None] * 3
+        assert states(session)["plane"].why == "Other values were entered after the calibration"
 
 
 def test_the_target_is_written_for_the_printer(tmp_path: Path) -> None:
@@ -223,7 +229,7 @@ def test_a_picture_without_a_target_is_said_and_points_can_be_placed(
     page.workspace.said.connect(lambda words, _: said.append(words))
     page.load(tmp_path / "bare.png")
     qtbot.waitUntil(lambda: len(said) == 1)
-    assert "no-target" in said[0]
+    assert "no dark marks" in said[0]
     assert [point.isVisible() for point in page.points] == [True] * 3
     for k, place in enumerate([(30.0, 180.0), (120.0, 181.0), (31.0, 120.0)]):
         assert not page.use_button.isEnabled()

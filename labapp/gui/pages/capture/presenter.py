@@ -252,8 +252,13 @@ def missing_in_words(session: Session) -> str:
     missing = session.missing_recording
     if missing is None:
         return ""
-    return (
+    told = (
         f"{missing.name} is not where it was ({missing.parent}). What was measured is still there, "
-        "but no frame can be seen or measured. Say where it is now: only the same recording is "
-        "taken, which its size and SHA-256 tell."
+        "but no frame can be seen or measured. "
+    )
+    if session.read_only:
+        return f"{told}The session is open read-only: open it for changes to say where it is now."
+    return (
+        f"{told}Say where it is now: only the same recording is taken, which its size and SHA-256 "
+        "tell."
     )

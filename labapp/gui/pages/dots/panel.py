@@ -224,7 +224,9 @@ class _RowList(QTableWidget):
         self.choose(chosen)
         self.resizeRowsToContents()
         height = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
-        self.setFixedHeight(height + sum(self.rowHeight(k) for k in range(len(lines))))
+        height += sum(self.rowHeight(k) for k in range(len(lines)))
+        # What is below must not jump from frame to frame.
+        self.setFixedHeight(max(height, self.minimumHeight() if lines else 0))
 
     def chosen(self) -> list[int]:
         """Rows of the chosen lines."""

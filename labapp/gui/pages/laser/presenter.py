@@ -12,6 +12,7 @@ from labapp.core.laser_calibration import LaserCalibration, calibrate_laser
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
+from labapp.gui.steps import calibrations_in_use
 from labapp.media import GreyImage, open_source
 from labapp.session.session import Session
 
@@ -131,10 +132,15 @@ def result(readings: Readings) -> Result:
 def in_use(session: Session) -> tuple[ResultRow, ...]:
     """The laser as the set-up has it."""
     values = setup_shown(session).values
-    note = "From this session's calibration" if session.laser_calibration else "As entered"
+    angle, distance = values["laser.projection_angle_deg"], values["laser.distance_mm"]
+    kept = session.laser_calibration
+    if kept is None or not calibrations_in_use(session)[0]:
+        rows = (("Projection angle", angle, None, "°"), ("Distance", distance, None, "mm"))
+        return tuple(ResultRow(*row, 3, "As entered") for row in rows)
+    note, found = "From this session's calibration", kept.found
     return (
-        ResultRow("Projection angle", values["laser.projection_angle_deg"], None, "°", 3, note),
-        ResultRow("Distance", values["laser.distance_mm"], None, "mm", 3, note),
+        ResultRow("Projection angle", angle, found.angle_sigma_deg, "°", note=note),
+        ResultRow("Distance", distance, found.distance_sigma_mm, "mm", note=note),
     )
 
 

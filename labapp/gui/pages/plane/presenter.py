@@ -18,6 +18,7 @@ from labapp.core.plane_calibration import (
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
+from labapp.gui.steps import calibrations_in_use
 from labapp.media import GreyImage
 from labapp.session.files import write_whole
 from labapp.session.session import Session
@@ -125,7 +126,8 @@ def result(found: PlaneCalibration | None) -> Result:
         name for name, sigma in zip(POINTS, found.sigma_px, strict=True) if sigma == UNPLACED
     ]
     if waiting:
-        return Result(why_not=f"Drag {' and '.join(waiting)} to where it is in the picture")
+        are = "it is" if len(waiting) == 1 else "they are"
+        return Result(why_not=f"Drag {' and '.join(waiting)} to where {are} in the picture")
     values = (*found.px_per_mm, found.angle_deg)
     sigmas = found.scales_and_angle_sigma.tolist()
     units = (("Scale along O′X′", "px/mm"), ("Scale along O′Z′", "px/mm"), ("Angle", "°"))
@@ -163,7 +165,7 @@ def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:
                 f"{left_out:.3f} px"
             )
             value = root_mean_square(fit.residual_px)
-            rows.append(ResultRow(f"{name} off", value, None, "px", 3, note))
+            rows.append(ResultRow(f"{name} residual", value, None, "px", 3, note))
     return rows
 
 
@@ -236,7 +238,8 @@ def residual_map(found: PlaneCalibration | None, height_px: int) -> ResidualMap 
 def in_use(session: Session) -> tuple[ResultRow, ...]:
     """Scales and angle of the image calibration that the set-up has."""
     names = (("Scale along X′", "px/mm"), ("Scale along Z′", "px/mm"), ("Angle", "°"))
-    values = [np.nan] * 3
+    values, sigmas = [np.nan] * 3, [None] * 3
+    kept = session.plane_calibration if calibrations_in_use(session)[1] else None
     keys = tomllib.loads(session.setup_text).get("image_calibration", {})
     try:
         calibration = (
@@ -247,16 +250,16 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     except (TypeError, ValueError, KeyError):
         pass  # it is not there, or not right: the set-up page says what
     else:
-        kept = session.plane_calibration
         x_mm, z_mm = (kept.found.x_axis_mm, kept.found.z_axis_mm) if kept else (1.0, 1.0)
         points = calibration.to_image(np.array([[0.0, 0.0], [x_mm, 0.0], [0.0, z_mm]]))
         origin, on_x, on_z = (_place(point) for point in points)
         shown = PlaneCalibration(origin, on_x, x_mm, on_z, z_mm, (0.0, 0.0, 0.0), 0.0)
         values = [*shown.px_per_mm, shown.angle_deg]
-    note = "From this session's calibration" if session.plane_calibration else "As entered"
+        sigmas = kept.found.scales_and_angle_sigma.tolist() if kept else sigmas
+    note = "From this session's calibration" if kept else "As entered"
     return tuple(
-        ResultRow(name, value, None, unit, 4 if unit == "px/mm" else 3, note)
-        for (name, unit), value in zip(names, values, strict=True)
+        ResultRow(name, value, sigma, unit, 4 if unit == "px/mm" else 3, note)
+        for (name, unit), value, sigma in zip(names, values, sigmas, strict=True)
     )
 
 

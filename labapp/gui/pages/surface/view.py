@@ -250,7 +250,9 @@ class SurfacePage(Page):
 
     def save_picture(self) -> None:
         """Ask for a file and write the picture to it."""
-        name = f"surface_{self.workspace.frame:06d}.png"
+        session = self.workspace.session
+        folder = Path() if session is None else session.path.parent
+        name = str(folder / f"surface_{self.workspace.frame:06d}.png")
         chosen, _ = QFileDialog.getSaveFileName(self, "Save picture", name, "PNG (*.png)")
         if chosen:
             self.write_picture(Path(chosen))
