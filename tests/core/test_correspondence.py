@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from labapp.core import correspondence
 from labapp.core.correction import (
     Correction,
     assign,
@@ -31,7 +32,7 @@ from labapp.core.orientation import ORIENTATIONS, Orientation, ways
 from labapp.core.rig import DotPattern, Laser, Rig
 from labapp.core.values import BoolArray, CannotMeasure
 from labapp.simulation.forward import Reflections, seen_orientation, trace
-from labapp.simulation.pools import Dent, Pool, egg, ellipsoidal_cap, spherical_cap
+from labapp.simulation.pools import Dent, Pool, Wave, egg, ellipsoidal_cap, spherical_cap
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, as_dots, see, visible_dots
 
 COARSE_RIG = replace(BENCH_RIG, laser=Laser(35.0, 40.0), pattern=DotPattern(15, 15, 0.8))
@@ -135,6 +136,19 @@ def test_most_scenes_are_answered_and_most_of_their_dots(answers: list[Answer]) 
     for answer in answers:
         assert (answer.match is None) != (answer.status == "ok")
         assert answer.status != "no reason"
+
+
+def test_a_row_that_growth_does_not_reach_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A wave bends the pool so that no ray alone comes into question for the dots of an end row.
+    rng = np.random.default_rng(7)
+    wave = Wave((2, 1), 0.015, 60.0, rng.uniform(0, 1 / 60), travelling=True)
+    seen = see(egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6), (wave,)), rng)
+    match, _ = matched(seen.dots)
+    assert match is not None
+    np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
+    assert len(match.dot) == len(seen.dots)
+    monkeypatch.setattr(correspondence, "with_rows_beyond", lambda _scene, found: found)
+    assert matched(seen.dots) == (None, "no-match")
 
 
 def test_the_orientation_is_right_and_far_ahead(answers: list[Answer]) -> None:
