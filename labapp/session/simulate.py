@@ -6,7 +6,6 @@ And a session of what was simulated.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import shutil
 import tempfile
@@ -70,8 +69,6 @@ def simulate(
                 shutil.rmtree(out)
             part.rename(out)
     except OSError as error:
-        if error.errno == errno.ENOSPC:
-            raise  # the program says so itself
         expected = "a folder that can be written"
         raise InputError(out, "--out", error.strerror or error, expected) from error
 

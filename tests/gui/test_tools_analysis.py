@@ -88,6 +88,8 @@ def test_the_budget_is_that_of_the_sessions_set_up(
     shown.copy_csv()
     made = (tmp_path / "command" / "error_budget.csv").read_text("utf-8")
     assert QApplication.clipboard().text() == made
+    analysis.save(setup / "below a file")
+    assert "expected one that can be written" in analysis.message.text()
     analysis.which.set_value("error_budget.png")
     analysis.which.edited.emit("error_budget.png")
     assert analysis.stack.currentWidget() is analysis.sheet

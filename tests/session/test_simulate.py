@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import pytest
@@ -57,3 +58,16 @@ def test_what_is_there_already_stays(made: tuple[Scenario, Path]) -> None:
     with pytest.raises(InputError, match="file"):
         begin_session(scenario, folder, path)
     assert path.read_text("utf-8") == "mine"
+
+
+def test_a_full_disk_is_said_and_leaves_nothing(
+    made: tuple[Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    scenario, _ = made
+    monkeypatch.setattr("labapp.simulation.recording.write_video", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        simulate(scenario, tmp_path / "out", workers=1)
+    assert list(tmp_path.iterdir()) == []

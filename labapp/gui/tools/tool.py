@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.errors import InputError
 from labapp.gui.messages import PROBLEM, ElidedLabel
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.views.fields import FieldForm
@@ -204,9 +205,13 @@ class ToolWindow(QDialog):
         """Write what was found, as the command does; each file is whole."""
 
         def write() -> None:
-            folder.mkdir(parents=True, exist_ok=True)
-            for name, content in self.files.items():
-                write_whole(folder / name, content)
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                for name, content in self.files.items():
+                    write_whole(folder / name, content)
+            except OSError as error:
+                expected = "one that can be written"
+                raise InputError(folder, "folder", error.strerror, expected) from error
 
         if self.tried(write):
             self.say(f"Saved in {folder}")
