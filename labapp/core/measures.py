@@ -104,9 +104,19 @@ def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
     """
     errors = reflection_errors(reconstruction, match, rig)
     boundary = reconstruction.boundary
-    size, peak = _size(reconstruction.surface, boundary)
-    variants = [_size(surface, outline)[0] for surface, outline in reconstruction.variants]
-    sigma = _sigma(variants, len(size))
+    size, peak = size_of(reconstruction.surface, boundary)
+    variants = [size_of(surface, outline)[0] for surface, outline in reconstruction.variants]
+    return measures_of(errors, size, peak, boundary.center_mm, _sigma(variants, len(size)))
+
+
+def measures_of(
+    errors: ReflectionErrors,
+    size: FloatArray,
+    peak_mm: FloatArray,
+    center_mm: FloatArray,
+    sigma: FloatArray,
+) -> Measures:
+    """Write down errors, what `size_of` gave, the centre, and the σ of each size, shape (6,)."""
     return Measures(
         are_mm=errors.are_mm,
         mre_mm=errors.mre_mm,
@@ -118,10 +128,10 @@ def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
         depth_mm=float(size[3]),
         area_mm2=float(size[4]),
         volume_mm3=float(size[5]),
-        center_x_mm=float(boundary.center_mm[0]),
-        center_y_mm=float(boundary.center_mm[1]),
-        peak_x_mm=float(peak[0]),
-        peak_y_mm=float(peak[1]),
+        center_x_mm=float(center_mm[0]),
+        center_y_mm=float(center_mm[1]),
+        peak_x_mm=float(peak_mm[0]),
+        peak_y_mm=float(peak_mm[1]),
         width_sigma_mm=float(sigma[0]),
         length_sigma_mm=float(sigma[1]),
         height_sigma_mm=float(sigma[2]),
@@ -171,24 +181,24 @@ def _inner(ray: IntArray) -> BoolArray:
     return np.asarray(inner)
 
 
-def _size(surface: Surface, boundary: Boundary) -> tuple[FloatArray, FloatArray]:
+def size_of(surface: Surface, boundary: Boundary) -> tuple[FloatArray, FloatArray]:
     """Width, length, height, depth, area, volume, shape (6,); and the peak's (x, y), shape (2,)."""
     outline = boundary.points_mm
     width, length = np.ptp(outline[:, :2], axis=0)
-    wedge = _wedges(boundary)
+    wedge = wedges(boundary)
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     fraction = (node + 1) / 2
     samples = _spokes(surface, boundary, fraction)
     # ∫∫ z dA in triangles about the centre: each spoke stands for half of the two beside it.
     volume = wedge @ (samples[..., 2] @ (weight * fraction))
     points = np.vstack([samples.reshape(-1, 3), outline])
-    high = _refined(surface, boundary, points[np.nanargmax(points[:, 2])], sign=1.0)
-    low = _refined(surface, boundary, points[np.nanargmin(points[:, 2])], sign=-1.0)
+    high = refined(surface, boundary, points[np.nanargmax(points[:, 2])], sign=1.0)
+    low = refined(surface, boundary, points[np.nanargmin(points[:, 2])], sign=-1.0)
     peak = high if abs(high[2]) >= abs(low[2]) else low
     return np.array([width, length, high[2], low[2], wedge.sum(), volume]), peak[:2]
 
 
-def _wedges(boundary: Boundary) -> FloatArray:
+def wedges(boundary: Boundary) -> FloatArray:
     """Area that each boundary point stands for, shape (m,), mm²; the sum is the polygon's."""
     x, y = (boundary.points_mm[:, :2] - boundary.center_mm).T
     after = (x * np.roll(y, -1) - y * np.roll(x, -1)) / 2
@@ -202,7 +212,7 @@ def _spokes(surface: Surface, boundary: Boundary, fraction: FloatArray) -> Float
     return np.concatenate([xy, surface.height(xy[..., 0], xy[..., 1])[..., None]], axis=-1)
 
 
-def _refined(surface: Surface, boundary: Boundary, start_mm: FloatArray, sign: float) -> FloatArray:
+def refined(surface: Surface, boundary: Boundary, start_mm: FloatArray, sign: float) -> FloatArray:
     """Extreme near a sample, shape (3,): the vertex of the paraboloid through a patch round it.
 
     An extreme at the boundary, or where the patch has no vertex, stays where it is.

@@ -180,7 +180,7 @@ def fit_pool(
         points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
     )
     told = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
-    weights = _slope_weights(points, plane_mm, plane_covariance_mm2, rig, settings.floor_mm)
+    weights = slope_weights(points, plane_mm, plane_covariance_mm2, rig, settings.floor_mm)
     out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
     rim = out > np.median(out)
     stiffness = CORRELATED_MM2 / settings.jerk**2
@@ -219,7 +219,7 @@ def landing_spacing(landing_mm: FloatArray) -> FloatArray:
     return np.asarray(np.abs([across, along]), float)
 
 
-def _slope_weights(
+def slope_weights(
     points: FloatArray, plane_mm: FloatArray, covariance: FloatArray, rig: Rig, floor: float
 ) -> FloatArray:
     """Inverse covariance of the slopes that dots of the given covariance give, shape (n, 2, 2)."""
@@ -322,21 +322,36 @@ def find_level(
     drop_mm
         How deep the rear lies, mm; None: found along with the level.
     """
-    height = surface.height(*landing_mm.T)
-    slope = surface.gradient(*landing_mm.T)
+    height, slope = surface.height(*landing_mm.T), surface.gradient(*landing_mm.T)
+    return place_level(height, slope, landing_mm[:, 1], witness, spacing_mm, drop_mm)
+
+
+def place_level(
+    height: FloatArray,
+    slope: FloatArray,
+    y: FloatArray,
+    witness: IntArray,
+    spacing_mm: FloatArray,
+    drop_mm: float | None = None,
+    about: tuple[float, int] | None = None,
+) -> Level:
+    """Do what `find_level` does, with the surface known where the witnesses would land.
+
+    Parameters
+    ----------
+    height, slope, y
+        Of the surface there, up to its level, shape (m,), mm, and (m, 2); and the place along Y.
+    witness, spacing_mm, drop_mm
+        See `find_level`.
+    about
+        A level that is near, as its shift, mm, and its sign; None: it is looked for.
+    """
     # Height by which the surface changes from one ray to the next, straight across the contour.
     rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
     rise = np.maximum(rise, np.median(rise) / 4)
-    scan = np.linspace((-height).min(), (-height).max(), 300)
-    best_loss, shift, sign = np.inf, 0.0, 1
-    inside = witness[:, None] * (height[:, None] + scan) / rise[:, None]
-    loss = _doubt(4.0 * inside)
-    for trial, doubt in ((1, loss), (-1, loss + 4.0 * inside.sum(axis=0))):
-        if doubt.min() < best_loss:
-            best_loss, shift, sign = doubt.min(), scan[np.argmin(doubt)], trial
+    shift, sign = about or _rough_level(height, rise, witness)
     near = np.abs(height + shift) < 3.0 * rise
     shifts = shift + np.linspace(-1.0, 1.0, 121) * np.median(rise)
-    y = landing_mm[:, 1]
     lit = y[witness > 0]
     start, end = (lit.max() + lit.min()) / 2, lit.min()
     # Only a pool that stands above the work piece is seen to sink at its rear.
@@ -358,3 +373,14 @@ def find_level(
     sigma = float(np.sqrt(posterior.sum(axis=0) @ (shifts - mean) ** 2))
     surprise = -log_likelihood.max() / np.log(2) / max(int(near.sum()), 1)
     return Level(mean, sigma, sign, Rear(drop, start, end), float(surprise))
+
+
+def _rough_level(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:
+    """Shift, mm, and sign that the witnesses contradict least."""
+    scan = np.linspace((-height).min(), (-height).max(), 300)
+    inside = witness[:, None] * (height[:, None] + scan) / rise[:, None]
+    above = _doubt(4.0 * inside)
+    below = above + 4.0 * inside.sum(axis=0)
+    if above.min() <= below.min():
+        return float(scan[np.argmin(above)]), 1
+    return float(scan[np.argmin(below)]), -1

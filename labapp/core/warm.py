@@ -1,0 +1,460 @@
+"""Frames one after the other: each measured from where the one before left off.
+
+The cold chain (`pipeline.measure`) looks for dots, rows and rays in every frame as if it were the
+first. Here the surface of the frames before predicts where every ray's dot should be; found there,
+the dots have their rays, and the fit starts from that surface. An answer is given only where the
+absent ray's place is dark amid lit ones, and where no more is left unexplained than the cold chain
+puts up with. Anything else, and the cold chain measures the frame.
+
+The same frames give the same answers: nothing depends on the clock or on how many are measured at
+once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core import measures
+from labapp.core.boundary import Boundary
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.correspondence import Match, Trial
+from labapp.core.dots import Image
+from labapp.core.fit import LEAST_DOTS, UNSETTLED_MM
+from labapp.core.lattice import Lattice
+from labapp.core.measures import reflection_errors
+from labapp.core.orientation import ways
+from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.pool_fit import Level, find_level, place_level
+from labapp.core.quick_dots import Exposure, quick_dots
+from labapp.core.ray_growth import UNLABELLED, Scene
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.rig import Rig
+from labapp.core.spline import SplineSurface
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
+from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, lay, met, spline_values
+from labapp.core.warm_match import Sight, around, beyond, testimony, tracked, widened
+from labapp.core.warm_measures import follow_rim, sigma_of, sizes_of
+
+FOUND = 0.85
+"""Share of the dots of the frame before that must be found again."""
+
+STEADY = 0.2
+"""… and half of them within this share of the way to the next dot of where they were predicted."""
+
+FIRST_RING, GROWING_ROUNDS = 2, 3
+"""Where no prediction finds the dots, they are first looked for so near the absent one."""
+
+WORSE = 2.0
+"""The residual of a track is at most so many times that of its first frame."""
+
+HELD = 8
+"""For so many frames the datum is carried on while a dot beside the absent one is not seen."""
+
+SINKS_EVERY = 16
+"""Every so many frames it is asked anew whether the rear sinks."""
+
+RAISED_MM = 0.01
+"""After a shift of the level by more, the slopes are fitted once more."""
+
+MEMORY, ORDER = 48, 4
+"""Frames that predictions are learnt from, and how many of them one is made from."""
+
+
+class Broken(Exception):
+    """A track does not lead to this frame; says why in a sentence."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """What a frame leaves to the next.
+
+    Parameters
+    ----------
+    bed
+        Splines and rays.
+    exposure
+        Size of dots and noise.
+    match
+        Of the cold chain, where the track began.
+    residual_mm
+        Root mean square residual there, mm.
+    pool, labels, boundary, level
+        The last surface, the dots' rays, where the pool ends, and z = 0.
+    past
+        Spline coefficients of the last frames, the newest last, shape (frames, p), mm.
+    open_mm
+        How far the level was left open when it was last asked how deep the rear lies, mm.
+    unseen
+        Frames since the absent ray's place was last seen dark amid four lit ones.
+    count
+        Frames that were followed.
+    """
+
+    bed: Bed
+    exposure: Exposure
+    match: Match
+    residual_mm: float
+    pool: WarmPool
+    lit: BoolArray
+    boundary: Boundary
+    level: Level
+    past: FloatArray
+    open_mm: float
+    unseen: int = 0
+    count: int = 0
+
+
+class WarmChain:
+    """Measures the frames of one recording in their order.
+
+    Parameters
+    ----------
+    rig, calibration
+        The bench, and how the camera sees the imaging plane.
+    settings
+        Of the cold chain. Only the fit to band-passed dots, the default, can be followed.
+
+    Attributes
+    ----------
+    broke
+        Why the last frame was measured by the cold chain; None where it was followed.
+    """
+
+    def __init__(self, rig: Rig, calibration: ImageCalibration, settings: Settings) -> None:
+        self.rig, self.calibration, self.settings = rig, calibration, settings
+        self.broke: str | None = None
+        self._track: Track | None = None
+
+    def measure(self, image: Image) -> Measurement:
+        """Measure the next frame; see `pipeline.measure`."""
+        try:
+            if self._track is None:
+                raise Broken("no frame before it was measured")
+            measurement, self._track = follow(image, self._track, self.calibration, self.settings)
+            self.broke = None
+            return measurement
+        except (Broken, CannotMeasure, np.linalg.LinAlgError) as reason:
+            self.broke = str(reason)
+        measurement = measure(image, self.rig, self.calibration, self.settings)
+        if measurement.status == "ok":
+            self._track = begin(image, measurement, self.rig, self.settings, self._track)
+        elif self._track is not None:
+            unseen = self._track.unseen + 1
+            self._track = replace(self._track, unseen=unseen) if unseen <= HELD else None
+        return measurement
+
+
+def begin(
+    image: Image, measurement: Measurement, rig: Rig, settings: Settings, former: Track | None
+) -> Track | None:
+    """Start a track from a frame that the cold chain measured; None where none can be."""
+    match, made = measurement.match, measurement.reconstruction
+    if match is None or made is None or not isinstance(made.surface, SplineSurface):
+        return None
+    if settings.dots.method != "band-pass" or rig.pattern.marker is None:
+        return None
+    surface = made.surface
+    bed = Bed.of(rig, surface.basis, settings.fit)
+    pool = met(bed, surface.coefficients, bed.landing_mm, 4)
+    number = {(i, j): k for k, (i, j) in enumerate((bed.at + 1).tolist())}
+    lit = np.zeros(len(bed.at), bool)
+    lit[[number[i, j] for i, j in match.ray.tolist()]] = True
+    witness = match.witness[tuple(bed.at.T)]
+    told = witness != 0
+    level = find_level(surface, bed.landing_mm[told, :2], witness[told], bed.spacing_mm)
+    return Track(
+        bed=bed,
+        exposure=Exposure.of(image, settings.dots.band_pass),
+        match=match,
+        residual_mm=_rms(made.residual_mm),
+        pool=pool,
+        lit=lit,
+        boundary=made.boundary,
+        level=level,
+        past=np.asarray(surface.coefficients)[None],
+        open_mm=level.sigma_mm,
+    )
+
+
+def _rms(residual: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.sum(residual**2, axis=-1))))
+
+
+# --- one frame ----------------------------------------------------------------------------------
+
+
+def follow(
+    image: Image, track: Track, calibration: ImageCalibration, settings: Settings
+) -> tuple[Measurement, Track]:
+    """Measure a frame from the one before.
+
+    Raises
+    ------
+    Broken
+        If the track does not lead here.
+    CannotMeasure
+        If there are no dots, or no surface.
+    """
+    bed = track.bed
+    if image.shape != track.exposure.noise.shape:
+        raise Broken("the frame has another size than the one before")
+    dots = quick_dots(image, track.exposure, settings.dots.band_pass)
+    scene = Scene.of(dots, bed.rig, calibration, (image.shape[0], image.shape[1]))
+    pool, labels = _found_again(track, scene)
+    pool, labels, lower = _fitted(bed, scene, pool, labels)
+    heard = testimony(bed, scene, pool, labels)
+    level, open_mm = _level(track, pool, heard.witness)
+    outside = beyond(bed, _shifted(pool, level), level, labels)
+    if len(outside) or abs(level.shift_mm) > RAISED_MM:
+        labels[outside] = UNLABELLED
+        pool, labels, lower = _fitted(bed, scene, _shifted(pool, level), labels, widen=False)
+        heard = testimony(bed, scene, pool, labels)
+        level, open_mm = _level(track, pool, heard.witness)
+    pool = met(bed, pool.coefficients + level.shift_mm, pool.points_mm, 1)
+    ray = np.flatnonzero(labels != UNLABELLED)
+    dot = labels[ray]
+    residual = pool.plane_mm[ray] - scene.plane_mm[dot]
+    limits = settings.match
+    if heard.stray > limits.stray[0] + limits.stray[1] * len(dots):
+        raise Broken(f"{heard.stray} dots have no ray")
+    if heard.missed > limits.missed[0] + limits.missed[1] * len(ray):
+        raise Broken(f"{heard.missed} rays amid the others have no dot")
+    if not _rms(residual) < WORSE * track.residual_mm:
+        raise Broken("the surface no longer has the dots")
+    unseen = 0 if _datum_seen(bed, scene, pool, labels) else track.unseen + 1
+    if unseen > HELD:
+        raise Broken("the dots beside the absent one have not been seen for long")
+    match = _match(track, scene, heard.witness, ray, dot, _rms(residual))
+    reconstruction, size = _sized(track, pool, level, lower, match, residual)
+    after = replace(
+        track,
+        pool=pool,
+        lit=labels != UNLABELLED,
+        boundary=reconstruction.boundary,
+        level=level,
+        past=np.vstack([track.past[1 - MEMORY :], pool.coefficients]),
+        open_mm=open_mm,
+        unseen=unseen,
+        count=track.count + 1,
+    )
+    lattice = _lattice(match, bed.rig, len(dots))
+    told = Measurement("ok", "", "fit", dots, lattice, match, reconstruction, size)
+    return told, after
+
+
+def _shifted(pool: WarmPool, level: Level) -> WarmPool:
+    return replace(pool, coefficients=pool.coefficients + level.shift_mm)
+
+
+def _predictions(track: Track) -> Iterator[FloatArray]:
+    """Spline coefficients that the next frame may have, the likeliest first.
+
+    A pool that swings goes on as it did: a linear recurrence, learnt from the frames before on the
+    heights where lit rays land, carries any few oscillations on.
+    """
+    past = track.past
+    if len(past) > 3 * ORDER:
+        own = np.flatnonzero(track.lit)
+        value, splines = track.bed.values[0, own], track.bed.splines[own]
+        heights = np.einsum("rs,frs->fr", value, past[:, splines])
+        heights = heights - heights.mean(axis=0)
+        count = len(past) - ORDER
+        steps = np.stack([heights[ORDER - k - 1 :][:count].ravel() for k in range(ORDER)])
+        gram = steps @ steps.T
+        gram[np.diag_indices(ORDER)] += 1e-4 * np.trace(gram)
+        ratio = np.linalg.solve(gram, steps @ heights[ORDER:].ravel())
+        mean = past.mean(axis=0)
+        yield mean + ratio @ (past[: -ORDER - 1 : -1] - mean)
+    if len(past) > 1:
+        yield 2 * past[-1] - past[-2]
+    yield past[-1]
+
+
+def _found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray]:
+    """A surface that finds the dots again, and the rays that gives them."""
+    bed, count = track.bed, int(track.lit.sum())
+    looked_for = around(bed, track.lit, 2)
+    for coefficients in _predictions(track):
+        pool = met(bed, coefficients, track.pool.points_mm)
+        sight = Sight.of(pool, scene, looked_for)
+        labels, off = tracked(sight, track.lit, scene.resolution_mm)
+        if len(off) >= FOUND * count and np.median(off) < STEADY:
+            return pool, labels
+    return _grown(track, scene)
+
+
+def _grown(track: Track, scene: Scene) -> tuple[WarmPool, IntArray]:
+    """Find the dots again from the absent one outwards, ring by ring.
+
+    Dots in the middle move least from frame to frame; how they moved tells how those around do.
+    """
+    bed, pool, count = track.bed, track.pool, int(track.lit.sum())
+    ring = np.abs(bed.at + 1 - np.array(bed.rig.pattern.marker)).max(axis=1)
+    labels = np.empty(0, np.int64)
+    for reach in range(FIRST_RING, int(ring[track.lit].max()) + 2):
+        sight = Sight.of(pool, scene, around(bed, track.lit, 2))
+        labels, _ = tracked(sight, track.lit & (ring <= reach), scene.resolution_mm)
+        ray = np.flatnonzero(labels != UNLABELLED)
+        if len(ray) < LEAST_DOTS:
+            break
+        dot = labels[ray]
+        slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+        rest = track.pool.coefficients
+        coefficients, _, _ = fit_slopes_to(bed, pool, slopes, GROWING_ROUNDS, rest)
+        pool = met(bed, coefficients, pool.points_mm)
+    found = int(np.sum(labels != UNLABELLED))
+    if found < max(FOUND * count, LEAST_DOTS):
+        raise Broken(f"{found} of {count} dots were found again")
+    return pool, labels
+
+
+def _fitted(
+    bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, *, widen: bool = True
+) -> tuple[WarmPool, IntArray, FloatArray]:
+    """Fit the surface, and once more with the labels that it bears out."""
+    for last in (not widen, True):
+        ray = np.flatnonzero(labels != UNLABELLED)
+        if len(ray) < LEAST_DOTS:
+            raise Broken("hardly a dot is left that has a ray")
+        dot = labels[ray]
+        slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+        coefficients, lower, moved = fit_slopes_to(bed, pool, slopes)
+        if not moved < UNSETTLED_MM:
+            raise Broken("the surface does not settle")
+        pool = met(bed, coefficients, pool.points_mm)
+        if last:
+            break
+        wider = widened(bed, scene, pool, lower, labels)
+        if np.array_equal(wider, labels):
+            break
+        labels = wider
+    return pool, labels, lower
+
+
+def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, float]:
+    """Where z = 0 lies on the fitted surface, and how far that was open when the rear was free.
+
+    How deep the rear lies is not asked every time; in between the level is known no better.
+    """
+    told = witness != 0
+    if not (witness < 0).any():
+        raise Broken("no ray that would show stayed away")
+    bed, before = track.bed, track.level
+    height, slope = lay(bed, pool.coefficients)
+    free = track.count % SINKS_EVERY == SINKS_EVERY - 1
+    drop = None if free else before.rear.drop_mm
+    y, about = bed.landing_mm[told, 1], (0.0, before.sign)
+    level = place_level(height[told], slope[told], y, witness[told], bed.spacing_mm, drop, about)
+    open_mm = level.sigma_mm if free else track.open_mm
+    return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
+
+
+def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> bool:
+    """Whether all four neighbours of the absent ray are lit.
+
+    Raises
+    ------
+    Broken
+        If the absent ray's place is lit, or two of its neighbours are dark: no hole tells the
+        rows (`lattice.find_holes`).
+    """
+    marker = np.array(bed.rig.pattern.marker) - 1
+    place = [
+        np.flatnonzero((bed.at == marker + step).all(axis=1))
+        for step in ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
+    ]
+    if any(len(one) == 0 for one in place):
+        raise Broken("the absent ray is at the pool's edge")
+    hole, *beside = (int(one[0]) for one in place)
+    lit = labels[beside] != UNLABELLED
+    reach = min(
+        float(np.linalg.norm(pool.plane_mm[a] - pool.plane_mm[b])) / 2
+        for a, b in (beside[:2], beside[2:])
+    )
+    if not np.linalg.norm(scene.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
+        raise Broken("a dot is where the absent one should be dark")
+    if lit.sum() < 3:
+        raise Broken("the dots beside the absent one are not seen")
+    return bool(lit.all())
+
+
+# --- what is told of it -------------------------------------------------------------------------
+
+
+def _match(
+    track: Track,
+    scene: Scene,
+    witness: IntArray,
+    ray: IntArray,
+    dot: IntArray,
+    residual_mm: float,
+) -> Match:
+    bed, first = track.bed, track.match
+    marker = np.array(bed.rig.pattern.marker)
+    numbers = (bed.at[ray] + 1 - marker) * ways(first.orientation)
+    said = np.zeros((bed.rig.pattern.rows, bed.rig.pattern.columns), np.int64)
+    said[tuple(bed.at.T)] = witness
+    others = tuple(t for t in first.trials if t.orientation != first.orientation)
+    return Match(
+        orientation=first.orientation,
+        dot=dot,
+        ray=bed.at[ray] + 1,
+        reflected=numbers + 1 - numbers.min(axis=0),
+        plane_mm=scene.plane_mm[dot],
+        plane_covariance_mm2=scene.covariance_mm2[dot],
+        witness=said,
+        trials=(Trial(first.orientation, residual_mm), *others),
+    )
+
+
+def _lattice(match: Match, rig: Rig, count: int) -> Lattice:
+    """Rows and columns of all dots (`correspondence.indexed_lattice`)."""
+    way = ways(match.orientation)
+    k, t = np.array(rig.pattern.marker) * way + (match.reflected - match.ray * way)[0]
+    row, column = np.zeros((2, count), np.int64)
+    row[match.dot], column[match.dot] = match.reflected.T
+    at = np.lexsort(match.reflected.T[::-1])
+    step = np.diff(match.reflected[at], axis=0)
+    gaps = match.reflected[at][1:, 0][(step[:, 0] == 0) & (step[:, 1] > 2)]
+    site = (int(k), int(t))
+    return Lattice(row, column, site, (site,), frozenset(np.unique(gaps).tolist()))
+
+
+def _sized(
+    track: Track,
+    pool: WarmPool,
+    level: Level,
+    lower: FloatArray,
+    match: Match,
+    residual: FloatArray,
+) -> tuple[Reconstruction, measures.Measures]:
+    """Boundary, sizes and all their ±."""
+    bed, coefficients = track.bed, pool.coefficients
+    own = np.flatnonzero(np.isin(bed.at[:, 0] * 4096 + bed.at[:, 1], (match.ray - 1) @ (4096, 1)))
+    points = pool.points_mm[own]
+    center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+    rim = follow_rim(bed, coefficients, level, center, track.boundary)
+    sizes = sizes_of(bed, coefficients, level, rim)
+    if not sizes.holds:
+        raise Broken("the surface comes down to the work piece within its boundary")
+    splines, values = spline_values(bed.basis, points[:, :2])
+    gradients = np.zeros((len(own) + len(sizes.size), len(coefficients)))
+    np.put_along_axis(gradients[: len(own)], splines, values[0], axis=1)
+    level_at = gradients[: len(own)].mean(axis=0)
+    gradients[len(own) :] = sizes.gradient
+    sigma = sigma_of(lower, gradients, level_at, level.sigma_mm)
+    made = Reconstruction(
+        scheme="fit",
+        surface=SplineSurface(bed.basis, coefficients),
+        boundary=rim.boundary,
+        ray=match.ray,
+        points_mm=points,
+        residual_mm=residual,
+        sigma_mm=sigma[: len(own)],
+    )
+    errors = reflection_errors(made, match, bed.rig)
+    told = measures.measures_of(errors, sizes.size, sizes.peak_mm, center, sigma[len(own) :])
+    return made, told

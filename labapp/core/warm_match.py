@@ -1,0 +1,226 @@
+"""Which ray made which dot, where the surface of the frame before tells where dots should be.
+
+Contract of `correspondence`: a dot that is not sure of its ray gets none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from labapp.core.hypothesis import BEYOND, FEW
+from labapp.core.optics import reflect, surface_normal
+from labapp.core.pool_fit import Level, slope_of_dot
+from labapp.core.ray_growth import (
+    CAUTION,
+    CLEAR,
+    MODEL_MM,
+    NEAR,
+    UNLABELLED,
+    Scene,
+)
+from labapp.core.values import BoolArray, FloatArray, IntArray
+from labapp.core.warm_fit import Bed, WarmPool, lay, solve, spline_values
+
+GATE, CLEARLY = 0.35, 2.0
+"""A dot is a tracked ray's within this share of the way to the next predicted dot, if no other ray
+is within so many times its distance."""
+
+ASTRAY = 0.25
+"""A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How predicted dots and found ones lie to each other; R rays, n dots.
+
+    Parameters
+    ----------
+    apart_mm
+        Distance of every ray's predicted dot from every dot, shape (R, n); infinite for rays whose
+        dots are not looked for.
+    next_mm
+        Distance of every predicted dot from the next one, shape (R,).
+    """
+
+    apart_mm: FloatArray
+    next_mm: FloatArray
+
+    @classmethod
+    def of(cls, pool: WarmPool, scene: Scene, looked_for: BoolArray) -> Sight:
+        """Compare the predictions of rays in a mask, shape (R,), with a frame's dots."""
+        plane = np.where(looked_for[:, None], pool.plane_mm, np.nan)
+        return cls(_apart(plane, scene.plane_mm), next_of(plane))
+
+
+def _apart(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Distances, shape (len(one), len(other)); infinite where a place is not known."""
+    x = one[:, 0, None] - other[:, 0]
+    y = one[:, 1, None] - other[:, 1]
+    return np.nan_to_num(np.sqrt(x * x + y * y), nan=np.inf)
+
+
+def next_of(plane_mm: FloatArray) -> FloatArray:
+    """Distance of each place, shape (R, 2), from the next one, shape (R,); infinite without."""
+    apart = _apart(plane_mm, plane_mm)
+    np.fill_diagonal(apart, np.inf)
+    return np.asarray(apart.min(axis=1))
+
+
+def around(bed: Bed, lit: BoolArray, rings: int) -> BoolArray:
+    """Rays in a mask, shape (R,), and their neighbours, so many rings of them."""
+    pattern = bed.rig.pattern
+    grid = np.zeros((pattern.rows, pattern.columns), bool)
+    grid[tuple(bed.at.T)] = lit
+    wide = binary_dilation(grid, np.ones((3, 3), bool), iterations=rings)
+    return np.asarray(wide[tuple(bed.at.T)])
+
+
+def tracked(sight: Sight, lit: BoolArray, resolution_mm: float) -> tuple[IntArray, FloatArray]:
+    """Dots of the rays that were lit before, each by the one prediction that is near.
+
+    Returns
+    -------
+    labels, off
+        Index of each ray's dot or `UNLABELLED`, shape (R,); how far those found are from where
+        they were predicted, in shares of the way to the next predicted dot, shape (found,).
+    """
+    apart = sight.apart_mm
+    ray = np.argmin(apart, axis=0)
+    dot = np.arange(apart.shape[1])
+    off = apart[ray, dot]
+    sure = (off < GATE * sight.next_mm[ray]) & (sight.next_mm[ray] > resolution_mm) & lit[ray]
+    sure &= np.argmin(apart, axis=1)[ray] == dot
+    sure &= np.partition(apart, 1, axis=0)[1] > CLEARLY * off
+    labels = np.full(len(apart), UNLABELLED, np.int64)
+    labels[ray[sure]] = dot[sure]
+    return labels, off[sure] / sight.next_mm[ray[sure]]
+
+
+def widened(
+    bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, labels: IntArray
+) -> IntArray:
+    """Labels that the fitted surface bears out, and new ones beside them that it makes sure of.
+
+    A new label stands where it is likelier by far than any other ray for the dot, and any other
+    dot for the ray (`ray_growth`), with what the prediction is uncertain by.
+    """
+    lit = labels != UNLABELLED
+    sight = Sight.of(pool, scene, around(bed, lit, 2))
+    rays = np.flatnonzero(lit)
+    off = sight.apart_mm[rays, labels[rays]]
+    astray = off > np.maximum(6.0 * np.median(off), ASTRAY * sight.next_mm[rays])
+    labels = labels.copy()
+    labels[rays[astray]] = UNLABELLED
+    free = np.setdiff1d(np.arange(len(scene.plane_mm)), labels)
+    if len(free) == 0:
+        return labels
+    beside = np.flatnonzero(around(bed, lit, 1) & ~lit & ~bed.absent)
+    if len(beside) == 0:
+        return labels
+    near = np.unique(np.argsort(sight.apart_mm[:, free], axis=0)[:3])
+    near = near[np.isfinite(pool.plane_mm[near, 0])]
+    cost, distance = _surprise(bed, scene, pool, lower, near)
+    for dot in free:
+        best = int(np.argmin(cost[:, dot]))
+        ray = int(near[best])
+        rivals = np.delete(cost[:, dot], best), np.delete(cost[best], dot)
+        clear = all(len(r) == 0 or r.min() > cost[best, dot] + CLEAR for r in rivals)
+        known = ray in beside and sight.next_mm[ray] > scene.resolution_mm
+        if clear and known and distance[best, dot] < NEAR:
+            labels[ray] = dot
+    return labels
+
+
+def _surprise(
+    bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, ray: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """−2 log likelihood, and squared distance in σ², of rays making dots, shapes (rays, n)."""
+    splines, values = spline_values(bed.basis, pool.points_mm[ray, :2])
+    by = np.zeros((2, len(ray), len(pool.coefficients)))
+    for axis in range(2):
+        np.put_along_axis(by[axis], splines, values[1 + axis], axis=1)
+    moved = np.linalg.inv(slope_of_dot(pool.points_mm[ray], pool.plane_mm[ray], bed.rig))
+    rows = moved @ np.moveaxis(by, 0, 1)
+    across = solve(lower, np.asfortranarray(rows.reshape(2 * len(ray), -1).T))
+    spread = rows @ across.T.reshape(len(ray), 2, -1).swapaxes(1, 2)
+    spread = CAUTION**2 * spread[:, None] + scene.covariance_mm2 + MODEL_MM**2 * np.eye(2)
+    offset = scene.plane_mm - pool.plane_mm[ray, None]
+    distance = np.einsum("rna,rnab,rnb->rn", offset, np.linalg.inv(spread), offset)
+    return distance + np.log(np.linalg.det(spread)), distance
+
+
+@dataclass(frozen=True)
+class Testimony:
+    """What the rays say with a surface under them.
+
+    Parameters
+    ----------
+    witness
+        +1 came back, −1 did not, 0 cannot tell, shape (R,) (see `Match.witness`).
+    stray, missed
+        Dots without a ray; rays amid the others without a dot.
+    """
+
+    witness: IntArray
+    stray: int
+    missed: int
+
+
+def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testimony:
+    """Ask every ray, as `hypothesis` does."""
+    lit = labels != UNLABELLED
+    next_mm = next_of(pool.plane_mm)
+    merged = next_mm < scene.resolution_mm
+    way = reflect(bed.rays, surface_normal(pool.slopes))
+    hidden = _behind_torch(pool.points_mm, bed.rays, way, bed.rig.electrode.height_mm)
+    known = np.isfinite(pool.plane_mm[:, 0])
+    seen = known & ~hidden & ~merged
+    seen[seen] = scene.in_view(pool.plane_mm[seen])
+    pattern = bed.rig.pattern
+    grid = np.zeros((pattern.rows, pattern.columns), bool)
+    grid[tuple(bed.at.T)] = lit
+    among = _amid(grid)[tuple(bed.at.T)]
+    missed = int(np.sum(among & ~bed.absent & ~lit & seen))
+    witness = np.where(seen & ~among & ~bed.absent, -1, 0)
+    witness[lit] = 1
+    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
+    if len(stray):
+        apart = _apart(pool.plane_mm, scene.plane_mm[stray])
+        doubt = apart.min(axis=1) < next_mm
+        witness[doubt & (witness < 0)] = 0
+        run_together = known & merged & among
+        if run_together.any():
+            stray = stray[apart[run_together].min(axis=0) > scene.resolution_mm]
+    return Testimony(witness, len(stray), missed)
+
+
+def _amid(lit: BoolArray) -> BoolArray:
+    """Rays between lit ones in their row or in their column, shape (rows, columns)."""
+    between = np.zeros_like(lit)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(lit, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(lit, axis), axis=axis), axis)
+        between |= before & after
+    return between
+
+
+def _behind_torch(
+    points: FloatArray, incident: FloatArray, reflected: FloatArray, tip_mm: float
+) -> BoolArray:
+    """Whether the torch may hide reflections (`ray_growth.blocked`)."""
+    way = np.where((points[:, 1] < 0)[:, None], -incident, reflected)
+    height = points[:, 2] - points[:, 1] * way[:, 2] / np.where(way[:, 1] == 0, 1e-12, way[:, 1])
+    return np.asarray(height > tip_mm - 0.3)
+
+
+def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray) -> IntArray:
+    """The one or two lit rays that landed well beyond the boundary: false dots (`hypothesis`)."""
+    lit = np.flatnonzero(labels != UNLABELLED)
+    height, slope = lay(bed, pool.coefficients)
+    over = height[lit] - level.rear.height(bed.landing_mm[lit, 1])
+    rise = np.linalg.norm(slope[lit] * bed.spacing_mm, axis=-1)
+    outside = lit[level.sign * over < -BEYOND * rise]
+    return np.asarray(outside if len(outside) <= FEW else outside[:0])

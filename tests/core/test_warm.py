@@ -1,0 +1,221 @@
+"""Frames measured one from the other: as the cold chain has them, and never a wrong ray."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.values import FloatArray
+from labapp.core.warm import WarmChain
+from labapp.simulation.camera import CameraView
+from labapp.simulation.pools import Wave, egg
+from labapp.simulation.recording import RecordedFrame, Recording
+from labapp.simulation.render import Look
+
+RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0))
+VIEW = CameraView((44.0, 590.0), (242.02, 590.0), 34.925, (44.0, 499.99), 15.875)
+CALIBRATION = ImageCalibration.from_three_points(
+    VIEW.origin_px, VIEW.x_axis_px, VIEW.x_axis_mm, VIEW.z_axis_px, VIEW.z_axis_mm
+)
+RATE_HZ, WAVE_HZ = 200.0, 31.0
+FRAMES, WARMED = 18, 16
+TRUE_PX = 2.5
+
+
+@cache
+def frames() -> tuple[RecordedFrame, ...]:
+    """A pool that swings: dots at its rim move by up to two columns from frame to frame."""
+    pool = egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6), terms=(Wave((0, 1), 0.03, WAVE_HZ),))
+    pools = tuple(pool.after(n / RATE_HZ) for n in range(FRAMES))
+    look = Look(hot_pixels=2, missing=0.01)
+    made = Recording(
+        file="recording.avi", rig=RIG, view=VIEW, look=look, pools=pools, seed=61,
+        frame_rate_hz=RATE_HZ,
+    )  # fmt: skip
+    return tuple(made.frame(n) for n in range(FRAMES))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A chain after `WARMED` frames, and what it said of each."""
+
+    chain: WarmChain
+    measurements: tuple[Measurement, ...]
+    broke: tuple[str | None, ...]
+
+
+@cache
+def warmed() -> Run:
+    chain = WarmChain(RIG, CALIBRATION, Settings())
+    measurements, broke = [], []
+    for frame in frames()[:WARMED]:
+        measurements.append(chain.measure(frame.image))
+        broke.append(chain.broke)
+    return Run(chain, tuple(measurements), tuple(broke))
+
+
+def chain() -> WarmChain:
+    return copy.copy(warmed().chain)
+
+
+def wrong_rays(result: Measurement, frame: RecordedFrame, shift_px: float = 0.0) -> int:
+    """How many dots have a ray whose true dot is not there."""
+    if result.match is None or result.dots is None:
+        return 0
+    true = frame.dot_px + np.array([shift_px, 0.0])
+    i, j = result.match.ray.T - 1
+    off = np.linalg.norm(result.dots.image_px[result.match.dot] - true[i, j], axis=-1)
+    return int(np.sum(~(off < TRUE_PX)))
+
+
+def with_dots(image: FloatArray, places: FloatArray, peak: float = 50.0) -> FloatArray:
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    light = image.astype(float)
+    for at in places:
+        light += peak * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * 1.8**2))
+    return np.clip(light, 0, 255).astype(np.uint8)
+
+
+def without_dots(image: FloatArray, places: FloatArray) -> FloatArray:
+    dark = image.copy()
+    rng = np.random.default_rng(7)
+    for u, v in np.rint(places).astype(int):
+        patch = dark[v - 6 : v + 7, u - 6 : u + 7]
+        patch[:] = np.clip(rng.normal(np.quantile(patch, 0.2), 1.5, patch.shape), 0, 255)
+    return dark
+
+
+def test_every_frame_after_the_first_is_followed() -> None:
+    run = warmed()
+    assert run.broke[0] is not None
+    assert [reason for reason in run.broke[1:] if reason] == []
+    for result, frame in zip(run.measurements, frames(), strict=False):
+        assert result.status == "ok"
+        assert wrong_rays(result, frame) == 0
+        assert result.match is not None
+        assert len(result.match.ray) >= 0.97 * frame.shown.sum()
+
+
+def test_sizes_are_true_within_what_they_are_said_to_be_uncertain_by() -> None:
+    for name in ("width", "length", "height"):
+        surprise = []
+        for result, frame in zip(warmed().measurements, frames(), strict=False):
+            assert result.measures is not None
+            off = getattr(result.measures, f"{name}_mm") - getattr(frame.pool.size, f"{name}_mm")
+            surprise.append(off / getattr(result.measures, f"{name}_sigma_mm"))
+        assert np.abs(surprise).max() < 4.0
+        assert 0.2 < np.sqrt(np.mean(np.square(surprise))) < 2.0
+
+
+@pytest.mark.parametrize("number", [2, 9])
+def test_a_followed_frame_is_what_the_cold_chain_makes_of_it(number: int) -> None:
+    warm = warmed().measurements[number]
+    cold = measure(frames()[number].image, RIG, CALIBRATION, Settings())
+    assert cold.match is not None
+    assert warm.match is not None
+    assert cold.measures is not None
+    assert warm.measures is not None
+    assert warm.match.orientation == cold.match.orientation
+    own = {tuple(ray): k for k, ray in enumerate(warm.match.ray.tolist())}
+    both = [(own[r], k) for k, r in enumerate(map(tuple, cold.match.ray.tolist())) if r in own]
+    assert len(both) >= 0.97 * len(cold.match.ray)
+    assert warm.reconstruction is not None
+    assert cold.reconstruction is not None
+    mine, its = np.array(both).T
+    off = warm.reconstruction.points_mm[mine, 2] - cold.reconstruction.points_mm[its, 2]
+    # Their splines need not have the same knots: where dots end these count for a few µm.
+    surprise = off / cold.reconstruction.sigma_mm[its]
+    assert np.sqrt(np.mean(surprise**2)) < 1.0
+    assert np.abs(surprise).max() < 2.0
+    np.testing.assert_allclose(
+        warm.reconstruction.sigma_mm[mine], cold.reconstruction.sigma_mm[its], rtol=0.4
+    )
+    for name in ("width_mm", "length_mm", "height_mm", "area_mm2", "volume_mm3"):
+        sigma = name.replace("_mm", "_sigma_mm")
+        a, b = warm.measures, cold.measures
+        assert abs(getattr(a, name) - getattr(b, name)) < getattr(b, sigma)
+        assert getattr(a, sigma) == pytest.approx(getattr(b, sigma), rel=0.4)
+    assert warm.measures.are_mm == pytest.approx(cold.measures.are_mm, rel=0.2)
+    assert warm.lattice is not None
+    assert cold.lattice is not None
+    assert warm.lattice.reference is not None
+    row = warm.lattice.row[warm.match.dot[mine]] - cold.lattice.row[cold.match.dot[its]]
+    assert (row == row[0]).all()
+
+
+def test_the_same_frames_give_the_same_answers() -> None:
+    one, other = chain(), chain()
+    for frame in frames()[WARMED:]:
+        first, second = one.measure(frame.image), other.measure(frame.image)
+        assert first.measures == second.measures
+
+
+def test_missing_and_false_dots_are_told_apart_from_the_others() -> None:
+    frame, follower = frames()[WARMED], chain()
+    gone = frame.dot_px[[9, 9, 11], [5, 13, 8]]
+    image = without_dots(frame.image, gone)
+    image = with_dots(image, gone[:1] + np.array([6.0, 14.0]))
+    result = follower.measure(image)
+    assert follower.broke is None
+    assert wrong_rays(result, frame) == 0
+    assert result.match is not None
+    rays = {tuple(ray) for ray in result.match.ray.tolist()}
+    assert not rays & {(10, 6), (10, 14), (12, 9)}
+    assert len(rays) >= frame.shown.sum() - 6
+
+
+def test_a_dot_where_the_absent_one_should_be_dark_breaks_the_track() -> None:
+    frame, follower = frames()[WARMED], chain()
+    hole = frame.dot_px[9, 8:11:2].mean(axis=0)
+    result = follower.measure(with_dots(frame.image, hole[None]))
+    assert follower.broke is not None
+    assert "absent" in follower.broke
+    assert wrong_rays(result, frame) == 0
+
+
+def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() -> None:
+    frame, follower = frames()[WARMED], chain()
+    step = round(float(np.nanmedian(np.diff(frame.dot_px[9, 5:14, 0]))))
+    result = follower.measure(np.roll(frame.image, step, axis=1))
+    assert follower.broke is not None
+    assert wrong_rays(result, frame, shift_px=step) == 0
+
+
+def test_a_pool_that_jumps_is_measured_anew() -> None:
+    other = egg(5.6, 2.6, 3.4, 0.2, (0.3, -0.2))
+    made = Recording(
+        file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(other,), seed=62,
+        frame_rate_hz=RATE_HZ,
+    )  # fmt: skip
+    frame, follower = made.frame(0), chain()
+    result = follower.measure(frame.image)
+    assert wrong_rays(result, frame) == 0
+    if result.measures is not None:
+        off = result.measures.height_mm - frame.pool.size.height_mm
+        assert abs(off) < 4 * result.measures.height_sigma_mm
+
+
+def test_the_track_goes_on_after_a_frame_without_dots() -> None:
+    follower = chain()
+    dark = np.full_like(frames()[0].image, 18)
+    assert follower.measure(dark).status == "no-dots"
+    assert follower.broke is not None
+    frame = frames()[WARMED + 1]
+    result = follower.measure(frame.image)
+    assert follower.broke is None
+    assert wrong_rays(result, frame) == 0
+
+
+def test_another_scheme_is_measured_by_the_cold_chain() -> None:
+    follower = WarmChain(RIG, CALIBRATION, Settings(scheme="ers"))
+    for frame in frames()[:2]:
+        result = follower.measure(frame.image)
+        assert follower.broke is not None
+        assert result.scheme == "ers"
