@@ -1,0 +1,261 @@
+"""Frame and what was found in it → whether it is fit to be measured, in words (§9.2).
+
+The gate before and during capture: exposure, blur, rows, reference, and the height's ± to expect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.detection import find_dots, find_lattice
+from labapp.core.dots import Dots, Image
+from labapp.core.exposure import Exposure, judge_exposure
+from labapp.core.lattice import Lattice
+from labapp.core.measures import Measures
+from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.rig import Rig
+from labapp.core.values import CannotMeasure
+
+Grade = Literal["good", "doubtful", "bad"]
+"""Measure on; measured, but not as well as it could be; not to be measured."""
+
+GRADES: tuple[Grade, ...] = ("good", "doubtful", "bad")
+
+BLURRED = 0.6
+"""Dots are about to merge when the valley between a tenth of them and their neighbours is flatter:
+what blurs them by 2 px more, in the sample runs, loses dots."""
+
+FEW = 0.1
+"""Part of the rays that should show at the least; the sample runs show 0.18 to 0.27."""
+
+MANY = 1.5
+"""More dots than so many times the rays are no dots: what merges or is blurred falls into noise."""
+
+HOLE = 0.5
+"""No dot is nearer to the reference's place than this part of the distance between dots."""
+
+USUAL_RAYS = 361
+"""Where the lens is not known."""
+
+UNMEASURED = "not-measured"
+"""Status of a frame for which there is no set-up to measure it by."""
+
+FATAL = frozenset({"blank", "no dots", "dots merge"})
+"""Verdicts on the exposure that leave nothing to measure."""
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One thing about a frame.
+
+    Parameters
+    ----------
+    about
+        What was looked at.
+    grade
+        How good it is.
+    words
+        What it is, and what to do about it; one or two sentences.
+    """
+
+    about: Literal["exposure", "blur", "rows", "reference", "measurement", "height ±"]
+    grade: Grade
+    words: str
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How fit a frame is to be measured.
+
+    Parameters
+    ----------
+    exposure
+        Levels, saturation, contrast, merging.
+    dots
+        How many were found.
+    blocked_rows
+        How many rows have dots that the torch hides, where rays could be matched.
+    reference
+        Whether the hole of the absent ray was seen, where rays could be matched.
+    height_sigma_mm
+        The ± that the height has (of a hollow the depth), standard uncertainty; NaN where the
+        frame cannot be measured or the scheme gives none.
+    remarks
+        What was looked at, the worst first.
+    """
+
+    exposure: Exposure
+    dots: int
+    blocked_rows: int
+    reference: bool
+    height_sigma_mm: float
+    remarks: tuple[Remark, ...]
+
+    @property
+    def grade(self) -> Grade:
+        """That of the worst remark."""
+        return self.remarks[0].grade
+
+    @property
+    def words(self) -> str:
+        """What is wrong, or that nothing is."""
+        wrong = [remark.words for remark in self.remarks if remark.grade != "good"]
+        return " ".join(wrong) or self.remarks[0].words
+
+
+def look(
+    image: Image,
+    settings: Settings,
+    bench: tuple[Rig, ImageCalibration] | None = None,
+) -> Measurement:
+    """Measure a frame as far as can be: dots and rows only where there is no set-up yet.
+
+    Parameters
+    ----------
+    image
+        Grey levels, shape (rows, columns).
+    settings
+        Those of the measurement.
+    bench
+        Rig and image calibration; None before they are known.
+    """
+    height, width = image.shape
+    found = Measurement(UNMEASURED, "there is no set-up yet", settings.scheme)
+    try:
+        dots = find_dots(image, settings.dots)
+        found = replace(found, dots=dots)
+        rays = USUAL_RAYS if bench is None else bench[0].pattern.rows * bench[0].pattern.columns
+        if len(dots) > MANY * rays:
+            # Rows are sought among them for minutes.
+            words = f"{len(dots)} spots stand out, where the lens makes {rays} dots at most"
+            raise CannotMeasure("too-many-dots", words)
+        if bench is not None:
+            return measure(image, *bench, settings)
+        lattice = find_lattice(dots, (height, width), settings.lattice)
+        return replace(found, lattice=lattice)
+    except CannotMeasure as answer:
+        return replace(found, status=answer.status, reason=answer.reason)
+
+
+def judge_quality(
+    image: Image,
+    measurement: Measurement,
+    bit_depth: int | None,
+    rays: int | None = None,
+    most_sigma_mm: float | None = None,
+) -> Quality:
+    """Judge a frame by its grey levels and by what was found in it.
+
+    Parameters
+    ----------
+    image
+        Grey levels, shape (rows, columns).
+    measurement
+        What it gave: `look`, or the live chain.
+    bit_depth
+        Significant bits of a grey level; None where not known.
+    rays
+        How many the lens makes; None where not known.
+    most_sigma_mm
+        The height's ± that is wanted at most, mm.
+    """
+    dots, sizes = measurement.dots, measurement.measures
+    # Until the rays agree a hole in the rows, or at their ends, is no more than a candidate.
+    lattice = measurement.lattice if measurement.match is not None else None
+    exposure = judge_exposure(image, dots, bit_depth)
+    blocked = 0 if lattice is None else len(lattice.blocked_rows)
+    reference = lattice is not None and dots is not None and _hole_seen(dots, lattice)
+    sigma_mm = float("nan") if sizes is None else _peak_sigma(sizes)
+    remarks = [_of_exposure(exposure)]
+    if dots is not None and len(dots):
+        remarks.append(_of_blur(exposure))
+        remarks.append(_of_rows(dots, blocked, rays))
+        if lattice is not None:
+            remarks.append(_of_reference(reference))
+        remarks += _of_measurement(measurement, sigma_mm, most_sigma_mm)
+    remarks.sort(key=lambda remark: -GRADES.index(remark.grade))  # else in the order of looking
+    count = 0 if dots is None else len(dots)
+    return Quality(exposure, count, blocked, reference, sigma_mm, tuple(remarks))
+
+
+def _of_exposure(exposure: Exposure) -> Remark:
+    grade: Grade = "good" if exposure.verdict == "good" else "doubtful"
+    if exposure.verdict in FATAL or exposure.snr == 0:
+        grade = "bad"
+    return Remark("exposure", grade, exposure.advice)
+
+
+def _of_blur(exposure: Exposure) -> Remark:
+    if exposure.valley < BLURRED and exposure.verdict != "dots merge":
+        full = f"{1 - exposure.valley:.0%}"
+        words = f"Dots are blurred, the gaps between them {full} full of light: focus the lens."
+        return Remark("blur", "doubtful", words)
+    return Remark("blur", "good", "The dots are sharp.")
+
+
+def _of_rows(dots: Dots, blocked: int, rays: int | None) -> Remark:
+    seen = f"{len(dots)} dots" if rays is None else f"{len(dots)} of {rays} dots"
+    if rays is not None and len(dots) < FEW * rays:
+        words = f"Only {seen} are seen: is the pool in the dot matrix, the plane in the picture?"
+        return Remark("rows", "doubtful", words)
+    if blocked:
+        rows = "a row" if blocked == 1 else f"{blocked} rows"
+        words = f"The torch hides dots in {rows}: raise it; Set-up shows which rays it blocks."
+        return Remark("rows", "doubtful", words)
+    return Remark("rows", "good", f"{seen} are seen.")
+
+
+def _of_reference(reference: bool) -> Remark:
+    if reference:
+        return Remark("reference", "good", "The reference is seen.")
+    words = (
+        "The reference, the hole of the absent ray, is not seen: a row may be taken for another."
+    )
+    return Remark("reference", "doubtful", words)
+
+
+def _hole_seen(dots: Dots, lattice: Lattice) -> bool:
+    """Whether dots stand on two opposite sides of the reference, and none in its place."""
+    if lattice.reference is None:
+        return False
+    k, t = lattice.reference
+    place = dots.image_px
+    for down, along in ((0, 1), (1, 0)):
+        pair = [
+            place[(lattice.row == k + side * down) & (lattice.column == t + side * along)]
+            for side in (-1, 1)
+        ]
+        if all(len(end) == 1 for end in pair):
+            one, other = pair[0][0], pair[1][0]
+            apart = float(np.linalg.norm(other - one)) / 2
+            nearest = np.linalg.norm(place - (one + other) / 2, axis=1).min()
+            return bool(nearest > HOLE * apart)
+    return False
+
+
+def _of_measurement(
+    measurement: Measurement, sigma_mm: float, most_mm: float | None
+) -> list[Remark]:
+    if measurement.status == UNMEASURED:
+        return []
+    if measurement.status != "ok":
+        reason = measurement.reason[:1].upper() + measurement.reason[1:]
+        return [Remark("measurement", "bad", f"{reason} ({measurement.status}).")]
+    found = [Remark("measurement", "good", "The frame can be measured.")]
+    if not np.isfinite(sigma_mm):
+        return found
+    told = f"The height will be known to ± {sigma_mm:.3f} mm"
+    if most_mm is not None and sigma_mm > most_mm:
+        words = f"{told}, not to ± {most_mm:g} mm: sharper or brighter dots, or more of them."
+        return [*found, Remark("height ±", "doubtful", words)]
+    return [*found, Remark("height ±", "good", f"{told}.")]
+
+
+def _peak_sigma(sizes: Measures) -> float:
+    """The ± of what is farther from the work piece, the highest or the lowest point."""
+    hollow = -sizes.depth_mm > sizes.height_mm
+    return sizes.depth_sigma_mm if hollow else sizes.height_sigma_mm
