@@ -36,8 +36,9 @@ of them are put down to false dots."""
 STRAY, MISSED = 16.0, 12.0
 """What a dot without a ray, and a ray without its dot amid the others, cost in units of χ²."""
 
-LEAST_ROW = 3
-"""A dot or two beyond the last row may be false; so many where one surface has them are not."""
+LEAST_ROW, MOST_BEYOND = 3, 0.3
+"""A dot or two beyond the last row may be false; so many where one surface has them are not. If more
+than that share of all dots is left over, it is not for a row that was not reached."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,8 @@ def with_rows_beyond(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
     """
     while found:
         best = min(found, key=lambda hypothesis: hypothesis.cost)
-        wider = _rows_begun(scene, best) if best.stray >= LEAST_ROW else []
+        most = MOST_BEYOND * len(scene.plane_mm)
+        wider = _rows_begun(scene, best) if LEAST_ROW <= best.stray <= most else []
         found = [*found, *wider]
         if min((h.cost for h in wider), default=np.inf) >= best.cost:
             break
