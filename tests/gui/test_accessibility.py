@@ -316,9 +316,12 @@ def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
     tool = opened.findChild(ToolWindow, f"tool-{key}")
     assert tool is not None
     qtbot.waitUntil(tool.isActiveWindow)
+    assert tool.form.isAncestorOf(QApplication.focusWidget())
     FILL[key](tool, qtbot)
     reached = check_round(tool)
-    assert tool.start_button in reached
+    enabled = [button for button in (tool.start_button, tool.close_button) if button.isEnabled()]
+    assert [each for each in reached if each in enabled] == enabled
+    assert tool.form.isAncestorOf(reached[(reached.index(tool.close_button) + 1) % len(reached)])
     assert all(each.window() is tool for each in reached)
     tool.resize(819, 460)  # 1366 × 768 at 150 %
     QTest.qWait(20)

@@ -51,10 +51,13 @@ def tick(tool: AnalysisWindow, *keys: str) -> None:
 
 
 def work_out(tool: AnalysisWindow, qtbot: QtBot) -> None:
-    click(tool.start_button)
+    tool.start_button.setFocus()
+    QTest.keyClick(tool.start_button, Qt.Key.Key_Space)
     assert tool.working
+    assert tool.focusWidget() is tool.cancel_button
     qtbot.waitUntil(lambda: not tool.working, timeout=TIMEOUT)
     assert tool.message.text() == "Done"
+    assert tool.focusWidget() is tool.start_button
 
 
 def check_same(window: Path, command: Path) -> None:

@@ -86,7 +86,8 @@ class SimulatorWindow(ToolWindow):
         )
         self.seed.edited.connect(lambda seed: self._draw(int(seed)))
         self.folder = PathField(
-            "Folder", tooltip="Where to: a new or empty folder, or a former simulation's"
+            "Folder",
+            tooltip="Where to: a new or empty folder, or a former simulation, which is replaced",
         )
         self.table = ResultTable("What is known of the first frame")
         self.form.add(self.scenario)

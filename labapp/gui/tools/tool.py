@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,6 +70,7 @@ class ToolWindow(QDialog):
         self.tasks = Tasks(self)
         self.files: dict[str, bytes] = {}
         self._task: Task | None = None
+        self._pressed: QWidget | None = None
         self.setObjectName(f"tool-{self.key}")
         self.setWindowTitle(self.title)
         self.setWindowFlag(Qt.WindowType.WindowMaximizeButtonHint)
@@ -147,9 +149,21 @@ class ToolWindow(QDialog):
         """Come into view, in front, with what the session holds."""
         self.prefill()
         self.show_state()
+        if self.focusWidget() is None:
+            self._order_keys()
         self.show()
         self.raise_()
         self.activateWindow()
+
+    def _order_keys(self) -> None:
+        """Have Tab lead from the form's first field, through the results, to the buttons."""
+        items = [self.buttons.itemAt(n) for n in range(self.buttons.count())]
+        buttons = [item.widget() for item in items if item is not None]
+        for one, next_one in itertools.pairwise(filter(None, buttons)):
+            QWidget.setTabOrder(one, next_one)
+        tab = Qt.FocusPolicy.TabFocus
+        fields = (each for each in self.form.findChildren(QWidget) if each.focusPolicy() & tab)
+        next(fields).setFocus()
 
     def reject(self) -> None:
         """Esc: stop the work under way; without any close the window."""
@@ -185,9 +199,13 @@ class ToolWindow(QDialog):
             with behind_a_window():
                 return work(control)
 
-        if not self.working:
-            self.say(f"{title} …")
-            self._task = self.tasks.start(title, behind, done, part)
+        if self.working:
+            return
+        self.say(f"{title} …")
+        self._pressed = self.focusWidget()
+        self._task = self.tasks.start(title, behind, done, part)
+        if self.focusWidget() is not self._pressed:
+            self.cancel_button.setFocus()  # it is disabled, and the keys went on to Close
 
     def cancel(self) -> None:
         """Ask the work to stop."""
@@ -232,8 +250,11 @@ class ToolWindow(QDialog):
     def _show_progress(self) -> None:
         task, active = self._task, self.working
         self.bar.setVisible(active)
+        on_cancel = self.focusWidget() is self.cancel_button
         self.cancel_button.setEnabled(active)
         self.show_state()
+        if on_cancel and not active and self._pressed is not None:
+            self._pressed.setFocus()
         if task is None:
             return
         stopping = task.control.cancelled.is_set()
