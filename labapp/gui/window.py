@@ -50,11 +50,11 @@ REST = 4
 LONGEST_REST_MS = 1000
 
 TICKS = (
-    Tick(Standing.NOT_MEASURED.words, "", "", ((0.0, 0.12),)),
-    Tick(Standing.MEASURED.words, "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
-    Tick(Standing.CORRECTED.words, "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
-    Tick(Standing.DOUBTFUL.words, "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
-    Tick(Standing.NOT_MEASURABLE.words, "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
+    Tick(Standing.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
+    Tick(Standing.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
+    Tick(Standing.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
+    Tick(Standing.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
+    Tick(Standing.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
 )
 """By `Standing`."""
 

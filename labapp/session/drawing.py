@@ -42,6 +42,12 @@ BAR_WIDTH = 0.04
 BAR_NUMBERS_PX = 56
 """Width of the colour scale, a part of the picture's, and what its numbers take beside it."""
 
+BESIDE_PX, ASIDE_PX = 110, 62
+"""What the scale takes of a picture's width, and how far that moves the pool's middle."""
+
+USUAL_DPI = 72
+"""At it VTK draws texts as large as they are told to be."""
+
 FLAT = 1 / 8
 """Axes less high than this part of their width have one number upwards: more would overlap."""
 
@@ -109,8 +115,8 @@ class Drawing:
             ends = scene.rays_mm.get(name, EMPTY).reshape(-1, 3) * self._stretch
             self._put(name, _polydata(ends, "lines", 2), COLOURS[name], line_width=1)
         self._axes(scene)
-        self._say("stamp", scene.stamp, scene.foreground, position="upper_right", font_size=8)
-        size = max(5, self.plotter.window_size[0] // 90)
+        self._say("stamp", scene.stamp, scene.foreground, **self._in_corner("upper_right"))
+        size = max(5, int(self.plotter.window_size[0] / self._scale) // 90)
         middle = {"position": (0.12, 0.75), "viewport": True, "font_size": size}
         self._say("notice", scene.notice, scene.foreground, **middle)
 
@@ -122,12 +128,18 @@ class Drawing:
         self.plotter.view_vector(way, viewup=up, render=False)
         bounds = (self._box * self._stretch).T.ravel().tolist()
         self.plotter.reset_camera(render=False, bounds=bounds)
-        # The numbers along the axes are as tall in a small picture.
-        height = self.plotter.window_size[1]
-        fill, margin = (1.3, 78) if direction == "free" else (1.15, 85)
-        self.plotter.camera.zoom(fill * max(1 - margin / height, 0.5))
+        # The numbers along the axes, and the colour scale, are as large in a small picture.
+        width, height = np.array(self.plotter.window_size) / self._scale
+        fill, below = (1.3, 78) if direction == "free" else (1.15, 85)
+        room = min(fill * (height - below), 0.95 * (width - BESIDE_PX)) / min(width, height)
+        self.plotter.camera.zoom(max(min(room, fill), 0.5))
         # To the left, beside the colour scale; and up, for the names of the axes are below.
-        self.plotter.camera.SetWindowCenter(0.12, -34 / height)
+        self.plotter.camera.SetWindowCenter(max(0.12, min(ASIDE_PX / width, 0.25)), -34 / height)
+
+    @property
+    def _scale(self) -> float:
+        """How many pixels the picture has for one of a usual screen; texts follow by themselves."""
+        return float(self.plotter.render_window.GetDPI()) / USUAL_DPI
 
     def _is_new(self, part: str, made_for: object) -> bool:
         """Whether a part must be made anew: it was made for something else."""
@@ -205,7 +217,8 @@ class Drawing:
     def _place_bar(self) -> None:
         """Put the colour scale where its numbers, as tall in any picture, stay within."""
         if self._bar is not None:
-            left = 1 - BAR_WIDTH - BAR_NUMBERS_PX / self.plotter.window_size[0]
+            numbers = BAR_NUMBERS_PX * self._scale / self.plotter.window_size[0]
+            left = 1 - BAR_WIDTH - numbers
             self._bar.SetPosition(min(left, 0.85), 0.2)
 
     def _axes(self, scene: Scene) -> None:
@@ -223,7 +236,7 @@ class Drawing:
             fmt="%.1f",
             color=scene.foreground,
             location="outer",
-            font_size=11,
+            font_size=round(11 * self._scale),
             use_3d_text=False,
             bounds=(box * self._stretch).T.ravel().tolist(),
             render=False,
@@ -238,8 +251,12 @@ class Drawing:
         self._put("electrode", mark, scene.foreground, line_width=1)
         high = scene.exaggeration
         told = [f"heights drawn {high:g} times as high"] if high != 1 else []
-        words = "; ".join(told + ["upright line: the electrode's axis"] * scene.electrode)
-        self._say("caption", words, scene.foreground, position="upper_left", font_size=8)
+        words = "\n".join(told + ["upright line: the electrode's axis"] * scene.electrode)
+        self._say("caption", words, scene.foreground, **self._in_corner("upper_left"))
+
+    def _in_corner(self, position: str) -> dict[str, Any]:
+        """Style of words in a corner, whose size VTK does not scale."""
+        return {"position": position, "font_size": round(6 * self._scale)}
 
     def _say(self, name: str, words: str, colour: str, **style: Any) -> None:
         """Put words over the picture; none take away those that were there."""

@@ -34,7 +34,7 @@ class BenchView(Drawn):
         self.words.setTextFormat(Qt.TextFormat.PlainText)
         self.whole, self.near = _plot(), _plot()
         self.whole.setLabel("left", "Z, mm")
-        self.near.setLabel("bottom", "the same, enlarged, mm")
+        self.near.setLabel("bottom", "enlarged, mm")
         self._column = layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.setSpacing(0)
@@ -159,7 +159,7 @@ class BenchView(Drawn):
             ends = np.array([[0.0, level], [length, level]])
             pen = pg.mkPen(self._ink, width=1.2)
             _line(self.near, ends, pen, symbol="|", symbolSize=10, symbolPen=pen)
-            words = f"{name} {abs(length):.1f} mm"
+            words = f"{name}\n{abs(length):.1f} mm"
             self._text(self.near, words, np.array([middle, level]), (0.5, 0.0))
 
     def _text(

@@ -75,14 +75,15 @@ class CrossHairView(Drawn):
             self._line([diode, [end, 0.0]], pg.mkPen(beam, width=1.6, style=style))
         self._line([diode, [diode[0], 0.0]], pg.mkPen(ink, width=1, style=Qt.PenStyle.DotLine))
         level = -0.06 * max(right + l2, diode[1])
-        for name, start, end in (("l₁", 0.0, l1), ("l₂", -l2, 0.0)):
-            self._line([[start, level], [end, level]], pg.mkPen(ink, width=1.2), symbol="|")
-            self._text(f"{name} {end - start:.2f} mm", ((start + end) / 2, level), (0.5, 0.0))
+        # Away from each other: a small window brings their middles together.
+        for name, end, anchor in (("l₁", l1, (-0.05, 0.0)), ("l₂", -l2, (1.05, 0.0))):
+            self._line([[0.0, level], [end, level]], pg.mkPen(ink, width=1.2), symbol="|")
+            self._text(f"{name} {abs(end):.2f} mm", (0.0, level), anchor)
         self.plot.plot(*diode[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=ink)
         self._text("laser", diode, (0.5, 1.4))
-        self._text(f"height {found.height_mm:.1f} mm", (diode[0], diode[1] / 2), (-0.05, 0.5))
-        words = f"{found.distance_mm:.1f} mm at {found.angle_deg:.2f}°"
-        self._text(words, (diode + np.array([-l2, 0.0])) / 2, (1.05, 1.0))
+        words = f"beam {found.distance_mm:.1f} mm at {found.angle_deg:.2f}°"
+        for part, told in ((0.4, f"height {found.height_mm:.1f} mm"), (0.2, words)):
+            self._text(told, (diode[0], diode[1] * part), (1.05, 0.5))
         self.plot.setRange(xRange=(-l2 - 4, right), yRange=(2 * level, diode[1] * 1.15))
 
     def _line(self, points: object, pen: object, **symbol: object) -> None:

@@ -5,6 +5,7 @@ The wheel and dragging work along the common axis; what goes up always fits what
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -13,6 +14,7 @@ from PySide6.QtCore import QEvent, QPointF, Qt, Signal
 from PySide6.QtGui import (
     QAction,
     QColor,
+    QFontMetricsF,
     QGuiApplication,
     QImage,
     QKeyEvent,
@@ -35,6 +37,9 @@ NEAR = 18.0
 
 AXIS_WIDTH = 60
 TITLE_HEIGHT = 18
+NUMBER_LINES = 1.3
+"""A number up an axis takes so many lines of its font."""
+
 LEAST_HEIGHT = 76
 """A plot is no lower than this; where they do not fit, they scroll."""
 
@@ -202,6 +207,9 @@ class PlotStack(Plotted):
 
     def _tell(self, words: str) -> None:
         self.read_out.setText(words or " ")
+        # It grows where a line wraps, and does not shrink: what is above must not jump.
+        height = self.read_out.heightForWidth(self.read_out.width())
+        self.read_out.setFixedHeight(max(self.read_out.minimumHeight(), height))
         self.read_out.setToolTip(words)
         self.describe(words)
 
@@ -288,6 +296,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             # Its grid is half of what drawing costs, and stepping moves only the upright line.
             axis.setCacheMode(QGraphicsItem.CacheMode.DeviceCoordinateCache)
         self.getAxis("left").setWidth(AXIS_WIDTH)
+        box.sigResized.connect(lambda *_: self._thin_out())
         # Above the plot: beside a low one its name would be cut off.
         self.titleLabel.setVisible(True)
         self.titleLabel.setMaximumHeight(TITLE_HEIGHT)
@@ -328,6 +337,12 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         self.cross.setPen(pg.mkPen(_faint(text, 90), width=1))
         if curve.from_zero:
             self.getViewBox().setLimits(yMin=0)
+
+    def _thin_out(self) -> None:
+        """Have no more numbers upwards than there is room for; the axis itself knows no font."""
+        height = max(self.getViewBox().height(), 1.0)
+        room = height / (NUMBER_LINES * QFontMetricsF(QGuiApplication.font()).height())
+        self.getAxis("left").setTickDensity(min(1.0, room / max(math.log(height), 2.0)))
 
     def show_curve(self, curve: Curve) -> None:
         """Show a curve."""

@@ -58,6 +58,8 @@ class Tick:
     ----------
     words
         What it means.
+    short
+        The same in a word, where there is little room.
     light, dark
         Colour on a light and on a dark ground; empty for the palette's.
     parts
@@ -65,6 +67,7 @@ class Tick:
     """
 
     words: str
+    short: str
     light: str
     dark: str
     parts: Shape
@@ -414,19 +417,20 @@ class Timeline(QWidget):
         return f"Frame {self._frames[position]}{when}"
 
     def _show_counts(self) -> None:
-        """A legend that counts the kinds that occur; without its words where there is no room."""
+        """A legend that counts the kinds that occur, in a word each where there is little room."""
         dark = self.palette().color(QPalette.ColorRole.Window).lightness() < 128
         kinds = self.scrubber.kinds
         found = np.bincount(kinds, minlength=len(self._ticks)) if len(kinds) else ()
-        long, short, told = [], [], []
+        long: list[str] = []
+        short: list[str] = []
+        told: list[str] = []
         for tick, count in zip(self._ticks, found, strict=False):
             if count:
                 square = (
                     f'<span style="color:{(tick.dark if dark else tick.light) or "gray"}">■</span>'
                 )
-                words = tick.words.split(":")[0]
-                long.append(f"{square}&nbsp;{count}&nbsp;{words.replace(' ', '&nbsp;')}")
-                short.append(f"{square}&nbsp;{count}")
+                for texts, words in ((long, tick.words.split(":")[0]), (short, tick.short)):
+                    texts.append(f"{square}&nbsp;{count}&nbsp;{words.replace(' ', '&nbsp;')}")
                 told.append(f"{count} {tick.words}")
         self.counts.setToolTip("\n".join(told))
         self.counts.setAccessibleName(", ".join(told))

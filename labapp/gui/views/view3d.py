@@ -32,7 +32,7 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.views.canvas import Drawn
-from labapp.session.drawing import Direction, Drawing, build_scene, can_draw
+from labapp.session.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
 from labapp.session.scene import Scene
 
 TURN_DEG = 10.0
@@ -283,6 +283,7 @@ class OffscreenView(View3d):
         from pyvista.plotting import Plotter
 
         plotter: Any = Plotter(off_screen=True, window_size=list(self._pixels()))
+        plotter.render_window.SetDPI(round(USUAL_DPI * self.devicePixelRatioF()))
         plotter.disable_anti_aliasing()
         plotter.render_window.SetMultiSamples(0)
         return plotter
@@ -373,6 +374,7 @@ class InteractiveView(View3d):
         )
         # Keys are this view's: VTK's own would end the program with q.
         plotter.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        plotter.render_window.SetDPI(round(USUAL_DPI * self.devicePixelRatioF()))
         plotter.disable_anti_aliasing()
         for event in ("InteractionEvent", "EndInteractionEvent", "MouseWheelForwardEvent"):
             plotter.iren.add_observer(event, self._interacted)

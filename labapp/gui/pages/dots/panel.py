@@ -92,7 +92,7 @@ class DotsPanel(QWidget):
     ) -> None:
         """Show what the session says of the frame in view; None leaves the list of rows."""
         self.seen.setText(seen)
-        self.why.setText(f"⚠ {why}" if why else "")
+        self.why.setText(f"⚠ {why[:1].upper()}{why[1:]}" if why else "")
         self.why.setVisible(bool(why))
         self.fit.set_rows(fit)
         if rows is not None:

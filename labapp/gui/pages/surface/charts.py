@@ -193,7 +193,11 @@ class PlanChart(Chart):
         """Take the window's colours."""
         super().paint()
         self._outline.setPen(pg.mkPen(self.colour(QPalette.ColorRole.Text), width=2))
-        self._line.setPen(pg.mkPen(self.colour(QPalette.ColorRole.Highlight), width=3))
+        pen = pg.mkPen(self.colour(QPalette.ColorRole.Highlight), width=3)
+        self._line.setPen(pen)
+        for handle in self._line.getHandles():
+            handle.pen = handle.currentPen = pen
+            handle.update()
 
 
 class ProfileChart(Chart):

@@ -70,7 +70,8 @@ class CompareView(QWidget):
         self.parts = PartsBar(
             "What is seen of the comparison",
             {
-                "Surfaces": (surfaces,),
+                "First": (surfaces, self.first),
+                "Second": (surfaces, self.second),
                 "Difference": (below, self.difference),
                 "Figures": (below, figures),
             },

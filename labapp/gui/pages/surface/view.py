@@ -52,6 +52,9 @@ LOOKS: dict[Direction, tuple[str, str]] = {
     "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
 }
 
+LEAST_PLAN_WIDTH = 140
+"""In a narrow window the section's fields would leave it less, too little to drag the line."""
+
 CHARTS_SOON_MS = 20
 """Charts are drawn after the 3-D view, not in one go with it: the window stays quick."""
 
@@ -78,6 +81,7 @@ class SurfacePage(Page):
         self.told = Shown(None, "unmeasured", "")
         self.view = make_view3d("The pool in 3-D")
         self.dots, self.plan, self.profile = DotsChart(), PlanChart(), ProfileChart()
+        self.plan.setMinimumWidth(LEAST_PLAN_WIDTH)
         self.plan.dragged.connect(self._set_section)
         self.compare = CompareView(workspace)
         self.side = SurfacePanel(workspace, self.panel_layout)
