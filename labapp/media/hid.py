@@ -1,0 +1,290 @@
+"""USB devices that are pressed and turned (HID): found, read, kept through unplugging."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from labapp.media.events import Event, Kind, Say, silent
+
+LONGEST = 64
+"""Bytes of a report, at most."""
+
+WAIT_MS = 100
+"""So long a report is waited for before it is seen whether reading is to end."""
+
+RETRY_S = 0.5
+"""Pause between attempts to open a device that is gone."""
+
+AWAY, UNPLUGGED = "it is not connected", "it was unplugged"
+
+RULES = "resources/udev/70-labapp.rules"
+
+INSTALL = (
+    f"sudo cp {RULES} /etc/udev/rules.d/ && sudo udevadm control --reload, and plug it in anew"
+)
+
+KNOWN: Mapping[tuple[int, int], str] = {
+    (0x0C45, 0x7403): "PCsensor FootSwitch",
+    (0x0C45, 0x7404): "PCsensor FootSwitch",
+    (0x413D, 0x2107): "PCsensor FootSwitch",
+    (0x1A86, 0xE026): "PCsensor FootSwitch",
+    (0x3553, 0xB001): "PCsensor FootSwitch",
+    (0x05F3, 0x00FF): "VEC Infinity foot pedal",
+}
+"""Foot switches by (vendor, product): those that the rules let in."""
+
+
+class HidError(Exception):
+    """A device cannot be used; the message says why and what to do about it."""
+
+
+@dataclass(frozen=True)
+class HidInfo:
+    """A device, or one of the several that it shows itself as.
+
+    Parameters
+    ----------
+    path
+        Where the system has it now: "/dev/hidraw3".
+    vendor, product, interface
+        USB's numbers.
+    usage
+        (page, usage) of HID: (1, 6) is a keyboard, (1, 8) a 3-D controller.
+    name
+        As it calls itself.
+    """
+
+    path: str
+    vendor: int
+    product: int
+    interface: int
+    usage: tuple[int, int]
+    name: str
+
+    @property
+    def key(self) -> str:
+        """What tells it from others wherever it is plugged in: "0c45:7403:1"."""
+        return f"{self.vendor:04x}:{self.product:04x}:{self.interface}"
+
+    @property
+    def is_pedal(self) -> bool:
+        """Whether it is a foot switch that is known."""
+        return (self.vendor, self.product) in KNOWN
+
+    @property
+    def is_3d(self) -> bool:
+        """Whether it is a controller with six axes."""
+        return self.usage == (1, 8)
+
+    @property
+    def is_keyboard(self) -> bool:
+        """Whether it tells of keys, by their numbers, rather than of buttons, by bits."""
+        return self.usage == (1, 6)
+
+
+class HidDevice(Protocol):
+    """A device that is open, as hidapi has it."""
+
+    def read(self, n: int, timeout_ms: int = 0) -> list[int]:
+        """Wait for a report, up to ``n`` bytes; empty when none came in time; OSError if gone."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it."""
+        ...
+
+    def get_report_descriptor(self) -> list[int]:
+        """Say how reports are made up."""
+        ...
+
+
+Find = Callable[[], Iterable[HidInfo]]
+Open = Callable[[HidInfo], HidDevice]
+
+
+def find_hid() -> list[HidInfo]:
+    """Devices that are connected, foot switches that are known first.
+
+    Raises
+    ------
+    HidError
+        If hidapi is not installed.
+    """
+    found = [
+        HidInfo(
+            path=os.fsdecode(entry["path"]),
+            vendor=entry["vendor_id"],
+            product=entry["product_id"],
+            interface=entry["interface_number"],
+            usage=(entry["usage_page"], entry["usage"]),
+            name=_name(entry),
+        )
+        for entry in _hidraw().enumerate()
+    ]
+    return sorted(found, key=lambda info: not info.is_pedal)
+
+
+def _name(entry: Mapping[str, Any]) -> str:
+    known = KNOWN.get((entry["vendor_id"], entry["product_id"]))
+    told = f"{entry['manufacturer_string'] or ''} {entry['product_string'] or ''}".strip()
+    return known or told or f"{entry['vendor_id']:04x}:{entry['product_id']:04x}"
+
+
+def open_hid(info: HidInfo) -> HidDevice:
+    """Open a device.
+
+    Raises
+    ------
+    HidError
+        If it is not there or may not be read: which rule to install, and how.
+    """
+    device: HidDevice = _hidraw().device()
+    try:
+        device.open_path(os.fsencode(info.path))  # type: ignore[attr-defined]
+    except OSError as error:
+        raise HidError(why_closed(info)) from error
+    return device
+
+
+def why_closed(info: HidInfo) -> str:
+    """Why a device cannot be opened, and what to do."""
+    if not os.path.exists(info.path):
+        return f"{info.name} is not connected"
+    if os.access(info.path, os.R_OK | os.W_OK):
+        return f"{info.name} does not answer: plug it in anew"
+    if info.is_pedal or info.is_3d:
+        return f"{info.name} may not be read. Install the rule that lets you: {INSTALL}"
+    rule = (
+        f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{info.vendor:04x}", '
+        f'ATTRS{{idProduct}}=="{info.product:04x}", TAG+="uaccess"'
+    )
+    return f"{info.name} may not be read. Add this line to {RULES}: {rule}. Then {INSTALL}"
+
+
+def has_numbers(descriptor: Iterable[int]) -> bool:
+    """Whether a device's reports begin with a number, as it has several kinds of them.
+
+    Parameters
+    ----------
+    descriptor
+        Its report descriptor (HID 1.11, §6.2.2): items of a byte that tells tag and size, and data.
+    """
+    items = iter(descriptor)
+    for item in items:
+        if item == 0xFE:  # a long item: size, tag, data
+            skipped = next(items, 0) + 1
+        else:
+            if item & 0xFC == 0x84:  # Report ID
+                return True
+            skipped = (0, 1, 2, 4)[item & 3]
+        for _ in range(skipped):
+            next(items, None)
+    return False
+
+
+class HidReader:
+    """Reads a device in a thread, and opens it again when it was unplugged.
+
+    Parameters
+    ----------
+    key
+        `HidInfo.key` of the device.
+    name
+        What to call it in what is said.
+    hear
+        Called with every report, (its number or 0, its bytes), in the reader's thread; with
+        (−1, nothing) when the device is gone: what was pressed is released.
+    say
+        Called with what happens.
+    find, opened
+        In tests others.
+    """
+
+    def __init__(
+        self,
+        key: str,
+        name: str,
+        hear: Callable[[int, bytes], None],
+        say: Say = silent,
+        find: Find = find_hid,
+        opened: Open = open_hid,
+    ) -> None:
+        self.connected = False
+        self._key, self._name = key, name
+        self._hear, self._say = hear, say
+        self._find, self._opened = find, opened
+        self._told = ""
+        self._gone_s = time.monotonic()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"reader of {name}", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Read no more. Twice does no harm."""
+        self._ending.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def __enter__(self) -> HidReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        try:
+            while not self._ending.is_set():
+                try:
+                    self._read_on()
+                except (HidError, OSError, ValueError) as error:
+                    self._is_gone(str(error) if isinstance(error, HidError) else UNPLUGGED)
+                    self._ending.wait(RETRY_S)
+        except Exception as error:
+            logging.getLogger("labapp").exception("reader of %s", self._name)
+            self._tell("warning", f"a fault in the program: {error!r}")
+        self.connected = False
+
+    def _is_gone(self, words: str) -> None:
+        """Say why nothing is read, once; that what was unplugged is not connected says nothing."""
+        if self.connected:
+            self.connected = False
+            self._gone_s = time.monotonic()
+            self._hear(-1, b"")
+        if words != self._told and not (self._told and words == AWAY):
+            self._tell("warning", words)
+            self._told = words
+
+    def _read_on(self) -> None:
+        info = next((info for info in self._find() if info.key == self._key), None)
+        if info is None:
+            raise HidError(AWAY)
+        device = self._opened(info)
+        try:
+            numbered = has_numbers(device.get_report_descriptor())
+            away_s = time.monotonic() - self._gone_s
+            self._tell("note", f"connected after {away_s:.1f} s" if self._told else "connected")
+            self._told, self.connected = "", True
+            while not self._ending.is_set():
+                report = bytes(device.read(LONGEST, WAIT_MS))
+                if report:
+                    self._hear(report[0] if numbered else 0, report[numbered:])
+        finally:
+            device.close()
+
+    def _tell(self, kind: Kind, words: str) -> None:
+        self._say(Event(self._name, kind, words))
+
+
+def _hidraw() -> Any:
+    """The part of hidapi that reads through the system, which leaves its drivers alone."""
+    try:
+        import hidraw
+    except ImportError as error:
+        raise HidError("foot switches need hidapi: pip install 'labapp[gui]'") from error
+    return hidraw
