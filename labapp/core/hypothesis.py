@@ -36,9 +36,9 @@ of them are put down to false dots."""
 STRAY, MISSED = 16.0, 12.0
 """What a dot without a ray, and a ray without its dot amid the others, cost in units of χ²."""
 
-LEAST_ROW, MOST_BEYOND = 3, 0.3
-"""A dot or two beyond the last row may be false; so many where one surface has them are not. If more
-than that share of all dots is left over, it is not for a row that was not reached."""
+LEAST_ROW, MOST_BEYOND = 3, 0.6
+"""A dot or two beyond the last row may be false; so many where one surface has them are not. If a
+larger share of all dots than that is left over, it is not for a row that was not reached."""
 
 
 @dataclass(frozen=True)
