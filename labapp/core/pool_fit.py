@@ -273,6 +273,10 @@ def _rim_level(surface: SplineSurface, points: FloatArray, rim: BoolArray) -> Le
     return Level(shift, float(np.std(height)), sign, Rear(), np.inf)
 
 
+WINDOW, OFF_WINDOW = 0.4, 1e-6
+"""Where the level is known nearly, it is looked for within this share of what is searched else; if
+so much of its probability is at the ends of that, everywhere."""
+
 # Width of the step from inside to outside, in dot spacings: from a boundary that is known as
 # sharply as the surface is to one that half the neighbouring rays contradict.
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
@@ -351,7 +355,8 @@ def place_level(
     rise = np.maximum(rise, np.median(rise) / 4)
     shift, sign = about or _rough_level(height, rise, witness)
     near = np.abs(height + shift) < 3.0 * rise
-    shifts = shift + np.linspace(-1.0, 1.0, 121) * np.median(rise)
+    reach = 1.0 if about is None else WINDOW
+    shifts = shift + np.linspace(-reach, reach, round(120 * reach) + 1) * np.median(rise)
     lit = y[witness > 0]
     start, end = (lit.max() + lit.min()) / 2, lit.min()
     # Only a pool that stands above the work piece is seen to sink at its rear.
@@ -367,6 +372,8 @@ def place_level(
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
     posterior /= posterior.sum()
     part = slice(1, None) if posterior[0].sum() < 0.5 else slice(0, 1)
+    if about is not None and posterior[:, [0, -1]].sum() > OFF_WINDOW:
+        return place_level(height, slope, y, witness, spacing_mm, drop_mm)
     chosen = posterior[part] / posterior[part].sum()
     drop = float(chosen.sum(axis=1) @ drops[part])
     mean = float(chosen.sum(axis=0) @ shifts)

@@ -7,6 +7,7 @@ are taken of a smaller picture, and what concerns few pixels is worked out for t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -158,8 +159,12 @@ def _not_hot(image: Grey, band: Grey, u: IntArray, v: IntArray, size: float) -> 
     return np.asarray(fine.max(axis=(1, 2)) < HOT * band[v, u])
 
 
+@cache
 def _nine(sigma: float) -> FloatArray:
-    """Gaussian weights of a pixel and its two neighbours on a line, shape (3, taps + 2)."""
+    """Gaussian weights of a pixel and its two neighbours on a line, shape (3, taps + 2).
+
+    Kept, as a recording has one size of dot.
+    """
     taps = round(8 * sigma + 1) | 1
     kernel = np.asarray(cv2.getGaussianKernel(taps, sigma, cv2.CV_32F), np.float32).ravel()
     return np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])

@@ -44,8 +44,9 @@ FOUND = 0.85
 STEADY = 0.2
 """… and half of them within this share of the way to the next dot of where they were predicted."""
 
-FIRST_RING, GROWING_ROUNDS = 2, 3
-"""Where no prediction finds the dots, they are first looked for so near the absent one."""
+FIRST_RING, GROWING_ROUNDS, GROWN_FROM = 2, 3, 12
+"""Where no prediction finds the dots, they are first looked for so near the absent one, in so many
+rounds a ring, from so many surfaces of the past."""
 
 WORSE = 2.0
 """The residual of a track is at most so many times that of its first frame."""
@@ -142,41 +143,68 @@ class WarmChain:
         if measurement.status == "ok":
             self._track = begin(image, measurement, self.rig, self.settings, self._track)
         elif self._track is not None:
-            unseen = self._track.unseen + 1
-            self._track = replace(self._track, unseen=unseen) if unseen <= HELD else None
+            track, unseen = self._track, self._track.unseen + 1
+            kept = replace(track, unseen=unseen, past=track.past[-1:])
+            self._track = kept if unseen <= HELD else None
         return measurement
 
 
 def begin(
     image: Image, measurement: Measurement, rig: Rig, settings: Settings, former: Track | None
 ) -> Track | None:
-    """Start a track from a frame that the cold chain measured; None where none can be."""
+    """Start a track from a frame that the cold chain measured; None where none can be.
+
+    What is remembered of a ``former`` track, of the frames just before, stays.
+    """
     match, made = measurement.match, measurement.reconstruction
     if match is None or made is None or not isinstance(made.surface, SplineSurface):
         return None
     if settings.dots.method != "band-pass" or rig.pattern.marker is None:
         return None
-    surface = made.surface
-    bed = Bed.of(rig, surface.basis, settings.fit)
-    pool = met(bed, surface.coefficients, bed.landing_mm, 4)
-    number = {(i, j): k for k, (i, j) in enumerate((bed.at + 1).tolist())}
-    lit = np.zeros(len(bed.at), bool)
-    lit[[number[i, j] for i, j in match.ray.tolist()]] = True
+    bed, pool = Bed.of(rig, made.surface.basis, settings.fit), None
+    if former is not None and bed.at.shape == former.bed.at.shape:
+        bed, pool = former.bed, _moved_to(former, match, made)
+    if pool is None:
+        former = None
+        pool = met(bed, made.surface.coefficients, bed.landing_mm, 4)
     witness = match.witness[tuple(bed.at.T)]
     told = witness != 0
+    surface = SplineSurface(bed.basis, pool.coefficients)
     level = find_level(surface, bed.landing_mm[told, :2], witness[told], bed.spacing_mm)
+    past = np.empty((0, len(pool.coefficients))) if former is None else former.past[1 - MEMORY :]
     return Track(
         bed=bed,
         exposure=Exposure.of(image, settings.dots.band_pass),
         match=match,
         residual_mm=_rms(made.residual_mm),
         pool=pool,
-        lit=lit,
+        lit=witness > 0,
         boundary=made.boundary,
         level=level,
-        past=np.asarray(surface.coefficients)[None],
+        past=np.vstack([past, pool.coefficients]),
         open_mm=level.sigma_mm,
     )
+
+
+def _moved_to(former: Track, match: Match, made: Reconstruction) -> WarmPool | None:
+    """The surface of a cold fit in the splines of a former track; None if they have no place."""
+    bed = former.bed
+    number = {(i, j): k for k, (i, j) in enumerate((bed.at + 1).tolist())}
+    rays = [number.get((i, j)) for i, j in match.ray.tolist()]
+    if None in rays:
+        return None
+    ray = np.array(rays, np.int64)
+    points = bed.landing_mm.copy()
+    points[ray] = made.points_mm
+    start = replace(former.pool, points_mm=points)
+    slopes = Slopes.of(bed, ray, match.plane_mm, match.plane_covariance_mm2)
+    try:
+        pool, _, moved = fit_slopes_to(bed, start, slopes)
+    except CannotMeasure:
+        return None
+    lower_by = float(np.mean(made.points_mm[:, 2] - pool.points_mm[ray, 2]))
+    pool = met(bed, pool.coefficients + lower_by, pool.points_mm, 4)
+    return pool if moved < UNSETTLED_MM else None
 
 
 def _rms(residual: FloatArray) -> float:
@@ -203,7 +231,7 @@ def follow(
         raise Broken("the frame has another size than the one before")
     dots = quick_dots(image, track.exposure, settings.dots.band_pass)
     scene = Scene.of(dots, bed.rig, calibration, (image.shape[0], image.shape[1]))
-    pool, labels = _found_again(track, scene)
+    pool, labels, foreseen = _found_again(track, scene)
     pool, labels, lower = _fitted(bed, scene, pool, labels)
     heard = testimony(bed, scene, pool, labels)
     level, open_mm = _level(track, pool, heard.witness)
@@ -224,7 +252,7 @@ def follow(
         raise Broken(f"{heard.missed} rays amid the others have no dot")
     if not _rms(residual) < WORSE * track.residual_mm:
         raise Broken("the surface no longer has the dots")
-    unseen = 0 if _datum_seen(bed, scene, pool, labels) else track.unseen + 1
+    unseen = 0 if _datum_seen(bed, scene, pool, labels, foreseen) else track.unseen + 1
     if unseen > HELD:
         raise Broken("the dots beside the absent one have not been seen for long")
     match = _match(track, scene, heard.witness, ray, dot, _rms(residual))
@@ -273,41 +301,47 @@ def _predictions(track: Track) -> Iterator[FloatArray]:
     yield past[-1]
 
 
-def _found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray]:
-    """A surface that finds the dots again, and the rays that gives them."""
+def _found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, bool]:
+    """A surface that finds the dots again, the rays that gives them, and whether it was foreseen.
+
+    Where none that is foreseen does, one is grown from the last, and from those before it.
+    """
     bed, count = track.bed, int(track.lit.sum())
     looked_for = around(bed, track.lit, 2)
     for coefficients in _predictions(track):
-        pool = met(bed, coefficients, track.pool.points_mm)
+        pool = met(bed, coefficients, track.pool.points_mm, 1)
         sight = Sight.of(pool, scene, looked_for)
         labels, off = tracked(sight, track.lit, scene.resolution_mm)
         if len(off) >= FOUND * count and np.median(off) < STEADY:
-            return pool, labels
-    return _grown(track, scene)
+            return pool, labels, True
+    found = 0
+    for coefficients in track.past[: -GROWN_FROM - 1 : -1]:
+        pool, labels = _grown(track, scene, coefficients)
+        found = max(found, int(np.sum(labels != UNLABELLED)))
+        if found >= max(FOUND * count, LEAST_DOTS):
+            return pool, labels, False
+    raise Broken(f"{found} of {count} dots were found again")
 
 
-def _grown(track: Track, scene: Scene) -> tuple[WarmPool, IntArray]:
+def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, IntArray]:
     """Find the dots again from the absent one outwards, ring by ring.
 
     Dots in the middle move least from frame to frame; how they moved tells how those around do.
     """
-    bed, pool, count = track.bed, track.pool, int(track.lit.sum())
+    bed = track.bed
+    pool = met(bed, start, track.pool.points_mm)
     ring = np.abs(bed.at + 1 - np.array(bed.rig.pattern.marker)).max(axis=1)
-    labels = np.empty(0, np.int64)
+    looked_for = around(bed, track.lit, 2)
+    labels = np.full(len(ring), UNLABELLED)
     for reach in range(FIRST_RING, int(ring[track.lit].max()) + 2):
-        sight = Sight.of(pool, scene, around(bed, track.lit, 2))
+        sight = Sight.of(pool, scene, looked_for)
         labels, _ = tracked(sight, track.lit & (ring <= reach), scene.resolution_mm)
         ray = np.flatnonzero(labels != UNLABELLED)
         if len(ray) < LEAST_DOTS:
             break
         dot = labels[ray]
         slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
-        rest = track.pool.coefficients
-        coefficients, _, _ = fit_slopes_to(bed, pool, slopes, GROWING_ROUNDS, rest)
-        pool = met(bed, coefficients, pool.points_mm)
-    found = int(np.sum(labels != UNLABELLED))
-    if found < max(FOUND * count, LEAST_DOTS):
-        raise Broken(f"{found} of {count} dots were found again")
+        pool, _, _ = fit_slopes_to(bed, pool, slopes, GROWING_ROUNDS, start)
     return pool, labels
 
 
@@ -321,10 +355,9 @@ def _fitted(
             raise Broken("hardly a dot is left that has a ray")
         dot = labels[ray]
         slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
-        coefficients, lower, moved = fit_slopes_to(bed, pool, slopes)
+        pool, lower, moved = fit_slopes_to(bed, pool, slopes)
         if not moved < UNSETTLED_MM:
             raise Broken("the surface does not settle")
-        pool = met(bed, coefficients, pool.points_mm)
         if last:
             break
         wider = widened(bed, scene, pool, lower, labels)
@@ -352,14 +385,14 @@ def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, floa
     return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
 
 
-def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> bool:
+def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, foreseen: bool) -> bool:
     """Whether all four neighbours of the absent ray are lit.
 
     Raises
     ------
     Broken
-        If the absent ray's place is lit, or two of its neighbours are dark: no hole tells the
-        rows (`lattice.find_holes`).
+        If the absent ray's place is lit, or so many of its neighbours are dark that no hole tells
+        the rows (`lattice.find_holes`): two; three where the dots are where they were foreseen.
     """
     marker = np.array(bed.rig.pattern.marker) - 1
     place = [
@@ -376,7 +409,7 @@ def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> boo
     )
     if not np.linalg.norm(scene.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
         raise Broken("a dot is where the absent one should be dark")
-    if lit.sum() < 3:
+    if lit.sum() < (2 if foreseen else 3):
         raise Broken("the dots beside the absent one are not seen")
     return bool(lit.all())
 

@@ -209,7 +209,7 @@ def fit_slopes_to(
     slopes: Slopes,
     rounds: int = ROUNDS,
     rest: FloatArray | float = 0.0,
-) -> tuple[FloatArray, FloatArray, float]:
+) -> tuple[WarmPool, FloatArray, float]:
     """Fit the surface to slopes, round by round from a pool that is near.
 
     Each round takes the slopes where the rays now meet the surface, fits, and meets them anew. The
@@ -219,9 +219,9 @@ def fit_slopes_to(
 
     Returns
     -------
-    coefficients, lower, moved_mm
-        Of the splines; the factor of the normal matrix (`factor`); how far the reflection point
-        moved that moved most in the last round.
+    pool, lower, moved_mm
+        The surface; the factor of the normal matrix (`factor`); how far the reflection point moved
+        that moved most in the last round.
 
     Raises
     ------
@@ -251,7 +251,9 @@ def fit_slopes_to(
         moved = float(np.abs(step).max())
         if moved < SETTLED_MM:
             break
-    return coefficients, lower, moved
+    every = pool.points_mm.copy()
+    every[slopes.ray] = points
+    return met(bed, coefficients, every, 1), lower, moved
 
 
 def factor(bed: Bed, splines: IntArray, values: FloatArray, weights: FloatArray) -> FloatArray:

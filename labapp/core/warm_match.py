@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
 
 from labapp.core.hypothesis import BEYOND, FEW
 from labapp.core.optics import reflect, surface_normal
@@ -25,8 +26,8 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.core.warm_fit import Bed, WarmPool, lay, solve, spline_values
 
 GATE, CLEARLY = 0.35, 2.0
-"""A dot is a tracked ray's within this share of the way to the next predicted dot, if no other ray
-is within so many times its distance."""
+"""A dot is a tracked ray's within this share of the way to the next predicted dot, if no other dot
+is, and no other ray within so many times its distance."""
 
 ASTRAY = 0.25
 """A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
@@ -51,22 +52,23 @@ class Sight:
     @classmethod
     def of(cls, pool: WarmPool, scene: Scene, looked_for: BoolArray) -> Sight:
         """Compare the predictions of rays in a mask, shape (R,), with a frame's dots."""
-        plane = np.where(looked_for[:, None], pool.plane_mm, np.nan)
-        return cls(_apart(plane, scene.plane_mm), next_of(plane))
+        ray = np.flatnonzero(looked_for & np.isfinite(pool.plane_mm[:, 0]))
+        apart = np.full((len(looked_for), len(scene.plane_mm)), np.inf)
+        apart[ray] = _apart(pool.plane_mm[ray], scene.plane_mm)
+        return cls(apart, next_of(pool.plane_mm, ray))
 
 
 def _apart(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Distances, shape (len(one), len(other)); infinite where a place is not known."""
-    x = one[:, 0, None] - other[:, 0]
-    y = one[:, 1, None] - other[:, 1]
-    return np.nan_to_num(np.sqrt(x * x + y * y), nan=np.inf)
+    """Distances, shape (len(one), len(other))."""
+    return np.hypot(one[:, 0, None] - other[:, 0], one[:, 1, None] - other[:, 1])
 
 
-def next_of(plane_mm: FloatArray) -> FloatArray:
-    """Distance of each place, shape (R, 2), from the next one, shape (R,); infinite without."""
-    apart = _apart(plane_mm, plane_mm)
-    np.fill_diagonal(apart, np.inf)
-    return np.asarray(apart.min(axis=1))
+def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
+    """Distance of some rays' dots from the next of them; infinite for other rays, shape (R,)."""
+    distance = np.full(len(plane_mm), np.inf)
+    if len(ray) > 1:
+        distance[ray] = cKDTree(plane_mm[ray]).query(plane_mm[ray], k=2)[0][:, 1]
+    return distance
 
 
 def around(bed: Bed, lit: BoolArray, rings: int) -> BoolArray:
@@ -94,6 +96,8 @@ def tracked(sight: Sight, lit: BoolArray, resolution_mm: float) -> tuple[IntArra
     sure = (off < GATE * sight.next_mm[ray]) & (sight.next_mm[ray] > resolution_mm) & lit[ray]
     sure &= np.argmin(apart, axis=1)[ray] == dot
     sure &= np.partition(apart, 1, axis=0)[1] > CLEARLY * off
+    if len(dot) > 1:  # speckle may split a dot in two
+        sure &= np.partition(apart, 1, axis=1)[ray, 1] > GATE * sight.next_mm[ray]
     labels = np.full(len(apart), UNLABELLED, np.int64)
     labels[ray[sure]] = dot[sure]
     return labels, off[sure] / sight.next_mm[ray[sure]]
@@ -172,11 +176,11 @@ class Testimony:
 def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testimony:
     """Ask every ray, as `hypothesis` does."""
     lit = labels != UNLABELLED
-    next_mm = next_of(pool.plane_mm)
+    known = np.isfinite(pool.plane_mm[:, 0])
+    next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
     merged = next_mm < scene.resolution_mm
     way = reflect(bed.rays, surface_normal(pool.slopes))
     hidden = _behind_torch(pool.points_mm, bed.rays, way, bed.rig.electrode.height_mm)
-    known = np.isfinite(pool.plane_mm[:, 0])
     seen = known & ~hidden & ~merged
     seen[seen] = scene.in_view(pool.plane_mm[seen])
     pattern = bed.rig.pattern
@@ -188,7 +192,8 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
     witness[lit] = 1
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
     if len(stray):
-        apart = _apart(pool.plane_mm, scene.plane_mm[stray])
+        apart = np.full((len(lit), len(stray)), np.inf)
+        apart[known] = _apart(pool.plane_mm[known], scene.plane_mm[stray])
         doubt = apart.min(axis=1) < next_mm
         witness[doubt & (witness < 0)] = 0
         run_together = known & merged & among

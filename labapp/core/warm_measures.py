@@ -25,6 +25,8 @@ STEPS = 3
 ON_RIM_MM = 1e-6
 """A boundary point is on the rim's height to within this, or the boundary is looked for anew."""
 
+NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
+
 STRIDE = 4
 """Every so many boundary points there is a spoke of samples: the surface is smooth."""
 
@@ -112,15 +114,14 @@ def sizes_of(bed: Bed, coefficients: FloatArray, level: Level, rim: Rim) -> Size
     boundary, count = rim.boundary, len(coefficients)
     surface = SplineSurface(bed.basis, coefficients)
     outline, center = boundary.points_mm, boundary.center_mm
-    node, weight = np.polynomial.legendre.leggauss(measures.RINGS)
-    fraction = (node + 1) / 2
+    fraction = (NODE + 1) / 2
     spoke = outline[::STRIDE, :2] - center
     place = (center + fraction[:, None] * spoke[:, None]).reshape(-1, 2)
     cells = bed.basis.cells(*place.T)
     value = cells.values()
     z = (value * coefficients[cells.splines]).sum(axis=-1)
     wedge = _gathered(measures.wedges(boundary))
-    share = (wedge[:, None] * (weight * fraction)).ravel()
+    share = (wedge[:, None] * (WEIGHT * fraction)).ravel()
     samples = np.vstack([np.column_stack([place, z]), outline])
     extremes = [int(np.argmax(samples[:, 2])), int(np.argmin(samples[:, 2]))]
     high, low = (
