@@ -14,6 +14,7 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QRectF, Qt
 from PySide6.QtGui import QBrush, QColor, QPen
+from scipy.spatial import cKDTree
 
 from labapp.core.correction import Correction
 from labapp.core.values import FloatArray, IntArray
@@ -29,8 +30,12 @@ COMPUTED = "#ff5c5c"
 BLOCKED = "⊘"
 """Beside the number of a row that the torch blocks."""
 
-LEAST, MOST, CHOSEN_MORE = 13.0, 60.0, 4.0
-"""Diameters of rings, points of the screen: never less, never more, and more for chosen dots."""
+TINY, LEAST, MOST, CHOSEN_MORE = 7.0, 13.0, 60.0, 4.0
+"""Diameters of rings, points of the screen: where dots crowd, else never less, never more, and
+more for chosen dots."""
+
+CROSS = 9.0
+"""Width of a cross, points of the screen; less in a ring that is smaller than usual."""
 
 DOT_WIDTHS = 6.0
 """A ring is so many σ of a dot's light wide at a near zoom: round the dot, not on it."""
@@ -53,7 +58,7 @@ class DotsOverlay:
         self._rows = _line("#ffffff", 150)
         self._blocked = _line("#ffffff", 200, Qt.PenStyle.DashLine)
         self._dots = _Marks(pxMode=True)
-        self._computed = _Marks(pxMode=True, symbol="+", size=9, pen=None, brush=QColor(COMPUTED))
+        self._computed = _Marks(pxMode=True, symbol="+", pen=None, brush=QColor(COMPUTED))
         self._reference = _Marks(pxMode=True, pen=pg.mkPen(CHOSEN, width=2), brush=None)
         self._box = pg.QtWidgets.QGraphicsRectItem()
         self._box.setPen(_pen(CHOSEN, 1, Qt.PenStyle.DashLine))
@@ -65,6 +70,7 @@ class DotsOverlay:
             view.add(item)
         self._drawn: tuple[FloatArray, IntArray] = (np.zeros((0, 2)), np.zeros(0, np.int64))
         self._size = LEAST
+        self._apart_px = np.inf
         view.box.sigXRangeChanged.connect(lambda *_: self._rescale())
 
     def show(
@@ -78,11 +84,12 @@ class DotsOverlay:
         if correction is not self._correction:
             self._correction = correction
             self._joints = _joints(correction)
+            self._apart_px = _apart(dots_px)
         self._drawn = dots_px, selection
         self._size = self._ring()
         self._draw_lines(dots_px)
         self._draw_dots(correction, dots_px, selection)
-        self._computed.setData(*computed_px.T)
+        self._computed.setData(*computed_px.T, size=self._cross())
         self._draw_labels(correction, dots_px)
         self._draw_reference(correction)
 
@@ -91,7 +98,11 @@ class DotsOverlay:
         if self._correction is None or not len(self._correction.dots):
             return LEAST
         width = DOT_WIDTHS * float(np.median(self._correction.dots.size_px))
-        return float(np.clip(width / self._view.px_per_point, LEAST, MOST))
+        least = float(np.clip(0.9 * self._apart_px / self._view.px_per_point, TINY, LEAST))
+        return float(np.clip(width / self._view.px_per_point, least, MOST))
+
+    def _cross(self) -> float:
+        return CROSS * min(self._size / LEAST, 1.0)
 
     def _rescale(self) -> None:
         """Draw rings round the dots at another zoom."""
@@ -100,6 +111,7 @@ class DotsOverlay:
             self._size = self._ring()
             self._draw_dots(correction, dots_px, selection)
             self._draw_reference(correction)
+            self._computed.setSize(self._cross())
         self._draw_labels(correction, dots_px)
 
     def toggle(self) -> None:
@@ -197,6 +209,13 @@ def _look(row: int, sited: bool, blocked: bool, chosen: bool) -> tuple[QPen, QBr
     filling = QColor(color)
     filling.setAlpha(60 if chosen else 0)
     return pen, QBrush(filling)
+
+
+def _apart(dots_px: FloatArray) -> float:
+    """How far dots are from their nearest, px, the median; infinite for one or none."""
+    if len(dots_px) < 2:
+        return np.inf
+    return float(np.median(cKDTree(dots_px).query(dots_px, 2)[0][:, 1]))
 
 
 def _joints(correction: Correction | None) -> tuple[IntArray, ...]:
