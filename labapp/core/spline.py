@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -66,6 +67,10 @@ class SplineBasis:
 
     def __post_init__(self) -> None:
         freeze(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Leave what is kept of earlier calls behind: it is many times larger."""
+        return SplineBasis, (self.x_knots, self.y_knots)
 
     @classmethod
     def over(cls, low_mm: FloatArray, high_mm: FloatArray, knot_mm: float) -> SplineBasis:

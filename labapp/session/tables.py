@@ -213,13 +213,29 @@ def csv_header(name: str) -> str:
 
 def csv_rows(name: str, table: Table) -> str:
     """A table's rows as CSV text, rounded to the digits of `TABLES`."""
-    cells = [
-        table[column.name].tolist()
-        if column.digits is None
-        else [number(value, column.digits) for value in table[column.name].tolist()]
-        for column in TABLES[name]
-    ]
-    return as_csv(zip(*cells, strict=True))
+    columns = TABLES[name]
+    if name == "measures":  # its reason may hold commas
+        cells = [
+            table[column.name].tolist()
+            if column.digits is None
+            else [number(value, column.digits) for value in table[column.name].tolist()]
+            for column in columns
+        ]
+        return as_csv(zip(*cells, strict=True))
+    line = ",".join("%s" if c.digits is None else f"%.{c.digits}f" for c in columns) + "\n"
+    rows = zip(*(table[column.name].tolist() for column in columns), strict=True)
+    text = "".join([line % row for row in rows])
+    for odd, plain in AS_NUMBER.items():
+        for end in ",\n":
+            if odd + end in text:
+                text = text.replace(odd + end, plain + end)
+    return text
+
+
+AS_NUMBER = {"nan": "", "-inf": "", "inf": ""} | {
+    f"{-0.0:.{digits}f}": f"{0.0:.{digits}f}" for digits in (0, PX_DIGITS, MM_DIGITS)
+}
+"""Cells as Python formats them, and as `number` does."""
 
 
 def surface_csv(reconstruction: Reconstruction, spacing_mm: float) -> bytes:
