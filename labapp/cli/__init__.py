@@ -20,7 +20,7 @@ import typer.core
 import typer.main
 
 import labapp
-from labapp.cli import advise, analyze, session, simulate
+from labapp.cli import advise, analyze, cameras, session, simulate
 from labapp.cli.shared import (
     BAD_INPUT,
     FAULT,
@@ -64,6 +64,8 @@ app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
 app.command()(simulate.simulate)
 app.command()(advise.advise)
+app.command()(cameras.cameras)
+app.command()(cameras.record)
 app.command()(tour)
 
 SetupToChange = Annotated[

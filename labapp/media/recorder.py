@@ -20,6 +20,7 @@ from labapp.errors import InputError
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Kind, Say, Tally, silent
 from labapp.media.nut import Codec, NutWriter
+from labapp.words import several
 
 NOTES = ("time_s", "frame", "source", "kind", "what")
 """Columns of the notes beside a recording."""
@@ -108,7 +109,9 @@ class Take:
     @property
     def summary(self) -> Event:
         """What became of it."""
-        words = f"{self.frames} frames recorded" + f", {self.lost} lost" * (self.lost > 0)
+        words = f"{several(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
+            self.lost > 0
+        )
         return Event(self.path.name, "loss" if self.lost else "note", words)
 
     @property
@@ -232,7 +235,9 @@ class Recorder:
             self._queue.extend((take, frame) for frame in self._ring)
             count = len(self._ring)
             self._ring.clear()
-            self._add_note(take, Event("recording", "note", f"trigger, {count} frames before it"))
+            self._add_note(
+                take, Event("recording", "note", f"trigger, {several(count, 'frame')} before it")
+            )
             self._turn.notify()
         self._say(Event(path.name, "note", "recording"))
         return take
@@ -321,8 +326,8 @@ class Recorder:
         self._queue.append((take, _Note(self._newest_s, event)))
 
     def _tell_lost(self, count: int) -> None:
-        are = "1 frame is" if count == 1 else f"{count} frames are"
-        event = Event("recording", "loss", f"{are} lost: the disk is too slow, memory is full")
+        words = f"{several(count, 'frame')} lost: the disk is too slow, memory is full"
+        event = Event("recording", "loss", words)
         self._say(event)
         self.note(event)
 
@@ -372,7 +377,7 @@ class Recorder:
             logging.getLogger("labapp").exception("recording %s", take.path)
         reason = error.strerror if isinstance(error, OSError) else error
         take.trouble = f"cannot be written: {reason}"
-        words = f"{take.trouble}; the {take.frames} frames written so far are whole"
+        words = f"{take.trouble}; what was written is whole: {several(take.frames, 'frame')}"
         self._say(Event(take.path.name, "loss", words))
 
 

@@ -211,7 +211,7 @@ def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: 
     assert take.frames + take.lost == 100
     with open_source(tmp_path / "disk.nut") as video:
         assert [number_in(each.image) for each in video] == list(range(take.frames))
-    assert f"the {take.frames} frames written so far are whole" in heard.words()
+    assert f"what was written is whole: {take.frames} frames" in heard.words()
 
 
 def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:

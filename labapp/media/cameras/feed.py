@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import logging
+import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,6 +24,7 @@ from labapp.media.cameras.base import (
     CameraSettings,
 )
 from labapp.media.events import Event, Kind, Say, Tally, silent
+from labapp.words import several
 
 WAIT_S = 0.1
 """So long a frame is waited for before it is seen whether the feed is to end."""
@@ -102,9 +105,15 @@ class Feed:
         self._say = say
         self._wanted = settings or CameraSettings()
         self._ending = threading.Event()
+        self._asked: queue.SimpleQueue[tuple[CameraSettings, Future[CameraSettings]]]
+        self._asked = queue.SimpleQueue()
         self._frames = self._lost = 0
-        self._broken = Tally(lambda n: self._tell("loss", f"{_frames(n)} not whole, left out"))
-        self._dropped = Tally(lambda n: self._tell("loss", f"{_frames(n)} lost on the way"))
+        self._broken = Tally(
+            lambda n: self._tell("loss", f"{several(n, 'frame')} not whole, left out")
+        )
+        self._dropped = Tally(
+            lambda n: self._tell("loss", f"{several(n, 'frame')} lost on the way")
+        )
         self._next = 0
         self._first_s: float | None = None
         self._last_s = 0.0
@@ -116,6 +125,29 @@ class Feed:
     def counts(self) -> Counts:
         """What it has seen so far."""
         return Counts(self._frames, self._broken.total, self._dropped.total, self._lost)
+
+    @property
+    def settings(self) -> CameraSettings:
+        """What the camera was set to when it was opened or set last."""
+        return self._connection.settings
+
+    @property
+    def bit_depth(self) -> int:
+        """Significant bits of its grey levels."""
+        return self.camera.bit_depth
+
+    def apply(self, wanted: CameraSettings) -> Future[CameraSettings]:
+        """Set the camera between two frames, now and whenever it is opened again.
+
+        Returns
+        -------
+        Future
+            What it is set to then. `InputError` or `CameraError` where it refuses: it goes on as
+            it was set before. A camera that is away is set when it is back.
+        """
+        answer: Future[CameraSettings] = Future()
+        self._asked.put((wanted, answer))
+        return answer
 
     def stop(self) -> None:
         """Take no more frames and let go of the camera. Twice does no harm."""
@@ -161,12 +193,15 @@ class Feed:
                 tally.flush(now=True)
             self.state = "ended"
             self.camera.close()
+            while not self._asked.empty():
+                self._asked.get()[1].set_exception(CameraError(f"{self.name} is closed"))
 
     def _read_on(self) -> None:
         """Hand frames on until the camera is lost or the feed is to end."""
         heard_s = time.monotonic()
         self.state = "running"
         while not self._ending.is_set():
+            self._set_asked()
             try:
                 frame = self.camera.read(WAIT_S)
             except BrokenFrame:
@@ -181,6 +216,24 @@ class Feed:
             self._is_heard(frame.arrived_s - heard_s)
             heard_s = frame.arrived_s
             self._hand_on(frame)
+
+    def _set_asked(self) -> None:
+        """Set what was asked for meanwhile; numbers and times go on."""
+        while not self._asked.empty():
+            wanted, answer = self._asked.get()
+            camera = self.camera
+            camera.stop()
+            try:
+                settings = camera.apply(wanted)
+            except (CameraError, InputError) as error:
+                answer.set_exception(error)
+                if isinstance(error, CameraLost):
+                    raise
+            else:
+                self._wanted = replace(self._wanted, **wanted.asked())
+                answer.set_result(settings)
+            camera.start()
+            self._connection = _Connection(camera)
 
     def _is_heard(self, silent_s: float) -> None:
         if self.state == "stalled":
@@ -262,7 +315,3 @@ class _Connection:
         more, self._overrun = max(0, overrun - self._overrun), overrun
         self._number = frame.number
         return gap + more
-
-
-def _frames(count: int) -> str:
-    return "1 frame was" if count == 1 else f"{count} frames were"

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -89,7 +90,7 @@ class SimulatedDevice:
         rate_hz: float = 60.0,
         faults: Faults | None = None,
     ) -> None:
-        self.info = CameraInfo(f"simulated:{name}", f"simulated {name}", "simulated")
+        self.info = CameraInfo(f"simulated:{name}", f"simulated {Path(name).name}", "simulated")
         self.picture = picture
         self.bit_depth = bit_depth
         self.faults = faults or Faults()

@@ -130,6 +130,29 @@ def test_a_camera_that_waits_for_a_trigger_does_not_stall() -> None:
     assert not heard
 
 
+def test_it_is_set_between_two_frames_and_stays_so_when_it_comes_back(hasty: None) -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    frames: list[CameraFrame] = []
+    with Feed("test", device.open, frames.append) as running:
+        wait_until(lambda: len(frames) > 10)
+        found = running.apply(CameraSettings(region=(0, 0, 20, 16))).result(10)
+        assert found == running.settings
+        assert found.region == (0, 0, 20, 16)
+        with pytest.raises(InputError, match="rate_hz"):
+            running.apply(CameraSettings(rate_hz=-1)).result(10)
+        wait_until(lambda: frames[-1].image.shape == (16, 20))
+        device.settings = CameraSettings(rate_hz=500, region=(0, 0, 32, 24))
+        device.unplug(0.02)
+        wait_until(lambda: running.counts.lost == 1 and running.state == "running")
+        assert running.settings.region == (0, 0, 20, 16)
+        seen = len(frames)
+        wait_until(lambda: len(frames) > seen + 10)
+    shapes = [frame.image.shape for frame in frames]
+    assert shapes == sorted(shapes, reverse=True)
+    assert set(shapes) == {(24, 32), (16, 20)}
+    assert (np.diff([frame.time_s for frame in frames]) > 0).all()
+
+
 @pytest.mark.usefixtures("hasty")
 def test_it_ends_while_its_camera_is_away() -> None:
     device = SimulatedDevice("test", numbered)

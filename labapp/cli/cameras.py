@@ -1,0 +1,178 @@
+"""`labapp cameras` and `labapp record`: what is connected, and a recording from it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from labapp.cli.shared import NOTHING, finite, note, progress_bar
+from labapp.errors import InputError
+from labapp.words import several
+
+if TYPE_CHECKING:
+    from labapp.media.cameras import Camera, CameraSettings, Feed, Range
+    from labapp.media.events import Event
+    from labapp.media.recorder import Plan, Take
+
+POLL_S = 0.05
+
+
+def cameras() -> None:
+    """List the cameras that are connected, and what can be set on each."""
+    from labapp.media.cameras import CameraError, find_cameras, open_camera
+
+    found, problems = find_cameras()
+    for info in found:
+        typer.echo(f"{info.id}  {info.name} ({info.kind})")
+        try:
+            with open_camera(info.id) as camera:
+                typer.echo("\n".join(f"    {line}" for line in _abilities(camera)))
+        except CameraError as error:
+            typer.echo(f"    {error}")
+    typer.echo("simulated:FILE  a scenario or a recording, played as if a camera filmed it")
+    for problem in problems:
+        typer.echo(problem, err=True)
+
+
+def _abilities(camera: Camera) -> list[str]:
+    """What can be set on a camera, and what it is set to."""
+    limits, settings = camera.limits, camera.settings
+
+    def span(name: str, limit: Range | None, value: float | None, unit: str) -> str:
+        if limit is None:
+            return f"{name:10}cannot be set"
+        now = "" if value is None else f", now {value:.6g}"
+        return f"{name:10}{limit.lowest:.6g} to {limit.highest:.6g} {unit}{now}"
+
+    width, height = limits.sensor
+    region = "whole" if limits.least_region is None else "any region"
+    return [
+        f"{'picture':10}{width}×{height} px, {camera.bit_depth} bit, {region}",
+        span("exposure", limits.exposure_us, settings.exposure_us, "µs"),
+        span("gain", limits.gain_db, settings.gain_db, "dB"),
+        span("rate", limits.rate_hz, settings.rate_hz, "frames/s"),
+        f"{'trigger':10}{', '.join(limits.triggers)}",
+    ]
+
+
+def record(
+    camera: Annotated[str, typer.Argument(help="Its id: labapp cameras lists them.")],
+    *,
+    out: Annotated[
+        Path | None, typer.Option(help="File of the recording (.nut); must not be there yet.")
+    ] = None,
+    session: Annotated[
+        Path | None,
+        typer.Option(help="A session to record into; the file is put beside it and imported."),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.001, callback=finite, help="For so long (s); else until Ctrl-C."),
+    ] = None,
+    every: Annotated[int, typer.Option(min=1, help="Every n-th frame.")] = 1,
+    codec: Annotated[
+        Literal["raw", "ffv1"],
+        typer.Option(help="Both lose nothing; ffv1 is less than half the size, and slower."),
+    ] = "raw",
+    exposure: Annotated[
+        float | None, typer.Option(callback=finite, help="How long light is gathered (µs).")
+    ] = None,
+    gain: Annotated[float | None, typer.Option(callback=finite, help="Amplification (dB).")] = None,
+    rate: Annotated[float | None, typer.Option(callback=finite, help="Frames a second.")] = None,
+    region: Annotated[
+        tuple[int, int, int, int] | None,
+        typer.Option(metavar="U V WIDTH HEIGHT", help="Part of the picture (px)."),
+    ] = None,
+    trigger: Annotated[
+        Literal["free", "line"] | None,
+        typer.Option(help="By itself, or at a signal on the camera's input."),
+    ] = None,
+) -> None:
+    """Record from a camera, without loss: docs/cameras.md.
+
+    What happens meanwhile is told on stderr, and kept beside the recording as FILE-notes.csv.
+
+    Ctrl-C ends the recording: what was recorded is kept.
+    """
+    from labapp.media.cameras import CameraSettings
+    from labapp.media.recorder import Plan
+
+    if (out is None) == (session is None):
+        raise InputError("labapp record", "--out", out, "either --out or --session")
+    settings = CameraSettings(
+        exposure_us=exposure, gain_db=gain, rate_hz=rate, region=region, trigger=trigger
+    )
+    place = _place(out, session)
+    taken = _film(camera, place, Plan(every=every, codec=codec), settings, seconds)
+    _tell(taken, session)
+    if taken.trouble:
+        raise InputError(taken.path, "recording", taken.trouble, "a place that can be written")
+    if not taken.frames:
+        raise typer.Exit(NOTHING)
+
+
+def _film(
+    camera: str,
+    place: Callable[[], Path],
+    plan: Plan,
+    settings: CameraSettings,
+    seconds: float | None,
+) -> Take:
+    """Record for some seconds, or until Ctrl-C; what happens is told on stderr."""
+    from labapp.media.cameras import CameraError
+    from labapp.session.cameras import camera_opener
+    from labapp.session.cameras import record as film
+
+    with progress_bar() as bar:
+        task = bar.add_task(camera, total=None)
+
+        def wait(feed: Feed, take: Take) -> None:
+            until_s = time.monotonic() + (math.inf if seconds is None else seconds)
+            try:
+                while feed.state != "ended" and not take.trouble and time.monotonic() < until_s:
+                    time.sleep(POLL_S)
+                    bar.update(task, completed=take.frames)
+            except KeyboardInterrupt:
+                return
+
+        try:
+            opened = camera_opener(
+                camera, lambda _, done, of: bar.update(task, completed=done, total=of)
+            )
+            bar.update(task, completed=0, total=None)
+
+            def say(event: Event) -> None:
+                note(bar.console, str(event))
+
+            return film(camera, opened, place, plan, settings, wait, say)
+        except CameraError as error:
+            expected = "a camera that answers: labapp cameras lists them"
+            raise InputError(camera, "camera", error, expected) from error
+
+
+def _place(out: Path | None, session: Path | None) -> Callable[[], Path]:
+    """What gives the recording's file: the one named, or one beside a session that is there."""
+    from labapp.media.recorder import recording_path
+
+    if session is None:
+        return lambda: out or Path()
+    if not session.is_file():
+        raise InputError(session, "--session", "is not there", "one: labapp session new")
+    return lambda: recording_path(session.parent, "recording")
+
+
+def _tell(take: Take, session: Path | None) -> None:
+    """Say what was recorded; import it where a session was named."""
+    from labapp.session.session import Session
+
+    lost = f", {several(take.lost, 'frame')} lost" * (take.lost > 0)
+    typer.echo(f"{several(take.frames, 'frame')}{lost} in {take.path.absolute()}")
+    if session is not None and take.frames:
+        with Session.open(session) as opened:
+            opened.import_recording(take.path)
+        typer.echo(f"Imported into {session}")

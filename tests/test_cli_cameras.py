@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from labapp.media import open_source
+from labapp.media.cameras import CameraInfo, CameraLost
+from labapp.session.cameras import simulated_device
+from labapp.session.session import Session
+from tests.conftest import Run
+
+ROOT = Path(__file__).resolve().parent.parent
+SAMPLE = ROOT / "sample_sessions/gtaw/recording.avi"
+CAMERA = f"simulated:{SAMPLE}"
+
+
+def test_a_recording_is_made_of_what_the_camera_gives(tmp_path: Path, labapp: Run) -> None:
+    out = tmp_path / "run.nut"
+    code, told, said = labapp("record", CAMERA, "--out", out, "--seconds", 0.5, "--rate", 60)
+    assert (code, said.splitlines()[0]) == (0, "run.nut: recording")
+    with open_source(out) as video, open_source(SAMPLE) as sample:
+        assert told == f"{len(video)} frames in {out}\n"
+        assert 10 < len(video) < 60
+        # The sample is played from its first frame; the recorder is there a little later.
+        first = next(
+            k for k in range(20) if np.array_equal(sample.frame(k).image, video.frame(0).image)
+        )
+        for k in range(3):
+            assert np.array_equal(video.frame(k).image, sample.frame(first + k).image)
+        assert video.frame_rate_hz == 60
+    with (tmp_path / "run-notes.csv").open(newline="") as file:
+        assert next(csv.DictReader(file))["what"].startswith("trigger")
+
+
+def test_it_is_recorded_into_a_session(tmp_path: Path, labapp: Run) -> None:
+    Session.create(tmp_path / "a.labsession").close()
+    code, told, _ = labapp(
+        *("record", CAMERA, "--session", tmp_path / "a.labsession", "--seconds", "0.3"),
+        *("--every", "2", "--codec", "ffv1", "--region", "0", "0", "64", "48"),
+    )
+    assert code == 0
+    assert told.endswith(f"Imported into {tmp_path / 'a.labsession'}\n")
+    with Session.open(tmp_path / "a.labsession", read_only=True) as session:
+        recording = session.recording
+        assert recording is not None
+        assert (recording.columns, recording.rows) == (64, 48)
+        assert recording.path.startswith("recording-")
+        assert len(session.frames) == recording.frames > 0
+
+
+def test_ctrl_c_ends_a_recording_and_keeps_it(tmp_path: Path) -> None:
+    out = tmp_path / "run.nut"
+    environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
+    command = [sys.executable, "-m", "labapp", "record", CAMERA, "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        until_s = time.monotonic() + 60
+        while not out.exists() or out.stat().st_size < 1_000_000:
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        assert process.stdout is not None
+        told = process.stdout.read()
+    assert process.returncode == 0
+    with open_source(out) as video:
+        assert told.startswith(f"{len(video)} frames in ")
+        assert not video.warnings
+
+
+def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None:
+    out = tmp_path / "run.nut"
+    (tmp_path / "there.nut").write_text("mine")
+    for arguments, expected in (
+        (("webcam", "--out", out), "webcam: camera: webcam; expected uvc:NUMBER"),
+        (("uvc:77", "--out", out), "uvc:77: camera: uvc:77 is not connected; expected a camera"),
+        ((CAMERA,), "either --out or --session"),
+        ((CAMERA, "--out", out, "--session", out), "either --out or --session"),
+        ((CAMERA, "--session", tmp_path / "no.labsession"), "is not there"),
+        ((CAMERA, "--out", out, "--rate", "0"), "rate_hz: 0.0; expected from 0.1 to 10000"),
+        ((CAMERA, "--out", out, "--exposure", "5"), "exposure_us: 5.0; expected nothing"),
+        ((CAMERA, "--out", tmp_path / "there.nut"), "recording: is there already"),
+        ((CAMERA, "--out", tmp_path / "no" / "a.nut"), "No such file or directory"),
+        (("simulated:nothing.avi", "--out", out), "No such file or directory"),
+    ):
+        code, told, said = labapp("record", *arguments, "--seconds", "30")
+        assert code == 2
+        assert expected in said
+        assert not told or told.startswith("0 frames")
+    assert not out.exists()
+    assert (tmp_path / "there.nut").read_text() == "mine"
+
+
+def test_cameras_are_listed_with_what_can_be_set(
+    labapp: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = simulated_device(SAMPLE)
+    away = CameraInfo("uvc:3", "Webcam", "USB video")
+
+    def opened(id: str):
+        if id == away.id:
+            raise CameraLost("Webcam is used by another program: close that")
+        return device.open()
+
+    monkeypatch.setattr(
+        "labapp.media.cameras.find_cameras", lambda: ([device.info, away], ["No Aravis"])
+    )
+    monkeypatch.setattr("labapp.media.cameras.open_camera", opened)
+    code, told, said = labapp("cameras")
+    assert (code, said) == (0, "No Aravis\n")
+    assert told.splitlines()[:6] == [
+        f"{CAMERA}  simulated recording.avi (simulated)",
+        "    picture   480×640 px, 8 bit, any region",
+        "    exposure  cannot be set",
+        "    gain      cannot be set",
+        "    rate      0.1 to 10000 frames/s, now 60",
+        "    trigger   free, software",
+    ]
+    assert "Webcam is used by another program" in told
+
+
+def test_a_scenario_is_played_there_and_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("labapp.session.cameras.FRAMES", 3)
+    told: list[tuple[int, int]] = []
+    scenario = ROOT / "resources/simulations/cap.toml"
+    device = simulated_device(scenario, lambda _, done, of: told.append((done, of)))
+    frames = [device.picture(k) for k in range(9)]
+    assert told[-1] == (3, 3)
+    for k, same in ((3, 1), (4, 0), (5, 1), (8, 0)):
+        assert np.array_equal(frames[k], frames[same])
+    assert not np.array_equal(frames[0], frames[1])
