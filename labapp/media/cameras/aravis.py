@@ -6,11 +6,12 @@ import contextlib
 import ctypes
 import time
 from ctypes import byref, c_int, c_size_t
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from labapp.errors import InputError
 from labapp.media.base import GreyImage
 from labapp.media.cameras.base import (
     BrokenFrame,
@@ -132,20 +133,33 @@ class GenicamCamera(Camera):
         """Set what is wanted; see `Camera.apply`."""
         if self._stream is not None:
             raise CameraError(f"{self.info.name} is running: stop it before it is set")
-        check_settings(self.info, self.limits, wanted)
-        if wanted.region is not None:
-            self._ask("set_region", *wanted.region)
+        check_settings(self.info, self.limits, replace(wanted, rate_hz=None))
+        before = self.settings
+        self._set_picture(wanted)
+        if wanted.rate_hz is not None:
+            # How many frames there can be depends on their size and exposure.
+            self.limits = self._limits()
+            try:
+                check_settings(self.info, self.limits, CameraSettings(rate_hz=wanted.rate_hz))
+            except InputError:
+                self._set_picture(before)
+                self.limits = self._limits()
+                raise
+            self._ask("set_frame_rate", wanted.rate_hz)
         if wanted.trigger == "free":
             self._ask("clear_triggers")
         elif wanted.trigger is not None:
             self._ask("set_trigger", SOURCES[wanted.trigger])
+        self.limits = self._limits()
+        return self.settings
+
+    def _set_picture(self, wanted: CameraSettings) -> None:
+        if wanted.region is not None:
+            self._ask("set_region", *wanted.region)
         if wanted.exposure_us is not None:
             self._ask("set_exposure_time", wanted.exposure_us)
         if wanted.gain_db is not None:
             self._ask("set_gain", wanted.gain_db)
-        if wanted.rate_hz is not None:
-            self._ask("set_frame_rate", wanted.rate_hz)
-        return self.settings
 
     def _limits(self) -> Limits:
         def span(name: str, feature: str) -> Range | None:

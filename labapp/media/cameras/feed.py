@@ -282,13 +282,19 @@ class Feed:
     def _reopen(self) -> None:
         """Open the camera again, however long that takes; or until the feed is to end."""
         gone_s = time.monotonic()
+        told: set[str] = set()
         self.camera.close()
         for pause_s in itertools.chain(RETRY_S, itertools.repeat(RETRY_S[-1])):
             if self._ending.wait(pause_s):
                 return
             try:
                 self.camera = self._open()
-            except (CameraError, InputError):
+            except CameraLost:
+                continue
+            except (CameraError, InputError) as error:
+                if str(error) not in told:
+                    told.add(str(error))
+                    self._tell("warning", str(error))
                 continue
             away_s = time.monotonic() - gone_s
             self._tell("note", f"it is back after {away_s:.1f} s, set as before")

@@ -123,6 +123,9 @@ def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:
             camera.apply(CameraSettings(exposure_us=1))
         with pytest.raises(InputError, match="within 2048×2048 px"):
             camera.apply(CameraSettings(region=(2000, 0, 100, 100)))
+        with pytest.raises(InputError, match=r"rate_hz: 1000000.0; expected from 0.1 to 1000 "):
+            camera.apply(CameraSettings(exposure_us=900, region=(0, 0, 64, 64), rate_hz=1e6))
+        assert camera.settings == found
         assert camera.apply(CameraSettings(trigger="software")).trigger == "software"
         with pytest.raises(CameraError, match="used by another program"):
             open_camera(ID)

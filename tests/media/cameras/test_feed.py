@@ -8,6 +8,7 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.media.cameras import (
+    CameraError,
     CameraFrame,
     CameraLost,
     CameraSettings,
@@ -151,6 +152,29 @@ def test_it_is_set_between_two_frames_and_stays_so_when_it_comes_back(hasty: Non
     assert shapes == sorted(shapes, reverse=True)
     assert set(shapes) == {(24, 32), (16, 20)}
     assert (np.diff([frame.time_s for frame in frames]) > 0).all()
+
+
+@pytest.mark.usefixtures("hasty")
+def test_what_keeps_it_from_being_opened_again_is_said_once() -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    taken = False
+    heard = Heard()
+    refused = 0
+
+    def opened():
+        nonlocal refused
+        if taken:
+            refused += 1
+            raise CameraError("it is used by another program")
+        return device.open()
+
+    with Feed("test", opened, lambda _: None, heard.append) as running:
+        taken = True
+        device.unplug(0.05)
+        wait_until(lambda: refused >= 3)
+        taken = False
+        wait_until(lambda: running.state == "running")
+    assert heard.words().count("used by another program") == 1
 
 
 @pytest.mark.usefixtures("hasty")
