@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +138,23 @@ def test_what_is_wrong_is_said_and_nothing_is_written(
     qtbot.waitUntil(lambda: "holds mine.txt" in simulator.message.text(), timeout=TIMEOUT)
     assert [path.name for path in mine.iterdir()] == ["mine.txt"]
     assert not simulator.open_button.isEnabled()
+
+
+def test_a_process_that_ends_is_said_and_it_can_begin_again(
+    simulator: SimulatorWindow, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    def killed(*_: object, **__: object) -> None:
+        raise BrokenProcessPool
+
+    with monkeypatch.context() as patched:
+        patched.setattr("labapp.gui.tools.simulator.simulate", killed)
+        simulator.folder.editor.setText(str(tmp_path / "out"))
+        click(simulator.start_button)
+        qtbot.waitUntil(lambda: not simulator.working, timeout=TIMEOUT)
+    assert "a process that simulates has ended" in simulator.message.text()
+    simulator.frames.set_value(1)
+    click(simulator.start_button)
+    qtbot.waitUntil(lambda: simulator.made is not None, timeout=TIMEOUT)
 
 
 @pytest.mark.parametrize("how", ["escape", "close", "app"])

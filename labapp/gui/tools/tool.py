@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,8 +49,8 @@ class ToolWindow(QDialog):
 
     Attributes
     ----------
-    key, title, hint
-        In code; for the operator; what it is for.
+    key, title
+        In code; for the operator.
     workspace
         What is open.
     tasks
@@ -62,7 +63,6 @@ class ToolWindow(QDialog):
 
     key = ""
     title = ""
-    hint = ""
 
     def __init__(self, window: MainWindow) -> None:
         super().__init__(window)
@@ -196,8 +196,11 @@ class ToolWindow(QDialog):
         """Begin work, one at a time; see `Tasks.start`."""
 
         def behind(control: Control) -> Any:
-            with behind_a_window():
-                return work(control)
+            try:
+                with behind_a_window():
+                    return work(control)
+            except BrokenProcessPool as error:
+                raise ValueError("a process that simulates has ended: begin again") from error
 
         if self.working:
             return
