@@ -12,7 +12,7 @@ once.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,6 +62,9 @@ RAISED_MM = 0.01
 
 MEMORY, ORDER = 48, 4
 """Frames that predictions are learnt from, and how many of them one is made from."""
+
+
+Passed = Callable[[str], None]
 
 
 class Broken(Exception):
@@ -117,6 +120,9 @@ class WarmChain:
         The bench, and how the camera sees the imaging plane.
     settings
         Of the cold chain. Only the fit to band-passed dots, the default, can be followed.
+    passed
+        Told the name of each step of a followed frame when it is done: dots, match, fit, level,
+        measures.
 
     Attributes
     ----------
@@ -124,8 +130,15 @@ class WarmChain:
         Why the last frame was measured by the cold chain; None where it was followed.
     """
 
-    def __init__(self, rig: Rig, calibration: ImageCalibration, settings: Settings) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        calibration: ImageCalibration,
+        settings: Settings,
+        passed: Passed = lambda _: None,
+    ) -> None:
         self.rig, self.calibration, self.settings = rig, calibration, settings
+        self._passed = passed
         self.broke: str | None = None
         self._track: Track | None = None
 
@@ -134,7 +147,9 @@ class WarmChain:
         try:
             if self._track is None:
                 raise Broken("no frame before it was measured")
-            measurement, self._track = follow(image, self._track, self.calibration, self.settings)
+            measurement, self._track = follow(
+                image, self._track, self.calibration, self.settings, self._passed
+            )
             self.broke = None
             return measurement
         except (Broken, CannotMeasure, np.linalg.LinAlgError) as reason:
@@ -215,7 +230,11 @@ def _rms(residual: FloatArray) -> float:
 
 
 def follow(
-    image: Image, track: Track, calibration: ImageCalibration, settings: Settings
+    image: Image,
+    track: Track,
+    calibration: ImageCalibration,
+    settings: Settings,
+    passed: Passed = lambda _: None,
 ) -> tuple[Measurement, Track]:
     """Measure a frame from the one before.
 
@@ -230,9 +249,12 @@ def follow(
     if image.shape != track.exposure.noise.shape:
         raise Broken("the frame has another size than the one before")
     dots = quick_dots(image, track.exposure, settings.dots.band_pass)
+    passed("dots")
     scene = Scene.of(dots, bed.rig, calibration, (image.shape[0], image.shape[1]))
     pool, labels, foreseen = _found_again(track, scene)
+    passed("match")
     pool, labels, lower = _fitted(bed, scene, pool, labels)
+    passed("fit")
     heard = testimony(bed, scene, pool, labels)
     level, open_mm = _level(track, pool, heard.witness)
     outside = beyond(bed, _shifted(pool, level), level, labels)
@@ -242,6 +264,7 @@ def follow(
         heard = testimony(bed, scene, pool, labels)
         level, open_mm = _level(track, pool, heard.witness)
     pool = met(bed, pool.coefficients + level.shift_mm, pool.points_mm, 1)
+    passed("level")
     ray = np.flatnonzero(labels != UNLABELLED)
     dot = labels[ray]
     residual = pool.plane_mm[ray] - scene.plane_mm[dot]
@@ -270,6 +293,7 @@ def follow(
     )
     lattice = _lattice(match, bed.rig, len(dots))
     told = Measurement("ok", "", "fit", dots, lattice, match, reconstruction, size)
+    passed("measures")
     return told, after
 
 

@@ -19,7 +19,7 @@ from labapp.core.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.session.files import as_bytes, write_whole
 from labapp.session.meshes import FORMATS, SPACING_MM, solid, surface
-from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables, surface_csv
+from labapp.session.tables import TABLES, csv_header, surface_csv, table_rows
 
 RUN_FILE = "run.json"
 OURS = re.compile(r"(measures|dots|points|boundary|surface_\d{6,})\.csv|surface_\d{6,}\.stl")
@@ -122,8 +122,14 @@ class ResultsWriter:
             self._close_files()
             raise self._unwritable(error) from error
 
-    def write(self, frame: int, time_s: float | None, measurement: Measurement) -> None:
-        """Write everything about one frame.
+    def write(
+        self,
+        frame: int,
+        time_s: float | None,
+        measurement: Measurement,
+        rows: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write everything about one frame; its ``rows`` of each table where they are made already.
 
         Raises
         ------
@@ -138,8 +144,7 @@ class ResultsWriter:
                 frame, measurement.reconstruction, formats, SPACING_MM
             ).items()
         }
-        tables = frame_tables(frame, time_s, measurement, self._calibration)
-        rows = {name: csv_rows(name, table) for name, table in tables.items()}
+        rows = rows or table_rows(frame, time_s, measurement, self._calibration)
         try:
             for path, content in surfaces.items():
                 write_whole(path, content)

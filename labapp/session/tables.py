@@ -206,6 +206,14 @@ def _boundary(reconstruction: Reconstruction) -> list[npt.NDArray[Any]]:
     return [reconstruction.boundary.theta_deg, *reconstruction.boundary.points_mm.T]
 
 
+def table_rows(
+    frame: int, time_s: float | None, measurement: Measurement, calibration: ImageCalibration
+) -> dict[str, str]:
+    """A frame's rows of every table, as CSV text (`frame_tables`)."""
+    tables = frame_tables(frame, time_s, measurement, calibration)
+    return {name: csv_rows(name, table) for name, table in tables.items()}
+
+
 def csv_header(name: str) -> str:
     """The first line of a table's CSV file."""
     return as_csv([[column.name for column in TABLES[name]]])

@@ -1,0 +1,97 @@
+"""`labapp benchmark`: how fast this machine measures a recording, and how well."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from labapp.cli.shared import progress_told
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.session.benchmark import Detected, Latency, Run, Spread
+
+
+def benchmark(
+    frames: Annotated[
+        int, typer.Option(min=40, max=100_000, help="Frames of the simulated video.")
+    ] = 2000,
+    cache: Annotated[
+        Path | None,
+        typer.Option(help="Folder where the video is kept. Default: the user's cache folder."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, help="Processes that measure; 0: none but this. Default: one a core."),
+    ] = None,
+) -> None:
+    """Measure a simulated video of an oscillating pool: speed, wrong labels, ±, frequency.
+
+    The video is simulated once, which takes minutes, and kept: 0.3 MB a frame, twice.
+
+    Other dot finders are timed on the same frames where they are installed.
+    """
+    import platformdirs
+
+    from labapp.session.benchmark import compare_detectors, make_video, run_video, time_frames
+
+    folder = cache or Path(platformdirs.user_cache_dir("labapp")) / "benchmark"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            folder, "--cache", error.strerror, "a folder that can be written"
+        ) from error
+    with progress_told() as progress:
+        video = make_video(folder, frames, workers or None, progress)
+    typer.echo(f"{frames} frames of 480 × 640 px, 200 frames/s: {video.path}")
+    with tempfile.TemporaryDirectory(dir=folder) as out, progress_told() as progress:
+        done = 0
+
+        def advance() -> None:
+            nonlocal done
+            done += 1
+            progress("frames", done, frames)
+
+        run = run_video(video, Path(out) / "results", workers, advance)
+    _tell_run(run)
+    _tell_latency(time_frames(video, min(frames, 400)))
+    _tell_detectors(compare_detectors(video, 40))
+
+
+def _tell_run(run: Run) -> None:
+    typer.echo(f"\nfrom file to CSV        {run.frames / run.seconds:.1f} frames/s")
+    typer.echo(
+        f"measured                {100 * run.measured / run.frames:.2f} % of the frames, "
+        f"{run.cold} by the cold chain"
+    )
+    typer.echo(f"wrong labels            {run.wrong}; {100 * run.labelled:.2f} % of the dots shown")
+    typer.echo(f"height: error over σ    {run.surprise:.2f} (root mean square)")
+    typer.echo(f"height: frequency       {run.frequency_hz:.3f} Hz, true {run.true_hz:.3f} Hz")
+
+
+def _tell_latency(latency: Latency) -> None:
+    def line(name: str, spread: Spread) -> str:
+        return f"{name:22}{spread.median:8.2f}{spread.worst:8.2f}"
+
+    typer.echo(f"\n{'one frame, one core':22}{'median':>8}{'99 %':>8}  ms")
+    typer.echo(line("frame", latency.frame))
+    typer.echo(line("  of its processor", latency.processor))
+    for name, spread in latency.steps.items():
+        typer.echo(line(f"  {name}", spread))
+    ratio = 1e3 * latency.cold_s / latency.processor.median
+    typer.echo(f"cold chain            {1e3 * latency.cold_s:8.0f}, {ratio:.0f} times as much")
+
+
+def _tell_detectors(made: list[Detected | tuple[str, str]]) -> None:
+    head = f"{'median':>9}{'99 %':>9}  ms{'recall':>9}{'precision':>11}{'error':>8}  px"
+    typer.echo(f"\n{'dots of a frame':26}{head}")
+    for one in made:
+        if isinstance(one, tuple):
+            typer.echo(f"{one[0]:26} {one[1]}")
+            continue
+        time = f"{one.time.median:9.2f}{one.time.worst:9.2f}    "
+        typer.echo(f"{one.name:26}{time}{one.recall:9.4f}{one.precision:11.4f}{one.error_px:8.3f}")

@@ -1,0 +1,166 @@
+"""A recording measured frame from frame (`core.warm`), long stretches of it at once.
+
+Stretches are of one length, however many processes there are, and begin with a cold frame each:
+results do not depend on the machine. A process opens the recording itself, and gives back what it
+measured together with the rows of its tables.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, Future
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import cv2
+from threadpoolctl import ThreadpoolController
+
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.warm import WarmChain
+from labapp.errors import InputError
+from labapp.media import FrameSource, open_source
+from labapp.session.run import measuring_pool
+from labapp.session.setup import Setup
+from labapp.session.tables import table_rows
+
+STRETCH = 1000
+"""Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
+
+BATCH = 20
+"""Frames that a process gives back at a time."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What one frame gave.
+
+    Parameters
+    ----------
+    frame, time_s
+        Its number, and its time where it has one.
+    measurement
+        What was measured.
+    broke
+        Why it was not measured from the frame before; None if it was.
+    rows
+        Its rows of each table, as CSV text.
+    """
+
+    frame: int
+    time_s: float | None
+    measurement: Measurement
+    broke: str | None
+    rows: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is measured, and with what.
+
+    Parameters
+    ----------
+    path, index
+        The recording, and what opening it found out (`FrameSource.index`).
+    setup, settings
+        What it is measured with.
+    """
+
+    path: Path
+    index: bytes | None
+    setup: Setup
+    settings: Settings
+
+
+def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None) -> Iterator[Told]:
+    """Measure frames in their order, each from the one before.
+
+    Parameters
+    ----------
+    job
+        What to measure.
+    frames
+        Numbers of the frames, as they follow on each other.
+    workers
+        How many processes measure; None: one a core, at most one a stretch; 0: here.
+
+    Raises
+    ------
+    InputError
+        If the recording cannot be opened.
+    """
+    stretches = [frames[at : at + STRETCH] for at in range(0, len(frames), STRETCH)]
+    if workers is None:
+        workers = min(os.cpu_count() or 1, len(stretches))
+    if workers == 0:
+        for stretch in stretches:
+            for at in range(0, len(stretch), BATCH):
+                yield from _measured(job if at == 0 else None, stretch[at : at + BATCH])
+        return
+    with ExitStack() as at_end:
+        pools = [at_end.enter_context(measuring_pool(1)) for _ in range(workers)]
+        for pool in pools:
+            at_end.callback(pool.shutdown, wait=False, cancel_futures=True)
+        begun: deque[deque[Future[list[Told]]]] = deque()
+        waiting = iter(enumerate(stretches))
+        begun += (_begun(pools[k % workers], job, s) for k, s in islice(waiting, workers))
+        while begun:
+            batches = begun.popleft()
+            while batches:
+                yield from batches.popleft().result()
+            begun += (_begun(pools[k % workers], job, s) for k, s in islice(waiting, 1))
+
+
+def _begun(pool: Executor, job: Job, stretch: Sequence[int]) -> deque[Future[list[Told]]]:
+    """Give a stretch to a process, batch by batch."""
+    return deque(
+        pool.submit(_measured, job if at == 0 else None, stretch[at : at + BATCH])
+        for at in range(0, len(stretch), BATCH)
+    )
+
+
+class Following:
+    """Measures one stretch of a recording."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._source: FrameSource = open_source(job.path, job.index)
+        self._chain = WarmChain(job.setup.rig, job.setup.calibration, job.settings)
+
+    def measure(self, number: int) -> Told:
+        """Measure the next frame."""
+        time_s, broke = None, None
+        try:
+            frame = self._source.frame(number)
+        except InputError as error:
+            measurement = Measurement("unreadable", str(error), self._job.settings.scheme)
+        else:
+            time_s = frame.time_s
+            measurement = self._chain.measure(frame.image)
+            broke = self._chain.broke
+        rows = table_rows(number, time_s, measurement, self._job.setup.calibration)
+        return Told(number, time_s, measurement, broke, rows)
+
+    def close(self) -> None:
+        """Let go of the recording."""
+        self._source.close()
+
+
+_following: Following | None = None
+"""The stretch that this process is at."""
+
+
+def _measured(job: Job | None, numbers: Sequence[int]) -> list[Told]:
+    global _following  # noqa: PLW0603 - a stretch stays in the process that began it
+    if job is not None:
+        if _following is not None:
+            _following.close()
+        cv2.setNumThreads(1)
+        _following = Following(job)
+    assert _following is not None
+    # Matrices are small: more threads than one get in each other's way.
+    with ThreadpoolController().limit(limits=1, user_api="blas"):
+        return [_following.measure(number) for number in numbers]
