@@ -123,6 +123,10 @@ def test_cameras_are_listed_with_what_can_be_set(
         "    trigger   free, software",
     ]
     assert "Webcam is used by another program" in told
+    monkeypatch.setattr("labapp.media.cameras.find_cameras", lambda: ([], []))
+    code, told, said = labapp("cameras")
+    assert (code, said.partition(",")[0]) == (0, "No camera is connected")
+    assert told.startswith("simulated:FILE")
 
 
 def test_a_scenario_is_played_there_and_back(

@@ -27,6 +27,8 @@ def cameras() -> None:
     from labapp.media.cameras import CameraError, find_cameras, open_camera
 
     found, problems = find_cameras()
+    if not found:
+        problems.append("No camera is connected, or none that can be seen from here.")
     for info in found:
         typer.echo(f"{info.id}  {info.name} ({info.kind})")
         try:
@@ -61,7 +63,9 @@ def _abilities(camera: Camera) -> list[str]:
 
 
 def record(
-    camera: Annotated[str, typer.Argument(help="Its id: labapp cameras lists them.")],
+    camera: Annotated[
+        str, typer.Argument(metavar="CAMERA", help="Its id: labapp cameras lists them.")
+    ],
     *,
     out: Annotated[
         Path | None, typer.Option(help="File of the recording (.nut); must not be there yet.")
