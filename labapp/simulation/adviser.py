@@ -64,9 +64,9 @@ class Effort:
     """
 
     grid: tuple[int, int, int] = (6, 6, 4)
-    pools: tuple[int, int, int] = (4, 16, 64)
+    pools: tuple[int, int, int] = (8, 32, 128)
     steps: int = 24
-    finalists: int = 4
+    finalists: int = 6
     sweep: int = 9
 
 

@@ -17,8 +17,8 @@ from labapp.simulation.pools import Pool, ellipsoidal_cap
 Kind = Literal["convex", "concave"]
 Range = tuple[float, float]
 
-SIZES = 5
-"""Width, length, height, and the place along X and Y: what is drawn of a pool."""
+SIZES, DRAWN = 3, 5
+"""Width, length and height; and with them the place along X and Y: what is drawn of a pool."""
 
 
 @dataclass(frozen=True)
@@ -85,19 +85,21 @@ class ExpectedPools:
         shares = [(*size, *place) for size in product((0, 1), repeat=3) for place in places]
         return tuple(dict.fromkeys(self.at(np.array(share)) for share in shares))
 
-    def sample(self, count: int, seed: int, even: bool = True) -> Sample:
-        """Draw pools, and errors of the calibration with each.
+    def sample(self, count: int, seed: int, even: bool = True, places: int = 1) -> Sample:
+        """Draw pools, each at so many places, and errors of the calibration with each of these.
 
-        Evenly, by a scrambled Sobol row, or each independently of the others.
+        Evenly, by a scrambled Sobol row, or each independently of the others. The places of a
+        pool follow each other.
         """
-        rng = np.random.default_rng(seed)
-        share = rng.random((count, SIZES + OFFSETS))
+        rng, total = np.random.default_rng(seed), count * places
+        share = rng.random((total, DRAWN + OFFSETS))
         if even:
-            row = qmc.Sobol(SIZES + OFFSETS, rng=rng)
-            share = row.random_base2(max(count - 1, 0).bit_length())[:count]
-        pools = tuple(self.at(one) for one in share[:, :SIZES])
+            row = qmc.Sobol(DRAWN + OFFSETS, rng=rng)
+            share = row.random_base2(max(total - 1, 0).bit_length())[:total]
+        share[:, :SIZES] = np.repeat(share[:count, :SIZES], places, axis=0)
+        pools = tuple(self.at(one) for one in share[:, :DRAWN])
         # It may hold a 0, to which no normal deviate belongs.
-        deviate = special.ndtri(np.clip(share[:, SIZES:], 1e-6, 1 - 1e-6))
+        deviate = special.ndtri(np.clip(share[:, DRAWN:], 1e-6, 1 - 1e-6))
         return Sample(pools, deviate, seed)
 
 

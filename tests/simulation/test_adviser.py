@@ -32,7 +32,7 @@ def advice() -> Advice:
 
 @pytest.fixture(scope="module")
 def checked(advice: Advice) -> Check:
-    return check(advice, pools=12, grid=(2, 1, 1), rematch=6, workers=1)
+    return check(advice, pools=6, places=4, grid=(2, 1, 1), workers=1)
 
 
 # --- the pools ----------------------------------------------------------------------------------
@@ -49,6 +49,11 @@ def test_pools_are_drawn_within_the_ranges_and_again_the_same(even: bool) -> Non
         assert max(map(abs, foot.center_mm)) <= 0.3
     assert sample.pools == EXPECTED.sample(40, 3, even).pools
     assert sample.pools != EXPECTED.sample(40, 4, even).pools
+    placed = EXPECTED.sample(10, 3, even, places=4)
+    sizes = {(pool.footprint.width_mm, pool.peak_mm) for pool in placed.pools[:4]}
+    assert len(sizes) == 1
+    assert len({(pool.footprint.width_mm, pool.peak_mm) for pool in placed.pools}) == 10
+    assert len({pool.footprint.center_mm for pool in placed.pools}) == len(placed.deviate) == 40
     assert abs(sample.deviate.mean()) < 0.1
     assert sample.deviate.std() == pytest.approx(1, abs=0.1)
 
@@ -150,14 +155,14 @@ def test_advice_is_possible_within_the_limits_and_the_same_again(advice: Advice)
 
 
 def test_fresh_pools_are_whole_and_as_well_measured_as_promised(checked: Check) -> None:
-    assert not checked.chosen[:, 1:].any()
-    # 12 pools of a kind have a mean that swings by a fifth, so twice Show 4's 20 % and some.
+    assert not checked.chosen[..., 1:].any()
+    # So few have a mean that swings by a fifth, so twice Show 4's 20 % and some.
     assert abs(checked.off_prediction) < 0.5
     assert checked.error_mm < checked.text_error_mm
     assert len(checked.places)
     assert checked.errors.min() > 0.6 * checked.error_mm
-    assert checked.rematch.shape == (2, 6)
-    assert "12 fresh pools: 0 rays hidden, 0 off the plane" in check_text(checked)
+    assert checked.rematch.shape == (2, 6, 4)
+    assert "6 fresh pools at 4 places each: 0 rays hidden, 0 off the plane" in check_text(checked)
 
 
 def test_sweeps_tell_where_a_set_up_breaks(advice: Advice) -> None:
