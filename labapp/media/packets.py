@@ -106,6 +106,11 @@ class Packets:
             return self
         return type(self)("pos", place, stamp, stamp, key > 0, np.ones(len(place), bool))
 
+    def without_last(self) -> Self:
+        """The same but for the last in the file."""
+        names = ("place", "pts", "dts", "key", "shown")
+        return dataclasses.replace(self, **{name: getattr(self, name)[:-1] for name in names})
+
     def with_keys(self, key: BoolArray) -> Self:
         """The same with other key frames."""
         return dataclasses.replace(self, key=key)

@@ -7,7 +7,8 @@ import dataclasses
 import itertools
 import math
 import zlib
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -297,7 +298,11 @@ class VideoSource(FrameSource):
             from_0=is_avi,
         )
         size = self._fingerprint[0]
-        packets = Packets.read(_packets(self._container, self._stream), size)
+        last: deque[Packet[VideoStream]] = deque(maxlen=2)
+        packets = Packets.read(_kept(_packets(self._container, self._stream), last), size)
+        is_cut = self._container.format.name == "nut" and not self._is_whole(tuple(last))
+        if is_cut and len(packets) > 1:
+            packets = packets.without_last()
         indexed = is_avi and len(entries) >= len(packets)
         if indexed:
             packets = packets.completed(entries, size)
@@ -326,9 +331,23 @@ class VideoSource(FrameSource):
             bit_depth=bit_depth_of(first),
             description=self._describe(first),
             slice_crc=codec.name == "ffv1" and slices_whole(bytes(packet)),
+            warnings=table.warnings
+            + (f"{self.name} ends early: its last frame is cut off",) * is_cut,
             # MPEG program streams have stamps for some packets only; the others' are guessed.
             seekable=self._container.format.name != "mpeg",
         )
+
+    def _is_whole(self, last: Sequence[Packet[VideoStream]]) -> bool:
+        """Whether the last of packets is, if it can be decoded by itself; if not, it is taken for.
+
+        Of FFV1 that has checksums, as the packet before it shows, they must be right.
+        """
+        if not last or not last[-1].is_keyframe:
+            return True
+        checked = self._stream.codec_context.name == "ffv1" and slices_whole(bytes(last[0]))
+        if checked and not slices_whole(bytes(last[-1])):
+            return False
+        return _decode_as(self._stream, last[-1], 0) is not None
 
     def _decode_through(self, packets: Packets) -> tuple[BoolArray, IntArray]:
         """Key frames, and the frame of each packet in the order shown, by decoding everything."""
@@ -450,6 +469,15 @@ def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[
             failures += 1
         else:
             return
+
+
+def _kept(
+    packets: Iterable[Packet[VideoStream]], last: deque[Packet[VideoStream]]
+) -> Iterator[Packet[VideoStream]]:
+    """Packets as they come, the last of which stay in ``last``."""
+    for packet in packets:
+        last.append(packet)
+        yield packet
 
 
 def _decode_as(
