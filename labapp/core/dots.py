@@ -315,19 +315,28 @@ def light_of(image: Grey, size: float) -> Grey:
 
 
 def describe(
-    light: Grey, band: Grey, noise: Grey, u: IntArray, v: IntArray, size: float, speckle_px: float
+    light: Grey,
+    band: Grey,
+    noise: Grey,
+    u: IntArray,
+    v: IntArray,
+    size: float,
+    speckle_px: float,
+    whole: float = 1.0,
 ) -> Dots:
     """Centroid, its uncertainty, size, peak and signal-to-noise of each peak.
 
     The centroid is weighted by the light above its surroundings (`light_of`) under a Gaussian
-    window, which is moved onto the centroid it gives until it stays.
+    window, ``whole`` times as wide as the size asks for, which is moved onto the centroid it gives
+    until it stays.
     """
-    width = 1.1 * np.full(len(u), size)
+    reach = whole * size
+    width = 1.1 * np.full(len(u), reach)
     if len(u) > 1:  # a window that ends half-way to the next dot keeps its light out
         place = np.stack([u, v], axis=1)
         nearest = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
         width = np.minimum(width, np.maximum(0.275 * nearest, 0.75))
-    margin = int(np.ceil(2.2 * size)) + 1
+    margin = int(np.ceil(2.2 * reach)) + 1
     across = np.arange(-margin, margin + 1.0)
     framed = cv2.copyMakeBorder(light, *(margin,) * 4, cv2.BORDER_CONSTANT)
     views = np.lib.stride_tricks.sliding_window_view(framed, (len(across), len(across)))
@@ -340,7 +349,7 @@ def describe(
         sums = weight.sum(axis=1), weight.sum(axis=2)
         mean = np.stack([part @ across for part in sums]) / total
         # The window holds the mean back; half as much again brings it home in a few steps.
-        offset = np.clip(offset + 1.5 * (mean - offset), -size, size)
+        offset = np.clip(offset + 1.5 * (mean - offset), -reach, reach)
     moment = sum(part @ across**2 for part in sums) / total - np.sum(mean**2, axis=0)
     moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
     spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / _WIDTH_KEPT**2

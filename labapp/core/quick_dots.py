@@ -1,7 +1,7 @@
 """Dots of a frame like the one before: with size and noise known it takes a millisecond or two.
 
-The peaks and centroids of `dots.band_pass_dots`, to a small fraction of their σ: wide Gaussians
-are taken of a smaller picture, and what concerns few pixels is worked out for these alone.
+The peaks of `dots.band_pass_dots`: wide Gaussians are taken of a smaller picture, and what concerns
+few pixels is worked out for these alone.
 """
 
 from __future__ import annotations
@@ -36,6 +36,11 @@ ROUND_PX2 = 0.25
 
 LEAST_PX2 = 0.8
 """A blur of less, px² of the smaller picture, is not taken of it."""
+
+
+WHOLE = 1.8
+"""Centroids are taken over so much more of a dot than it is found by: over more of its grains of
+speckle, which move it the less."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +105,9 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     keep = bright >= settings.contrast * typical(bright)
     keep[keep] = first_of_each(u[keep], v[keep], size)
     u, v = u[keep], v[keep]
-    light = fine - _widened(narrow, (3.0**2 - 0.8**2) * size**2)
+    light = fine - _widened(narrow, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
     np.maximum(light, 0.0, out=light)
-    return describe(light, band, exposure.noise, u, v, size, settings.speckle_px)
+    return describe(light, band, exposure.noise, u, v, size, settings.speckle_px, WHOLE)
 
 
 def _widened(image: Grey, variance_px2: float) -> Grey:

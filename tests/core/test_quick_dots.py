@@ -1,7 +1,8 @@
-"""Quick dots are the default detector's: the same ones, at the same places, of the same light."""
+"""Quick dots are those of the default detector, and better placed where there is speckle."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -39,12 +40,27 @@ def test_the_dots_of_the_next_frame_are_those_of_the_default_detector(seed: int)
     slow = band_pass_dots(after, BandPassSettings(size_px=exposure.size_px))
     assert len(quick) == len(slow) >= len(true) - 1  # a hot pixel may hit a dot
     away, own = cKDTree(quick.image_px).query(slow.image_px)
-    assert np.quantile(away / slow.u_sigma_px, 0.95) < 0.1
-    assert (away / slow.u_sigma_px).max() < 1.0
+    assert np.quantile(away / slow.u_sigma_px, 0.95) < 1.0
     np.testing.assert_allclose(quick.snr[own], slow.snr, rtol=0.25)  # noise of another frame
-    np.testing.assert_allclose(quick.size_px[own], slow.size_px, rtol=0.1)
+    np.testing.assert_allclose(quick.size_px[own], slow.size_px, rtol=0.25)
     off = cKDTree(true).query(quick.image_px)[0]
     assert np.sqrt(np.mean(off**2)) < np.sqrt(2) * 0.08
+
+
+def test_speckle_moves_them_less() -> None:
+    rng = np.random.default_rng(9)
+    exposure, off = None, []
+    for _ in range(2):
+        true = places(rng)
+        clean = frame(true, rng).astype(float) - 20.0
+        grain = cv2.GaussianBlur(rng.normal(0.0, 1.0, SHAPE), (0, 0), 0.9)
+        image = 20.0 + clean * (1 + 0.35 * grain / grain.std())
+        exposure = exposure or Exposure.of(image, BandPassSettings())
+        slow = band_pass_dots(image, BandPassSettings(size_px=exposure.size_px))
+        quick = quick_dots(image, exposure, BandPassSettings())
+        off.append([cKDTree(true).query(dots.image_px)[0].mean() for dots in (quick, slow)])
+    mine, its = np.mean(off, axis=0)
+    assert mine < 0.9 * its
 
 
 def test_a_frame_without_dots_has_none() -> None:
