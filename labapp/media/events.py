@@ -5,6 +5,7 @@ Whoever reports calls a `Say`; it may be called from any thread.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -42,6 +43,17 @@ class Event:
 
 
 Say = Callable[[Event], None]
+
+
+def logged(say: Say) -> Say:
+    """Tell the same, and keep it in the program's log."""
+    levels = {"note": logging.INFO, "warning": logging.WARNING, "loss": logging.ERROR}
+
+    def tell(event: Event) -> None:
+        logging.getLogger("labapp").log(levels[event.kind], "%s", event)
+        say(event)
+
+    return tell
 
 
 def silent(_: Event) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from labapp.errors import InputError
 from labapp.media.events import Event, Kind, Say, silent
 
 LONGEST = 64
@@ -255,7 +256,7 @@ class HidReader:
         if self.connected:
             self.connected = False
             self._gone_s = time.monotonic()
-            self._hear(-1, b"")
+            self._hand_on(-1, b"")
         if words != self._told and not (self._told and words == AWAY):
             self._tell("warning", words)
             self._told = words
@@ -273,9 +274,18 @@ class HidReader:
             while not self._ending.is_set():
                 report = bytes(device.read(LONGEST, WAIT_MS))
                 if report:
-                    self._hear(report[0] if numbered else 0, report[numbered:])
+                    self._hand_on(report[0] if numbered else 0, report[numbered:])
         finally:
             device.close()
+
+    def _hand_on(self, number: int, report: bytes) -> None:
+        """Let a report be heard; what goes wrong with what it does ends no reading."""
+        try:
+            self._hear(number, report)
+        except Exception as error:
+            if not isinstance(error, InputError):
+                logging.getLogger("labapp").exception("%s, report %s", self._name, report.hex())
+            self._tell("warning", f"what it was pressed for failed: {error}")
 
     def _tell(self, kind: Kind, words: str) -> None:
         self._say(Event(self._name, kind, words))

@@ -20,7 +20,7 @@ from labapp.media.cameras import (
     SimulatedDevice,
     open_camera,
 )
-from labapp.media.events import Event, Say, silent
+from labapp.media.events import Event, Say, logged, silent
 from labapp.media.recorder import Plan, Recorder, Take
 from labapp.session.scenario import read_scenario
 from labapp.session.simulate import simulate
@@ -141,14 +141,16 @@ def record(
         for recorder in recorders:
             recorder.take(frame)
 
+    told = logged(say)
+
     def tell(event: Event) -> None:
-        say(event)
+        told(event)
         for recorder in recorders:
             recorder.note(event)
 
     with (
         Feed(id, opened, hand_on, tell, settings) as feed,
-        Recorder(place, plan, feed.bit_depth, feed.settings.rate_hz, say) as recorder,
+        Recorder(place, plan, feed.bit_depth, feed.settings.rate_hz, told) as recorder,
     ):
         take = recorder.trigger()
         recorders.append(recorder)

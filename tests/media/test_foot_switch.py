@@ -169,6 +169,24 @@ def test_unplugged_and_plugged_in_again_it_goes_on_and_says_so() -> None:
     assert heard.words().count("connected after") >= 4
 
 
+def test_what_a_pedal_does_may_fail_and_the_next_press_counts() -> None:
+    device, done, heard = Device(), [], Heard()
+
+    def do(action: Action) -> None:
+        done.append(action)
+        if action == "trigger":
+            raise OSError("no room")  # not the pedal's
+        raise InputError("run.nut", "recording", "is there already", "another name")
+
+    with switch(device, INFINITY, do, heard.append, trigger=0, mark=1):
+        device.send("0100", "0200", "0000")
+        wait_until(lambda: len(heard) == 3)
+    assert done == ["trigger", "mark"]
+    assert device.opened == 1
+    assert "failed: no room" in heard.words()
+    assert "failed: run.nut: recording: is there already" in heard.words()
+
+
 def test_one_that_is_not_there_is_said_once_and_waited_for() -> None:
     device, done, heard = Device(), [], Heard()
     device.plugged = False
