@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -263,6 +264,44 @@ SLOW = """
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     main(sys.argv[1:])
 """
+
+
+def test_measures_are_told_while_they_are_made(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = ["reconstruct", SAMPLE / "recording.avi", "--setup", SETUP, "--out", out]
+    started = subprocess.Popen(
+        [sys.executable, "-m", "labapp", *arguments, "--frames", "0:2", "--lines", "0"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert started.stderr is not None
+    port = int(started.stderr.readline().rpartition(":")[2])
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as connected:
+        told = [json.loads(line) for line in connected.makefile("rb")][1:]
+    _, complained = started.communicate(timeout=60)
+    assert started.returncode == 0, complained
+    assert [line["frame"] for line in told] == [0, 1]
+    for line, row in zip(told, table(out / "measures.csv"), strict=True):
+        assert line["status"] == row["status"] == "ok"
+        for name in ("height_mm", "width_mm", "height_sigma_mm", "are_mm"):
+            assert line[name] == pytest.approx(float(row[name]), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--lines", "0.0.0.0:0"), "only if that is asked for"),
+        (("--opcua", "port"), "PORT or HOST:PORT"),
+    ],
+)
+def test_a_stream_that_cannot_be_is_refused(
+    labapp: Run, tmp_path: Path, options: tuple[str, str], said: str
+) -> None:
+    source = ("reconstruct", SAMPLE / "recording.avi", "--setup", SETUP, "--out", tmp_path / "out")
+    code, _, complained = labapp(*source, *options)
+    assert code == 2
+    assert said in " ".join(complained.split())
+    assert not (tmp_path / "out").exists()
 
 
 def test_ctrl_c_leaves_whole_frames(tmp_path: Path) -> None:

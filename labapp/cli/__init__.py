@@ -10,8 +10,8 @@ import errno
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
@@ -39,7 +39,7 @@ from labapp.errors import InputError
 from labapp.session.log import log_file, start_log
 
 if TYPE_CHECKING:
-    from labapp.core.pipeline import Settings
+    from labapp.core.pipeline import Measurement, Settings
     from labapp.session.summary import Summary
 
 IMPATIENT_S = 2.0
@@ -185,6 +185,18 @@ def reconstruct(
     surfaces: Annotated[
         Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
     ] = "all",
+    *,
+    lines: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Tell measures as lines of JSON over TCP there."),
+    ] = None,
+    opcua: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Tell measures as variables of OPC UA there."),
+    ] = None,
+    anywhere: Annotated[
+        bool, typer.Option("--anywhere", help="Let other machines connect: nobody is asked who.")
+    ] = False,
 ) -> None:
     """Measure frames and write measures, dots, points, boundaries and surfaces.
 
@@ -197,9 +209,36 @@ def reconstruct(
     if algorithm != "opa" and scheme != "irs":
         raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
-    summary = _run(source, setup, out, settings, frames, surfaces == "all")
+    places = {"lines": lines, "opcua": opcua}
+    with ExitStack() as streams:
+        tell = _teller(streams, places, anywhere)
+        summary = _run(source, setup, out, settings, frames, surfaces == "all", tell)
     if not summary.statuses["ok"]:
         raise typer.Exit(NOTHING)
+
+
+def _teller(
+    streams: ExitStack, places: dict[str, str | None], anywhere: bool
+) -> Callable[[int, float | None, Measurement], None] | None:
+    """Tells measurements to the streams that are asked for; None where none is."""
+    if not any(places.values()):
+        return None
+    from labapp.session.streams import open_stream, told_values
+
+    opened = []
+    for kind, place in places.items():
+        if place is not None:
+            stream = open_stream(kind, place, anywhere)
+            streams.callback(stream.close)
+            typer.echo(f"Measures are told at {stream.address}", err=True)
+            opened.append(stream)
+
+    def tell(frame: int, time_s: float | None, measurement: Measurement) -> None:
+        values = told_values(frame, time_s, measurement)
+        for stream in opened:
+            stream.publish(values)
+
+    return tell
 
 
 def _run(
@@ -209,6 +248,7 @@ def _run(
     settings: Settings,
     frames: str = ":",
     surfaces: bool = True,
+    tell: Callable[[int, float | None, Measurement], None] | None = None,
 ) -> Summary:
     """Measure, showing progress and failures on stderr and the summary on stdout."""
     from labapp.media import open_source
@@ -232,6 +272,8 @@ def _run(
                     source, selected, setup, settings, results
                 ):
                     summary.add(frame, time_s, measurement)
+                    if tell is not None:
+                        tell(frame, time_s, measurement)
                     progress.advance(task)
                     if measurement.status != "ok":
                         note(progress.console, failure(frame, measurement))

@@ -1,0 +1,168 @@
+"""Measures told while they are made: to who listens, to who does not read, and to nobody else."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from labapp.core.pipeline import Measurement
+from labapp.errors import InputError
+from labapp.session.streams import LineStream, OpcuaStream, open_stream, told_values
+from labapp.session.tables import SIZES
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def lines() -> Iterator[LineStream]:
+    stream = LineStream()
+    yield stream
+    stream.close()
+
+
+def listener(stream: LineStream) -> Any:
+    """A file of lines, the first already read."""
+    connected = socket.create_connection(("127.0.0.1", stream.port), timeout=30)
+    file = connected.makefile("rb")
+    connected.close()
+    assert "labapp" in json.loads(file.readline())
+    return file
+
+
+def test_a_measurement_is_told_with_the_names_of_the_table(measured: Measurement) -> None:
+    told = told_values(7, 0.1, measured)
+    assert list(told)[:5] == ["frame", "time_s", "status", "reason", "scheme"]
+    assert list(told)[5:] == SIZES
+    assert measured.measures is not None
+    assert told["height_mm"] == measured.measures.height_mm
+    without = told_values(8, None, Measurement("no-dots", "It is dark", "fit"))
+    assert without["time_s"] is without["height_mm"] is without["height_sigma_mm"] is None
+    assert without["reason"] == "It is dark"
+
+
+def test_every_listener_gets_every_line(lines: LineStream) -> None:
+    files = [listener(lines), listener(lines)]
+    for frame in range(500):
+        lines.publish({"frame": frame, "status": "ok", "height_mm": 0.1 * frame})
+    for file in files:
+        for frame in range(500):
+            assert json.loads(file.readline()) == {
+                "frame": frame,
+                "status": "ok",
+                "height_mm": 0.1 * frame,
+            }
+        file.close()
+
+
+def test_who_does_not_read_is_told_what_it_missed_and_holds_nobody_up(lines: LineStream) -> None:
+    idle, eager = listener(lines), listener(lines)
+    padding = "x" * 10_000
+    for frame in range(3000):
+        lines.publish({"frame": frame, "reason": padding})
+        assert json.loads(eager.readline())["frame"] == frame
+    seen, missed = [], 0
+    while not seen or seen[-1] < 2999:
+        if not missed:
+            lines.publish({"frame": 3000 + len(seen), "reason": ""})
+        told = json.loads(idle.readline())
+        seen.append(told["frame"])
+        missed += told.get("missed", 0)
+    assert missed > 0
+    assert seen == sorted(seen)
+    assert seen[-1] + 1 == len(seen) + missed
+    idle.close()
+    eager.close()
+
+
+def test_a_listener_that_goes_harms_nobody(lines: LineStream) -> None:
+    gone, stays = listener(lines), listener(lines)
+    gone.close()
+    for frame in range(200):
+        lines.publish({"frame": frame})
+        assert json.loads(stays.readline())["frame"] == frame
+    stays.close()
+
+
+def test_what_was_told_arrives_when_the_stream_ends() -> None:
+    stream = LineStream()
+    file = listener(stream)
+    for frame in range(100):
+        stream.publish({"frame": frame})
+    stream.close()
+    assert [json.loads(line)["frame"] for line in file] == list(range(100))
+    file.close()
+
+
+def test_a_stream_ends_though_a_listener_does_not_read() -> None:
+    stream = LineStream()
+    idle = listener(stream)
+    for frame in range(2000):
+        stream.publish({"frame": frame, "reason": "x" * 5000})
+    stream.close()
+    idle.close()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.0.7", "weld.example"])
+@pytest.mark.parametrize("kind", [LineStream, OpcuaStream])
+def test_other_machines_are_let_in_only_if_that_is_said(kind: Any, host: str) -> None:
+    with pytest.raises(InputError, match="only if that is asked for"):
+        kind(host, 0)
+
+
+def test_a_way_in_for_others_can_be_asked_for() -> None:
+    open_stream("lines", "0.0.0.0:0", anywhere=True).close()
+
+
+@pytest.mark.parametrize("place", ["", "x", "127.0.0.1:", "127.0.0.1:-1", "65536", "localhost"])
+def test_what_is_no_place_is_refused(place: str) -> None:
+    with pytest.raises(InputError, match="PORT or HOST:PORT"):
+        open_stream("lines", place, anywhere=False)
+
+
+def test_a_port_that_is_taken_is_said(lines: LineStream) -> None:
+    for kind in (LineStream, OpcuaStream):
+        with pytest.raises(InputError, match=f"{lines.port}: Address already in use"):
+            kind(port=lines.port)
+
+
+def test_opc_ua_clients_read_the_newest_frame(measured: Measurement) -> None:
+    asyncua = pytest.importorskip("asyncua")
+    stream = OpcuaStream(port=free_port())
+    wanted = told_values(41, 0.5, measured)
+
+    async def read() -> dict[str, Any]:
+        async with asyncua.Client(stream.address) as client:
+            space = await client.get_namespace_index("urn:labapp:measures")
+            pool = await client.nodes.objects.get_child(f"{space}:Pool")
+            found: dict[str, Any] = {}
+            for _ in range(1000):
+                found = {
+                    name: await (await pool.get_child(f"{space}:{name}")).read_value()
+                    for name in wanted
+                }
+                if found["frame"] == 41:
+                    break
+                await asyncio.sleep(0.02)
+            return found
+
+    try:
+        stream.publish(told_values(40, None, Measurement("no-dots", "It is dark", "fit")))
+        stream.publish(wanted)
+        found = asyncio.run(read())
+    finally:
+        stream.close()
+    for name, value in wanted.items():
+        if value is None:
+            assert math.isnan(found[name])
+        else:
+            assert found[name] == value, name
