@@ -1,0 +1,68 @@
+"""A recording measured in stretches: the same whatever measures it, and whole in its tables."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.core.pipeline import Settings
+from labapp.session import sequence
+from labapp.session.benchmark import SCENARIO
+from labapp.session.results import ResultsWriter
+from labapp.session.scenario import read_scenario
+from labapp.session.sequence import Job, Told, measure_sequence
+from labapp.session.setup import read_setup
+from labapp.session.simulate import simulate
+
+FRAMES = 9
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    folder = tmp_path_factory.mktemp("sequence")
+    (folder / "scenario.toml").write_text(SCENARIO.format(frames=FRAMES), "utf-8")
+    simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
+    setup = read_setup(folder / "made" / "setup.toml")
+    return Job(folder / "made" / "recording.avi", None, setup, Settings())
+
+
+def test_stretches_are_measured_alike_here_and_by_processes(
+    job: Job, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sequence, "STRETCH", 5)
+    monkeypatch.setattr(sequence, "BATCH", 2)
+    told: dict[int, list[Told]] = {
+        workers: list(measure_sequence(job, range(FRAMES), workers)) for workers in (0, 2)
+    }
+    assert [one.frame for one in told[2]] == list(range(FRAMES))
+    for here, there in zip(told[0], told[2], strict=True):
+        assert here.rows == there.rows
+        assert here.broke == there.broke
+        assert here.measurement.measures == there.measurement.measures
+    cold = [one.frame for one in told[0] if one.broke is not None]
+    assert {0, 5} <= set(cold)
+    assert len(cold) <= 4
+    with ResultsWriter(tmp_path / "out", job.setup.calibration, {}, False) as results:
+        for one in told[2]:
+            results.write(one.frame, one.time_s, one.measurement, one.rows)
+    with (tmp_path / "out" / "measures.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["status"] for row in rows] == ["ok"] * FRAMES
+    assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
+
+
+def test_a_frame_that_cannot_be_read_is_told_and_the_others_measured(
+    job: Job, tmp_path: Path
+) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    with sequence.open_source(job.path) as source:
+        for n in range(3):
+            cv2.imwrite(str(folder / f"frame_{n}.png"), np.asarray(source.frame(n).image))
+    (folder / "frame_1.png").write_bytes(b"not a picture")
+    told = list(measure_sequence(Job(folder, None, job.setup, job.settings), range(3), 0))
+    assert [one.measurement.status for one in told] == ["ok", "unreadable", "ok"]
