@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.core.exposure import ADVICE
-from labapp.core.pipeline import Settings
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import GRADES, Quality, judge_quality, look
 from labapp.media import GreyImage, open_source
 from labapp.session.setup import read_setup
@@ -23,11 +23,14 @@ def frame(sample: str, recording: str, number: int) -> GreyImage:
         return source.frame(number).image
 
 
-def judged(image: GreyImage, sample: str | None = "gtaw", **given: float) -> Quality:
+def judged(image: GreyImage, sample: str | None = "gtaw") -> Quality:
     """Judge a frame with a sample's set-up, or without any."""
+    return judge_quality(image, seen(image, sample), 8, RAYS)
+
+
+def seen(image: GreyImage, sample: str | None) -> Measurement:
     setup = None if sample is None else read_setup(SAMPLES / sample / "setup.toml")
-    bench = None if setup is None else (setup.rig, setup.calibration)
-    return judge_quality(image, look(image, Settings(), bench), 8, RAYS, **given)
+    return look(image, Settings(), None if setup is None else (setup.rig, setup.calibration))
 
 
 def about(quality: Quality, what: str) -> str:
@@ -41,26 +44,34 @@ def good() -> GreyImage:
     return frame("gtaw", "recording.avi", 0)
 
 
-def test_a_good_frame_is_good_and_its_height_known_to_what_is_predicted(good: GreyImage) -> None:
-    found = judged(good)
+@pytest.fixture(scope="module")
+def measured(good: GreyImage) -> Measurement:
+    return seen(good, "gtaw")
+
+
+def test_a_good_frame_is_good_and_its_height_known_to_what_is_predicted(
+    good: GreyImage, measured: Measurement
+) -> None:
+    found = judge_quality(good, measured, 8, RAYS)
     assert found.grade == "good"
     assert found.words == ADVICE["good"]
     assert {remark.grade for remark in found.remarks} == {"good"}
     assert (found.blocked_rows, found.reference) == (0, True)
     with (SAMPLES / "gtaw" / "truth.csv").open() as file:
         height_mm = float(next(csv.DictReader(file))["height_mm"])
-    setup = read_setup(SAMPLES / "gtaw" / "setup.toml")
-    sizes = look(good, Settings(), (setup.rig, setup.calibration)).measures
+    sizes = measured.measures
     assert sizes is not None
     assert 0.0005 < found.height_sigma_mm < 0.02
     assert abs(sizes.height_mm - height_mm) < 4 * found.height_sigma_mm
 
 
-def test_a_height_that_is_not_known_well_enough_is_said(good: GreyImage) -> None:
-    found = judged(good, most_sigma_mm=1e-4)
+def test_a_height_that_is_not_known_well_enough_is_said(
+    good: GreyImage, measured: Measurement
+) -> None:
+    found = judge_quality(good, measured, 8, RAYS, most_sigma_mm=1e-4)
     assert found.grade == "doubtful"
     assert f"± {found.height_sigma_mm:.3f} mm, not to ± 0.0001 mm" in found.words
-    assert judged(good, most_sigma_mm=1.0).grade == "good"
+    assert judge_quality(good, measured, 8, RAYS, most_sigma_mm=1.0).grade == "good"
 
 
 def test_of_a_hollow_the_depth_counts() -> None:
@@ -126,18 +137,15 @@ def test_a_frame_that_cannot_be_measured_is_bad_and_says_why() -> None:
     assert found.words.endswith("(no-match).")
 
 
-def test_a_reference_that_is_not_seen_is_said(good: GreyImage) -> None:
-    found = judged(good_without_middle())
+def test_a_reference_that_is_not_seen_is_said(good: GreyImage, measured: Measurement) -> None:
+    found = judged(without_middle(good, measured))
     assert not found.reference
     assert about(found, "reference") == "doubtful"
     assert "a row may be taken for another" in found.words
 
 
-def good_without_middle() -> GreyImage:
-    """Frame 0 of gtaw with a dot where the reference is."""
-    image = frame("gtaw", "recording.avi", 0)
-    setup = read_setup(SAMPLES / "gtaw" / "setup.toml")
-    measured = look(image, Settings(), (setup.rig, setup.calibration))
+def without_middle(image: GreyImage, measured: Measurement) -> GreyImage:
+    """A frame with a dot where the reference is."""
     assert measured.lattice is not None
     assert measured.dots is not None
     k, t = measured.lattice.reference or (0, 0)
