@@ -326,7 +326,9 @@ class Recorder:
         self._queue.append((take, _Note(self._newest_s, event)))
 
     def _tell_lost(self, count: int) -> None:
-        words = f"{several(count, 'frame')} lost: the disk is too slow, memory is full"
+        faster = "; raw is written faster" * (self.plan.codec == "ffv1")
+        lost = several(count, "frame")
+        words = f"{lost} lost: writing does not keep up, and memory is full{faster}"
         event = Event("recording", "loss", words)
         self._say(event)
         self.note(event)
