@@ -33,7 +33,7 @@ from tests.media.cameras.watching import Heard, wait_until
 FAKE = Path(__file__).with_name("fake_gige.py")
 ID = "aravis:Aravis-Fake-LAB1"
 
-Plug = Callable[[], subprocess.Popen[str]]
+Plug = Callable[..., subprocess.Popen[str]]
 
 
 @pytest.fixture
@@ -48,9 +48,9 @@ def plug() -> Iterator[Plug]:
         lacks(f"{genicam.LIBRARY} is not installed")
     running: list[subprocess.Popen[str]] = []
 
-    def start() -> subprocess.Popen[str]:
+    def start(lost: float = 0.0) -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            [sys.executable, FAKE, "127.0.0.1", "LAB1"],
+            [sys.executable, FAKE, "127.0.0.1", "LAB1", str(lost)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -108,6 +108,24 @@ def test_it_is_discovered_streamed_recorded_killed_and_brought_back(
     assert (steps_s > 0).all()
     assert np.median(steps_s) == pytest.approx(0.01, rel=0.1)
     assert steps_s.max() > 1
+
+
+def test_a_frame_with_packets_missing_is_left_out_and_counted(plug: Plug) -> None:
+    plug(0.03)
+    heard = Heard()
+    frames: list[CameraFrame] = []
+    wanted = CameraSettings(region=(0, 0, 128, 96), rate_hz=100)
+    with Feed(ID, lambda: open_camera(ID), frames.append, heard.append, wanted) as running:
+        wait_until(lambda: running.counts.broken >= 10 and len(frames) >= 50, 60)
+    counts = running.counts
+    assert (counts.frames, counts.lost) == (len(frames), 0)
+    # The fake camera's picture is a ramp that begins again at 255, which a missing packet breaks.
+    for frame in frames:
+        for axis in (0, 1):
+            assert set(np.unique(np.diff(frame.image.astype(int), axis=axis))) <= {1, -254}
+    gaps = int((np.diff([frame.number for frame in frames]) - 1).sum())
+    assert gaps <= counts.broken + counts.dropped
+    assert "not whole, left out" in heard.words()
 
 
 def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:

@@ -165,3 +165,18 @@ def test_the_system_lists_a_camera_once(tmp_path: Path) -> None:
         ("uvc:10", "Microscope"),
     ]
     assert uvc.find_uvc(tmp_path / "nothing") == []
+
+
+def test_the_drivers_question_is_put_as_the_kernel_has_it() -> None:
+    # linux/videodev2.h: VIDIOC_QUERYCTRL is _IOWR('V', 36, struct v4l2_queryctrl), of 17 words.
+    assert uvc.QUERY.size == 4 * 17
+    assert uvc.QUERY_CONTROL == 3 << 30 | uvc.QUERY.size << 16 | ord("V") << 8 | 36
+    assert uvc.query_control(77, uvc.GAIN) is None
+
+
+def test_a_device_that_may_not_be_read_says_which_group_to_join(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(CameraLost, match="usermod -aG video"):
+        opened(Driver(opens=False))
