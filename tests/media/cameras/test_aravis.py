@@ -149,6 +149,24 @@ def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:
             open_camera(ID)
 
 
+def test_a_frame_is_taken_when_it_is_triggered(plug: Plug) -> None:
+    plug()
+    with open_camera(ID) as camera:
+        camera.apply(CameraSettings(region=(0, 0, 64, 48), rate_hz=100, trigger="software"))
+        camera.start()
+        assert camera.read(0.2) is None
+        for _ in range(3):
+            camera.trigger()
+            frame = camera.read(5.0)
+            assert frame is not None
+            assert frame.image.shape == (48, 64)
+            assert camera.read(0.1) is None
+        camera.stop()
+        assert camera.apply(CameraSettings(trigger="free")).trigger == "free"
+        camera.start()
+        assert all(camera.read(5.0) for _ in range(3))
+
+
 def test_a_camera_that_is_not_there_is_said_to_be_away(plug: Plug) -> None:
     with pytest.raises(CameraLost, match="aravis:Nobody-1 is not connected"):
         open_camera("aravis:Nobody-1")
