@@ -13,7 +13,8 @@ from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
 
 import labapp
-from labapp.gui.actions import ACTIONS, MENUS
+from labapp.gui.action import MENUS
+from labapp.gui.actions import ACTIONS
 from labapp.gui.standing import Standing
 from labapp.gui.steps import STEPS
 from labapp.session.log import log_file

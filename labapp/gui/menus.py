@@ -9,7 +9,8 @@ from PySide6.QtCore import QKeyCombination, Qt
 from PySide6.QtGui import QAction, QActionGroup, QKeyEvent, QKeySequence
 from PySide6.QtWidgets import QMenu
 
-from labapp.gui.actions import ACTIONS, MENUS, Action
+from labapp.gui.action import MENUS, Action
+from labapp.gui.actions import ACTIONS
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
@@ -90,6 +91,7 @@ class Menus:
             "undo": bool(undo),
             "redo": bool(redo),
             "work": bool(window.workspace.tasks.active),
+            "live": window.page is not None and window.page.live,
         }
         for name, made in self.actions.items():
             action = BY_NAME[name]

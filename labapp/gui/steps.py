@@ -68,7 +68,8 @@ STEPS = (
     Step(
         "capture",
         "Recording",
-        "Import a video, images or a stack. It is read through once, and stays where it is.",
+        "Import a video, images or a stack, or capture one with a camera. What is imported is read "
+        "through once, and stays where it is.",
     ),
     Step(
         "dots",

@@ -341,6 +341,11 @@ class MainWindow(QMainWindow):
             return
         self.workspace.measure(frames)
 
+    def trigger(self) -> None:
+        """Begin a recording of the live camera, or end it."""
+        if self.page is not None:
+            self.page.trigger()
+
     def copy_picture(self) -> None:
         """Copy the picture of the page in view."""
         if self.page is not None:
@@ -437,7 +442,8 @@ class MainWindow(QMainWindow):
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Do what a plain key means that nothing else has taken."""
-        if not self.menus.key(event):
+        taken = self.page is not None and self.page.takes_key(event)
+        if not taken and not self.menus.key(event):
             super().keyPressEvent(event)
 
     def dragEnterEvent(self, event: QDragEnterEvent) -> None:

@@ -4,7 +4,8 @@ from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.actions import ACTIONS, MENUS
+from labapp.gui.action import MENUS
+from labapp.gui.actions import ACTIONS
 from labapp.gui.help import TEXTS, keys
 from labapp.gui.steps import STEPS
 from labapp.gui.views import picture, plots, view3d

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import labapp
-from labapp.gui.actions import MENUS
+from labapp.gui.action import MENUS
 from labapp.gui.help import TITLES
 from labapp.gui.pages import PAGES
 from labapp.gui.tools import TOOLS

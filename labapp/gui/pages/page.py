@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from PySide6.QtGui import QPixmap
+from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.steps import State
@@ -57,6 +57,18 @@ class Page(QWidget):
 
         The page is in view.
         """
+
+    @property
+    def live(self) -> bool:
+        """Whether the page watches a camera that it can record from."""
+        return False
+
+    def trigger(self) -> None:
+        """Begin a recording, or end the one that runs; while `live`."""
+
+    def takes_key(self, event: QKeyEvent) -> bool:
+        """Do what a plain key means here that nothing in view has taken; whether it did."""
+        return False
 
     def picture(self) -> QPixmap:
         """What *Copy picture* puts on the clipboard."""

@@ -236,7 +236,7 @@ def test_a_missing_recording_is_found_again(copy_sample, tmp_path: Path, qtbot: 
     page.relink(moved)
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
     assert not page.find_button.isVisibleTo(page.panel)
-    qtbot.waitUntil(lambda: page.verdict.text().startswith("● Good."))
+    qtbot.waitUntil(lambda: page.exposure.verdict.text().startswith("● Good."))
     workspace.close()
 
 
@@ -244,9 +244,3 @@ def test_every_button_says_what_it_does(page: CapturePage) -> None:
     for button in page.panel.findChildren(QAbstractButton):
         if button.text():
             assert button.toolTip(), button.text()
-
-
-def test_where_a_camera_will_be_chosen_it_says_that_there_is_none(page: CapturePage) -> None:
-    assert page.camera.isVisibleTo(page.panel)
-    assert not page.camera.isEnabled()
-    assert "import the file" in page.camera.editor.toolTip()

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import (
     QCheckBox,
     QFileDialog,
-    QFormLayout,
     QGridLayout,
     QHBoxLayout,
     QLabel,
-    QProgressBar,
-    QPushButton,
     QSlider,
-    QVBoxLayout,
-    QWidget,
 )
 
 from labapp.gui.dialogs import EVERYTHING, recordings
+from labapp.gui.pages.capture.live_view import LiveView, told_of
+from labapp.gui.pages.capture.parts import ExposureBars, button, headed, whole, wrapped
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
     Seen,
-    bars,
     choice_in_words,
     look,
     missing_in_words,
@@ -35,21 +31,23 @@ from labapp.gui.pages.capture.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.fields import FieldForm, NumberField
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
+from labapp.media.recorder import Take
 from labapp.session.record import Recording
+from labapp.words import several
 
 MOST_HZ = 1e7
 REST_MS = 120
 """Exposure is judged where a frame stays in view so long: not while frames rush by."""
 
-NONE_YET = "Choose a video, an image, a folder of images or a stack, or drop it on the window."
-
-NO_CAMERA = (
-    "This version shows no camera live, nor the simulated one: record with the camera's own "
-    "program and import the file. Try the sample (menu File) opens a simulated recording."
+NONE_YET = (
+    "Choose a video, an image, a folder of images or a stack, or drop it on the window; or start a "
+    "camera."
 )
+
+KEYPAD = Qt.KeyboardModifier.KeypadModifier
 
 
 class CapturePage(Page):
@@ -82,6 +80,11 @@ class CapturePage(Page):
         self.canvas_layout.addWidget(self.title)
         self.canvas_layout.addWidget(self.picture_view, 1)
         self.canvas_layout.addWidget(self.slider)
+        self.exposure = ExposureBars()
+        self.live_view = LiveView(workspace, self.picture_view, self.exposure)
+        self.live_view.changed.connect(self._live_changed)
+        self.live_view.recorded.connect(self._recorded)
+        self.canvas_layout.addWidget(self.live_view.bar)
         self._make_panel()
         workspace.opened.connect(self._drop_preview)
         workspace.tasks.changed.connect(self._show_import)
@@ -106,12 +109,19 @@ class CapturePage(Page):
     def state(self, found: State) -> State:
         """How far the step is: a recording may be chosen that the session does not have yet."""
         session = self.workspace.session
+        if self.live_view.live is not None:
+            return State(Mark.READY, "A camera is watched: Space records")
         if self.preview is None or session is None or session.recording is not None:
             return found
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
 
     def leave(self) -> None:
-        """Judge no frame that nobody sees."""
+        """Judge no frame that nobody sees; let go of the camera, a recording is finished first."""
+        if self.live_view.live is not None:
+            told = self.live_view.blockSignals(True)  # nobody sees what would be shown instead
+            self.live_view.stop()
+            self.live_view.blockSignals(told)
+            self._wanted = self._seen = None
         if self._rest.isActive():
             self._rest.stop()
             self._seen = None
@@ -120,8 +130,54 @@ class CapturePage(Page):
         """Look at a recording, to import it."""
         self.choose(path)
 
+    # --- live ---------------------------------------------------------------------------------
+
+    @property
+    def live(self) -> bool:
+        """Whether a camera is watched."""
+        return self.live_view.is_live
+
+    def trigger(self) -> None:
+        """Begin a recording, or end the one that runs."""
+        self.live_view.trigger()
+
+    def takes_key(self, event: QKeyEvent) -> bool:
+        """Space records and M marks while a camera is watched."""
+        plain = event.modifiers() in (Qt.KeyboardModifier.NoModifier, KEYPAD)
+        if not plain or not self.live:
+            return False
+        return event.isAutoRepeat() or self.live_view.take_key(Qt.Key(event.key()))
+
+    def _live_changed(self) -> None:
+        """A camera was started, or let go: its picture is in view, or the session's."""
+        live = self.live_view.live
+        self._rest.stop()
+        self._wanted = self._seen = None
+        if live is None:
+            self.exposure.hide()
+        else:
+            self._drop_preview()
+            self._show_seen(Seen(f"Live: {live.name}", None, None, "Opening the camera …"))
+        self.refresh()
+        self.workspace.changed.emit()
+
+    def _recorded(self, take: Take) -> None:
+        """Import what was recorded, or say why not."""
+        session, why_kept = self.workspace.session, ""
+        if session is None or not take.frames:
+            self.workspace.said.emit(f"{take.path.name}: nothing was recorded", True)
+            return
+        if session.read_only:
+            why_kept = "the session is open read-only"
+        elif session.recording is not None or self._importing in self.workspace.tasks.active:
+            why_kept = "the session has a recording already"
+        if why_kept:
+            self.workspace.said.emit(told_of(take, why_kept), False)
+        else:
+            self._import(take.path, ":", None, False)
+
     def _show_recording(self, recording: Recording | None) -> None:
-        self.told_group.setVisible(recording is not None)
+        self.told_group.setVisible(recording is not None and self.live_view.live is None)
         if recording is None or recording == self._told:
             return
         self._told = recording
@@ -134,9 +190,9 @@ class CapturePage(Page):
         rows = recording_in_words(recording)
         for row, (name, words) in enumerate(rows):
             self.told.addWidget(QLabel(f"{name}:"), row, 0)
-            self.told.addWidget(_words(words), row, 1)
+            self.told.addWidget(wrapped(words), row, 1)
         for row, sentence in enumerate(recording.warnings, len(rows)):
-            self.told.addWidget(_words(f"⚠ {sentence}"), row, 0, 1, 2)
+            self.told.addWidget(wrapped(f"⚠ {sentence}"), row, 0, 1, 2)
 
     def _show_import(self) -> None:
         working = self._importing in self.workspace.tasks.active
@@ -155,21 +211,19 @@ class CapturePage(Page):
         self.picture_view.show_picture(seen.image, seen.words)
         if seen.exposure is None:
             if seen.image is None:
-                self.exposure_group.hide()
+                self.exposure.hide()
             return  # else the verdict on the frame before stays until this one is judged
-        self.exposure_group.show()
-        for bar, widget in zip(bars(seen.exposure), self.bars, strict=True):
-            widget.setValue(round(100 * bar.part))
-            widget.setFormat(bar.words)
-            widget.setAccessibleName(f"{bar.name}: {bar.words}")
-            widget.setToolTip(bar.tip)
-        sign = "●" if seen.exposure.verdict == "good" else "▲"
-        self.verdict.setText(f"{sign} {seen.exposure.verdict.capitalize()}. {seen.exposure.advice}")
+        self.exposure.show()
+        verdict = seen.exposure.verdict
+        told = f"{verdict.capitalize()}. {seen.exposure.advice}"
+        self.exposure.show_exposure(seen.exposure, told, verdict == "good")
 
     # --- frames to look at --------------------------------------------------------------------
 
     def _look(self) -> None:
         """Read the frame to be seen in the background; of several asked for, the last."""
+        if self.live_view.live is not None:
+            return
         session, preview = self.workspace.session, self.preview
         if preview is not None:
             self._wanted = (preview, self.slider.value())
@@ -199,7 +253,7 @@ class CapturePage(Page):
             return look(session, number, judged)
 
         def done(seen: Seen) -> None:
-            if self.workspace.session is not session:
+            if self.workspace.session is not session or self.live_view.live is not None:
                 return
             self._seen = wanted
             if self._wanted == wanted or self.slider.isSliderDown():
@@ -238,6 +292,7 @@ class CapturePage(Page):
     def choose(self, path: Path) -> None:
         """Look at a recording, to import it."""
         self._last_folder = path.parent
+        self.live_view.stop()
         if self._opening in self.workspace.tasks.active and self._opening is not None:
             self._opening.cancel()
 
@@ -278,13 +333,15 @@ class CapturePage(Page):
         if session is None or preview is None or choice is None or not choice.count:
             return
 
+        self._import(preview.path, choice.frames, choice.rate_hz, choice.embed)
+
+    def _import(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
+        session = self.workspace.session
+        assert session is not None
+
         def work(control: Control) -> Recording:
             recording = session.import_recording(
-                preview.path,
-                choice.frames,
-                frame_rate_hz=choice.rate_hz,
-                embed=choice.embed,
-                progress=control.progress,
+                path, frames, frame_rate_hz=rate_hz, embed=embed, progress=control.progress
             )
             session.overview()  # looked up here: the window would wait for it
             return recording
@@ -297,12 +354,11 @@ class CapturePage(Page):
             if self.workspace.frame not in frames:
                 self.workspace.show_frame(frames[0])
             self._seen = None
-            count = len(frames)
-            told = f"{count} frame{'s' * (count != 1)} of {preview.path.name} imported"
+            told = f"{several(len(frames), 'frame')} of {path.name} imported"
             self.workspace.said.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
             self.workspace.changed.emit()
 
-        self._importing = self.workspace.tasks.start(f"Importing {preview.path.name}", work, done)
+        self._importing = self.workspace.tasks.start(f"Importing {path.name}", work, done)
         self._show_import()
 
     def _drop_preview(self) -> None:
@@ -352,48 +408,39 @@ class CapturePage(Page):
 
     def _make_panel(self) -> None:
         row = QHBoxLayout()
-        row.addWidget(_button("Choose a file …", "A video, an image or a stack", self.choose_file))
+        row.addWidget(button("Choose a file …", "A video, an image or a stack", self.choose_file))
         row.addWidget(
-            _button("Choose a folder …", "A folder of images in order", self.choose_folder)
+            button("Choose a folder …", "A folder of images in order", self.choose_folder)
         )
         self.panel_layout.addLayout(row)
+        self.panel_layout.addWidget(self.live_view.group)
         self._make_missing()
         self._make_choice()
-        self._make_exposure()
-        self.told_group, layout = _group("What was read")
+        self.exposure.hide()
+        self.panel_layout.addWidget(self.exposure)
+        self.told_group, layout = headed("What was read")
         self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
         self.told.setColumnStretch(1, 1)
         layout.addLayout(self.told)
         self.panel_layout.addWidget(self.told_group)
-        self._make_camera()
         self.panel_layout.addStretch(1)
 
-    def _make_camera(self) -> None:
-        group, layout = _group("Capture")
-        form = FieldForm()
-        self.camera = ChoiceField("Camera", [("", "none")], tooltip=NO_CAMERA)
-        self.camera.setEnabled(False)
-        form.add(self.camera)
-        layout.addWidget(form)
-        layout.addWidget(_words(NO_CAMERA))
-        self.panel_layout.addWidget(group)
-
     def _make_missing(self) -> None:
-        self.missing = _words()
-        self.find_button = _button(
+        self.missing = wrapped()
+        self.find_button = button(
             "Say where it is …", "Find the recording in its new place", self.find_recording
         )
         self.panel_layout.addWidget(self.missing)
         self.panel_layout.addWidget(self.find_button)
 
     def _make_choice(self) -> None:
-        self.choice_group, layout = _group("To be imported")
-        self.source_words = _words()
+        self.choice_group, layout = headed("To be imported")
+        self.source_words = wrapped()
         layout.addWidget(self.source_words)
         form = FieldForm()
-        self.first = _whole("First frame", 0, "The first frame to use, counted from 0")
-        self.last = _whole("Last frame", 0, "The last frame to use")
-        self.every = _whole("Every n-th", 1, "1: every frame; 2: every second one …")
+        self.first = whole("First frame", 0, "The first frame to use, counted from 0")
+        self.last = whole("Last frame", 0, "The last frame to use")
+        self.every = whole("Every n-th", 1, "1: every frame; 2: every second one …")
         self.rate = NumberField(
             "Frame rate",
             "frames/s",
@@ -414,69 +461,15 @@ class CapturePage(Page):
         )
         self.embed.toggled.connect(lambda _: self._show_import())
         layout.addWidget(self.embed)
-        self.choice_words = _words()
+        self.choice_words = wrapped()
         layout.addWidget(self.choice_words)
         row = QHBoxLayout()
-        self.import_button = _button("Import", "", self.import_chosen)
+        self.import_button = button("Import", "", self.import_chosen)
         self.import_button.setDefault(True)
         row.addWidget(self.import_button)
         row.addWidget(
-            _button("Not this one", "Leave it, and see the session's frames", self.cancel_choice)
+            button("Not this one", "Leave it, and see the session's frames", self.cancel_choice)
         )
         layout.addLayout(row)
         self.choice_group.hide()
         self.panel_layout.addWidget(self.choice_group)
-
-    def _make_exposure(self) -> None:
-        self.exposure_group, layout = _group("Exposure of the frame in view")
-        form = QFormLayout()
-        self.bars = []
-        for name in ("Exposure", "Saturation", "Contrast"):
-            bar = QProgressBar()
-            bar.setRange(0, 100)
-            self.bars.append(bar)
-            form.addRow(f"{name}:", bar)
-        layout.addLayout(form)
-        self.verdict = _words()
-        layout.addWidget(self.verdict)
-        self.panel_layout.addWidget(self.exposure_group)
-
-
-def _group(words: str) -> tuple[QWidget, QVBoxLayout]:
-    group = QWidget()
-    layout = QVBoxLayout(group)
-    layout.setContentsMargins(0, 6, 0, 0)
-    heading = QLabel(words)
-    font = heading.font()
-    font.setBold(True)
-    heading.setFont(font)
-    layout.addWidget(heading)
-    return group, layout
-
-
-def _words(text: str = "") -> QLabel:
-    """Words that wrap, even a SHA-256, and can be copied."""
-    label = QLabel(_breakable(text))
-    label.setWordWrap(True)
-    label.setTextFormat(Qt.TextFormat.PlainText)
-    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-    label.setToolTip(text)
-    return label
-
-
-def _breakable(text: str) -> str:
-    """Let long words (a checksum, a path) break where they must."""
-    return "".join(
-        f"{letter}\u200b" if len(text) > 24 and " " not in text else letter for letter in text
-    )
-
-
-def _whole(label: str, lowest: int, tip: str) -> NumberField:
-    return NumberField(label, lowest=lowest, highest=1, decimals=0, tooltip=tip)
-
-
-def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
-    button = QPushButton(words)
-    button.setToolTip(tip)
-    button.clicked.connect(lambda _: work())
-    return button

@@ -1,0 +1,349 @@
+"""A camera that is watched and recorded from, without widgets; its frames come in threads."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from labapp.core.detection import DotSettings, find_dots
+from labapp.core.pipeline import Measurement
+from labapp.core.quality import UNMEASURED, Quality, judge_quality
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.errors import InputError
+from labapp.gui.pages.capture.presenter import size_in_words
+from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
+from labapp.media.events import Event
+from labapp.media.recorder import Plan, Recorder, Take
+from labapp.session.log import NAME
+from labapp.session.session import Session
+from labapp.words import several
+
+SIMULATED = "simulated"
+"""Id of the simulated camera."""
+
+LOOK_S = 0.25
+"""A frame is judged no more often, and never for more than half of the time."""
+
+IDLE_S = 0.02
+
+RATE_S = 1.0
+"""The rate that is shown is that of so long."""
+
+STATES = {
+    "opening": ("○", "Opening the camera …"),
+    "running": ("●", "Live"),
+    "stalled": ("▲", "No frame comes, though it is connected: what is missing is not recorded"),
+    "lost": ("▲", "Not connected: it is tried again and again. What was recorded is kept"),
+    "ended": ("▲", "It has ended: start it again"),
+}
+
+
+def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
+    """(id, words) of the cameras to choose from: those that are connected, and the simulated."""
+    named = [(info.id, f"{info.name} ({info.kind})") for info in found]
+    return [*named, (SIMULATED, "Simulated camera")]
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What was found in a frame.
+
+    Parameters
+    ----------
+    dots_px
+        (u, v) of its dots, shape (n, 2).
+    quality
+        Whether it is fit to be measured.
+    room_byte
+        Free on the disk; None where that cannot be told.
+    """
+
+    dots_px: FloatArray
+    quality: Quality
+    room_byte: int | None
+
+
+class Live:
+    """A camera at work: its newest frame to look at, and what is recorded of it.
+
+    Made at once; `open` and `close` wait, and belong into a task. The other methods are quick.
+
+    Parameters
+    ----------
+    name
+        Of the camera.
+    place
+        Gives the file of a recording that begins.
+    plan
+        What is recorded.
+    settings
+        What the camera is set to.
+    dots
+        How dots are looked for.
+    rays
+        How many the lens makes; None where not known.
+
+    Attributes
+    ----------
+    takes
+        The recordings made, in their order.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        place: Callable[[], Path],
+        plan: Plan,
+        settings: CameraSettings,
+        dots: DotSettings,
+        rays: int | None = None,
+    ) -> None:
+        self.name = name
+        self.plan = plan
+        self.takes: list[Take] = []
+        self.feed: Feed | None = None
+        self._place, self._settings = place, settings
+        self._dots, self._rays = dots, rays
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._newest: deque[CameraFrame] = deque(maxlen=1)
+        self._to_judge: deque[CameraFrame] = deque(maxlen=1)
+        self._judged: deque[Looked] = deque(maxlen=1)
+        self._recorders: list[Recorder] = []
+        self._told: set[Path] = set()
+        self._counted: deque[tuple[float, int]] = deque()
+        self._frame_byte = 0
+        self._ring_since_s = time.monotonic()
+        self._closing = threading.Event()
+        self._turn = threading.Lock()
+        self._judge = threading.Thread(target=self._judge_on, name="live judge", daemon=True)
+
+    # --- begin and end ------------------------------------------------------------------------
+
+    def open(self, opened: Callable[[], Camera]) -> None:
+        """Open the camera and let frames come, unless it was closed meanwhile.
+
+        Raises
+        ------
+        InputError, CameraError
+            If it cannot be opened, or set so.
+        """
+        feed = Feed(self.name, opened, self._take, self._say, self._settings)
+        with self._turn:
+            if not self._closing.is_set():
+                self.feed = feed
+                self._recorders = [self._recorder(feed)]
+                self._judge.start()
+                return
+        feed.stop()
+
+    def close(self) -> None:
+        """End the recording, write all of it, and let go of the camera. Twice does no harm."""
+        with self._turn:
+            self._closing.set()
+        if self.feed is not None:
+            self.feed.stop()
+            self._judge.join()
+        for recorder in self._recorders:
+            recorder.close()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether frames come, or will when the camera is back."""
+        return self.feed is not None and not self._closing.is_set()
+
+    def _recorder(self, feed: Feed) -> Recorder:
+        self._ring_since_s = time.monotonic()
+        return Recorder(
+            self._place, self.plan, feed.bit_depth, feed.settings.rate_hz, self._events.put
+        )
+
+    # --- in the camera's thread ---------------------------------------------------------------
+
+    def _take(self, frame: CameraFrame) -> None:
+        for recorder in self._recorders[-1:]:
+            recorder.take(frame)
+        self._newest.append(frame)
+        self._to_judge.append(frame)
+
+    def _say(self, event: Event) -> None:
+        self._events.put(event)
+        for recorder in self._recorders[-1:]:
+            recorder.note(event)
+
+    # --- in the judge's thread ----------------------------------------------------------------
+
+    def _judge_on(self) -> None:
+        try:
+            while not self._closing.is_set():
+                if not self._to_judge:
+                    self._closing.wait(IDLE_S)
+                    continue
+                began_s = time.monotonic()
+                self._judged.append(self._look_at(self._to_judge.popleft()))
+                self._closing.wait(max(LOOK_S, time.monotonic() - began_s))
+        except Exception as error:
+            logging.getLogger(NAME).exception("judging live frames")
+            words = f"a fault in the program ended the verdict on frames: {error!r}"
+            self._events.put(Event(self.name, "warning", words))
+
+    def _look_at(self, frame: CameraFrame) -> Looked:
+        try:
+            dots = find_dots(frame.image, self._dots)
+        except CannotMeasure:
+            dots = None
+        found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
+        depth = None if self.feed is None else self.feed.bit_depth
+        quality = judge_quality(frame.image, found, depth, self._rays)
+        places = np.zeros((0, 2)) if dots is None else dots.image_px
+        self._frame_byte = frame.image.nbytes
+        try:
+            room_byte = shutil.disk_usage(self._place().parent).free
+        except OSError:
+            room_byte = None
+        return Looked(places, quality, room_byte)
+
+    # --- to look at ---------------------------------------------------------------------------
+
+    def newest(self) -> CameraFrame | None:
+        """The newest frame; None if it was given already."""
+        return self._newest.popleft() if self._newest else None
+
+    def looked(self) -> Looked | None:
+        """What was found in the frame judged last; None if it was given already."""
+        return self._judged.popleft() if self._judged else None
+
+    def events(self) -> list[Event]:
+        """What has happened since it was asked last."""
+        return [self._events.get() for _ in range(self._events.qsize())]
+
+    def ended_takes(self) -> list[Take]:
+        """Recordings that are written to their end, each given once."""
+        ended = [t for t in self.takes if t.finished.is_set() and t.path not in self._told]
+        self._told |= {take.path for take in ended}
+        return ended
+
+    @property
+    def running(self) -> Take | None:
+        """The recording that frames go into now."""
+        return self._recorders[-1].running if self._recorders else None
+
+    def rate_hz(self) -> float | None:
+        """Frames a second that came of late; None while that is not known."""
+        now_s, counted = time.monotonic(), self._counted
+        counted.append((now_s, 0 if self.feed is None else self.feed.counts.frames))
+        while len(counted) > 2 and counted[1][0] < now_s - RATE_S:
+            counted.popleft()
+        (first_s, first), (last_s, last) = counted[0], counted[-1]
+        return (last - first) / (last_s - first_s) if last_s - first_s > RATE_S / 2 else None
+
+    def state_in_words(self) -> str:
+        """Whether frames come, and how many."""
+        state = "opening" if self.feed is None else self.feed.state
+        rate = self.rate_hz()
+        sign, words = STATES[state]
+        fast = f", {rate:.1f} frames/s" if state == "running" and rate is not None else ""
+        return f"{sign} {words}{fast}"
+
+    def counts_in_words(self) -> str:
+        """What came, and what did not."""
+        if self.feed is None:
+            return ""
+        counts = self.feed.counts
+        told = [several(counts.frames, "frame")]
+        told += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
+        told += [f"lost {several(counts.lost, 'time')}"] * (counts.lost > 0)
+        return ", ".join(told)
+
+    def ring(self) -> tuple[float, str]:
+        """How full the memory of what comes before a trigger is, 0 … 1, and that in words."""
+        wanted_s = self.plan.before_s
+        if not wanted_s:
+            return 0.0, "nothing before the trigger"
+        kept_s = min(wanted_s, time.monotonic() - self._ring_since_s)
+        kept_s *= self.running is None
+        return kept_s / wanted_s, f"{kept_s:.1f} of {wanted_s:g} s"
+
+    def recording_in_words(self, room_byte: int | None) -> str:
+        """What is being recorded, or what became of the last recording, and for how long is room.
+
+        Parameters
+        ----------
+        room_byte
+            Free on the disk; None: not known yet.
+        """
+        take, told = self.running, []
+        if take is not None:
+            told = [f"● Recording: {several(take.frames, 'frame')} written, {take.lost} lost"]
+            told += [f"▲ {take.trouble}"] * bool(take.trouble)
+        elif self.takes and not self.takes[-1].finished.is_set():
+            told = [f"Writing the rest of {self.takes[-1].path.name}"]
+        elif self.takes:
+            told = [f"{self.takes[-1].path.name}: {self.takes[-1].summary.words}"]
+        rate = self.rate_hz()
+        if room_byte is not None and rate:
+            room_s = room_byte / (self._frame_byte * rate / self.plan.every)
+            told.append(f"room for {_lasting(room_s)} ({size_in_words(room_byte)})")
+        return "; ".join(told)
+
+    # --- to do --------------------------------------------------------------------------------
+
+    def trigger(self) -> None:
+        """Begin a recording, or end the one that runs.
+
+        Raises
+        ------
+        InputError
+            If there is a file of that name already.
+        """
+        if not self.is_open:
+            return
+        recorder = self._recorders[-1]
+        if recorder.running is None:
+            self.takes.append(recorder.trigger())
+        else:
+            recorder.stop()
+            self._ring_since_s = time.monotonic()
+
+    def mark(self) -> None:
+        """Note the present frame beside the recording that runs."""
+        self._say(Event(self.name, "note", "marked by hand"))
+
+    def set_plan(self, plan: Plan) -> None:
+        """Record otherwise from now on; not while a recording runs."""
+        self.plan = plan
+        if self.feed is not None and self.running is None:
+            former = self._recorders[-1]
+            self._recorders.append(self._recorder(self.feed))
+            # What it has still to write is waited for elsewhere; `close` waits for it, too.
+            threading.Thread(target=former.close, name="recorder ends", daemon=True).start()
+
+    def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
+        """Set the camera between two frames; what it is set to is answered when it is."""
+        return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
+
+
+def rays_of(session: Session) -> int | None:
+    """How many rays the lens of a session makes; None where the set-up is not complete."""
+    try:
+        pattern = session.setup.rig.pattern
+    except InputError:
+        return None
+    return pattern.rows * pattern.columns
+
+
+def _lasting(seconds: float) -> str:
+    """A time in words: the larger, the coarser."""
+    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

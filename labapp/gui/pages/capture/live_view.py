@@ -1,0 +1,486 @@
+"""The camera on the recording page: chosen, set, watched; and the bar that records."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
+from typing import Any
+
+import pyqtgraph as pg
+from PySide6.QtCore import QObject, Qt, QTimer, Signal
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidget
+
+from labapp.errors import InputError
+from labapp.gui.pages.capture.live import SIMULATED, Live, choices, rays_of
+from labapp.gui.pages.capture.parts import ExposureBars, button, headed, wrapped
+from labapp.gui.tasks import Control, Task
+from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.picture import PictureView
+from labapp.gui.workspace import Workspace
+from labapp.media.cameras import (
+    Camera,
+    CameraError,
+    CameraInfo,
+    CameraSettings,
+    Limits,
+    SimulatedDevice,
+    find_cameras,
+    open_camera,
+)
+from labapp.media.events import Event
+from labapp.media.recorder import Plan, Take, recording_path
+from labapp.session.session import Session
+from labapp.session.simulated_pool import pool_camera, simulated_pool
+
+TICK_MS = 33
+"""The picture is renewed no more often; less often where that takes long."""
+
+TELL_S = 0.2
+"""Figures are renewed no more often."""
+
+BEFORE_S = 2.0
+
+RING, RING_PX = "#2fd39b", 15
+"""Round the dots that are found: a colour of the dots page; points of the screen."""
+
+BUTTON_PX = 44
+"""Least height of the buttons that are pressed in gloves."""
+
+RING_BAR_PX = 130
+
+SETTINGS = {
+    "exposure_us": ("Exposure", "µs", 0, 100.0, "How long light is gathered for a frame"),
+    "gain_db": ("Gain", "dB", 1, 1.0, "Amplification: it brightens the noise, too"),
+    "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames a second"),
+}
+"""Label, unit, decimals, step and tip of what can be set."""
+
+
+class LiveView(QObject):
+    """A camera that is watched in the page's picture and recorded from.
+
+    Parameters
+    ----------
+    workspace
+        What is open.
+    picture
+        Where live frames are shown.
+    exposure
+        Where the verdict on them is.
+
+    Signals
+    -------
+    changed
+        A camera was started, or let go.
+    recorded
+        A recording was written to its end: a `Take`.
+
+    Attributes
+    ----------
+    group
+        Choice and settings, for the panel.
+    bar
+        What records, below the picture; seen while live.
+    live
+        The camera that runs; None without one.
+    """
+
+    changed = Signal()
+    recorded = Signal(object)
+
+    def __init__(self, workspace: Workspace, picture: PictureView, exposure: ExposureBars) -> None:
+        super().__init__(picture)
+        self.workspace = workspace
+        self.live: Live | None = None
+        self.updates = 0
+        """How many live frames were shown."""
+        self._picture, self._exposure = picture, exposure
+        self._ending: list[Live] = []
+        self._pools: dict[str, SimulatedDevice] = {}
+        self._opening: Task | None = None
+        self._finding: Task | None = None
+        self._answers: list[tuple[str, float, Future[CameraSettings]]] = []
+        self._told_s = 0.0
+        self._room_byte: int | None = None
+        self._timer = QTimer(self)
+        self._timer.setInterval(TICK_MS)
+        self._timer.timeout.connect(self._tick)
+        self._rings = pg.ScatterPlotItem(
+            size=RING_PX, pxMode=True, pen=pg.mkPen(RING, width=1.2), brush=None
+        )
+        self._rings.hide()
+        picture.add(self._rings)
+        self._make_group()
+        self._make_bar()
+        workspace.closing.connect(self._session_closes)
+        workspace.tasks.changed.connect(self._show_state)
+        self._show_state()
+
+    # --- cameras ------------------------------------------------------------------------------
+
+    def find(self) -> None:
+        """Look for the cameras that are connected, in the background."""
+
+        def done(answer: tuple[list[CameraInfo], list[str]]) -> None:
+            found, problems = answer
+            self._choices = choices(found)
+            self.camera.set_choices(self._choices)
+            told = f"{len(found)} camera{'s' * (len(found) != 1)} found"
+            self.workspace.said.emit(". ".join([told, *problems]), False)
+
+        if self._finding not in self.workspace.tasks.active:
+            self._finding = self.workspace.tasks.start(
+                "Looking for cameras", lambda _: find_cameras(), done
+            )
+
+    def start(self) -> None:
+        """Show what the chosen camera sees."""
+        session = self.workspace.session
+        if session is None or self.live is not None:
+            return
+        chosen = self.camera.value()
+        name = dict(self._choices)[chosen]
+        folder, stem = session.path.parent, session.path.stem
+        live = Live(
+            name,
+            lambda: recording_path(folder, stem),
+            self._plan(),
+            CameraSettings(),
+            session.settings.dots,
+            rays_of(session),
+        )
+        opener = self._opener(chosen, session)
+
+        def work(control: Control) -> None:
+            try:
+                live.open(opener(control))
+            except CameraError as error:
+                raise ValueError(str(error)) from error
+
+        self._opening = self.workspace.tasks.start(
+            f"Opening {name}", work, lambda _: self._opened(live)
+        )
+        self.live = live
+        self._show_state()
+        self.changed.emit()
+
+    def _opener(self, chosen: str, session: Session) -> Callable[[Control], Callable[[], Camera]]:
+        """What makes what opens a camera; the pool is rendered at the first time only."""
+        if chosen != SIMULATED:
+            return lambda _: partial(open_camera, chosen)
+        text = simulated_pool(session)
+
+        def rendered(control: Control) -> Callable[[], Camera]:
+            if text not in self._pools:
+                self._pools[text] = pool_camera(text, control.progress)
+            return self._pools[text].open
+
+        return rendered
+
+    def _opened(self, live: Live) -> None:
+        if self.live is not live or live.feed is None:
+            return
+        self._show_settings(live.feed.settings, live.feed.camera.limits)
+        self._room_byte = None
+        self._rings.setData([])
+        self._rings.show()
+        self._timer.start(TICK_MS)
+        self._show_state()
+        # Where Space records even as the key of what has the focus.
+        self.record_button.setFocus()
+
+    def stop(self) -> None:
+        """Let go of the camera; what is being recorded is written to its end first."""
+        live, self.live = self.live, None
+        if live is None:
+            return
+        self._timer.stop()
+        self._rings.hide()
+        self._ending.append(live)
+        title = "Stopping the camera" if live.running is None else "Finishing the recording"
+
+        def done(_: object) -> None:
+            self._ending.remove(live)
+            self._hear(live)
+
+        self.workspace.tasks.start(title, lambda _: live.close(), done)
+        self._show_state()
+        self.changed.emit()
+
+    def _session_closes(self) -> None:
+        """Write what is being recorded to its end before anything else goes."""
+        for live in (*self._ending, *([self.live] if self.live is not None else [])):
+            live.close()
+            for event in live.events():
+                self._tell(event, live)
+            for take in live.ended_takes():
+                self.workspace.said.emit(f"Recorded beside the session: {take.path.name}", False)
+        self._ending.clear()
+        self.live = None
+        self._timer.stop()
+        self._rings.hide()
+        self._show_state()
+
+    # --- recording ----------------------------------------------------------------------------
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames come, or will when the camera is back."""
+        return self.live is not None and self.live.is_open
+
+    def trigger(self) -> None:
+        """Begin a recording, or end the one that runs."""
+        live = self.live
+        if live is not None and live.is_open:
+            self.workspace.tried(live.trigger)
+            self._tell_figures(live)
+            self._show_state()
+
+    def mark(self) -> None:
+        """Note the present frame beside the recording that runs."""
+        if self.live is not None and self.live.running is not None:
+            self.live.mark()
+
+    def _plan(self) -> Plan:
+        return Plan(
+            before_s=self.before.value() or 0.0,
+            after_s=self.after.value(),
+            every=int(self.every.value() or 1),
+        )
+
+    def _replan(self) -> None:
+        if self.live is not None and self._plan() != self.live.plan:
+            self.live.set_plan(self._plan())
+
+    # --- while it runs ------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        live, began_s = self.live, time.perf_counter()
+        if live is None:
+            return
+        frame = live.newest()
+        if frame is not None:
+            self._picture.show_picture(frame.image)
+            self.updates += 1
+        looked = live.looked()
+        if looked is not None:
+            self._room_byte = looked.room_byte
+            self._rings.setData(pos=looked.dots_px)
+            quality = looked.quality
+            self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
+            self._exposure.show()
+        if time.monotonic() - self._told_s > TELL_S:
+            self._tell_figures(live)
+        self._hear(live)
+        self._take_answers(live)
+        took_ms = (time.perf_counter() - began_s) * 1000
+        wanted = max(TICK_MS, round(2 * took_ms))
+        if abs(wanted - self._timer.interval()) > TICK_MS / 4:
+            self._timer.setInterval(wanted)
+
+    def _hear(self, live: Live) -> None:
+        """Tell what happened, and hand on what is recorded."""
+        for event in live.events():
+            self._tell(event, live)
+        for take in live.ended_takes():
+            self.recorded.emit(take)
+
+    def _tell(self, event: Event, live: Live) -> None:
+        """Tell of an event; frames that are lost are a problem only where they are recorded."""
+        recorded = live.running is not None or event.source != live.name
+        problem = event.kind == "warning" or (event.kind == "loss" and recorded)
+        self.workspace.said.emit(str(event), problem)
+
+    def _tell_figures(self, live: Live) -> None:
+        self._told_s = time.monotonic()
+        self.state.setText(live.state_in_words())
+        self.counts.setText(live.counts_in_words())
+        part, told = live.ring()
+        self.ring.setValue(round(100 * part))
+        self.ring.setFormat(told)
+        self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
+        self.recording.setText(live.recording_in_words(self._room_byte))
+        if self._shown != (live.running is not None):
+            self._show_state()
+
+    # --- settings -----------------------------------------------------------------------------
+
+    def _set(self, name: str, value: float | None) -> None:
+        if self.live is not None and value is not None:
+            wanted: dict[str, Any] = {name: value}
+            answer = self.live.apply(CameraSettings(**wanted))
+            if answer is not None:
+                self._answers.append((name, value, answer))
+
+    def _take_answers(self, live: Live) -> None:
+        """Show what was really set."""
+        for each in [each for each in self._answers if each[2].done()]:
+            self._answers.remove(each)
+            name, wanted, answer = each
+            try:
+                settings = answer.result()
+            except (CameraError, InputError) as error:
+                self.fields[name].set_value(None)
+                if live.feed is not None:
+                    self._show_settings(live.feed.settings, live.feed.camera.limits)
+                self.fields[name].set_problem(str(error))
+                continue
+            if live.feed is not None:
+                self._show_settings(settings, live.feed.camera.limits)
+            now = getattr(settings, name)
+            if now is not None and abs(now - wanted) > 1e-3 * abs(wanted):
+                self.fields[name].set_problem(f"The camera takes {now:.6g}, not {wanted:.6g}")
+            if name == "rate_hz":
+                live.set_plan(live.plan)
+
+    def _show_settings(self, settings: CameraSettings, limits: Limits) -> None:
+        for name, field in self.fields.items():
+            span = getattr(limits, name)
+            if span is not None:
+                field.lowest, field.highest = span.lowest, span.highest
+            field.set_value(getattr(settings, name))
+            for part in (field, field.label):
+                part.setVisible(span is not None)
+
+    # --- widgets ------------------------------------------------------------------------------
+
+    def _show_state(self) -> None:
+        """Show what can be done now."""
+        active = self.workspace.tasks.active
+        if self.live is not None and self.live.feed is None and self._opening not in active:
+            self.live = None  # it could not be opened, or that was cancelled
+            self.changed.emit()
+        live = self.live
+        runs = live is not None and live.is_open
+        self._shown = recording = live is not None and live.running is not None
+        self.camera.setEnabled(live is None)
+        for each in (self.start_button, self.find_button):
+            each.setVisible(live is None)
+        self.start_button.setEnabled(self.workspace.session is not None and not self._ending)
+        self.settings.setVisible(runs)
+        self.bar.setVisible(runs)
+        self.mark_button.setEnabled(recording)
+        for field in (self.before, self.after, self.every):
+            field.setEnabled(not recording)
+        self.record_button.setText("■ End the recording" if recording else "● Record")
+
+    def _make_group(self) -> None:
+        self.group, layout = headed("Capture")
+        form = FieldForm()
+        self._choices = choices([])
+        self.camera = ChoiceField(
+            "Camera",
+            self._choices,
+            tooltip="Which camera to watch; the simulated one films a pool on this bench",
+        )
+        form.add(self.camera)
+        layout.addWidget(form)
+        row = QHBoxLayout()
+        self.start_button = button("Start", "Show live what the camera sees", self.start)
+        self.find_button = button(
+            "Look for cameras", "Find the cameras that are connected", self.find
+        )
+        row.addWidget(self.start_button)
+        row.addWidget(self.find_button)
+        layout.addLayout(row)
+        self.settings = QWidget()
+        inner = QVBoxLayout(self.settings)
+        inner.setContentsMargins(0, 0, 0, 0)
+        self.counts = wrapped()
+        inner.addWidget(self.counts)
+        fields = FieldForm()
+        self.fields: dict[str, NumberField] = {}
+        for name, (label, unit, decimals, step, tip) in SETTINGS.items():
+            self.fields[name] = field = NumberField(
+                label, unit, lowest=0, highest=1e9, decimals=decimals, step=step, tooltip=tip
+            )
+            field.edited.connect(partial(self._set, name))
+            fields.add(field)
+        self._make_plan(fields)
+        inner.addWidget(fields)
+        layout.addWidget(self.settings)
+
+    def _make_plan(self, form: FieldForm) -> None:
+        form.add_heading("Recording")
+        self.before = NumberField(
+            "Before the trigger",
+            "s",
+            lowest=0,
+            highest=600,
+            decimals=1,
+            tooltip="So much from before the trigger is recorded, too: it is kept in memory",
+        )
+        self.before.set_value(BEFORE_S)
+        self.after = NumberField(
+            "After it",
+            "s",
+            lowest=0.1,
+            highest=86_400,
+            decimals=1,
+            optional=True,
+            tooltip="The recording ends so long after the trigger; empty: when you end it",
+        )
+        self.every = NumberField(
+            "Every n-th frame",
+            lowest=1,
+            highest=10_000,
+            decimals=0,
+            tooltip="1: every frame is recorded; 2: every second one …",
+        )
+        self.every.set_value(1)
+        for field in (self.before, self.after, self.every):
+            field.edited.connect(lambda _: self._replan())
+            form.add(field)
+
+    def _make_bar(self) -> None:
+        self.bar = QWidget()
+        layout = QVBoxLayout(self.bar)
+        layout.setContentsMargins(8, 2, 8, 4)
+        self.state = QLabel()
+        self.ring = QProgressBar()
+        self.ring.setRange(0, 100)
+        self.ring.setFixedWidth(RING_BAR_PX)
+        self.ring.setToolTip("How much from before the trigger is in memory")
+        line = QHBoxLayout()
+        line.addWidget(self.state, 1)
+        line.addWidget(QLabel("Before the trigger:"))
+        line.addWidget(self.ring)
+        layout.addLayout(line)
+        self.recording = wrapped()
+        layout.addWidget(self.recording)
+        row = QHBoxLayout()
+        self.record_button = button(
+            "● Record",
+            "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
+            self.trigger,
+        )
+        self.mark_button = button(
+            "Mark", "Note this moment beside the recording that runs (M)", self.mark
+        )
+        self.stop_button = button(
+            "Stop the camera", "Let go of the camera; a recording is written first", self.stop
+        )
+        font = self.record_button.font()
+        font.setBold(True)
+        self.record_button.setFont(font)
+        for each, wide in ((self.record_button, 3), (self.mark_button, 1), (self.stop_button, 2)):
+            each.setMinimumHeight(BUTTON_PX)
+            row.addWidget(each, wide)
+        layout.addLayout(row)
+
+    def take_key(self, key: Qt.Key) -> bool:
+        """Do what a plain key means while live; whether it means anything."""
+        if not self.is_live or key not in (Qt.Key.Key_Space, Qt.Key.Key_M):
+            return False
+        (self.trigger if key == Qt.Key.Key_Space else self.mark)()
+        return True
+
+
+def told_of(take: Take, why_kept: str) -> str:
+    """What became of a recording that is not imported."""
+    return (
+        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, make a new "
+        "session (Ctrl+N) and choose the file there"
+    )

@@ -1,0 +1,423 @@
+"""A camera on the recording page: watched, set, recorded from, failing."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QAbstractButton, QApplication
+from pytestqt.qtbot import QtBot
+
+from labapp.core.detection import DotSettings
+from labapp.gui.pages.capture import live_view
+from labapp.gui.pages.capture.live import SIMULATED, Live, choices
+from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.window import MainWindow
+from labapp.media import GreyImage, open_source
+from labapp.media.cameras import CameraInfo, CameraSettings, Faults, SimulatedDevice
+from labapp.media.recorder import Plan
+from labapp.session.session import Session
+from labapp.session.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
+from tests.gui.conftest import SAMPLES
+from tests.gui.hand import Hand
+from tests.gui.test_accessibility import check_round
+
+SHAPE = (48, 64)
+
+
+def numbered(k: int) -> GreyImage:
+    """Frame k: its number in the first four pixels, over a pattern that is dark and bright."""
+    image = np.add.outer(np.arange(SHAPE[0]), 2 * np.arange(SHAPE[1])).astype(np.uint8)
+    image[0, :4] = np.frombuffer(np.uint32(k).tobytes(), np.uint8)
+    return image
+
+
+def number_in(image: GreyImage) -> int:
+    return int(np.frombuffer(image[0, :4].astype(np.uint8).tobytes(), np.uint32)[0])
+
+
+def wait_until(reached: Callable[[], bool], seconds: float = 30.0) -> None:
+    until_s = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < until_s, "it did not happen"
+        time.sleep(0.005)
+
+
+# --- without widgets ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[Live]:
+    names = iter(range(100))
+    made = Live(
+        "test camera",
+        lambda: tmp_path / f"run{next(names)}.nut",
+        Plan(before_s=0.2),
+        CameraSettings(rate_hz=200.0),
+        DotSettings(),
+    )
+    yield made
+    made.close()
+
+
+def test_what_is_recorded_is_what_the_camera_gave(live: Live):
+    device = SimulatedDevice("test", numbered)
+    live.open(device.open)
+    assert live.feed is not None
+    wait_until(lambda: live.feed.counts.frames > 60)
+    seen = live.feed.counts.frames
+    live.trigger()
+    assert live.running is live.takes[0]
+    live.mark()
+    wait_until(lambda: live.takes[0].frames > 80)
+    live.trigger()
+    assert live.running is None
+    wait_until(live.takes[0].finished.is_set)
+    take = live.takes[0]
+    with open_source(take.path) as video:
+        images = [frame.image for frame in video]
+    numbers = [number_in(image) for image in images]
+    assert len(numbers) == take.frames
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    # 0.2 s at 200 frames/s are from before the trigger.
+    assert numbers[0] < seen - 20
+    for number, image in zip(numbers, images, strict=True):
+        assert np.array_equal(image, numbered(number))
+    assert "marked by hand" in take.notes.read_text()
+    assert live.ended_takes() == [take]
+    assert live.ended_takes() == []
+
+
+def test_the_newest_frame_is_given_once_and_judged(live: Live):
+    gate = threading.Event()
+
+    def picture(k: int) -> GreyImage:
+        if k == 20:
+            gate.wait(30)
+        return numbered(k)
+
+    live.open(SimulatedDevice("test", picture).open)
+    wait_until(lambda: live.feed.counts.frames == 20)
+    newest = live.newest()
+    assert newest is not None
+    assert number_in(newest.image) == 19
+    assert live.newest() is None
+    found = []
+    wait_until(lambda: bool(found.append(live.looked()) or found[-1]))
+    gate.set()
+    assert found[-1].quality.exposure.verdict in ("no dots", "too dark", "good", "dots merge")
+    assert found[-1].room_byte > 0
+    assert "room for" in live.recording_in_words(found[-1].room_byte) or live.rate_hz() is None
+
+
+def test_unplugged_garbage_and_stalled_are_said_and_nothing_recorded_is_lost(live: Live):
+    device = SimulatedDevice("test", numbered, faults=Faults(garbage=0.1, dropped=0.05, seed=3))
+    live.open(device.open)
+    wait_until(lambda: live.feed.counts.frames > 20)
+    live.trigger()
+    device.unplug()
+    wait_until(lambda: live.feed.state == "lost")
+    assert live.state_in_words().startswith("▲ Not connected")
+    kept = live.takes[0].frames
+    device.plug()
+    wait_until(lambda: live.feed.state == "running" and live.takes[0].frames > kept + 40)
+    assert live.state_in_words().startswith("● Live")
+    live.close()
+    counts = live.feed.counts
+    assert (counts.lost, live.takes[0].lost) == (1, 0)
+    assert counts.broken > 0
+    assert counts.dropped > 0
+    assert "lost 1 time" in live.counts_in_words()
+    words = [str(event) for event in live.events()]
+    assert any("unplugged" in each for each in words)
+    assert any("it is back" in each for each in words)
+    assert any("not whole" in each for each in words)
+    with open_source(live.takes[0].path) as video:
+        numbers = [number_in(frame.image) for frame in video]
+    assert len(numbers) == live.takes[0].frames
+    assert numbers == sorted(set(numbers))
+
+
+def test_one_that_is_closed_while_it_opens_leaves_nothing(live: Live):
+    device, begun, gate = SimulatedDevice("test", numbered), threading.Event(), threading.Event()
+
+    def slow():
+        begun.set()
+        gate.wait(30)
+        return device.open()
+
+    opening = threading.Thread(target=live.open, args=(slow,))
+    opening.start()
+    begun.wait(30)
+    live.close()
+    gate.set()
+    opening.join()
+    assert live.feed is None
+    assert not live.is_open
+    live.trigger()
+    assert live.takes == []
+
+
+def test_another_plan_holds_from_then_on(live: Live):
+    live.open(SimulatedDevice("test", numbered).open)
+    live.set_plan(Plan(before_s=0, after_s=0.1, every=3))
+    assert live.ring() == (0.0, "nothing before the trigger")
+    live.trigger()
+    wait_until(live.takes[0].finished.is_set)
+    with open_source(live.takes[0].path) as video:
+        numbers = [number_in(frame.image) for frame in video]
+    assert set(np.diff(numbers)) == {3}
+    assert 4 <= len(numbers) <= 8
+
+
+def test_the_cameras_to_choose_from():
+    found = [CameraInfo("uvc:0", "Microscope", "USB video")]
+    assert choices(found) == [
+        ("uvc:0", "Microscope (USB video)"),
+        (SIMULATED, "Simulated camera"),
+    ]
+
+
+def test_the_simulated_camera_films_a_pool_on_the_session_s_bench(tmp_path: Path):
+    with Session.create(tmp_path / "a.labsession") as session:
+        assert simulated_pool(session) == f"{POOL}{BENCH}"
+        setup = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
+        session.set_setup(setup)
+        assert simulated_pool(session) == f"{POOL}\n{setup}"
+    told: list[tuple[int, int]] = []
+    device = pool_camera(f"{POOL}{BENCH}", lambda *reached: told.append(reached))
+    assert told[-1][0] + 1 == told[-1][1] == len(told)
+    images = [device.picture(k) for k in range(2 * len(told))]
+    assert images[0].shape == (640, 480)
+    assert np.array_equal(images[0], images[2 * len(told) - 2])
+    steps = [np.abs(a.astype(float) - b).mean() for a, b in pairwise(images)]
+    assert min(steps) > 0
+
+
+# --- on the page ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def device() -> SimulatedDevice:
+    return SimulatedDevice("test", numbered, rate_hz=100)
+
+
+@pytest.fixture
+def page(
+    window: MainWindow,
+    tmp_path: Path,
+    device: SimulatedDevice,
+    qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+) -> CapturePage:
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
+    assert window.workspace.create(tmp_path / "new.labsession")
+    window.show_step("capture")
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    page = window.page
+    assert isinstance(page, CapturePage)
+    return page
+
+
+def start(page: CapturePage, qtbot: QtBot) -> None:
+    page.live_view.start_button.click()
+    qtbot.waitUntil(lambda: page.live_view.updates > 2)
+
+
+def said_in(window: MainWindow) -> str:
+    return "\n".join(window.log_panel.texts())
+
+
+def test_start_record_and_import_by_mouse_and_keys(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    hand, view = Hand(window), page.live_view
+    assert not window.menus.actions["record"].isEnabled()
+    hand.button("Start")
+    qtbot.waitUntil(lambda: view.updates > 2)
+    assert page.title.text() == "Live: Simulated camera"
+    assert page.picture_view.picture.shape == SHAPE
+    assert window.menus.actions["record"].isEnabled()
+    qtbot.waitUntil(lambda: view.state.text().startswith("● Live"))
+    qtbot.waitUntil(page.exposure.isVisible)
+    page.setFocus()
+    hand.press(Qt.Key.Key_Space)
+    assert view.live.running is not None
+    assert view.record_button.text() == "■ End the recording"
+    assert not view.before.isEnabled()
+    hand.press(Qt.Key.Key_M)
+    qtbot.waitUntil(lambda: view.live.running.frames > 20)
+    hand.button("■ End the recording")
+    session = window.workspace.session
+    qtbot.waitUntil(lambda: session.recording is not None)
+    take = view.live.takes[0]
+    assert take.path.parent == session.path.parent
+    assert take.path.name.startswith("new-20")
+    assert len(session.frames) == take.frames
+    numbers = [number_in(session.frame(int(k)).image) for k in session.frames]
+    assert numbers == list(range(numbers[0], numbers[0] + take.frames))
+    assert "marked by hand" in take.notes.read_text()
+    assert view.is_live
+    # A second one is kept as a file.
+    hand.press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: view.live.running.frames > 5)
+    hand.press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(lambda: "is kept beside the session" in said_in(window))
+    assert len(session.frames) == take.frames
+    hand.button("Stop the camera")
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    qtbot.waitUntil(lambda: "of the session" in page.title.text())
+    assert not view.bar.isVisible()
+    assert view.start_button.isVisible()
+
+
+def test_space_plays_where_no_camera_is_live(window: MainWindow, copy_sample, qtbot: QtBot):
+    window.files.open(copy_sample("gtaw"))
+    window.show_step("capture")
+    window.page.setFocus()
+    QTest.keyClick(window.page, Qt.Key.Key_Space)
+    assert window.timeline.playing
+    window.timeline.set_playing(False)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+
+
+def test_settings_show_what_was_really_set(page: CapturePage, device, qtbot: QtBot):
+    view = page.live_view
+    start(page, qtbot)
+    assert view.fields["rate_hz"].value() == 100
+    assert view.fields["exposure_us"].isHidden()
+    hand = Hand(page.window())
+    hand.enter(view.fields["rate_hz"], "40")
+    qtbot.waitUntil(lambda: device.settings.rate_hz == 40 and not view._answers)
+    hand.enter(view.fields["rate_hz"], "0.001")
+    assert "is not from 0.1 to 10000" in view.fields["rate_hz"].problem.text()
+    assert device.settings.rate_hz == 40
+    view.before.set_value(0.5)
+    view.before.edited.emit(0.5)
+    assert view.live.plan.before_s == 0.5
+
+
+def test_faults_are_told_in_words(window: MainWindow, page: CapturePage, device, qtbot: QtBot):
+    view = page.live_view
+    start(page, qtbot)
+    view.trigger()
+    device.unplug()
+    qtbot.waitUntil(lambda: view.state.text().startswith("▲ Not connected"))
+    assert "unplugged. Trying to get it back" in said_in(window)
+    device.plug()
+    qtbot.waitUntil(lambda: view.state.text().startswith("● Live"), timeout=10_000)
+    assert "it is back after" in said_in(window)
+    device.faults = Faults(garbage=1.0)
+    qtbot.waitUntil(lambda: "not whole, left out" in said_in(window))
+    device.faults = Faults()
+    updates = view.updates
+    qtbot.waitUntil(lambda: view.updates > updates + 2)
+
+
+def test_leaving_the_page_finishes_the_recording_and_imports_it(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    start(page, qtbot)
+    live = page.live_view.live
+    page.live_view.trigger()
+    qtbot.waitUntil(lambda: live.takes[0].frames > 10)
+    window.show_step("setup")
+    assert page.live_view.live is None
+    session = window.workspace.session
+    qtbot.waitUntil(lambda: session.recording is not None)
+    assert len(session.frames) == live.takes[0].frames
+    assert live.feed.state == "ended"
+
+
+def test_closing_the_window_finishes_the_recording(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    start(page, qtbot)
+    live = page.live_view.live
+    page.live_view.trigger()
+    qtbot.waitUntil(lambda: live.takes[0].frames > 10)
+    window.close()
+    take = live.takes[0]
+    assert take.finished.is_set()
+    with open_source(take.path) as video:
+        numbers = [number_in(frame.image) for frame in video]
+    assert len(numbers) == take.frames > 10
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_a_camera_that_cannot_be_opened_is_told(
+    window: MainWindow, page: CapturePage, device, qtbot: QtBot
+):
+    device.unplug()
+    page.live_view.start()
+    qtbot.waitUntil(lambda: "is not connected" in said_in(window))
+    assert page.live_view.live is None
+    assert page.live_view.start_button.isVisible()
+    assert "fault in the program" not in said_in(window)
+    device.plug()
+    start(page, qtbot)
+
+
+def test_an_opening_that_is_cancelled(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    begun, gate = threading.Event(), threading.Event()
+
+    def slow(_text: str, progress):
+        begun.set()
+        gate.wait(30)
+        progress(1, 2)
+
+    monkeypatch.setattr(live_view, "pool_camera", slow)
+    page.live_view.start()
+    qtbot.waitUntil(begun.is_set)
+    window.status_line.cancel()
+    gate.set()
+    qtbot.waitUntil(lambda: page.live_view.live is None)
+    assert page.live_view.start_button.isVisible()
+    assert not page.live
+
+
+def test_cameras_are_looked_for(window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch):
+    found = [CameraInfo("uvc:0", "Microscope", "USB video")], ["Aravis is not installed"]
+    monkeypatch.setattr(live_view, "find_cameras", lambda: found)
+    page.live_view.find_button.click()
+    qtbot.waitUntil(lambda: "1 camera found. Aravis is not installed" in said_in(window))
+    assert page.live_view.camera.value() == SIMULATED
+    page.live_view.camera.set_value("uvc:0")
+    assert page.live_view.camera.value() == "uvc:0"
+
+
+def test_a_file_that_is_chosen_takes_the_place_of_the_camera(
+    page: CapturePage, tmp_path: Path, qtbot: QtBot
+):
+    start(page, qtbot)
+    path = tmp_path / "stack.npy"
+    np.save(path, np.zeros((3, 20, 30), np.uint8))
+    page.take(path)
+    assert page.live_view.live is None
+    qtbot.waitUntil(lambda: page.preview is not None)
+    qtbot.waitUntil(lambda: np.shape(page.picture_view.picture) == (20, 30))
+
+
+def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePage, qtbot: QtBot):
+    start(page, qtbot)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert QApplication.focusWidget() is page.live_view.record_button
+    reached = check_round(window)
+    assert page.live_view.record_button in reached
+    assert page.live_view.fields["rate_hz"].editor in reached
+    window.resize(911, 512)  # 1366 × 768 at 150 %
+    QTest.qWait(20)
+    for button in window.findChildren(QAbstractButton):
+        if button.isVisible() and button.text():
+            assert button.width() >= button.sizeHint().width() - 1, button.text()
+    assert window.page.live_view.record_button.isVisible()
