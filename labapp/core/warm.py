@@ -35,7 +35,7 @@ from labapp.core.rig import Rig
 from labapp.core.spline import SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, lay, met, spline_values
-from labapp.core.warm_match import Sight, around, beyond, testimony, tracked, widened
+from labapp.core.warm_match import around, beyond, testimony, tracked, widened
 from labapp.core.warm_measures import follow_rim, sigma_of, sizes_of
 
 FOUND = 0.85
@@ -56,6 +56,9 @@ HELD = 8
 
 SINKS_EVERY = 16
 """Every so many frames it is asked anew whether the rear sinks."""
+
+POINTS_EVERY = 8
+"""Every so many frames the uncertainty of the reflection points is worked out anew."""
 
 RAISED_MM = 0.01
 """After a shift of the level by more, the slopes are fitted once more."""
@@ -91,6 +94,9 @@ class Track:
         Spline coefficients of the last frames, the newest last, shape (frames, p), mm.
     open_mm
         How far the level was left open when it was last asked how deep the rear lies, mm.
+    free_mm
+        Uncertainty of the height where each ray meets the surface, its level apart, as it was last
+        worked out, shape (R,), mm; NaN where it never was. It changes slowly.
     unseen
         Frames since the absent ray's place was last seen dark amid four lit ones.
     count
@@ -107,6 +113,7 @@ class Track:
     level: Level
     past: FloatArray
     open_mm: float
+    free_mm: FloatArray
     unseen: int = 0
     count: int = 0
 
@@ -198,6 +205,7 @@ def begin(
         level=level,
         past=np.vstack([past, pool.coefficients]),
         open_mm=level.sigma_mm,
+        free_mm=np.full(len(bed.at), np.nan),
     )
 
 
@@ -279,7 +287,8 @@ def follow(
     if unseen > HELD:
         raise Broken("the dots beside the absent one have not been seen for long")
     match = _match(track, scene, heard.witness, ray, dot, _rms(residual))
-    reconstruction, size = _sized(track, pool, level, lower, match, residual)
+    track = _with_uncertainty(track, pool, ray, lower)
+    reconstruction, size = _sized(track, pool, level, lower, match, residual, ray)
     after = replace(
         track,
         pool=pool,
@@ -334,8 +343,7 @@ def _found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, bool]:
     looked_for = around(bed, track.lit, 2)
     for coefficients in _predictions(track):
         pool = met(bed, coefficients, track.pool.points_mm, 1)
-        sight = Sight.of(pool, scene, looked_for)
-        labels, off = tracked(sight, track.lit, scene.resolution_mm)
+        labels, off = tracked(scene, pool, track.lit, looked_for)
         if len(off) >= FOUND * count and np.median(off) < STEADY:
             return pool, labels, True
     found = 0
@@ -358,8 +366,7 @@ def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, Int
     looked_for = around(bed, track.lit, 2)
     labels = np.full(len(ring), UNLABELLED)
     for reach in range(FIRST_RING, int(ring[track.lit].max()) + 2):
-        sight = Sight.of(pool, scene, looked_for)
-        labels, _ = tracked(sight, track.lit & (ring <= reach), scene.resolution_mm)
+        labels, _ = tracked(scene, pool, track.lit & (ring <= reach), looked_for)
         ray = np.flatnonzero(labels != UNLABELLED)
         if len(ray) < LEAST_DOTS:
             break
@@ -480,6 +487,18 @@ def _lattice(match: Match, rig: Rig, count: int) -> Lattice:
     return Lattice(row, column, site, (site,), frozenset(np.unique(gaps).tolist()))
 
 
+def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatArray) -> Track:
+    """Work out how uncertain reflection points are, every now and then or where it is not known."""
+    if track.count % POINTS_EVERY and np.isfinite(track.free_mm[ray]).all():
+        return track
+    splines, values = spline_values(track.bed.basis, pool.points_mm[ray, :2])
+    at_points = np.zeros((len(ray), len(pool.coefficients)))
+    np.put_along_axis(at_points, splines, values[0], axis=1)
+    free = track.free_mm.copy()
+    free[ray] = sigma_of(lower, at_points, at_points.mean(axis=0), 0.0)
+    return replace(track, free_mm=free)
+
+
 def _sized(
     track: Track,
     pool: WarmPool,
@@ -487,22 +506,18 @@ def _sized(
     lower: FloatArray,
     match: Match,
     residual: FloatArray,
+    ray: IntArray,
 ) -> tuple[Reconstruction, measures.Measures]:
     """Boundary, sizes and all their ±."""
     bed, coefficients = track.bed, pool.coefficients
-    own = np.flatnonzero(np.isin(bed.at[:, 0] * 4096 + bed.at[:, 1], (match.ray - 1) @ (4096, 1)))
-    points = pool.points_mm[own]
+    points = pool.points_mm[ray]
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     rim = follow_rim(bed, coefficients, level, center, track.boundary)
     sizes = sizes_of(bed, coefficients, level, rim)
     if not sizes.holds:
         raise Broken("the surface comes down to the work piece within its boundary")
     splines, values = spline_values(bed.basis, points[:, :2])
-    gradients = np.zeros((len(own) + len(sizes.size), len(coefficients)))
-    np.put_along_axis(gradients[: len(own)], splines, values[0], axis=1)
-    level_at = gradients[: len(own)].mean(axis=0)
-    gradients[len(own) :] = sizes.gradient
-    sigma = sigma_of(lower, gradients, level_at, level.sigma_mm)
+    level_at = np.bincount(splines.ravel(), values[0].ravel(), len(coefficients)) / len(ray)
     made = Reconstruction(
         scheme="fit",
         surface=SplineSurface(bed.basis, coefficients),
@@ -510,8 +525,8 @@ def _sized(
         ray=match.ray,
         points_mm=points,
         residual_mm=residual,
-        sigma_mm=sigma[: len(own)],
+        sigma_mm=np.hypot(track.free_mm[ray], level.sigma_mm),
     )
+    sigma = sigma_of(lower, sizes.gradient, level_at, level.sigma_mm)
     errors = reflection_errors(made, match, bed.rig)
-    told = measures.measures_of(errors, sizes.size, sizes.peak_mm, center, sigma[len(own) :])
-    return made, told
+    return made, measures.measures_of(errors, sizes.size, sizes.peak_mm, center, sigma)

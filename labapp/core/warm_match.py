@@ -33,34 +33,10 @@ ASTRAY = 0.25
 """A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
 
 
-@dataclass(frozen=True)
-class Sight:
-    """How predicted dots and found ones lie to each other; R rays, n dots.
-
-    Parameters
-    ----------
-    apart_mm
-        Distance of every ray's predicted dot from every dot, shape (R, n); infinite for rays whose
-        dots are not looked for.
-    next_mm
-        Distance of every predicted dot from the next one, shape (R,).
-    """
-
-    apart_mm: FloatArray
-    next_mm: FloatArray
-
-    @classmethod
-    def of(cls, pool: WarmPool, scene: Scene, looked_for: BoolArray) -> Sight:
-        """Compare the predictions of rays in a mask, shape (R,), with a frame's dots."""
-        ray = np.flatnonzero(looked_for & np.isfinite(pool.plane_mm[:, 0]))
-        apart = np.full((len(looked_for), len(scene.plane_mm)), np.inf)
-        apart[ray] = _apart(pool.plane_mm[ray], scene.plane_mm)
-        return cls(apart, next_of(pool.plane_mm, ray))
-
-
-def _apart(one: FloatArray, other: FloatArray) -> FloatArray:
+def apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
     """Distances, shape (len(one), len(other))."""
-    return np.hypot(one[:, 0, None] - other[:, 0], one[:, 1, None] - other[:, 1])
+    x, y = one[:, 0, None] - other[:, 0], one[:, 1, None] - other[:, 1]
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
@@ -80,8 +56,17 @@ def around(bed: Bed, lit: BoolArray, rings: int) -> BoolArray:
     return np.asarray(wide[tuple(bed.at.T)])
 
 
-def tracked(sight: Sight, lit: BoolArray, resolution_mm: float) -> tuple[IntArray, FloatArray]:
+def tracked(
+    scene: Scene, pool: WarmPool, lit: BoolArray, looked_for: BoolArray
+) -> tuple[IntArray, FloatArray]:
     """Dots of the rays that were lit before, each by the one prediction that is near.
+
+    Parameters
+    ----------
+    scene, pool
+        The frame's dots, and the surface that predicts them.
+    lit, looked_for
+        Rays that may have dots, and those and their rivals, shape (R,).
 
     Returns
     -------
@@ -89,18 +74,22 @@ def tracked(sight: Sight, lit: BoolArray, resolution_mm: float) -> tuple[IntArra
         Index of each ray's dot or `UNLABELLED`, shape (R,); how far those found are from where
         they were predicted, in shares of the way to the next predicted dot, shape (found,).
     """
-    apart = sight.apart_mm
-    ray = np.argmin(apart, axis=0)
-    dot = np.arange(apart.shape[1])
-    off = apart[ray, dot]
-    sure = (off < GATE * sight.next_mm[ray]) & (sight.next_mm[ray] > resolution_mm) & lit[ray]
-    sure &= np.argmin(apart, axis=1)[ray] == dot
-    sure &= np.partition(apart, 1, axis=0)[1] > CLEARLY * off
-    if len(dot) > 1:  # speckle may split a dot in two
-        sure &= np.partition(apart, 1, axis=1)[ray, 1] > GATE * sight.next_mm[ray]
-    labels = np.full(len(apart), UNLABELLED, np.int64)
-    labels[ray[sure]] = dot[sure]
-    return labels, off[sure] / sight.next_mm[ray[sure]]
+    labels = np.full(len(lit), UNLABELLED, np.int64)
+    near = np.flatnonzero(looked_for & np.isfinite(pool.plane_mm[:, 0]))
+    if len(near) < 2 or len(scene.plane_mm) < 2:
+        return labels, np.empty(0)
+    plane = pool.plane_mm[near]
+    rays, dots = cKDTree(plane), cKDTree(scene.plane_mm)
+    step = rays.query(plane, k=2)[0][:, 1]
+    off, ray = rays.query(scene.plane_mm, k=2)
+    other, dot = dots.query(plane, k=2)
+    own, off_own = ray[:, 0], off[:, 0]
+    gate = GATE * step[own]
+    sure = (off_own < gate) & (step[own] > scene.resolution_mm) & lit[near[own]]
+    sure &= (dot[own, 0] == np.arange(len(own))) & (off[:, 1] > CLEARLY * off_own)
+    sure &= other[own, 1] > gate  # speckle may split a dot in two
+    labels[near[own[sure]]] = np.flatnonzero(sure)
+    return labels, off_own[sure] / step[own[sure]]
 
 
 def widened(
@@ -112,10 +101,11 @@ def widened(
     dot for the ray (`ray_growth`), with what the prediction is uncertain by.
     """
     lit = labels != UNLABELLED
-    sight = Sight.of(pool, scene, around(bed, lit, 2))
+    looked_for = np.flatnonzero(around(bed, lit, 2) & np.isfinite(pool.plane_mm[:, 0]))
+    next_mm = next_of(pool.plane_mm, looked_for)
     rays = np.flatnonzero(lit)
-    off = sight.apart_mm[rays, labels[rays]]
-    astray = off > np.maximum(6.0 * np.median(off), ASTRAY * sight.next_mm[rays])
+    off = np.linalg.norm(pool.plane_mm[rays] - scene.plane_mm[labels[rays]], axis=-1)
+    astray = off > np.maximum(6.0 * np.median(off), ASTRAY * next_mm[rays])
     labels = labels.copy()
     labels[rays[astray]] = UNLABELLED
     free = np.setdiff1d(np.arange(len(scene.plane_mm)), labels)
@@ -124,15 +114,15 @@ def widened(
     beside = np.flatnonzero(around(bed, lit, 1) & ~lit & ~bed.absent)
     if len(beside) == 0:
         return labels
-    near = np.unique(np.argsort(sight.apart_mm[:, free], axis=0)[:3])
-    near = near[np.isfinite(pool.plane_mm[near, 0])]
+    apart = apart_mm(pool.plane_mm[looked_for], scene.plane_mm[free])
+    near = looked_for[np.unique(np.argsort(apart, axis=0)[:3])]
     cost, distance = _surprise(bed, scene, pool, lower, near)
     for dot in free:
         best = int(np.argmin(cost[:, dot]))
         ray = int(near[best])
         rivals = np.delete(cost[:, dot], best), np.delete(cost[best], dot)
         clear = all(len(r) == 0 or r.min() > cost[best, dot] + CLEAR for r in rivals)
-        known = ray in beside and sight.next_mm[ray] > scene.resolution_mm
+        known = ray in beside and next_mm[ray] > scene.resolution_mm
         if clear and known and distance[best, dot] < NEAR:
             labels[ray] = dot
     return labels
@@ -193,7 +183,7 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
     if len(stray):
         apart = np.full((len(lit), len(stray)), np.inf)
-        apart[known] = _apart(pool.plane_mm[known], scene.plane_mm[stray])
+        apart[known] = apart_mm(pool.plane_mm[known], scene.plane_mm[stray])
         doubt = apart.min(axis=1) < next_mm
         witness[doubt & (witness < 0)] = 0
         run_together = known & merged & among

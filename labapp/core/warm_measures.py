@@ -124,8 +124,9 @@ def sizes_of(bed: Bed, coefficients: FloatArray, level: Level, rim: Rim) -> Size
     share = (wedge[:, None] * (WEIGHT * fraction)).ravel()
     samples = np.vstack([np.column_stack([place, z]), outline])
     extremes = [int(np.argmax(samples[:, 2])), int(np.argmin(samples[:, 2]))]
+    # An extreme on the rim is where it is; one within may lie between the samples.
     high, low = (
-        measures.refined(surface, boundary, samples[at], sign)
+        measures.refined(surface, boundary, samples[at], sign) if at < len(place) else samples[at]
         for at, sign in zip(extremes, (1.0, -1.0), strict=True)
     )
     gradient = np.zeros((6, count))

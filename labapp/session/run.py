@@ -56,6 +56,7 @@ def provenance(
     setup: Setup,
     settings: Settings,
     frames: range,
+    warm: bool = False,
 ) -> dict[str, object]:
     """What `run.json` tells of where results come from."""
     return {
@@ -69,6 +70,7 @@ def provenance(
         },
         "frames": {"start": frames.start, "stop": frames.stop, "step": frames.step},
         "settings": dataclasses.asdict(settings),
+        "warm": warm,
         "setup": {"path": str(Path(setup_path).absolute()), "toml": setup.text},
     }
 

@@ -23,6 +23,7 @@ from labapp.core.pipeline import Measurement, Settings
 from labapp.core.warm import WarmChain
 from labapp.errors import InputError
 from labapp.media import FrameSource, open_source
+from labapp.session.results import ResultsWriter
 from labapp.session.run import measuring_pool
 from labapp.session.setup import Setup
 from labapp.session.tables import table_rows
@@ -112,6 +113,26 @@ def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None
             while batches:
                 yield from batches.popleft().result()
             begun += (_begun(pools[k % workers], job, s) for k, s in islice(waiting, 1))
+
+
+def follow_frames(
+    path: Path,
+    index: bytes | None,
+    frames: Sequence[int],
+    setup: Setup,
+    settings: Settings,
+    results: ResultsWriter,
+) -> Iterator[tuple[int, float | None, Measurement]]:
+    """Measure frames of a recording by `measure_sequence` and write each, as `run.measure_frames`.
+
+    Raises
+    ------
+    InputError
+        If the recording cannot be opened, or a frame's results cannot be written.
+    """
+    for told in measure_sequence(Job(path, index, setup, settings), frames):
+        results.write(told.frame, told.time_s, told.measurement, told.rows)
+        yield told.frame, told.time_s, told.measurement
 
 
 def _begun(pool: Executor, job: Job, stretch: Sequence[int]) -> deque[Future[list[Told]]]:

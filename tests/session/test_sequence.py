@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from labapp.cli import app
 from labapp.core.pipeline import Settings
 from labapp.session import sequence
 from labapp.session.benchmark import SCENARIO
@@ -66,3 +69,25 @@ def test_a_frame_that_cannot_be_read_is_told_and_the_others_measured(
     (folder / "frame_1.png").write_bytes(b"not a picture")
     told = list(measure_sequence(Job(folder, None, job.setup, job.settings), range(3), 0))
     assert [one.measurement.status for one in told] == ["ok", "unreadable", "ok"]
+
+
+def test_the_command_follows_frames(job: Job, tmp_path: Path) -> None:
+    (tmp_path / "setup.toml").write_text(job.setup.text, "utf-8")
+    out = tmp_path / "results"
+    given = ["reconstruct", job.path, "--setup", tmp_path / "setup.toml", "--out", out]
+    some = ["--frames", "2:6", "--surfaces", "none", "--warm"]
+    result = CliRunner().invoke(app, [*map(str, given), *some])
+    assert result.exit_code == 0, result.output
+    assert "4 frames, 4 with a surface" in result.output
+    assert json.loads((out / "run.json").read_text("utf-8"))["warm"] is True
+    with (out / "measures.csv").open(encoding="utf-8", newline="") as file:
+        assert [row["frame"] for row in csv.DictReader(file)] == ["2", "3", "4", "5"]
+
+
+def test_the_benchmark_measures_every_frame_and_no_label_wrong(tmp_path: Path) -> None:
+    given = ["benchmark", "--frames", "40", "--workers", "0", "--cache", str(tmp_path)]
+    result = CliRunner().invoke(app, given)
+    assert result.exit_code == 0, result.output
+    assert "100.00 % of the frames" in result.output
+    assert "wrong labels            0;" in result.output
+    assert (tmp_path / "oscillating_40.avi").exists()
