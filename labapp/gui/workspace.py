@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui.tasks import Control, Task, Tasks, in_words
+from labapp.simulation import parallel
 
 if TYPE_CHECKING:
     from labapp.session.measured import Overview
@@ -115,9 +116,7 @@ class Workspace(QObject):
             task.cancel()  # or it would take the end of its processes for a fault
         pool, self._pool = self._pool, None
         if pool is not None:
-            for process in list((pool._processes or {}).values()):
-                process.terminate()
-            pool.shutdown(cancel_futures=True)
+            parallel.end_processes(pool)
 
     def tried(self, work: Callable[[], T]) -> T | None:
         """Do something short; a refusal is said in words and gives None."""

@@ -105,11 +105,26 @@ def processes(
     try:
         yield pool
     except BaseException:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()  # a task can take a minute
+        end_processes(pool)
         raise
-    finally:
-        pool.shutdown(cancel_futures=True)
+    pool.shutdown()
+
+
+def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
+    """End processes whatever they are at, which can take a minute.
+
+    Parameters
+    ----------
+    pool
+        Their pool, of no more use then.
+    wait
+        Whether to return only when they are gone.
+    """
+    # One may be half through telling its result: who listens must see that nobody goes on.
+    pool._result_queue._writer.close()  # type: ignore[attr-defined]
+    for process in list((pool._processes or {}).values()):
+        process.terminate()
+    pool.shutdown(wait, cancel_futures=True)
 
 
 def begin_worker(nice: int = 0, become: Callable[..., None] | None = None, *given: object) -> None:

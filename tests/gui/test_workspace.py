@@ -13,23 +13,22 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.workspace import Workspace
 from labapp.session import run
 from labapp.session.log import NAME
+from labapp.simulation import parallel
 from tests.gui.conftest import CopySample
 from tests.gui.watching import Noting
 
 
 class Stuck(Executor):
-    """Never measures anything; what waits for it is let go when it is shut down."""
+    """Never measures anything; what waits for it is let go when it is ended."""
 
     def __init__(self) -> None:
-        self._processes: dict[int, Any] = {}
         self.begun: list[Future[Any]] = []
 
     def submit(self, *_: object, **__: object) -> Future[Any]:
         self.begun.append(Future())
         return self.begun[-1]
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        assert cancel_futures
+    def end(self) -> None:
         for future in self.begun:
             future.cancel()
 
@@ -41,6 +40,7 @@ def test_measuring_that_is_left_for_another_session_is_no_fault(
     faults: list[str] = []
     stuck, noting, log = Stuck(), Noting(faults), logging.getLogger(NAME)
     monkeypatch.setattr(run, "measuring_pool", lambda _: stuck)
+    monkeypatch.setattr(parallel, "end_processes", Stuck.end)
     log.addHandler(noting)
     space = Workspace()
     said: list[str] = []

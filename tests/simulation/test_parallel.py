@@ -21,6 +21,18 @@ if __name__ == "__main__":
     in_parallel(time.sleep, [600, 600], "asleep", lambda *_: print(flush=True), workers=2)
 """
 
+ENDED = """
+import contextlib, multiprocessing
+from labapp.simulation.parallel import processes
+if __name__ == "__main__":
+    for _ in range(10):
+        with contextlib.suppress(InterruptedError), processes(2) as pool:
+            told = [pool.submit(bytes, 20_000_000) for _ in range(20)]
+            told[0].result()
+            raise InterruptedError
+        assert not multiprocessing.active_children()
+"""
+
 
 def test_they_give_way_to_a_window_and_use_one_thread() -> None:
     own = os.nice(0)
@@ -78,3 +90,10 @@ def spawned(parent: int) -> list[int]:
         and Path(f"/proc/{pid}/task").is_dir()
         and len(list(Path(f"/proc/{pid}/task").iterdir())) > 1  # one of them follows the parent
     ]
+
+
+def test_one_that_is_ended_while_it_tells_much_holds_nobody_up(tmp_path: Path) -> None:
+    """What is told is larger than what a pipe holds: each is ended half through one."""
+    program = tmp_path / "ended.py"
+    program.write_text(ENDED, "utf-8")
+    subprocess.run([sys.executable, program], timeout=120, check=True)

@@ -15,6 +15,7 @@ from labapp.gui.pages.dots.presenter import Shown
 from labapp.gui.tasks import Cancelled, Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.session.run import measuring_pool
+from labapp.simulation.parallel import end_processes
 
 WARM_MS = 1500
 """The page is shown first; its processes begin then."""
@@ -54,13 +55,13 @@ class Processes:
 
     def replace(self) -> None:
         """End the first, whatever it is at, and put the second in its place."""
-        _end(self._pools.pop(0)[0])
+        end_processes(self._pools.pop(0)[0], wait=False)
         self.begin()
 
     def end(self) -> None:
         """End both."""
         while self._pools:
-            _end(self._pools.pop()[0])
+            end_processes(self._pools.pop()[0], wait=False)
 
 
 class Refit:
@@ -166,9 +167,3 @@ class _Patient(Executor):
                 future.cancel()
                 raise Cancelled
         return future
-
-
-def _end(pool: ProcessPoolExecutor) -> None:
-    for process in list((pool._processes or {}).values()):
-        process.terminate()
-    pool.shutdown(wait=False, cancel_futures=True)
