@@ -1,0 +1,218 @@
+"""What a measured frame leaves to the next, and how the next one's dots are found with it.
+
+A pool that swings is carried on as it swung (`predictions`). Where that does not find the dots, as
+at the start, they are followed from the absent one outwards, ring by ring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.boundary import Boundary
+from labapp.core.correspondence import Match
+from labapp.core.dots import Image
+from labapp.core.fit import LEAST_DOTS, UNSETTLED_MM
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.pool_fit import Level, find_level
+from labapp.core.quick_dots import Exposure
+from labapp.core.ray_growth import UNLABELLED, Scene
+from labapp.core.reconstruction import Reconstruction
+from labapp.core.rig import Rig
+from labapp.core.spline import SplineSurface
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
+from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, met
+from labapp.core.warm_match import around, tracked
+
+FOUND = 0.85
+"""Share of the dots of the frame before that must be found again."""
+
+STEADY = 0.2
+"""… and half of them within this share of the way to the next dot of where they were predicted."""
+
+FIRST_RING, GROWING_ROUNDS, GROWN_FROM = 2, 3, 12
+"""Where no prediction finds the dots, they are first looked for so near the absent one, in so many
+rounds a ring, from so many surfaces of the past."""
+
+MEMORY, ORDER = 48, 4
+"""Frames that predictions are learnt from, and how many of them one is made from."""
+
+
+class Broken(Exception):
+    """A track does not lead to this frame; says why in a sentence."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """What a frame leaves to the next.
+
+    Parameters
+    ----------
+    bed
+        Splines and rays.
+    exposure
+        Size of dots and noise.
+    match
+        Of the cold chain, where the track began.
+    residual_mm
+        Root mean square residual there, mm.
+    pool, lit, boundary, level
+        The last surface, the rays that had dots, where the pool ends, and z = 0.
+    past
+        Spline coefficients of the last frames, the newest last, shape (frames, p), mm.
+    open_mm
+        How far the level was left open when it was last asked how deep the rear lies, mm.
+    free_mm
+        Uncertainty of the height where each ray meets the surface, its level apart, as it was last
+        worked out, shape (R,), mm; NaN where it never was. It changes slowly.
+    unseen
+        Frames since the absent ray's place was last seen dark amid four lit ones.
+    count
+        Frames that were followed.
+    """
+
+    bed: Bed
+    exposure: Exposure
+    match: Match
+    residual_mm: float
+    pool: WarmPool
+    lit: BoolArray
+    boundary: Boundary
+    level: Level
+    past: FloatArray
+    open_mm: float
+    free_mm: FloatArray
+    unseen: int = 0
+    count: int = 0
+
+
+def begin(
+    image: Image, measurement: Measurement, rig: Rig, settings: Settings, former: Track | None
+) -> Track | None:
+    """Start a track from a frame that the cold chain measured; None where none can be.
+
+    What is remembered of a ``former`` track, of the frames just before, stays.
+    """
+    match, made = measurement.match, measurement.reconstruction
+    if match is None or made is None or not isinstance(made.surface, SplineSurface):
+        return None
+    if settings.dots.method != "band-pass" or rig.pattern.marker is None:
+        return None
+    bed, pool = Bed.of(rig, made.surface.basis, settings.fit), None
+    if former is not None and bed.at.shape == former.bed.at.shape:
+        bed, pool = former.bed, _moved_to(former, match, made)
+    if pool is None:
+        former = None
+        pool = met(bed, made.surface.coefficients, bed.landing_mm, 4)
+    witness = match.witness[tuple(bed.at.T)]
+    told = witness != 0
+    surface = SplineSurface(bed.basis, pool.coefficients)
+    level = find_level(surface, bed.landing_mm[told, :2], witness[told], bed.spacing_mm)
+    past = np.empty((0, len(pool.coefficients))) if former is None else former.past[1 - MEMORY :]
+    return Track(
+        bed=bed,
+        exposure=Exposure.of(image, settings.dots.band_pass),
+        match=match,
+        residual_mm=rms(made.residual_mm),
+        pool=pool,
+        lit=witness > 0,
+        boundary=made.boundary,
+        level=level,
+        past=np.vstack([past, pool.coefficients]),
+        open_mm=level.sigma_mm,
+        free_mm=np.full(len(bed.at), np.nan),
+    )
+
+
+def _moved_to(former: Track, match: Match, made: Reconstruction) -> WarmPool | None:
+    """The surface of a cold fit in the splines of a former track; None if they have no place."""
+    bed = former.bed
+    number = {(i, j): k for k, (i, j) in enumerate((bed.at + 1).tolist())}
+    rays = [number.get((i, j)) for i, j in match.ray.tolist()]
+    if None in rays:
+        return None
+    ray = np.array(rays, np.int64)
+    points = bed.landing_mm.copy()
+    points[ray] = made.points_mm
+    start = replace(former.pool, points_mm=points)
+    slopes = Slopes.of(bed, ray, match.plane_mm, match.plane_covariance_mm2)
+    try:
+        pool, _, moved = fit_slopes_to(bed, start, slopes)
+    except CannotMeasure:
+        return None
+    lower_by = float(np.mean(made.points_mm[:, 2] - pool.points_mm[ray, 2]))
+    pool = met(bed, pool.coefficients + lower_by, pool.points_mm, 4)
+    return pool if moved < UNSETTLED_MM else None
+
+
+def rms(residual: FloatArray) -> float:
+    """Root mean square length of residuals, shape (n, 2)."""
+    return float(np.sqrt(np.mean(np.sum(residual**2, axis=-1))))
+
+
+def predictions(track: Track) -> Iterator[FloatArray]:
+    """Spline coefficients that the next frame may have, the likeliest first.
+
+    A pool that swings goes on as it did: a linear recurrence, learnt from the frames before on the
+    heights where lit rays land, carries any few oscillations on.
+    """
+    past = track.past
+    if len(past) > 3 * ORDER:
+        own = np.flatnonzero(track.lit)
+        value, splines = track.bed.values[0, own], track.bed.splines[own]
+        heights = np.einsum("rs,frs->fr", value, past[:, splines])
+        heights = heights - heights.mean(axis=0)
+        count = len(past) - ORDER
+        steps = np.stack([heights[ORDER - k - 1 :][:count].ravel() for k in range(ORDER)])
+        gram = steps @ steps.T
+        gram[np.diag_indices(ORDER)] += 1e-4 * np.trace(gram)
+        ratio = np.linalg.solve(gram, steps @ heights[ORDER:].ravel())
+        mean = past.mean(axis=0)
+        yield mean + ratio @ (past[: -ORDER - 1 : -1] - mean)
+    if len(past) > 1:
+        yield 2 * past[-1] - past[-2]
+    yield past[-1]
+
+
+def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, bool]:
+    """A surface that finds the dots again, the rays that gives them, and whether it was foreseen.
+
+    Where none that is foreseen does, one is grown from the last, and from those before it.
+    """
+    bed, count = track.bed, int(track.lit.sum())
+    looked_for = around(bed, track.lit, 2)
+    for coefficients in predictions(track):
+        pool = met(bed, coefficients, track.pool.points_mm, 1)
+        labels, off = tracked(scene, pool, track.lit, looked_for)
+        if len(off) >= FOUND * count and np.median(off) < STEADY:
+            return pool, labels, True
+    found = 0
+    for coefficients in track.past[: -GROWN_FROM - 1 : -1]:
+        pool, labels = _grown(track, scene, coefficients)
+        found = max(found, int(np.sum(labels != UNLABELLED)))
+        if found >= max(FOUND * count, LEAST_DOTS):
+            return pool, labels, False
+    raise Broken(f"{found} of {count} dots were found again")
+
+
+def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, IntArray]:
+    """Find the dots again from the absent one outwards, ring by ring.
+
+    Dots in the middle move least from frame to frame; how they moved tells how those around do.
+    """
+    bed = track.bed
+    pool = met(bed, start, track.pool.points_mm)
+    ring = np.abs(bed.at + 1 - np.array(bed.rig.pattern.marker)).max(axis=1)
+    looked_for = around(bed, track.lit, 2)
+    labels = np.full(len(ring), UNLABELLED)
+    for reach in range(FIRST_RING, int(ring[track.lit].max()) + 2):
+        labels, _ = tracked(scene, pool, track.lit & (ring <= reach), looked_for)
+        ray = np.flatnonzero(labels != UNLABELLED)
+        if len(ray) < LEAST_DOTS:
+            break
+        dot = labels[ray]
+        slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+        pool, _, _ = fit_slopes_to(bed, pool, slopes, GROWING_ROUNDS, start)
+    return pool, labels
