@@ -58,7 +58,7 @@ PURPOSES = {
     "setup": ("Usual values", "Load…", "Laser goggles are worn", "Water cooling is on"),
     "laser": ("Use these",),
     "plane": ("Load picture…", "Find O′ and the axes", "Use"),
-    "capture": ("Choose a file …", "Import"),
+    "capture": ("Choose a file …", "Import", "Start", "● Record", "Mark", "Stop the camera"),
     "surface": ("Along X", "Compare", "&This frame", "Copy"),
     "trends": ("Read a table …", "Width", "Height"),
     "export": ("Measures", "PLY", "Export"),

@@ -16,11 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from labapp.core.detection import DotSettings, find_dots
+from labapp.core.dots import Dots
 from labapp.core.pipeline import Measurement
 from labapp.core.quality import UNMEASURED, Quality, judge_quality
+from labapp.core.quick_dots import Exposure, quick_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.gui.pages.capture.presenter import size_in_words
+from labapp.media import GreyImage
 from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
 from labapp.media.events import Event
 from labapp.media.recorder import Plan, Recorder, Take
@@ -31,10 +34,10 @@ from labapp.words import several
 SIMULATED = "simulated"
 """Id of the simulated camera."""
 
-LOOK_S = 0.25
-"""A frame is judged no more often, and never for more than half of the time."""
+SHOW_S, LOOK_S = 0.025, 0.25
+"""Dots are looked for in a frame, and a frame is judged, no more often."""
 
-IDLE_S = 0.02
+IDLE_S = 0.005
 
 RATE_S = 1.0
 """The rate that is shown is that of so long."""
@@ -61,16 +64,32 @@ class Looked:
     Parameters
     ----------
     dots_px
-        (u, v) of its dots, shape (n, 2).
+        (u, v) of its dots, shape (n, 2); None where they come with the frames that are shown.
     quality
         Whether it is fit to be measured.
     room_byte
         Free on the disk; None where that cannot be told.
     """
 
-    dots_px: FloatArray
+    dots_px: FloatArray | None
     quality: Quality
     room_byte: int | None
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A frame to be shown.
+
+    Parameters
+    ----------
+    frame
+        As the camera gave it.
+    dots_px
+        (u, v) of its dots, shape (n, 2); None where it is not known how to find them quickly.
+    """
+
+    frame: CameraFrame
+    dots_px: FloatArray | None
 
 
 class Live:
@@ -115,8 +134,9 @@ class Live:
         self._place, self._settings = place, settings
         self._dots, self._rays = dots, rays
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._newest: deque[CameraFrame] = deque(maxlen=1)
+        self._to_show: deque[CameraFrame] = deque(maxlen=1)
         self._to_judge: deque[CameraFrame] = deque(maxlen=1)
+        self._newest: deque[Shown] = deque(maxlen=1)
         self._judged: deque[Looked] = deque(maxlen=1)
         self._recorders: list[Recorder] = []
         self._told: set[Path] = set()
@@ -125,7 +145,14 @@ class Live:
         self._ring_since_s = time.monotonic()
         self._closing = threading.Event()
         self._turn = threading.Lock()
-        self._judge = threading.Thread(target=self._judge_on, name="live judge", daemon=True)
+        self._light: Exposure | None = None
+        self._workers = [
+            threading.Thread(target=self._work_on, args=given, name=f"live {given[0]}", daemon=True)
+            for given in (
+                ("dots", self._to_show, self._find_quickly, SHOW_S),
+                ("judge", self._to_judge, self._judge, LOOK_S),
+            )
+        ]
 
     # --- begin and end ------------------------------------------------------------------------
 
@@ -142,7 +169,8 @@ class Live:
             if not self._closing.is_set():
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
-                self._judge.start()
+                for worker in self._workers:
+                    worker.start()
                 return
         feed.stop()
 
@@ -152,7 +180,8 @@ class Live:
             self._closing.set()
         if self.feed is not None:
             self.feed.stop()
-            self._judge.join()
+            for worker in self._workers:
+                worker.join()
         for recorder in self._recorders:
             recorder.close()
 
@@ -172,7 +201,7 @@ class Live:
     def _take(self, frame: CameraFrame) -> None:
         for recorder in self._recorders[-1:]:
             recorder.take(frame)
-        self._newest.append(frame)
+        self._to_show.append(frame)
         self._to_judge.append(frame)
 
     def _say(self, event: Event) -> None:
@@ -180,41 +209,64 @@ class Live:
         for recorder in self._recorders[-1:]:
             recorder.note(event)
 
-    # --- in the judge's thread ----------------------------------------------------------------
+    # --- in threads of their own --------------------------------------------------------------
 
-    def _judge_on(self) -> None:
+    def _work_on(
+        self,
+        what: str,
+        frames: deque[CameraFrame],
+        work: Callable[[CameraFrame], None],
+        every_s: float,
+    ) -> None:
+        """Do something with the newest frame, no more often than that, and half of the time."""
         try:
             while not self._closing.is_set():
-                if not self._to_judge:
+                if not frames:
                     self._closing.wait(IDLE_S)
                     continue
                 began_s = time.monotonic()
-                self._judged.append(self._look_at(self._to_judge.popleft()))
-                self._closing.wait(max(LOOK_S, time.monotonic() - began_s))
+                work(frames.popleft())
+                took_s = time.monotonic() - began_s
+                self._closing.wait(max(every_s - took_s, took_s))
         except Exception as error:
-            logging.getLogger(NAME).exception("judging live frames")
-            words = f"a fault in the program ended the verdict on frames: {error!r}"
+            logging.getLogger(NAME).exception("live %s", what)
+            words = f"a fault in the program has ended its {what}: {error!r}"
             self._events.put(Event(self.name, "warning", words))
 
-    def _look_at(self, frame: CameraFrame) -> Looked:
+    def _find_quickly(self, frame: CameraFrame) -> None:
+        light, places = self._light, None
+        if light is not None and light.noise.shape == frame.image.shape:
+            places = _places_px(self._dots_in(frame.image, light))
+        self._newest.append(Shown(frame, places))
+
+    def _dots_in(self, image: GreyImage, light: Exposure | None) -> Dots | None:
+        """Dots of a frame, quickly where its light is known; None if there is none."""
         try:
-            dots = find_dots(frame.image, self._dots)
+            if light is not None:
+                return quick_dots(image, light, self._dots.band_pass)
+            return find_dots(image, self._dots)
         except CannotMeasure:
-            dots = None
+            return None
+
+    def _judge(self, frame: CameraFrame) -> None:
+        quick = self._dots.method == "band-pass"
+        if quick:
+            self._light = Exposure.of(frame.image, self._dots.band_pass)
+        dots = self._dots_in(frame.image, self._light)
         found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
         depth = None if self.feed is None else self.feed.bit_depth
         quality = judge_quality(frame.image, found, depth, self._rays)
-        places = np.zeros((0, 2)) if dots is None else dots.image_px
         self._frame_byte = frame.image.nbytes
         try:
             room_byte = shutil.disk_usage(self._place().parent).free
         except OSError:
             room_byte = None
-        return Looked(places, quality, room_byte)
+        places = None if quick else _places_px(dots)
+        self._judged.append(Looked(places, quality, room_byte))
 
     # --- to look at ---------------------------------------------------------------------------
 
-    def newest(self) -> CameraFrame | None:
+    def newest(self) -> Shown | None:
         """The newest frame; None if it was given already."""
         return self._newest.popleft() if self._newest else None
 
@@ -330,6 +382,10 @@ class Live:
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
         """Set the camera between two frames; what it is set to is answered when it is."""
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
+
+
+def _places_px(dots: Dots | None) -> FloatArray:
+    return np.zeros((0, 2)) if dots is None else dots.image_px
 
 
 def rays_of(session: Session) -> int | None:

@@ -12,6 +12,7 @@ import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidget
 
+from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.pages.capture.live import SIMULATED, Live, choices, rays_of
 from labapp.gui.pages.capture.parts import ExposureBars, button, headed, wrapped
@@ -260,14 +261,15 @@ class LiveView(QObject):
         live, began_s = self.live, time.perf_counter()
         if live is None:
             return
-        frame = live.newest()
-        if frame is not None:
-            self._picture.show_picture(frame.image)
+        shown = live.newest()
+        if shown is not None:
+            self._picture.show_picture(shown.frame.image)
+            self._ring_dots(shown.dots_px)
             self.updates += 1
         looked = live.looked()
         if looked is not None:
             self._room_byte = looked.room_byte
-            self._rings.setData(pos=looked.dots_px)
+            self._ring_dots(looked.dots_px)
             quality = looked.quality
             self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
             self._exposure.show()
@@ -279,6 +281,10 @@ class LiveView(QObject):
         wanted = max(TICK_MS, round(2 * took_ms))
         if abs(wanted - self._timer.interval()) > TICK_MS / 4:
             self._timer.setInterval(wanted)
+
+    def _ring_dots(self, dots_px: FloatArray | None) -> None:
+        if dots_px is not None:
+            self._rings.setData(pos=dots_px)
 
     def _hear(self, live: Live) -> None:
         """Tell what happened, and hand on what is recorded."""
