@@ -7,8 +7,10 @@ heard on this machine only unless told otherwise, as neither asks who connects.
 from __future__ import annotations
 
 import asyncio
+import errno
 import ipaddress
 import json
+import logging
 import math
 import os
 import threading
@@ -18,6 +20,7 @@ from typing import Any, Protocol
 import labapp
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
+from labapp.session.log import NAME
 from labapp.session.tables import SIZES
 
 MOST_WAITING = 1_000_000
@@ -113,6 +116,7 @@ class LineStream:
         try:
             while await reader.read(1024):
                 pass  # what listeners say is not for us
+            await writer.wait_closed()  # one that says no more may still read
         except OSError:
             pass  # it is gone
         finally:
@@ -130,7 +134,9 @@ class LineStream:
 
     async def _close(self) -> None:
         self._server.close()
-        for writer in self._missed:
+        for writer, missed in self._missed.items():
+            if missed:
+                writer.write(b'{"missed": %d}\n' % missed)
             writer.transport.close()  # when all is sent
         for _ in range(round(PATIENCE_S / 0.01)):
             if not self._missed:
@@ -170,6 +176,8 @@ class OpcuaStream:
         except ImportError as error:
             expected = "asyncua, which pip install 'labapp[control]' brings"
             raise InputError("OPC UA", "library", "missing", expected) from error
+        # What it says of security policies and ports is said here in words of our own.
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)
         self._ua = ua
         self._newest: Values | None = None
         self._variables: dict[str, Any] = {}
@@ -199,6 +207,7 @@ class OpcuaStream:
         server.set_endpoint(self.address)
         server.set_server_name("labapp")
         server.set_security_policy([self._ua.SecurityPolicyType.NoSecurity])
+        server.allow_remote_admin(False)  # or anybody could write, and take variables away
         space = await server.register_namespace(NAMESPACE)
         pool = await server.nodes.objects.add_object(space, "Pool")
         kinds = {"frame": -1, "time_s": math.nan, "status": "", "reason": "", "scheme": ""}
@@ -210,8 +219,11 @@ class OpcuaStream:
     async def _tell(self) -> None:
         while not self._ended or self._newest is not None:
             values, self._newest = self._newest, None
-            for name, value in (values or {}).items():
-                await self._variables[name].write_value(math.nan if value is None else value)
+            try:
+                for name, value in (values or {}).items():
+                    await self._variables[name].write_value(math.nan if value is None else value)
+            except Exception as error:  # what one frame does must not end the telling
+                logging.getLogger(NAME).error("not told by OPC UA", exc_info=error)
             if not self._ended:
                 await asyncio.sleep(OPCUA_S)
 
@@ -249,8 +261,11 @@ def check_host(host: str, anywhere: bool) -> None:
 
 
 def _taken(host: str, port: int, error: OSError) -> InputError:
-    why = os.strerror(error.errno or 0)
-    return InputError("stream", "port", f"{host}:{port}: {why}", "a free one")
+    """What to tell when nobody can be heard at a place: the port is taken, or the host not here."""
+    if error.errno in (errno.EADDRINUSE, errno.EACCES):
+        why = os.strerror(error.errno)
+        return InputError("stream", "port", f"{host}:{port}: {why}", "a free one, from 1024 on")
+    return InputError("stream", "host", f"{host}: {error.strerror}", "an address of this machine")
 
 
 class _Loop:

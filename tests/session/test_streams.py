@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import socket
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -84,6 +85,30 @@ def test_who_does_not_read_is_told_what_it_missed_and_holds_nobody_up(lines: Lin
     eager.close()
 
 
+def test_what_was_missed_is_told_at_the_end_too() -> None:
+    stream = LineStream()
+    idle = listener(stream)
+    for frame in range(1500):
+        stream.publish({"frame": frame, "reason": "x" * 10_000})
+    ending = threading.Thread(target=stream.close)
+    ending.start()
+    told = [json.loads(line) for line in idle]
+    ending.join()
+    assert told[-1]["missed"] + len(told) - 1 == 1500
+    idle.close()
+
+
+def test_a_listener_that_says_no_more_is_told_on(lines: LineStream) -> None:
+    with socket.create_connection(("127.0.0.1", lines.port), timeout=30) as connected:
+        file = connected.makefile("rb")
+        file.readline()
+        connected.shutdown(socket.SHUT_WR)
+        for frame in range(50):
+            lines.publish({"frame": frame})
+            assert json.loads(file.readline())["frame"] == frame
+        file.close()
+
+
 def test_a_listener_that_goes_harms_nobody(lines: LineStream) -> None:
     gone, stays = listener(lines), listener(lines)
     gone.close()
@@ -133,6 +158,35 @@ def test_a_port_that_is_taken_is_said(lines: LineStream) -> None:
     for kind in (LineStream, OpcuaStream):
         with pytest.raises(InputError, match=f"{lines.port}: Address already in use"):
             kind(port=lines.port)
+
+
+@pytest.mark.parametrize("kind", [LineStream, OpcuaStream])
+def test_a_place_that_is_not_on_this_machine_is_said(kind: Any) -> None:
+    with pytest.raises(InputError, match="an address of this machine"):
+        kind("192.0.2.1", free_port(), anywhere=True)
+
+
+def test_opc_ua_clients_cannot_write(caplog: pytest.LogCaptureFixture) -> None:
+    asyncua = pytest.importorskip("asyncua")
+    stream = OpcuaStream(port=free_port())
+
+    async def write(user: str) -> None:
+        client = asyncua.Client(stream.address)
+        if user:
+            client.set_user(user)
+        async with client:
+            space = await client.get_namespace_index("urn:labapp:measures")
+            pool = await client.nodes.objects.get_child(f"{space}:Pool")
+            height = await pool.get_child(f"{space}:height_mm")
+            await height.write_value(99.0)
+
+    try:
+        for user in ("", "admin"):
+            with pytest.raises(asyncua.ua.UaStatusCodeError):
+                asyncio.run(write(user))
+    finally:
+        stream.close()
+    assert not caplog.records
 
 
 def test_opc_ua_clients_read_the_newest_frame(measured: Measurement) -> None:
