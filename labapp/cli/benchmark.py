@@ -64,6 +64,8 @@ def benchmark(
 
 def _tell_run(run: Run) -> None:
     typer.echo(f"\nfrom file to CSV        {run.frames / run.seconds:.1f} frames/s")
+    ms = 1e3 * run.processor_s / run.frames
+    typer.echo(f"processor time          {ms:.1f} ms a frame, the start of all processes included")
     typer.echo(
         f"measured                {100 * run.measured / run.frames:.2f} % of the frames, "
         f"{run.cold} by the cold chain"

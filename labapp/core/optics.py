@@ -66,9 +66,10 @@ def meet_plane(origin_mm: FloatArray, direction: FloatArray, plane: ImagingPlane
 
     A ray that runs away from the plane or along it gives NaN. The plane is taken as unbounded.
     """
-    along = np.asarray(direction @ plane.normal)
+    normal = plane.normal
+    along = np.asarray(direction @ normal)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distance = ((plane.origin_mm - origin_mm) @ plane.normal) / along
+        distance = ((plane.origin_mm - origin_mm) @ normal) / along
     distance = np.where((distance > 0) & np.isfinite(distance), distance, np.nan)
     return plane.from_universal(origin_mm + distance[..., None] * direction)
 

@@ -7,6 +7,7 @@ electrode tip, Y along the welding direction, Z up, X to the right as the camera
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -122,7 +123,7 @@ class ImagingPlane:
         """Build the plane y = −distance_mm with O′ at X = −s, Z = h (Fig. 4-5, Eq. 4-5)."""
         return cls(np.array([-s_mm, -distance_mm, h_mm]), width_mm=width_mm, height_mm=height_mm)
 
-    @property
+    @cached_property
     def normal(self) -> FloatArray:
         """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
         return np.cross(self.x_axis, self.z_axis)

@@ -51,6 +51,16 @@ class Cells:
         product = along_x[:, :, None] * along_y[:, None, :]
         return np.asarray(product.reshape(-1, (DEGREE + 1) ** 2))
 
+    def value_and_slopes(self) -> FloatArray:
+        """Value and derivatives by x and by y of those splines at once, shape (3, n, 16)."""
+        side = DEGREE + 1
+        pieces = np.concatenate([_PIECES[:1] * 2, _PIECES[1] / self.step_mm[:, None, None]], axis=2)
+        x, y = self.power @ pieces
+        along = np.stack([x[:, :side], x[:, side:], x[:, :side]])
+        across = np.stack([y[:, :side], y[:, :side], y[:, side:]])
+        product = along[..., None] * across[:, :, None, :]
+        return np.asarray(product.reshape(3, -1, side**2))
+
 
 @dataclass(frozen=True)
 class SplineBasis:

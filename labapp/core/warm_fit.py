@@ -129,7 +129,7 @@ def spline_values(basis: SplineBasis, place_mm: FloatArray) -> tuple[IntArray, F
     """
     x, y = np.clip(place_mm, basis.low_mm, basis.high_mm).T
     cells = basis.cells(x, y)
-    return cells.splines, np.stack([cells.values(), cells.values(1, 0), cells.values(0, 1)])
+    return cells.splines, cells.value_and_slopes()
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ def factor(bed: Bed, splines: IntArray, values: FloatArray, weights: FloatArray)
     at = (splines[:, :1] + bed.pairs).ravel()
     gram = np.bincount(at, square.reshape(len(by), -1)[:, LOWER].ravel(), bed.stiffness.size)
     band = gram.reshape(bed.stiffness.shape) + bed.stiffness
-    band[0, int(np.median(splines[:, 5]))] += band[0].mean()
+    band[0, splines[len(splines) // 2, 5]] += band[0].mean()
     lower, info = dpbtrf(band, lower=1, overwrite_ab=1)
     if info:
         raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib
+import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -246,8 +247,8 @@ class Run:
 
     Parameters
     ----------
-    frames, seconds
-        How many frames, in how long.
+    frames, seconds, processor_s
+        How many frames, in how long, and what time of processors that took.
     measured, cold
         How many have a surface; how many were measured by the cold chain.
     wrong, labelled
@@ -260,6 +261,7 @@ class Run:
 
     frames: int
     seconds: float
+    processor_s: float
     measured: int
     cold: int
     wrong: int
@@ -282,7 +284,7 @@ def run_video(
     frames = len(video.height_mm)
     broke = measured = wrong = labelled = 0
     heights, surprises = np.full(frames, np.nan), []
-    begun = time.perf_counter()
+    begun, used = time.perf_counter(), sum(os.times()[:4])
     kept = []
     job = Job(video.path, None, video.setup, Settings())
     with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
@@ -290,7 +292,7 @@ def run_video(
             results.write(told.frame, told.time_s, told.measurement, told.rows)
             kept.append(told)
             progress()
-    seconds = time.perf_counter() - begun
+    seconds, used = time.perf_counter() - begun, sum(os.times()[:4]) - used
     for told in kept:
         broke += told.broke is not None
         found, match, size = (
@@ -313,6 +315,7 @@ def run_video(
     return Run(
         frames,
         seconds,
+        used,
         measured,
         broke,
         wrong,

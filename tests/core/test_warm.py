@@ -142,7 +142,8 @@ def test_a_followed_frame_is_what_the_cold_chain_makes_of_it(number: int) -> Non
         a, b = warm.measures, cold.measures
         assert abs(getattr(a, name) - getattr(b, name)) < getattr(b, sigma)
         assert getattr(a, sigma) == pytest.approx(getattr(b, sigma), rel=0.4)
-    assert warm.measures.are_mm == pytest.approx(cold.measures.are_mm, rel=0.2)
+    # Centroids over more of each dot leave less of the speckle in it.
+    assert 0.6 < warm.measures.are_mm / cold.measures.are_mm < 1.1
     assert warm.lattice is not None
     assert cold.lattice is not None
     assert warm.lattice.reference is not None
