@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -30,7 +31,7 @@ Action = Literal["trigger", "mark", "next"]
 ACTIONS: tuple[Action, ...] = ("trigger", "mark", "next")
 
 BOUNCE_S = 0.05
-"""A pedal that is pressed again within this time was pressed once."""
+"""A pedal that is down again within this time of having been down was pressed once."""
 
 GLANCE_MS = 10
 """So long each device is listened to in turn while one is learned."""
@@ -121,6 +122,11 @@ class Pedals:
         self._keyboard = keyboard
         self._down: dict[int, frozenset[int]] = {}
 
+    @property
+    def down(self) -> frozenset[int]:
+        """Pedals that are down, as told last."""
+        return frozenset().union(*self._down.values())
+
     def pressed(self, number: int, report: bytes) -> frozenset[int]:
         """Pedals that a report tells to be down, and that were not before.
 
@@ -178,7 +184,7 @@ class FootSwitch:
         self.pedals = pedals
         self._do = do
         self._known = Pedals(pedals.keyboard)
-        self._done_s: dict[int, float] = {}
+        self._down_s: dict[int, float] = {}
         self._reader = HidReader(pedals.device, pedals.name, self._hear, say, find, opened)
 
     @property
@@ -197,13 +203,17 @@ class FootSwitch:
         self.stop()
 
     def _hear(self, number: int, report: bytes) -> None:
-        now_s = time.monotonic()
-        for pedal in sorted(self._known.pressed(number, report)):
+        now_s, before = time.monotonic(), self._known.down
+        new = self._known.pressed(number, report)
+        first = [p for p in sorted(new) if now_s - self._down_s.get(p, -math.inf) >= BOUNCE_S]
+        # One that is let go now was down until now: contacts bounce then, too.
+        self._down_s |= dict.fromkeys(before | new, now_s)
+        if number < 0:
+            self._down_s.clear()
+        for pedal in first:
             action = self.pedals.actions.get(pedal)
-            if action is None or now_s - self._done_s.get(pedal, -BOUNCE_S) < BOUNCE_S:
-                continue
-            self._done_s[pedal] = now_s
-            self._do(action)
+            if action is not None:
+                self._do(action)
 
 
 def learn(
@@ -268,5 +278,9 @@ def _listen(
             problems.append(str(error))
             continue
         devices.callback(device.close)
-        numbered = has_numbers(device.get_report_descriptor())
+        try:
+            numbered = has_numbers(device.get_report_descriptor())
+        except (OSError, ValueError) as error:
+            problems.append(f"{info.name} cannot be listened to: {error}")
+            continue
         yield info, device, numbered, Pedals(info.is_keyboard)

@@ -7,11 +7,12 @@ import queue
 import re
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from labapp.errors import InputError
-from labapp.media import hid
+from labapp.media import foot_switch, hid
 from labapp.media.foot_switch import Action, FootSwitch, Learned, PedalMap, Pedals, learn
 from labapp.media.hid import HidError, HidInfo, find_hid, has_numbers, open_hid, why_closed
 from labapp.media.space_mouse import SixAxes
@@ -145,6 +146,27 @@ def test_a_pedal_that_bounces_was_pressed_once() -> None:
     assert done == ["mark", "next"]
 
 
+def test_a_pedal_that_bounces_when_it_is_let_go_was_pressed_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s, done = 100.0, []
+    monkeypatch.setattr(foot_switch, "time", SimpleNamespace(monotonic=lambda: now_s))
+    device = Device()
+    with switch(device, INFINITY, done.append, lambda _: None, mark=0, next=1) as running:
+        running.stop()  # reports come from the test, at times of its own
+        for pause_s, report in (
+            (0.0, "0100"),
+            (0.5, "0000"),
+            (0.004, "0100"),
+            (0.004, "0000"),
+            (0.06, "0100"),
+            (0.5, "0200"),
+        ):
+            now_s += pause_s
+            running._hear(0, bytes.fromhex(report))
+    assert done == ["mark", "mark", "next"]
+
+
 def test_a_numbered_keyboard_is_read_behind_its_number() -> None:
     device, done = Device(NUMBERED), []
     with switch(device, PCSENSOR, done.append, lambda _: None, trigger=5):
@@ -161,7 +183,6 @@ def test_unplugged_and_plugged_in_again_it_goes_on_and_says_so() -> None:
             wait_until(lambda count=count: len(done) == count)
             device.plugged = False
             wait_until(lambda: not running.connected)
-            running._done_s.clear()
             device.plugged = True
     assert done == ["trigger"] * 5
     assert device.opened >= 5
@@ -232,6 +253,21 @@ def test_learning_can_be_given_up_and_says_what_cannot_be_read() -> None:
 
     assert learn(ending, lambda: [INFINITY, PCSENSOR], opened, tell) is None
     assert told == ["may not be read"]
+
+
+def test_a_device_that_does_not_tell_what_it_sends_is_left_out_when_learning() -> None:
+    class Mute(Device):
+        def get_report_descriptor(self) -> list[int]:
+            raise OSError("get_report_descriptor failed")
+
+    device, told = Device(), []
+    device.send("0200")
+    devices = {INFINITY.path: device, PCSENSOR.path: Mute()}
+    found = learn(
+        threading.Event(), lambda: [PCSENSOR, INFINITY], lambda i: devices[i.path], told.extend
+    )
+    assert found == Learned(INFINITY, 1)
+    assert told == ["PCsensor FootSwitch cannot be listened to: get_report_descriptor failed"]
 
 
 def test_where_nothing_can_be_learned_it_is_said_why() -> None:
