@@ -134,7 +134,8 @@ class UvcCamera(Camera):
         self.bit_depth = self._choose_format()
         exposure, gain = query(self._number, EXPOSURE), query(self._number, GAIN)
         if exposure is not None:
-            self._set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
+            # Refused by one that has no automatic exposure.
+            self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
             exposure = Range(
                 exposure.lowest * EXPOSURE_UNIT_US, exposure.highest * EXPOSURE_UNIT_US
             )

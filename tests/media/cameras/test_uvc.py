@@ -27,7 +27,7 @@ YUYV = cv2.VideoWriter.fourcc(*"YUYV")
 class Driver:
     """Stands in for `cv2.VideoCapture` on Video4Linux, as its source has it."""
 
-    def __init__(self, *, grey: bool = True, opens: bool = True) -> None:
+    def __init__(self, *, grey: bool = True, opens: bool = True, automatic: bool = True) -> None:
         self.values = {
             cv2.CAP_PROP_FRAME_WIDTH: 640.0,
             cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
@@ -36,7 +36,7 @@ class Driver:
             cv2.CAP_PROP_GAIN: 4.0,
             cv2.CAP_PROP_FOURCC: float(YUYV),
         }
-        self.grey, self.opens = grey, opens
+        self.grey, self.opens, self.automatic = grey, opens, automatic
         self.plugged = self.whole = True
         self.silent = False
 
@@ -48,6 +48,8 @@ class Driver:
 
     def set(self, name: int, value: float) -> bool:
         if name == cv2.CAP_PROP_FOURCC and not (self.grey and value == GREY):
+            return False
+        if name == cv2.CAP_PROP_AUTO_EXPOSURE and not self.automatic:
             return False
         if name == cv2.CAP_PROP_FPS:
             value = min((10, 30, 60), key=lambda own: abs(own - value))
@@ -89,6 +91,11 @@ def test_what_it_can_be_set_to_comes_of_its_driver() -> None:
     # As the driver has it: 20 units of 100 µs, whole gains, the nearest rate.
     assert (found.exposure_us, found.gain_db, found.rate_hz) == (2000, 8, 60)
     assert found.region == (0, 0, 640, 480)
+
+
+def test_one_whose_exposure_is_never_automatic_is_opened_and_set() -> None:
+    with opened(Driver(automatic=False), exposure=Range(3, 2047)) as camera:
+        assert camera.apply(CameraSettings(exposure_us=2000)).exposure_us == 2000
 
 
 def test_one_without_controls_says_so() -> None:
