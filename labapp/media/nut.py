@@ -32,13 +32,28 @@ FFV1 = {"level": "3", "slices": "4", "slicecrc": "1", "g": "1", "context": "0"}
 class ByteFile(Protocol):
     """What is written to: a file without a buffer of its own."""
 
-    def write(self, content: bytes) -> int:
-        """Write it, or raise OSError."""
+    def write(self, content: memoryview) -> int:
+        """Write it or the beginning of it, and tell how many bytes; or raise OSError."""
         ...
 
     def close(self) -> None:
         """Let go of it."""
         ...
+
+
+class _Whole:
+    """A file that everything is written to: a disk that is nearly full takes a part at first."""
+
+    def __init__(self, file: ByteFile) -> None:
+        self._file = file
+        self.close = file.close
+
+    def write(self, content: bytes) -> int:
+        """Write all of it, or raise OSError."""
+        left = memoryview(content)
+        while left:
+            left = left[self._file.write(left) :]
+        return len(content)
 
 
 class NutWriter:
@@ -78,7 +93,7 @@ class NutWriter:
         file: ByteFile | None = None,
     ) -> None:
         self.frames = 0
-        self._file = _made(path) if file is None else file
+        self._file = _Whole(_made(path) if file is None else file)
         self._shape, self._top = shape, 2**bit_depth - 1
         self._dtype = np.uint8 if bit_depth <= 8 else np.uint16
         options = {"flush_packets": "1"}

@@ -154,16 +154,17 @@ def test_a_frame_that_would_not_be_kept_whole_is_refused(tmp_path: Path, image: 
 
 
 class FullDisk:
-    """A file on a disk with room for so much."""
+    """A file on a disk with room for so much: it takes what still fits, then nothing."""
 
     def __init__(self, path: Path, room: int) -> None:
         self.file, self.room = path.open("xb", buffering=0), room
 
-    def write(self, content: bytes) -> int:
-        if len(content) > self.room:
+    def write(self, content: memoryview) -> int:
+        if not self.room:
             raise OSError(errno.ENOSPC, "No space left on device")
-        self.room -= len(content)
-        return self.file.write(content)
+        written = self.file.write(content[: self.room])
+        self.room -= written
+        return written
 
     def close(self) -> None:
         self.file.close()

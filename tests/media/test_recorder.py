@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import errno
+import sys
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -25,17 +26,18 @@ RATE_HZ = 100.0
 class Disk:
     """A file that can be stalled, and refuse what is beyond its room."""
 
-    def __init__(self, path: Path, room: float = float("inf")) -> None:
+    def __init__(self, path: Path, room: int = sys.maxsize) -> None:
         self.file, self.room = path.open("xb", buffering=0), room
         self.goes = threading.Event()
         self.goes.set()
 
-    def write(self, content: bytes) -> int:
+    def write(self, content: memoryview) -> int:
         self.goes.wait()
-        if len(content) > self.room:
+        if not self.room:
             raise OSError(errno.ENOSPC, "No space left on device")
-        self.room -= len(content)
-        return self.file.write(content)
+        written = self.file.write(content[: self.room])
+        self.room -= written
+        return written
 
     def close(self) -> None:
         self.file.close()
