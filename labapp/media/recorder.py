@@ -19,7 +19,7 @@ from pathlib import Path
 from labapp.errors import InputError
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Kind, Say, Tally, silent
-from labapp.media.nut import Codec, NutWriter
+from labapp.media.nut import TICKS_HZ, Codec, NutWriter
 from labapp.words import several
 
 NOTES = ("time_s", "frame", "source", "kind", "what")
@@ -41,7 +41,7 @@ class Plan:
     before_s
         So much from before the trigger, s.
     after_s
-        So long after it, s; None: until it is stopped.
+        So long from the first frame after it on, s; None: until it is stopped.
     every
         Every n-th frame.
     codec
@@ -97,6 +97,9 @@ class Take:
         Why writing ended early; empty if it did not.
     finished
         Set when nothing more is written.
+    triggered_s, ends_s
+        When it was triggered and when it ends by itself, by the camera's clock, s; None: not known
+        yet, or never.
     """
 
     path: Path
@@ -105,6 +108,7 @@ class Take:
     trouble: str = ""
     finished: threading.Event = field(default_factory=threading.Event)
     triggered_s: float = 0.0
+    ends_s: float | None = None
 
     @property
     def summary(self) -> Event:
@@ -276,8 +280,10 @@ class Recorder:
     def _record(self, take: Take, frame: CameraFrame, size: int | None) -> list[tuple[Kind, str]]:
         """Queue a frame of the recording that runs; ``size`` None: there is no room for it."""
         told: list[tuple[Kind, str]] = []
-        after_s = self.plan.after_s
-        if after_s is not None and frame.time_s > take.triggered_s + after_s:
+        if take.ends_s is None and self.plan.after_s is not None:
+            # Not from the newest frame at the trigger on: the camera may have been away since.
+            take.ends_s = frame.time_s + self.plan.after_s
+        if take.ends_s is not None and frame.time_s > take.ends_s - 1 / TICKS_HZ:
             self._end(take)
             return told
         if take.trouble or size is None:

@@ -109,6 +109,16 @@ def test_it_records_until_it_is_stopped_and_every_third_frame(start: Start) -> N
         assert video.frame_rate_hz == pytest.approx(RATE_HZ / 3, rel=1e-3)
 
 
+def test_one_triggered_while_the_camera_is_away_begins_when_it_is_back(start: Start) -> None:
+    with start(after_s=0.2) as recorder:
+        for k in range(10):
+            recorder.take(frame(k))
+        take = recorder.trigger()
+        for k in range(6000, 6100):  # a minute later
+            recorder.take(frame(k))
+    assert numbers(take) == list(range(6000, 6020))
+
+
 def test_recordings_follow_each_other_in_files_of_their_own(start: Start) -> None:
     with start(before_s=0.05, after_s=0.1) as recorder:
         for k in range(100):
