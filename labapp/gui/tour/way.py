@@ -9,6 +9,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox, QTabBar, QToolButton
 
+from labapp.gui.pages.capture import CapturePage
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.plane import PlanePage
@@ -51,6 +52,7 @@ def go_through(hands: Hands, folder: Path) -> None:
     _laser(hands, files)
     _plane(hands, files)
     _record(hands, files)
+    _film(hands)
     _measure(hands)
     _surface(hands)
     _compare(hands)
@@ -144,6 +146,22 @@ def _record(hands: Hands, files: Path) -> None:
     hands.press("Import")
     hands.picture("imported")
     hands.asked("import", lambda: hands.do("import"))
+
+
+def _film(hands: Hands) -> None:
+    """Watch the simulated camera and record from it; the session has a recording: it is a file."""
+    page = hands.on(CapturePage)
+    hands.press("Start")
+    view = page.live_view
+    hands.wait(lambda: view.updates > 20 and page.exposure.isVisible(), "live frames")
+    hands.wait(lambda: view.ring.value() == 100, "the seconds before a trigger")
+    hands.picture("live")
+    hands.press("● Record")
+    hands.wait(lambda: view.live and view.live.takes[0].frames > 150, "frames to be recorded")
+    hands.picture("recording")
+    hands.press("■ End the recording")
+    hands.press("Stop the camera")
+    hands.settle()
 
 
 def _measure(hands: Hands) -> None:
