@@ -220,6 +220,9 @@ def measure(
         Literal["auto", "S/S", "S/I", "I/I"] | None,
         typer.Option(help="From now on: order of columns/rows of dots to that of rays."),
     ] = None,
+    warm: Annotated[
+        bool, typer.Option("--warm", help="Measure each frame from the one before, much faster.")
+    ] = False,
 ) -> None:
     """Measure frames: those that are not measured yet or whose measures no longer stand.
 
@@ -241,7 +244,7 @@ def measure(
         if not chosen:
             typer.echo("Nothing to measure: the measures of all frames stand (--all: once more)")
             return
-        summary = measure_frames(session, chosen)
+        summary = measure_frames(session, chosen, warm=warm)
     typer.echo(summary.text())
     if not summary.statuses["ok"]:
         raise typer.Exit(NOTHING)

@@ -103,7 +103,7 @@ def choose_frames(session: Session, text: str) -> list[int]:
     return chosen
 
 
-def measure_frames(session: Session, frames: Sequence[int]) -> Summary:
+def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = False) -> Summary:
     """Measure frames of a session, showing progress and failures on stderr.
 
     Ctrl-C ends the program; what was finished is kept.
@@ -114,7 +114,7 @@ def measure_frames(session: Session, frames: Sequence[int]) -> Summary:
     with progress_bar() as progress:
         task = progress.add_task(session.path.name, total=len(frames))
         try:
-            for frame, measurement in session.measure(frames):
+            for frame, measurement in session.measure(frames, warm=warm):
                 summary.add(frame, None, measurement)
                 progress.advance(task)
                 if measurement.status != "ok":

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,10 +19,11 @@ from pathlib import Path
 import cv2
 from threadpoolctl import ThreadpoolController
 
-from labapp.core.pipeline import Measurement, Settings
+from labapp.core.correction import Correction
+from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.warm import WarmChain
 from labapp.errors import InputError
-from labapp.media import FrameSource, open_source
+from labapp.media import Frame, FrameSource, open_source
 from labapp.session.results import ResultsWriter
 from labapp.session.run import measuring_pool
 from labapp.session.setup import Setup
@@ -133,6 +134,36 @@ def follow_frames(
     for told in measure_sequence(Job(path, index, setup, settings), frames):
         results.write(told.frame, told.time_s, told.measurement, told.rows)
         yield told.frame, told.time_s, told.measurement
+
+
+def follow_each(
+    frames: Iterable[int],
+    read: Callable[[int], Frame],
+    setup: Setup,
+    settings: Settings,
+    correction: Callable[[int], Correction | None],
+) -> Iterator[tuple[int, float | None, Measurement]]:
+    """Measure frames as `run.measure_each` does, but each from the one before, and here.
+
+    A frame that was corrected by hand is measured as it was corrected.
+    """
+    threads, chain = ThreadpoolController(), WarmChain(setup.rig, setup.calibration, settings)
+    for place, number in enumerate(frames):
+        if place % STRETCH == 0:
+            chain = WarmChain(setup.rig, setup.calibration, settings)
+        try:
+            frame = read(number)
+        except InputError as error:
+            yield number, None, Measurement("unreadable", str(error), settings.scheme)
+            continue
+        corrected = correction(number)
+        with threads.limit(limits=1, user_api="blas"):
+            if corrected is None:
+                measurement = chain.measure(frame.image)
+            else:
+                bench = (setup.rig, setup.calibration, settings)
+                measurement = measure(frame.image, *bench, corrected)
+        yield number, frame.time_s, measurement
 
 
 def _begun(pool: Executor, job: Job, stretch: Sequence[int]) -> deque[Future[list[Told]]]:

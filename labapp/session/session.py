@@ -35,6 +35,7 @@ from labapp.session.measured import Basis, Overview, Result, Results, scheme_nam
 from labapp.session.overviews import Overviews
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.run import measure_each
+from labapp.session.sequence import follow_each
 from labapp.session.setup import Setup, parse_setup, updated_setup
 from labapp.session.signals import Signals
 
@@ -345,7 +346,11 @@ class Session:
     # --- what was measured ------------------------------------------------------------------
 
     def measure(
-        self, frames: Iterable[int] | None = None, pool: Executor | None = None
+        self,
+        frames: Iterable[int] | None = None,
+        pool: Executor | None = None,
+        *,
+        warm: bool = False,
     ) -> Iterator[tuple[int, Measurement]]:
         """Measure frames and keep what they give; yields (frame, measurement) once it is kept.
 
@@ -357,6 +362,8 @@ class Session:
             Which ones; None: those not measured yet, or measured from what was changed since.
         pool
             Processes to measure in (`run.measuring_pool`); None: here.
+        warm
+            Whether to measure each frame from the one before (`core.warm`), here.
 
         Raises
         ------
@@ -373,9 +380,9 @@ class Session:
             return corrections.setdefault(number, self.correction(number))
 
         numbers = (int(number) for number in chosen)
-        for number, _, measurement in measure_each(
-            numbers, self.frame, basis.setup, basis.settings, correction, pool
-        ):
+        given = (numbers, self.frame, basis.setup, basis.settings, correction)
+        measured = follow_each(*given) if warm else measure_each(*given, pool)
+        for number, _, measurement in measured:
             # What it was measured with, whatever has been corrected meanwhile.
             used = corrections.pop(number, None)
             self._results.put(

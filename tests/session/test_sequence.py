@@ -12,12 +12,14 @@ import pytest
 from typer.testing import CliRunner
 
 from labapp.cli import app
-from labapp.core.pipeline import Settings
+from labapp.core.pipeline import Settings, start_correction
 from labapp.session import sequence
 from labapp.session.benchmark import SCENARIO
+from labapp.session.record import Record
 from labapp.session.results import ResultsWriter
 from labapp.session.scenario import read_scenario
 from labapp.session.sequence import Job, Told, measure_sequence
+from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from labapp.session.simulate import simulate
 
@@ -91,3 +93,22 @@ def test_the_benchmark_measures_every_frame_and_no_label_wrong(tmp_path: Path) -
     assert "100.00 % of the frames" in result.output
     assert "wrong labels            0;" in result.output
     assert (tmp_path / "oscillating_40.avi").exists()
+
+
+def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
+    job: Job, tmp_path: Path
+) -> None:
+    with Session.create(tmp_path / "one.labsession", Record(title="a pool that swings")) as session:
+        session.set_setup(job.setup.text)
+        session.import_recording(job.path)
+        first = dict(session.measure([0, 1, 2], warm=True))
+        assert [one.status for one in first.values()] == ["ok"] * 3
+        assert first[1].measures == told_here(job)[1].measurement.measures
+        session.correct({1: start_correction(first[1])}, "as it is")
+        again = dict(session.measure([0, 1, 2], warm=True))
+        assert again[1].correction is not None
+        assert again[2].status == "ok"
+
+
+def told_here(job: Job) -> list[Told]:
+    return list(measure_sequence(job, range(3), 0))
