@@ -354,9 +354,13 @@ class Recorder:
             try:
                 video.do(item)
             except Exception as error:
-                self._give_up(take, error)
-                if item is None:
-                    take.finished.set()
+                if isinstance(item, CameraFrame):
+                    with self._turn:
+                        take.lost += 1
+                if not take.trouble:
+                    self._give_up(take, error)
+            if item is None:
+                take.finished.set()
             self._forget(item, take)
 
     def _new_video(self, take: Take, shape: tuple[int, int]) -> NutWriter:
@@ -378,9 +382,6 @@ class Recorder:
 
     def _give_up(self, take: Take, error: Exception) -> None:
         """Say why no more of a recording can be written; what is there stays."""
-        if take.trouble:
-            take.lost += 1
-            return
         if not isinstance(error, OSError | InputError):
             logging.getLogger("labapp").exception("recording %s", take.path)
         reason = error.strerror if isinstance(error, OSError) else error
@@ -405,13 +406,10 @@ class _Video:
         if isinstance(item, CameraFrame):
             self._write(item)
         elif item is None:
-            try:
-                self._note_early()
-                if self._video is not None:
-                    self._note(_Note(self._last_s, self.take.summary))
-                    self._video.close()
-            finally:
-                self.take.finished.set()
+            self._note_early()
+            if self._video is not None:
+                self._note(_Note(self._last_s, self.take.summary))
+                self._video.close()
         elif self._video is None:
             self._early.append(item)
         else:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from labapp.errors import InputError
-from labapp.media import open_source
+from labapp.media import GreyImage, open_source
 from labapp.media.cameras import CameraFrame, Faults, Feed, SimulatedDevice, feed
 from labapp.media.events import Event
 from labapp.media.nut import NutWriter
@@ -224,6 +224,26 @@ def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: 
     with open_source(tmp_path / "disk.nut") as video:
         assert [number_in(each.image) for each in video] == list(range(take.frames))
     assert f"what was written is whole: {take.frames} frames" in heard.words()
+
+
+@pytest.mark.parametrize("marks", [0, 4])
+def test_what_a_broken_disk_loses_is_counted(start: Start, marks: int) -> None:
+    class Breaking(NutWriter):
+        def write(self, image: GreyImage, time_s: float) -> None:
+            if self.frames == 5:
+                raise OSError(errno.EIO, "Input/output error")
+            super().write(image, time_s)
+
+    with start(writer=Breaking) as recorder:
+        take = recorder.trigger()
+        for k in range(50):
+            recorder.take(frame(k))
+        wait_until(lambda: recorder.waiting_mb == 0)
+        for _ in range(marks):
+            recorder.note(Event("pedal", "note", "mark"))
+    assert (take.frames, take.lost) == (5, 45)
+    assert take.trouble == "cannot be written: Input/output error"
+    assert notes(take)[-1]["what"] == "5 frames recorded, 45 lost"
 
 
 def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
