@@ -350,7 +350,7 @@ class Recorder:
                     break
                 take, item = self._queue.popleft()
             if video is None or video.take is not take:
-                video = _Video(take, self._new_video)
+                video = _Video(take, self._new_video, self._say)
             try:
                 video.do(item)
             except Exception as error:
@@ -393,9 +393,13 @@ class Recorder:
 class _Video:
     """A recording's files while they are written."""
 
-    def __init__(self, take: Take, opened: Callable[[Take, tuple[int, int]], NutWriter]) -> None:
+    def __init__(
+        self, take: Take, opened: Callable[[Take, tuple[int, int]], NutWriter], say: Say
+    ) -> None:
         self.take = take
         self._opened = opened
+        self._say = say
+        self._has_notes = True
         self._video: NutWriter | None = None
         self._early: list[_Note] = []
         """Notes from before the first frame, whose time they are told by."""
@@ -406,10 +410,13 @@ class _Video:
         if isinstance(item, CameraFrame):
             self._write(item)
         elif item is None:
-            self._note_early()
-            if self._video is not None:
-                self._note(_Note(self._last_s, self.take.summary))
-                self._video.close()
+            try:
+                self._note_early()
+                if self._video is not None:
+                    self._note(_Note(self._last_s, self.take.summary))
+            finally:
+                if self._video is not None:
+                    self._video.close()
         elif self._video is None:
             self._early.append(item)
         else:
@@ -433,14 +440,21 @@ class _Video:
             self._note(note)
 
     def _note(self, note: _Note) -> None:
-        began = not self.take.notes.exists()
+        """Add a row to the notes; the video goes on where that cannot be, which is said once."""
         time_s = note.time_s - self._first_s
         event = note.event
         row = (f"{time_s:.6f}", self.take.frames, event.source, event.kind, event.words)
         text = io.StringIO(newline="")
-        csv.writer(text, lineterminator="\n").writerows([NOTES, row] if began else [row])
-        with self.take.notes.open("a", encoding="utf-8", newline="") as file:
-            file.write(text.getvalue())
+        try:
+            began = not self.take.notes.exists()
+            csv.writer(text, lineterminator="\n").writerows([NOTES, row] if began else [row])
+            with self.take.notes.open("a", encoding="utf-8", newline="") as file:
+                file.write(text.getvalue())
+        except OSError as error:
+            if self._has_notes:
+                self._has_notes = False
+                words = f"not all notes can be written beside it: {error.strerror}"
+                self._say(Event(self.take.path.name, "warning", words))
 
 
 def recording_path(folder: Path, stem: str) -> Path:

@@ -226,6 +226,21 @@ def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: 
     assert f"what was written is whole: {take.frames} frames" in heard.words()
 
 
+def test_notes_that_cannot_be_written_end_no_video_and_are_said_once(start: Start) -> None:
+    heard = Heard()
+    with start(heard.append) as recorder:
+        take = recorder.trigger()
+        take.notes.mkdir()
+        for k in range(30):
+            recorder.take(frame(k))
+            recorder.note(Event("pedal", "note", "mark"))
+    assert numbers(take) == list(range(30))
+    assert (take.frames, take.lost, take.trouble) == (30, 0, "")
+    assert heard.words().count("not all notes can be written beside it: Is a directory") == 1
+    with open_source(take.path) as video:
+        assert not video.warnings  # it was ended as it should be
+
+
 @pytest.mark.parametrize("marks", [0, 4])
 def test_what_a_broken_disk_loses_is_counted(start: Start, marks: int) -> None:
     class Breaking(NutWriter):
