@@ -41,6 +41,10 @@ class ByteFile(Protocol):
         ...
 
 
+class WrongFrame(ValueError):
+    """A frame is not as the video's are, and was left out; the next may be."""
+
+
 class _Whole:
     """A file that everything is written to: a disk that is nearly full takes a part at first."""
 
@@ -130,11 +134,11 @@ class NutWriter:
         ------
         OSError
             If it cannot be written: frames before it are whole.
-        ValueError
+        WrongFrame
             If it is of another shape or has levels of more bits.
         """
         if image.shape != self._shape or image.dtype != self._dtype or image.max() > self._top:
-            raise ValueError(f"a frame of {image.shape}, {image.dtype}, up to {image.max()}")
+            raise WrongFrame(f"a frame of {image.shape}, {image.dtype}, up to {image.max()}")
         levels = np.ascontiguousarray(image)
         frame = av.VideoFrame.from_ndarray(levels, format=self._format)
         self._last = max(self._last + 1, round(time_s * TICKS_HZ))

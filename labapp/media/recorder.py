@@ -19,7 +19,7 @@ from pathlib import Path
 from labapp.errors import InputError
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Kind, Say, Tally, silent
-from labapp.media.nut import TICKS_HZ, Codec, NutWriter
+from labapp.media.nut import TICKS_HZ, Codec, NutWriter, WrongFrame
 from labapp.words import several
 
 NOTES = ("time_s", "frame", "source", "kind", "what")
@@ -92,7 +92,7 @@ class Take:
     frames
         Written so far.
     lost
-        Left out for want of room in memory, or of a disk.
+        Left out for want of room in memory, or of a disk; or not as the others are.
     trouble
         Why writing ended early; empty if it did not.
     finished
@@ -357,7 +357,9 @@ class Recorder:
                 if isinstance(item, CameraFrame):
                     with self._turn:
                         take.lost += 1
-                if not take.trouble:
+                if isinstance(error, WrongFrame):
+                    video.wrong.add()
+                elif not take.trouble:
                     self._give_up(take, error)
             if item is None:
                 take.finished.set()
@@ -397,6 +399,8 @@ class _Video:
         self, take: Take, opened: Callable[[Take, tuple[int, int]], NutWriter], say: Say
     ) -> None:
         self.take = take
+        self.wrong = Tally(self._tell_wrong)
+        """Frames that are not as the others are."""
         self._opened = opened
         self._say = say
         self._has_notes = True
@@ -411,13 +415,14 @@ class _Video:
             self._write(item)
         elif item is None:
             try:
+                self.wrong.flush(now=True)
                 self._note_early()
                 if self._video is not None:
                     self._note(_Note(self._last_s, self.take.summary))
             finally:
                 if self._video is not None:
                     self._video.close()
-        elif self._video is None:
+        elif not self.take.frames:
             self._early.append(item)
         else:
             self._note(item)
@@ -428,11 +433,20 @@ class _Video:
         if self._video is None:
             rows, columns = frame.image.shape
             self._video = self._opened(self.take, (rows, columns))
+        if not self.take.frames:
             self._first_s = frame.time_s
-            self._note_early()
         self._video.write(frame.image, frame.time_s - self._first_s)
+        self._note_early()
+        self.wrong.flush()
         self.take.frames += 1
         self._last_s = frame.time_s
+
+    def _tell_wrong(self, count: int) -> None:
+        frames = several(count, "frame")
+        words = f"{frames} left out: of another size, or brighter than the camera's bits allow"
+        event = Event(self.take.path.name, "loss", words)
+        self._say(event)
+        self.do(_Note(self._last_s, event))
 
     def _note_early(self) -> None:
         early, self._early = self._early, []

@@ -226,6 +226,25 @@ def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: 
     assert f"what was written is whole: {take.frames} frames" in heard.words()
 
 
+def test_frames_that_are_not_as_the_others_are_left_out_and_said(tmp_path: Path) -> None:
+    heard = Heard()
+    wrong = {0: (24, 32), 7: (24, 32), 8: (12, 32)}
+    with Recorder(lambda: tmp_path / "run.nut", Plan(), 12, RATE_HZ, heard.append) as recorder:
+        take = recorder.trigger()
+        for k in range(30):
+            levels = 5000 if k in wrong else 100 + k  # of 4095
+            image = np.full(wrong.get(k, (24, 32)), levels, np.uint16)
+            recorder.take(CameraFrame(k, k / RATE_HZ, 0.0, image))
+    assert (take.frames, take.lost, take.trouble) == (27, 3, "")
+    with open_source(take.path) as video:
+        found = [int(each.image[0, 0]) - 100 for each in video]
+        assert found == [k for k in range(30) if k not in wrong]
+        assert [video.frame(k).time_s for k in (0, 5, 6)] == pytest.approx([0, 0.05, 0.08])
+    told = [each.words for each in heard if "left out: of another size" in each.words]
+    assert sum(int(words.split()[0]) for words in told) == 3
+    assert [row["what"] for row in notes(take) if row["what"] in told] == told
+
+
 def test_notes_that_cannot_be_written_end_no_video_and_are_said_once(start: Start) -> None:
     heard = Heard()
     with start(heard.append) as recorder:
