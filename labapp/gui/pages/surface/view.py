@@ -52,7 +52,7 @@ LOOKS: dict[Direction, tuple[str, str]] = {
     "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
 }
 
-LEAST_PLAN_WIDTH = 140
+LEAST_PLAN_WIDTH = 100
 """In a narrow window the section's fields would leave it less, too little to drag the line."""
 
 CHARTS_SOON_MS = 20
