@@ -203,14 +203,14 @@ class Recorder:
             self._newest_s = frame.time_s
             if frame.number % self.plan.every or self._closing:
                 return
-            size = frame.image.nbytes + FRAME_BYTE
+            size = _size(frame)
             while self._ring and (
                 self._ring[0].time_s < frame.time_s - self.plan.before_s
                 or self._held_byte + size > self._memory_byte
             ):
                 if self._ring[0].time_s >= frame.time_s - self.plan.before_s:
                     told += self._ring_is_short(frame)
-                self._held_byte -= self._ring.popleft().image.nbytes + FRAME_BYTE
+                self._held_byte -= _size(self._ring.popleft())
             running = self._running
             has_room = self._held_byte + size <= self._memory_byte
             if running is None and has_room and self.plan.before_s > 0:
@@ -228,9 +228,11 @@ class Recorder:
         Raises
         ------
         InputError
-            If there is a file of that name already.
+            If there is a file of that name already, or the recorder was closed.
         """
         with self._turn:
+            if self._closing:
+                raise InputError("recording", "trigger", "closed", "one before it is closed")
             if self._running is not None:
                 return self._running
             path = self._apart(self._place())
@@ -265,6 +267,10 @@ class Recorder:
         self.stop()
         with self._turn:
             self._closing = True
+            if self._running is not None:  # triggered meanwhile
+                self._end(self._running)
+            self._held_byte -= sum(_size(frame) for frame in self._ring)
+            self._ring.clear()
             self._turn.notify()
         self._thread.join()
         self._lost.flush(now=True)
@@ -373,7 +379,7 @@ class Recorder:
         caught_up = False
         with self._turn:
             if isinstance(item, CameraFrame):
-                self._held_byte -= item.image.nbytes + FRAME_BYTE
+                self._held_byte -= _size(item)
             if self._is_behind and self._held_byte < self._memory_byte / 8:
                 self._is_behind, caught_up = False, True
         if caught_up:
@@ -390,6 +396,11 @@ class Recorder:
         take.trouble = f"cannot be written: {reason}"
         words = f"{take.trouble}; what was written is whole: {several(take.frames, 'frame')}"
         self._say(Event(take.path.name, "loss", words))
+
+
+def _size(frame: CameraFrame) -> int:
+    """What a frame takes in memory, bytes."""
+    return frame.image.nbytes + FRAME_BYTE
 
 
 class _Video:

@@ -150,6 +150,18 @@ def test_marks_and_what_happened_are_kept_beside_it(start: Start) -> None:
     assert int(found[1]["frame"]) == 5
 
 
+def test_a_recorder_that_is_closed_holds_no_frames_and_begins_nothing(start: Start) -> None:
+    with start(before_s=1) as recorder:
+        for k in range(50):
+            recorder.take(frame(k))
+        assert recorder.waiting_mb > 0.04
+    assert recorder.waiting_mb == 0
+    assert not recorder._ring
+    with pytest.raises(InputError, match="recording: trigger: closed"):
+        recorder.trigger()
+    assert not recorder.takes
+
+
 def test_a_stalled_disk_loses_nothing_that_memory_has_room_for(
     start: Start, tmp_path: Path
 ) -> None:
