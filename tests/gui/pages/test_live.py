@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,18 +13,19 @@ import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QAbstractButton, QApplication
+from PySide6.QtWidgets import QAbstractButton, QApplication, QLabel
 from pytestqt.qtbot import QtBot
 
-from labapp.core.detection import DotSettings
+from labapp.core.pipeline import Settings
 from labapp.gui.pages.capture import live_view
-from labapp.gui.pages.capture.live import SIMULATED, Live, choices
+from labapp.gui.pages.capture.live import SIMULATED, Live, choices, figures
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.window import MainWindow
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import CameraInfo, CameraSettings, Faults, SimulatedDevice
 from labapp.media.recorder import Plan
 from labapp.session.session import Session
+from labapp.session.setup import read_setup
 from labapp.session.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
 from tests.gui.conftest import SAMPLES
 from tests.gui.hand import Hand
@@ -61,7 +63,7 @@ def live(tmp_path: Path) -> Iterator[Live]:
         lambda: tmp_path / f"run{next(names)}.nut",
         Plan(before_s=0.2),
         CameraSettings(rate_hz=200.0),
-        DotSettings(),
+        Settings(),
     )
     yield made
     made.close()
@@ -179,6 +181,33 @@ def test_another_plan_holds_from_then_on(live: Live):
     assert 4 <= len(numbers) <= 8
 
 
+def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
+    assert not live.measures
+    assert figures(None)[0].texts == ("Width", "–", "", "mm")
+    folder = SAMPLES / "gtaw"
+    with open_source(folder / "recording.avi") as video:
+        images = [video.frame(k).image for k in range(2)]
+    setup = read_setup(folder / "setup.toml")
+    with_setup = Live("test", live._place, Plan(), CameraSettings(), Settings(), setup)
+    device = SimulatedDevice("test", lambda k: images[k % 2], rate_hz=20)
+    try:
+        with_setup.open(device.open)
+        assert with_setup.measures
+        found = []
+        wait_until(lambda: bool(found.append(with_setup.measured()) or found[-1]), 120)
+    finally:
+        with_setup.close()
+    measured = found[-1]
+    assert measured.status == "ok"
+    assert measured.quality.reference
+    width, length, height = figures(measured)
+    with (folder / "truth.csv").open() as file:
+        truth = list(csv.DictReader(file))[:2]
+    for row, name in ((width, "width_mm"), (length, "length_mm"), (height, "height_mm")):
+        either = [abs(row.value - float(true[name])) for true in truth]
+        assert min(either) < max(5 * row.sigma, 0.02 * row.value), row
+
+
 def test_the_cameras_to_choose_from():
     found = [CameraInfo("uvc:0", "Microscope", "USB video")]
     assert choices(found) == [
@@ -279,6 +308,25 @@ def test_start_record_and_import_by_mouse_and_keys(
     qtbot.waitUntil(lambda: "of the session" in page.title.text())
     assert not view.bar.isVisible()
     assert view.start_button.isVisible()
+
+
+def test_large_figures_where_the_set_up_is_complete(
+    window: MainWindow, page: CapturePage, device: SimulatedDevice, qtbot: QtBot
+):
+    with open_source(SAMPLES / "gtaw" / "recording.avi") as video:
+        image = video.frame(0).image
+    window.workspace.attempt(
+        lambda session: session.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
+    )
+    film = SimulatedDevice("pool", lambda _: image, rate_hz=20)
+    device.open = film.open  # type: ignore[method-assign]
+    start(page, qtbot)
+    view = page.live_view
+    assert view.figures.isVisible()
+    shown = view.figures.findChildren(QLabel)
+    qtbot.waitUntil(lambda: "Height" in [each.text() for each in shown], timeout=5_000)
+    qtbot.waitUntil(lambda: any("±" in each.text() for each in shown), timeout=120_000)
+    assert {"Width", "Length", "Height", "mm"} <= {each.text() for each in shown}
 
 
 def test_space_plays_where_no_camera_is_live(window: MainWindow, copy_sample, qtbot: QtBot):

@@ -15,20 +15,23 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.core.detection import DotSettings, find_dots
+from labapp.core.detection import find_dots
 from labapp.core.dots import Dots
-from labapp.core.pipeline import Measurement
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import UNMEASURED, Quality, judge_quality
 from labapp.core.quick_dots import Exposure, quick_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
+from labapp.gui.digits import ResultRow
 from labapp.gui.pages.capture.presenter import size_in_words
 from labapp.media import GreyImage
 from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
 from labapp.media.events import Event
 from labapp.media.recorder import Plan, Recorder, Take
+from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring, LiveMeasuringEnded
 from labapp.session.log import NAME
 from labapp.session.session import Session
+from labapp.session.setup import Setup
 from labapp.words import several
 
 SIMULATED = "simulated"
@@ -39,7 +42,7 @@ SHOW_S, LOOK_S = 0.025, 0.25
 
 IDLE_S = 0.005
 
-RATE_S = 1.0
+RATE_S = 2.0
 """The rate that is shown is that of so long."""
 
 STATES = {
@@ -105,12 +108,12 @@ class Live:
         Gives the file of a recording that begins.
     plan
         What is recorded.
-    settings
+    wanted
         What the camera is set to.
-    dots
-        How dots are looked for.
-    rays
-        How many the lens makes; None where not known.
+    settings
+        Of the measurement.
+    setup
+        Rig and image calibration that frames are measured by; None: they are only looked at.
 
     Attributes
     ----------
@@ -123,21 +126,25 @@ class Live:
         name: str,
         place: Callable[[], Path],
         plan: Plan,
-        settings: CameraSettings,
-        dots: DotSettings,
-        rays: int | None = None,
+        wanted: CameraSettings,
+        settings: Settings,
+        setup: Setup | None = None,
     ) -> None:
         self.name = name
         self.plan = plan
         self.takes: list[Take] = []
         self.feed: Feed | None = None
-        self._place, self._settings = place, settings
-        self._dots, self._rays = dots, rays
+        self._place, self._wanted = place, wanted
+        self._settings, self._setup = settings, setup
+        self._dots = settings.dots
+        self._measuring: LiveMeasuring | None = None
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._to_show: deque[CameraFrame] = deque(maxlen=1)
         self._to_judge: deque[CameraFrame] = deque(maxlen=1)
         self._newest: deque[Shown] = deque(maxlen=1)
         self._judged: deque[Looked] = deque(maxlen=1)
+        self._to_measure: deque[CameraFrame] = deque(maxlen=1)
+        self._measured: deque[LiveMeasurement] = deque(maxlen=1)
         self._recorders: list[Recorder] = []
         self._told: set[Path] = set()
         self._counted: deque[tuple[float, int]] = deque()
@@ -150,7 +157,8 @@ class Live:
             threading.Thread(target=self._work_on, args=given, name=f"live {given[0]}", daemon=True)
             for given in (
                 ("dots", self._to_show, self._find_quickly, SHOW_S),
-                ("judge", self._to_judge, self._judge, LOOK_S),
+                ("verdict", self._to_judge, self._judge, LOOK_S),
+                ("figures", self._to_measure, self._measure, SHOW_S),
             )
         ]
 
@@ -164,11 +172,14 @@ class Live:
         InputError, CameraError
             If it cannot be opened, or set so.
         """
-        feed = Feed(self.name, opened, self._take, self._say, self._settings)
+        feed = Feed(self.name, opened, self._take, self._say, self._wanted)
         with self._turn:
             if not self._closing.is_set():
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
+                if self._setup is not None:
+                    given = (self._setup, self._settings, feed.bit_depth)
+                    self._measuring = LiveMeasuring(*given)
                 for worker in self._workers:
                     worker.start()
                 return
@@ -180,6 +191,8 @@ class Live:
             self._closing.set()
         if self.feed is not None:
             self.feed.stop()
+            if self._measuring is not None:
+                self._measuring.close()
             for worker in self._workers:
                 worker.join()
         for recorder in self._recorders:
@@ -203,6 +216,7 @@ class Live:
             recorder.take(frame)
         self._to_show.append(frame)
         self._to_judge.append(frame)
+        self._to_measure.append(frame)
 
     def _say(self, event: Event) -> None:
         self._events.put(event)
@@ -229,6 +243,8 @@ class Live:
                 took_s = time.monotonic() - began_s
                 self._closing.wait(max(every_s - took_s, took_s))
         except Exception as error:
+            if self._closing.is_set() and isinstance(error, LiveMeasuringEnded):
+                return
             logging.getLogger(NAME).exception("live %s", what)
             words = f"a fault in the program has ended its {what}: {error!r}"
             self._events.put(Event(self.name, "warning", words))
@@ -255,7 +271,7 @@ class Live:
         dots = self._dots_in(frame.image, self._light)
         found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
         depth = None if self.feed is None else self.feed.bit_depth
-        quality = judge_quality(frame.image, found, depth, self._rays)
+        quality = judge_quality(frame.image, found, depth, rays_of(self._setup))
         self._frame_byte = frame.image.nbytes
         try:
             room_byte = shutil.disk_usage(self._place().parent).free
@@ -263,6 +279,10 @@ class Live:
             room_byte = None
         places = None if quick else _places_px(dots)
         self._judged.append(Looked(places, quality, room_byte))
+
+    def _measure(self, frame: CameraFrame) -> None:
+        if self._measuring is not None:
+            self._measured.append(self._measuring.measure(frame.image))
 
     # --- to look at ---------------------------------------------------------------------------
 
@@ -273,6 +293,15 @@ class Live:
     def looked(self) -> Looked | None:
         """What was found in the frame judged last; None if it was given already."""
         return self._judged.popleft() if self._judged else None
+
+    @property
+    def measures(self) -> bool:
+        """Whether frames are measured."""
+        return self._measuring is not None
+
+    def measured(self) -> LiveMeasurement | None:
+        """What the frame measured last gave; None if it was given already."""
+        return self._measured.popleft() if self._measured else None
 
     def events(self) -> list[Event]:
         """What has happened since it was asked last."""
@@ -388,13 +417,41 @@ def _places_px(dots: Dots | None) -> FloatArray:
     return np.zeros((0, 2)) if dots is None else dots.image_px
 
 
-def rays_of(session: Session) -> int | None:
-    """How many rays the lens of a session makes; None where the set-up is not complete."""
+def told_of(take: Take, why_kept: str) -> str:
+    """What became of a recording that is not imported."""
+    return (
+        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, make a new "
+        "session (Ctrl+N) and choose the file there"
+    )
+
+
+def rays_of(setup: Setup | None) -> int | None:
+    """How many rays the lens makes; None where the set-up is not complete."""
+    return None if setup is None else setup.rig.pattern.rows * setup.rig.pattern.columns
+
+
+def setup_of(session: Session) -> Setup | None:
+    """The set-up of a session; None where it is not complete."""
     try:
-        pattern = session.setup.rig.pattern
+        return session.setup
     except InputError:
         return None
-    return pattern.rows * pattern.columns
+
+
+def figures(found: LiveMeasurement | None) -> tuple[ResultRow, ...]:
+    """Width, length and height; of a hollow pool the depth."""
+    sizes = None if found is None else found.measures
+    hollow = sizes is not None and -sizes.depth_mm > sizes.height_mm
+    names = ("width", "length", "depth" if hollow else "height")
+    return tuple(
+        ResultRow(
+            name.capitalize(),
+            getattr(sizes, f"{name}_mm", None),
+            getattr(sizes, f"{name}_sigma_mm", None),
+            "mm",
+        )
+        for name in names
+    )
 
 
 def _lasting(seconds: float) -> str:

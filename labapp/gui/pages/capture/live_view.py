@@ -12,10 +12,11 @@ import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidget
 
+from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.gui.pages.capture.live import SIMULATED, Live, choices, rays_of
-from labapp.gui.pages.capture.parts import ExposureBars, button, headed, wrapped
+from labapp.gui.pages.capture.live import SIMULATED, Live, choices, figures, setup_of
+from labapp.gui.pages.capture.parts import ExposureBars, Figures, button, headed, wrapped
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.views.picture import PictureView
@@ -31,12 +32,15 @@ from labapp.media.cameras import (
     open_camera,
 )
 from labapp.media.events import Event
-from labapp.media.recorder import Plan, Take, recording_path
+from labapp.media.recorder import Plan, recording_path
 from labapp.session.session import Session
 from labapp.session.simulated_pool import pool_camera, simulated_pool
 
 TICK_MS = 33
 """The picture is renewed no more often; less often where that takes long."""
+
+FRESH_S = 2.0
+"""The verdict on a measured frame stands so long before that on one that was only looked at."""
 
 TELL_S = 0.2
 """Figures are renewed no more often."""
@@ -46,10 +50,8 @@ BEFORE_S = 2.0
 RING, RING_PX = "#2fd39b", 15
 """Round the dots that are found: a colour of the dots page; points of the screen."""
 
-BUTTON_PX = 44
-"""Least height of the buttons that are pressed in gloves."""
-
-RING_BAR_PX = 130
+BUTTON_PX, RING_BAR_PX = 44, 130
+"""Least height of the buttons that are pressed in gloves; width of the bar beside them."""
 
 SETTINGS = {
     "exposure_us": ("Exposure", "µs", 0, 100.0, "How long light is gathered for a frame"),
@@ -103,7 +105,7 @@ class LiveView(QObject):
         self._opening: Task | None = None
         self._finding: Task | None = None
         self._answers: list[tuple[str, float, Future[CameraSettings]]] = []
-        self._told_s = 0.0
+        self._told_s = self._measured_s = 0.0
         self._room_byte: int | None = None
         self._timer = QTimer(self)
         self._timer.setInterval(TICK_MS)
@@ -149,8 +151,8 @@ class LiveView(QObject):
             lambda: recording_path(folder, stem),
             self._plan(),
             CameraSettings(),
-            session.settings.dots,
-            rays_of(session),
+            session.settings,
+            setup_of(session),
         )
         opener = self._opener(chosen, session)
 
@@ -186,6 +188,9 @@ class LiveView(QObject):
         self._show_settings(live.feed.settings, live.feed.camera.limits)
         self._room_byte = None
         self._rings.setData([])
+        self._measured_s = 0.0
+        self.figures.setVisible(live.measures)
+        self.figures.show_rows(figures(None))
         self._rings.show()
         self._timer.start(TICK_MS)
         self._show_state()
@@ -270,9 +275,13 @@ class LiveView(QObject):
         if looked is not None:
             self._room_byte = looked.room_byte
             self._ring_dots(looked.dots_px)
-            quality = looked.quality
-            self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
-            self._exposure.show()
+            if time.monotonic() - self._measured_s > FRESH_S:
+                self._show_quality(looked.quality)
+        measured = live.measured()
+        if measured is not None:
+            self._measured_s = time.monotonic()
+            self.figures.show_rows(figures(measured))
+            self._show_quality(measured.quality)
         if time.monotonic() - self._told_s > TELL_S:
             self._tell_figures(live)
         self._hear(live)
@@ -281,6 +290,10 @@ class LiveView(QObject):
         wanted = max(TICK_MS, round(2 * took_ms))
         if abs(wanted - self._timer.interval()) > TICK_MS / 4:
             self._timer.setInterval(wanted)
+
+    def _show_quality(self, quality: Quality) -> None:
+        self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
+        self._exposure.show()
 
     def _ring_dots(self, dots_px: FloatArray | None) -> None:
         if dots_px is not None:
@@ -394,7 +407,9 @@ class LiveView(QObject):
         self.settings = QWidget()
         inner = QVBoxLayout(self.settings)
         inner.setContentsMargins(0, 0, 0, 0)
+        self.figures = Figures()
         self.counts = wrapped()
+        inner.addWidget(self.figures)
         inner.addWidget(self.counts)
         fields = FieldForm()
         self.fields: dict[str, NumberField] = {}
@@ -482,11 +497,3 @@ class LiveView(QObject):
             return False
         (self.trigger if key == Qt.Key.Key_Space else self.mark)()
         return True
-
-
-def told_of(take: Take, why_kept: str) -> str:
-    """What became of a recording that is not imported."""
-    return (
-        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, make a new "
-        "session (Ctrl+N) and choose the file there"
-    )

@@ -16,7 +16,8 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.dialogs import EVERYTHING, recordings
-from labapp.gui.pages.capture.live_view import LiveView, told_of
+from labapp.gui.pages.capture.live import told_of
+from labapp.gui.pages.capture.live_view import LiveView
 from labapp.gui.pages.capture.parts import ExposureBars, button, headed, whole, wrapped
 from labapp.gui.pages.capture.presenter import (
     Choice,
@@ -110,7 +111,7 @@ class CapturePage(Page):
         """How far the step is: a recording may be chosen that the session does not have yet."""
         session = self.workspace.session
         if self.live_view.live is not None:
-            return State(Mark.READY, "A camera is watched: Space records")
+            return State(Mark.READY, "A camera is watched: Space records, and ends the recording")
         if self.preview is None or session is None or session.recording is not None:
             return found
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")

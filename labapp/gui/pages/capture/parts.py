@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
     QFormLayout,
+    QGridLayout,
     QLabel,
     QProgressBar,
     QPushButton,
@@ -15,8 +16,12 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.core.exposure import Exposure
+from labapp.gui.digits import ResultRow
 from labapp.gui.pages.capture.presenter import bars
 from labapp.gui.views.fields import NumberField
+
+LARGE = 1.9
+"""A figure that is read from afar is so many times as large as others."""
 
 
 class ExposureBars(QWidget):
@@ -47,6 +52,38 @@ class ExposureBars(QWidget):
             widget.setAccessibleName(f"{bar.name}: {bar.words}")
             widget.setToolTip(bar.tip)
         self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
+
+
+class Figures(QWidget):
+    """Results in large figures, to be read from where the work is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._grid = QGridLayout(self)
+        self._grid.setContentsMargins(0, 0, 0, 0)
+        self._grid.setColumnStretch(1, 1)
+        self._labels: dict[tuple[int, int], QLabel] = {}
+
+    def show_rows(self, rows: Iterable[ResultRow]) -> None:
+        """Show a row for each: name, value, ± and unit."""
+        for row, result in enumerate(rows):
+            name, value, sigma, unit = result.texts
+            texts = (name, value, f"± {sigma}" if sigma else "", unit)
+            for column, text in enumerate(texts):
+                self._label(row, column).setText(text)
+
+    def _label(self, row: int, column: int) -> QLabel:
+        if (row, column) not in self._labels:
+            label = self._labels[row, column] = QLabel()
+            if column in (1, 2):
+                label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+            if column == 1:
+                font = label.font()
+                font.setPointSizeF(LARGE * font.pointSizeF())
+                font.setBold(True)
+                label.setFont(font)
+            self._grid.addWidget(label, row, column)
+        return self._labels[row, column]
 
 
 def headed(words: str) -> tuple[QWidget, QVBoxLayout]:

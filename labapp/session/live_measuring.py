@@ -1,0 +1,116 @@
+"""Frames of a live camera measured in a process of their own, each from the one before."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import CancelledError, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from threadpoolctl import ThreadpoolController
+
+from labapp.core.measures import Measures
+from labapp.core.pipeline import Settings
+from labapp.core.quality import Quality, judge_quality
+from labapp.core.warm import WarmChain
+from labapp.media import GreyImage
+from labapp.session.setup import Setup
+from labapp.simulation.parallel import NICE, begin_worker
+
+
+class LiveMeasuringEnded(Exception):
+    """The process has ended: it was closed, or something ended it."""
+
+
+@dataclass(frozen=True)
+class LiveMeasurement:
+    """What a live frame gave.
+
+    Parameters
+    ----------
+    status, reason
+        As in `pipeline.Measurement`.
+    quality
+        How fit the frame is to be measured.
+    measures
+        Sizes; None where it could not be measured.
+    """
+
+    status: str
+    reason: str
+    quality: Quality
+    measures: Measures | None
+
+
+class LiveMeasuring:
+    """Measures frames in one process; each call waits for its frame.
+
+    Parameters
+    ----------
+    setup
+        Rig and image calibration.
+    settings
+        Of the measurement.
+    bit_depth
+        Significant bits of a grey level.
+    """
+
+    def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        given = _Chain(setup, settings, bit_depth)
+        self._pool = ProcessPoolExecutor(
+            1, spawn, initializer=begin_worker, initargs=(NICE, _begin, given)
+        )
+
+    def measure(self, image: GreyImage) -> LiveMeasurement:
+        """Measure the next frame.
+
+        Raises
+        ------
+        LiveMeasuringEnded
+            If the process has ended.
+        """
+        try:
+            return self._pool.submit(_measured, image).result()
+        except (BrokenProcessPool, CancelledError, RuntimeError) as error:
+            raise LiveMeasuringEnded(str(error)) from error
+
+    def close(self) -> None:
+        """End the process, whatever it is at. Twice does no harm."""
+        for process in list((self._pool._processes or {}).values()):
+            process.terminate()
+        self._pool.shutdown(cancel_futures=True)
+
+
+class _Chain(NamedTuple):
+    """What the process measures by."""
+
+    setup: Setup
+    settings: Settings
+    bit_depth: int
+
+
+_measure: list[Callable[[GreyImage], LiveMeasurement]] = []
+"""In the process: what measures."""
+
+
+def _begin(given: _Chain) -> None:
+    setup, settings, depth = given
+    chain = WarmChain(setup.rig, setup.calibration, settings)
+    pattern = setup.rig.pattern
+
+    def measure(image: GreyImage) -> LiveMeasurement:
+        # The matrices are small: more threads than one get in each other's way.
+        with ThreadpoolController().limit(limits=1, user_api="blas"):
+            found = chain.measure(image)
+        quality = judge_quality(image, found, depth, pattern.rows * pattern.columns)
+        sizes = found.measures if found.status == "ok" else None
+        return LiveMeasurement(found.status, found.reason, quality, sizes)
+
+    _measure[:] = [measure]
+
+
+def _measured(image: GreyImage) -> LiveMeasurement:
+    return _measure[0](image)
