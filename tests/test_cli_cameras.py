@@ -83,6 +83,7 @@ def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None
         ((CAMERA,), "either --out or --session"),
         ((CAMERA, "--out", out, "--session", out), "either --out or --session"),
         ((CAMERA, "--session", tmp_path / "no.labsession"), "is not there"),
+        ((CAMERA, "--out", out.with_suffix(".avi")), "run.avi; expected a file that ends in .nut"),
         ((CAMERA, "--out", out, "--rate", "0"), "rate_hz: 0.0; expected from 0.1 to 10000"),
         ((CAMERA, "--out", out, "--exposure", "5"), "exposure_us: 5.0; expected nothing"),
         ((CAMERA, "--out", tmp_path / "there.nut"), "recording: is there already"),
@@ -93,7 +94,7 @@ def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None
         assert code == 2
         assert expected in said
         assert not told or told.startswith("0 frames")
-    assert not out.exists()
+    assert not list(tmp_path.glob("run*"))
     assert (tmp_path / "there.nut").read_text() == "mine"
 
 

@@ -108,6 +108,8 @@ def record(
 
     if (out is None) == (session is None):
         raise InputError("labapp record", "--out", out, "either --out or --session")
+    if out is not None and out.suffix.lower() != ".nut":
+        raise InputError("labapp record", "--out", out, "a file that ends in .nut")
     settings = CameraSettings(
         exposure_us=exposure, gain_db=gain, rate_hz=rate, region=region, trigger=trigger
     )

@@ -121,7 +121,7 @@ class Take:
     @property
     def notes(self) -> Path:
         """Table of what happened meanwhile: trigger, marks, frames lost (CSV)."""
-        return self.path.with_name(f"{self.path.stem}-notes.csv")
+        return _notes_of(self.path)
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class Recorder:
     Parameters
     ----------
     place
-        Gives the file of a recording that begins; must not be there yet.
+        Gives the file of a recording that begins; it and its notes must not be there yet.
     plan
         What is recorded.
     bit_depth, rate_hz
@@ -228,7 +228,7 @@ class Recorder:
         Raises
         ------
         InputError
-            If there is a file of that name already, or the recorder was closed.
+            If there is such a file, or its notes, already; or the recorder was closed.
         """
         with self._turn:
             if self._closing:
@@ -325,8 +325,9 @@ class Recorder:
             if path not in own:
                 break
             path = wanted.with_stem(f"{wanted.stem}-{number}")
-        if path.exists():
-            raise InputError(path, "recording", "is there already", "another name")
+        for there in (path, _notes_of(path)):
+            if there.exists():
+                raise InputError(there, "recording", "is there already", "another name")
         return path
 
     def _end(self, take: Take) -> None:
@@ -396,6 +397,10 @@ class Recorder:
         take.trouble = f"cannot be written: {reason}"
         words = f"{take.trouble}; what was written is whole: {several(take.frames, 'frame')}"
         self._say(Event(take.path.name, "loss", words))
+
+
+def _notes_of(path: Path) -> Path:
+    return path.with_name(f"{path.stem}-notes.csv")
 
 
 def _size(frame: CameraFrame) -> int:
@@ -486,7 +491,7 @@ def recording_path(folder: Path, stem: str) -> Path:
     """A file, not there yet, for a recording that begins now: its name ends in date and time."""
     begun = time.strftime("%Y-%m-%d-%H%M%S")
     path, count = folder / f"{stem}-{begun}.nut", 1
-    while path.exists():
+    while path.exists() or _notes_of(path).exists():
         count += 1
         path = folder / f"{stem}-{begun}-{count}.nut"
     return path

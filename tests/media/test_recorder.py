@@ -302,13 +302,14 @@ def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
     assert "No such file or directory" in take.trouble
 
 
-def test_a_file_that_is_there_is_not_written_over(tmp_path: Path) -> None:
-    (tmp_path / "mine.nut").write_text("mine")
+@pytest.mark.parametrize("name", ["mine.nut", "mine-notes.csv"])
+def test_a_file_that_is_there_is_not_written_over(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
     with Recorder(lambda: tmp_path / "mine.nut", Plan(), 8, RATE_HZ) as recorder:
-        with pytest.raises(InputError, match="is there already"):
+        with pytest.raises(InputError, match=f"{name}: recording: is there already"):
             recorder.trigger()
         assert recorder.running is None
-    assert (tmp_path / "mine.nut").read_text() == "mine"
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [(name, "mine")]
 
 
 @pytest.mark.parametrize(
