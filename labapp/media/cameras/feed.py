@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import queue
@@ -143,10 +144,13 @@ class Feed:
         -------
         Future
             What it is set to then. `InputError` or `CameraError` where it refuses: it goes on as
-            it was set before. A camera that is away is set when it is back.
+            it was set before. A camera that is away is set when it is back; of a feed that has
+            ended it is refused.
         """
         answer: Future[CameraSettings] = Future()
         self._asked.put((wanted, answer))
+        if self.state == "ended":
+            self._refuse_asked()
         return answer
 
     def stop(self) -> None:
@@ -193,8 +197,7 @@ class Feed:
                 tally.flush(now=True)
             self.state = "ended"
             self.camera.close()
-            while not self._asked.empty():
-                self._asked.get()[1].set_exception(CameraError(f"{self.name} is closed"))
+            self._refuse_asked()
 
     def _read_on(self) -> None:
         """Hand frames on until the camera is lost or the feed is to end."""
@@ -234,6 +237,11 @@ class Feed:
                 answer.set_result(settings)
             camera.start()
             self._connection = _Connection(camera)
+
+    def _refuse_asked(self) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._asked.get_nowait()[1].set_exception(CameraError(f"{self.name} is closed"))
 
     def _is_heard(self, silent_s: float) -> None:
         if self.state == "stalled":

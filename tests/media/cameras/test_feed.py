@@ -188,6 +188,13 @@ def test_it_ends_while_its_camera_is_away() -> None:
     assert running.state == "ended"
 
 
+def test_one_that_has_ended_refuses_to_be_set() -> None:
+    running = Feed("test", SimulatedDevice("test", numbered).open, lambda _: None)
+    running.stop()
+    with pytest.raises(CameraError, match="test is closed"):
+        running.apply(CameraSettings(rate_hz=10)).result(10)
+
+
 def test_a_fault_of_whoever_takes_frames_is_said_and_lets_go_of_the_camera() -> None:
     device = SimulatedDevice("test", numbered)
     heard = Heard()
