@@ -314,6 +314,17 @@ def light_of(image: Grey, size: float) -> Grey:
     return np.asarray(np.maximum(gauss(image, 0.5 * size) - gauss(image, 3.0 * size), 0.0))
 
 
+def _patches(light: Grey, u: IntArray, v: IntArray, margin: int) -> FloatArray:
+    """Squares round pixels, dark beyond the picture, shape (n, 2·margin + 1, 2·margin + 1)."""
+    step = np.arange(-margin, margin + 1)
+    rows, columns = v[:, None] + step, u[:, None] + step
+    height, width = light.shape
+    inside = [(at >= 0) & (at < n) for at, n in ((rows, height), (columns, width))]
+    rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
+    patches = light[rows[:, :, None], columns[:, None, :]].astype(float)
+    return np.asarray(patches * inside[0][:, :, None] * inside[1][:, None, :])
+
+
 def describe(
     light: Grey,
     band: Grey,
@@ -338,9 +349,7 @@ def describe(
         width = np.minimum(width, np.maximum(0.275 * nearest, 0.75))
     margin = int(np.ceil(2.2 * reach)) + 1
     across = np.arange(-margin, margin + 1.0)
-    framed = cv2.copyMakeBorder(light, *(margin,) * 4, cv2.BORDER_CONSTANT)
-    views = np.lib.stride_tricks.sliding_window_view(framed, (len(across), len(across)))
-    patches = views[v, u].astype(float)
+    patches = _patches(light, u, v, margin)
     offset = np.zeros((2, len(u)))
     for _ in range(4):
         pull = np.exp(-0.5 * ((across - offset[..., None]) / width[:, None]) ** 2)

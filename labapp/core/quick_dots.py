@@ -7,7 +7,7 @@ few pixels is worked out for these alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -23,7 +23,6 @@ from labapp.core.dots import (
     describe,
     estimate_size,
     first_of_each,
-    gauss,
     hot_scale,
     local_noise,
     peak_disc,
@@ -36,6 +35,41 @@ ROUND_PX2 = 0.25
 
 LEAST_PX2 = 0.8
 """A blur of less, px² of the smaller picture, is not taken of it."""
+
+
+class Pad:
+    """Pictures to work on. Made anew for every frame they would cost as much as the work."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.image, self.fine, self.narrow, self.wide, self.band = (
+            np.empty(shape, np.float32) for _ in range(5)
+        )
+        self.peak = np.empty(shape, np.uint8)
+        self._small: dict[int, tuple[Grey, Grey]] = {}
+
+    def blur(self, image: Grey, into: Grey, sigma: float) -> None:
+        """Blur by a Gaussian (`dots.gauss`)."""
+        cv2.GaussianBlur(image, (0, 0), sigma, dst=into, borderType=cv2.BORDER_REFLECT)
+
+    def widen(self, image: Grey, into: Grey, variance_px2: float) -> None:
+        """Blur by a Gaussian of some variance, by way of a smaller picture where it is wide."""
+        height, width = image.shape
+        scale = 1
+        while (
+            variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
+            and height % (2 * scale) == width % (2 * scale) == 0
+        ):
+            scale *= 2
+        if scale == 1:
+            self.blur(image, into, float(np.sqrt(variance_px2)))
+            return
+        shape = height // scale, width // scale
+        if scale not in self._small:
+            self._small[scale] = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        small, blurred = self._small[scale]
+        cv2.resize(image, shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
+        self.blur(small, blurred, float(np.sqrt(variance_px2 / scale**2 - ROUND_PX2)))
+        cv2.resize(blurred, (width, height), dst=into)
 
 
 WHOLE = 1.8
@@ -64,6 +98,11 @@ class Exposure:
     def __post_init__(self) -> None:
         freeze(self)
 
+    @cached_property
+    def pad(self) -> Pad:
+        """What its frames are worked on with, one at a time."""
+        return Pad(self.noise.shape)
+
     @classmethod
     def of(cls, frame: Image, settings: BandPassSettings) -> Exposure:
         """Take it from a frame, as `band_pass_dots` does."""
@@ -91,12 +130,14 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     CannotMeasure
         ``no-dots`` if nothing stands out of the noise.
     """
-    image = np.asarray(frame, np.float32)
-    size = exposure.size_px
-    fine = gauss(image, 0.5 * size)
-    narrow = gauss(fine, float(np.sqrt(0.8**2 - 0.5**2)) * size)
-    band = narrow - _widened(narrow, (1.6**2 - 0.8**2) * size**2)
-    u, v = _peaks(band, exposure.floor, size)
+    pad, size = exposure.pad, exposure.size_px
+    image, fine, narrow, wide, band = pad.image, pad.fine, pad.narrow, pad.wide, pad.band
+    np.copyto(image, frame, casting="unsafe")
+    pad.blur(image, fine, 0.5 * size)
+    pad.blur(fine, narrow, float(np.sqrt(0.8**2 - 0.5**2)) * size)
+    pad.widen(narrow, wide, (1.6**2 - 0.8**2) * size**2)
+    cv2.subtract(narrow, wide, dst=band)
+    u, v = _peaks(band, exposure.floor, size, pad)
     keep = _not_hot(image, band, u, v, size)
     u, v = u[keep], v[keep]
     if len(u) == 0:
@@ -105,35 +146,19 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     keep = bright >= settings.contrast * typical(bright)
     keep[keep] = first_of_each(u[keep], v[keep], size)
     u, v = u[keep], v[keep]
-    light = fine - _widened(narrow, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
-    np.maximum(light, 0.0, out=light)
+    pad.widen(narrow, wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
+    light = np.maximum(np.subtract(fine, wide, out=wide), 0.0, out=wide)
     return describe(light, band, exposure.noise, u, v, size, settings.speckle_px, WHOLE)
 
 
-def _widened(image: Grey, variance_px2: float) -> Grey:
-    """Blur by a Gaussian of the given variance, by way of a smaller picture where it is wide."""
-    height, width = image.shape
-    small, scale = image, 1
-    while (
-        variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
-        and height % (2 * scale) == width % (2 * scale) == 0
-    ):
-        scale *= 2
-        smaller = cv2.resize(image, (width // scale, height // scale), interpolation=cv2.INTER_AREA)
-        small = np.asarray(smaller, np.float32)
-    if scale == 1:
-        return gauss(image, float(np.sqrt(variance_px2)))
-    small = gauss(small, float(np.sqrt(variance_px2 / scale**2 - ROUND_PX2)))
-    return np.asarray(cv2.resize(small, (width, height)), np.float32)
-
-
-def _peaks(band: Grey, floor: Grey, size: float) -> tuple[IntArray, IntArray]:
+def _peaks(band: Grey, floor: Grey, size: float, pad: Pad) -> tuple[IntArray, IntArray]:
     """Columns and rows of the local maxima (`dots.local_maxima`): first among 3 × 3 pixels."""
-    highest = cv2.max(cv2.dilate(band, np.ones((3, 3), np.uint8)), floor)
-    peak = cv2.compare(band, highest, cv2.CMP_GE)
-    if not cv2.countNonZero(peak):
+    cv2.dilate(band, np.ones((3, 3), np.uint8), dst=pad.wide)
+    cv2.max(pad.wide, floor, dst=pad.wide)
+    cv2.compare(band, pad.wide, cv2.CMP_GE, dst=pad.peak)
+    if not cv2.countNonZero(pad.peak):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    u, v = np.asarray(cv2.findNonZero(peak)).reshape(-1, 2).T.astype(np.int64)
+    u, v = np.asarray(cv2.findNonZero(pad.peak)).reshape(-1, 2).T.astype(np.int64)
     disc = peak_disc(size).astype(bool)
     around = _patches(band, u, v, disc.shape[0] // 2)[:, disc]
     keep = (band[v, u] >= around.max(axis=1)) & (band[v, u] > floor[v, u])

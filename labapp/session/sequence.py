@@ -103,9 +103,9 @@ def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None
                 yield from _measured(job if at == 0 else None, stretch[at : at + BATCH])
         return
     with ExitStack() as at_end:
-        pools = [at_end.enter_context(measuring_pool(1)) for _ in range(workers)]
+        pools = [measuring_pool(1) for _ in range(workers)]
         for pool in pools:
-            at_end.callback(pool.shutdown, wait=False, cancel_futures=True)
+            at_end.callback(pool.shutdown, cancel_futures=True)
         begun: deque[deque[Future[list[Told]]]] = deque()
         waiting = iter(enumerate(stretches))
         begun += (_begun(pools[k % workers], job, s) for k, s in islice(waiting, workers))
