@@ -94,7 +94,7 @@ def record(
     ] = None,
     trigger: Annotated[
         Literal["free", "line"] | None,
-        typer.Option(help="By itself, or at a signal on the camera's input."),
+        typer.Option(help="By itself (free, the default), or at a signal on its input."),
     ] = None,
 ) -> None:
     """Record from a camera, without loss: docs/cameras.md.

@@ -135,31 +135,39 @@ class GenicamCamera(Camera):
             raise CameraError(f"{self.info.name} is running: stop it before it is set")
         check_settings(self.info, self.limits, replace(wanted, rate_hz=None))
         before = self.settings
-        self._set_picture(wanted)
-        if wanted.rate_hz is not None:
-            # How many frames there can be depends on their size and exposure.
-            self.limits = self._limits()
-            try:
-                check_settings(self.info, self.limits, CameraSettings(rate_hz=wanted.rate_hz))
-            except InputError:
-                self._set_picture(before)
-                self.limits = self._limits()
-                raise
-            self._ask("set_frame_rate", wanted.rate_hz)
-        if wanted.trigger == "free":
-            self._ask("clear_triggers")
-        elif wanted.trigger is not None:
-            self._ask("set_trigger", SOURCES[wanted.trigger])
-        self.limits = self._limits()
+        try:
+            self._set(wanted)
+        except (CameraError, InputError):
+            self._put_back(before, set(wanted.asked()))
+            raise
         return self.settings
 
-    def _set_picture(self, wanted: CameraSettings) -> None:
+    def _set(self, wanted: CameraSettings) -> None:
         if wanted.region is not None:
             self._ask("set_region", *wanted.region)
         if wanted.exposure_us is not None:
             self._ask("set_exposure_time", wanted.exposure_us)
         if wanted.gain_db is not None:
             self._ask("set_gain", wanted.gain_db)
+        if wanted.rate_hz is not None:
+            # How many frames there can be depends on their size and exposure.
+            self.limits = self._limits()
+            check_settings(self.info, self.limits, CameraSettings(rate_hz=wanted.rate_hz))
+            self._ask("set_frame_rate", wanted.rate_hz)
+        if wanted.trigger is not None and wanted.trigger != "free":
+            self._ask("set_trigger", SOURCES[wanted.trigger])
+        elif wanted.trigger is not None and len(self.limits.triggers) > 1:
+            self._ask("clear_triggers")
+        self.limits = self._limits()
+
+    def _put_back(self, before: CameraSettings, names: set[str]) -> None:
+        """Set what was changed as it was, each by itself; of one that is lost nothing can be."""
+        if "trigger" in names:
+            names.add("rate_hz")  # a trigger takes its place
+        for name in ("region", "exposure_us", "gain_db", "rate_hz", "trigger"):
+            if name in names:
+                with contextlib.suppress(CameraError, InputError):
+                    self._set(CameraSettings(**{name: getattr(before, name)}))
 
     def _limits(self) -> Limits:
         def span(name: str, feature: str) -> Range | None:

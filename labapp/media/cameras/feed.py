@@ -83,7 +83,8 @@ class Feed:
     say
         Called with what happens.
     settings
-        What the camera is set to whenever it was opened.
+        What the camera is set to whenever it was opened. Where no trigger is asked for it takes
+        frames by itself, whatever mode it was left in.
 
     Raises
     ------
@@ -104,7 +105,8 @@ class Feed:
         self._opened = opened
         self._take = take
         self._say = say
-        self._wanted = settings or CameraSettings()
+        wanted = settings or CameraSettings()
+        self._wanted = replace(wanted, trigger=wanted.trigger or "free")
         self._ending = threading.Event()
         self._asked: queue.SimpleQueue[tuple[CameraSettings, Future[CameraSettings]]]
         self._asked = queue.SimpleQueue()

@@ -144,6 +144,14 @@ def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:
         with pytest.raises(InputError, match=r"rate_hz: 1000000.0; expected from 0.1 to 1000 "):
             camera.apply(CameraSettings(exposure_us=900, region=(0, 0, 64, 64), rate_hz=1e6))
         assert camera.settings == found
+        # It has no Line1, and says so only when it was put in the mode that waits for it.
+        with pytest.raises(CameraError, match="Line1"):
+            camera.apply(
+                CameraSettings(
+                    exposure_us=900, gain_db=1, rate_hz=20, region=(0, 0, 64, 64), trigger="line"
+                )
+            )
+        assert camera.settings == found
         assert camera.apply(CameraSettings(trigger="software")).trigger == "software"
         with pytest.raises(CameraError, match="used by another program"):
             open_camera(ID)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,6 +130,17 @@ def test_a_camera_that_waits_for_a_trigger_does_not_stall() -> None:
         running.camera.trigger()
         wait_until(lambda: len(frames) == 1)
     assert not heard
+
+
+@pytest.mark.usefixtures("hasty")
+def test_a_camera_that_was_left_waiting_for_a_trigger_gives_frames() -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    device.settings = replace(device.settings, trigger="software")
+    frames: list[CameraFrame] = []
+    with Feed("test", device.open, frames.append, settings=CameraSettings(rate_hz=500)) as running:
+        wait_until(lambda: len(frames) > 10)
+        assert running.settings.trigger == "free"
+        assert running.settings.rate_hz == 500
 
 
 def test_it_is_set_between_two_frames_and_stays_so_when_it_comes_back(hasty: None) -> None:
