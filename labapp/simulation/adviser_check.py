@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from labapp.core.values import FloatArray, freeze
-from labapp.simulation.adviser import Advice
+from labapp.simulation.adviser import Advice, constraint_words
 from labapp.simulation.bench_limits import LaserPlace, Place
 from labapp.simulation.expected_pools import Sample
 from labapp.simulation.height_error import blocks, simulated_errors
@@ -67,6 +67,14 @@ class Check:
         """Mean error of the set-up of §8.3.1, over the pools that it can measure."""
         error = self.text[..., 0]
         return float(error[np.isfinite(error)].mean())
+
+    @property
+    def text_breaks(self) -> tuple[str, ...]:
+        """What the set-up of §8.3.1 does not keep, in words: its dots run into each other, say."""
+        angle, distance = TEXT_PLACE.projection_angle_deg, TEXT_PLACE.distance_mm
+        laser = LaserPlace(self.advice.expected, self.advice.limits, angle, distance)
+        margins = laser.margins(TEXT_PLACE)
+        return tuple(constraint_words(name, much) for name, much in margins.items() if much < 0)
 
     @property
     def off_prediction(self) -> float:
@@ -146,7 +154,8 @@ def check_text(found: Check) -> str:
         f"{100 * found.off_prediction:+.1f} % off the predicted "
         f"{micro * found.advice.error_mm:.2f} µm",
         f"set-up of §8.3.1: {micro * found.text_error_mm:.2f} µm"
-        + (f", {lost} times no surface" if lost else ""),
+        + (f", {lost} times no surface" if lost else "")
+        + "".join(f"; {words}" for words in found.text_breaks),
     ]
     if found.places:
         least = float(found.errors.min())

@@ -165,6 +165,14 @@ def test_fresh_pools_are_whole_and_as_well_measured_as_promised(checked: Check) 
     assert "6 fresh pools at 4 places each: 0 rays hidden, 0 off the plane" in check_text(checked)
 
 
+def test_what_the_texts_set_up_does_not_keep_is_said(checked: Check) -> None:
+    # There the dots of a hollow cross: exact ones are told apart, those of a frame are not.
+    hollow = ExpectedPools((5.0, 5.5), (5.5, 6.0), (0.25, 0.3), kind="concave")
+    other = replace(checked, advice=replace(checked.advice, expected=hollow, limits=BenchLimits()))
+    assert [words.split(":")[0] for words in other.text_breaks] == ["neighbouring dots apart"]
+    assert other.text_breaks[0] in check_text(other)
+
+
 def test_sweeps_tell_where_a_set_up_breaks(advice: Advice) -> None:
     names = {sweep.name: sweep for sweep in advice.sweeps}
     assert list(names) == ["projection_angle_deg", "distance_mm", "plane_mm", "s_mm", "h_mm"]
