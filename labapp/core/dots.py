@@ -353,9 +353,10 @@ def describe(
     offset = np.zeros((2, len(u)))
     for _ in range(4):
         pull = np.exp(-0.5 * ((across - offset[..., None]) / width[:, None]) ** 2)
-        weight = patches * pull[1][:, :, None] * pull[0][:, None, :]
-        total = weight.sum(axis=(1, 2)) + 1e-12
-        sums = weight.sum(axis=1), weight.sum(axis=2)
+        along_u = (pull[1][:, None] @ patches)[:, 0] * pull[0]
+        along_v = (patches @ pull[0][:, :, None])[:, :, 0] * pull[1]
+        total = along_u.sum(axis=1) + 1e-12
+        sums = along_u, along_v
         mean = np.stack([part @ across for part in sums]) / total
         # The window holds the mean back; half as much again brings it home in a few steps.
         offset = np.clip(offset + 1.5 * (mean - offset), -reach, reach)
