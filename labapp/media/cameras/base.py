@@ -115,6 +115,15 @@ class CameraSettings:
         found = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in found.items() if value is not None}
 
+    def in_words(self) -> str:
+        """What is not left as it is, for people: "exposure 800 µs, rate 200 frames/s"."""
+        told = []
+        for name, value in self.asked().items():
+            unit = NUMBERS.get(name)
+            shown = value if unit is None else f"{value:.6g} {unit}"
+            told.append(f"{name.partition('_')[0]} {shown}")
+        return ", ".join(told)
+
 
 @dataclass(frozen=True)
 class CameraFrame:

@@ -78,7 +78,8 @@ class Feed:
         Opens the camera: raises `CameraError` while it cannot.
     take
         Called with every frame, in the feed's thread: it must not wait. Frames are numbered from
-        0 on; numbers of frames that did not arrive are left out. `CameraFrame.time_s` is the time
+        0 on; numbers of frames that did not arrive are left out, and of those there was no time for
+        while the camera was set, as far as its rate tells. `CameraFrame.time_s` is the time
         since the first, by the camera's clock, and goes on when the camera is opened again.
     say
         Called with what happens.
@@ -117,6 +118,9 @@ class Feed:
         self._dropped = Tally(
             lambda n: self._tell("loss", f"{several(n, 'frame')} lost on the way")
         )
+        self._set_words = ""
+        """To be said when frames come again after a setting."""
+        self._arrived_s: float | None = None
         self._next = 0
         self._first_s: float | None = None
         self._last_s = 0.0
@@ -140,7 +144,9 @@ class Feed:
         return self.camera.bit_depth
 
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings]:
-        """Set the camera between two frames, now and whenever it is opened again.
+        """Set the camera between two frames, now and whenever it is opened again; this is said.
+
+        It gives no frames meanwhile, of some cameras for half a second.
 
         Returns
         -------
@@ -187,6 +193,7 @@ class Feed:
                 try:
                     self._read_on()
                 except CameraError as error:
+                    self._tell_set()
                     self._lost += 1
                     self.state = "lost"
                     self._tell("warning", f"{error}. Trying to get it back")
@@ -195,6 +202,7 @@ class Feed:
             logging.getLogger("labapp").exception("feed of %s", self.name)
             self._tell("loss", f"a fault in the program ended its pictures: {error!r}")
         finally:
+            self._tell_set()
             for tally in (self._broken, self._dropped):
                 tally.flush(now=True)
             self.state = "ended"
@@ -226,7 +234,8 @@ class Feed:
         """Set what was asked for meanwhile; numbers and times go on."""
         while not self._asked.empty():
             wanted, answer = self._asked.get()
-            camera = self.camera
+            self._tell_set()
+            camera, former = self.camera, self._connection
             camera.stop()
             try:
                 settings = camera.apply(wanted)
@@ -234,11 +243,24 @@ class Feed:
                 answer.set_exception(error)
                 if isinstance(error, CameraLost):
                     raise
+                words = "it could not be set, and goes on as it was"
             else:
                 self._wanted = replace(self._wanted, **wanted.asked())
                 answer.set_result(settings)
+                found = {name: getattr(settings, name) for name in wanted.asked()}
+                words = f"set to {CameraSettings(**found).in_words()}"
             camera.start()
             self._connection = _Connection(camera)
+            self._set_words = words
+            if former.is_free and self._connection.is_free and self._arrived_s is not None:
+                self._connection.former_hz = former.last_hz
+            else:
+                self._tell_set()
+
+    def _tell_set(self, more: str = "") -> None:
+        words, self._set_words = self._set_words, ""
+        if words:
+            self._tell("note", words + more)
 
     def _refuse_asked(self) -> None:
         with contextlib.suppress(queue.Empty):
@@ -251,11 +273,10 @@ class Feed:
             self._tell("note", f"frames come again, after {silent_s:.1f} s without")
 
     def _is_silent(self, heard_s: float) -> None:
-        settings = self._connection.settings
-        if settings.trigger not in (None, "free"):
+        if not self._connection.is_free:
             return
         silent_s = time.monotonic() - heard_s
-        longest_s = max(SILENT_S, 20 / (settings.rate_hz or 20))
+        longest_s = max(SILENT_S, 20 / (self._connection.settings.rate_hz or 20))
         if silent_s > longest_s + HOPELESS_S:
             raise CameraLost(f"no frame came for {silent_s:.0f} s")
         if silent_s > longest_s and self.state == "running":
@@ -271,6 +292,9 @@ class Feed:
         if missing > known.spoiled:
             self._dropped.add(missing - known.spoiled)
         known.spoiled = 0
+        if self._set_words:
+            missing += self._end_setting(frame.arrived_s)
+        self._arrived_s = frame.arrived_s
         if self._first_s is None:
             self._first_s = frame.arrived_s
         if known.offset_s is None:
@@ -284,6 +308,12 @@ class Feed:
         self._next, self._last_s = number + 1, time_s
         self._frames += 1
         self._take(replace(frame, number=number, time_s=time_s))
+
+    def _end_setting(self, arrived_s: float) -> int:
+        """Say how long no frames came for a setting; how many there would have been."""
+        gap_s = arrived_s - (self._arrived_s or arrived_s)
+        self._tell_set(f"; {gap_s:.2f} s without frames")
+        return max(0, round(gap_s * (self._connection.former_hz or 0.0)) - 1)
 
     def _leave_out(self) -> None:
         self._connection.spoiled += 1
@@ -322,8 +352,20 @@ class _Connection:
         self.spoiled = 0
         """Frames that were left out since the last whole one."""
         self.offset_s: float | None = None
+        self.former_hz: float | None = None
+        """The rate at which frames came before it was set."""
         self._number: int | None = None
         self._overrun = 0
+
+    @property
+    def is_free(self) -> bool:
+        """Whether frames come by themselves."""
+        return self.settings.trigger in (None, "free")
+
+    @property
+    def last_hz(self) -> float | None:
+        """The rate at which frames came last."""
+        return self.former_hz if self._number is None else self.settings.rate_hz
 
     def missing(self, frame: CameraFrame, overrun: int) -> int:
         """How many frames should have come before this one and did not."""

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from dataclasses import replace
@@ -164,6 +165,47 @@ def test_it_is_set_between_two_frames_and_stays_so_when_it_comes_back(hasty: Non
     assert shapes == sorted(shapes, reverse=True)
     assert set(shapes) == {(24, 32), (16, 20)}
     assert (np.diff([frame.time_s for frame in frames]) > 0).all()
+
+
+def test_frames_that_do_not_come_while_it_is_set_are_said_and_numbered() -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=100)
+    frames: list[CameraFrame] = []
+    heard = Heard()
+
+    def opened():
+        camera = device.open()
+        quick = camera.apply
+
+        def slow(wanted: CameraSettings) -> CameraSettings:
+            time.sleep(0.1)
+            return quick(wanted)
+
+        camera.apply = slow
+        return camera
+
+    with Feed("test", opened, frames.append, heard.append) as running:
+        for count, wanted in (
+            (1, CameraSettings(region=(0, 0, 20, 16), rate_hz=50)),
+            (2, CameraSettings(rate_hz=-1)),
+        ):
+            seen = len(frames)
+            wait_until(lambda seen=seen: len(frames) > seen + 5)
+            running.apply(wanted).exception(10)
+            wait_until(lambda count=count: len(heard) == count)
+        running.apply(CameraSettings(trigger="software")).result(10)
+        wait_until(lambda: len(heard) == 3)
+        assert running.counts.dropped == 0
+    pauses = [(a, b) for a, b in itertools.pairwise(frames) if b.number - a.number > 1]
+    gaps_s = [b.arrived_s - a.arrived_s for a, b in pauses]
+    assert [b.number - a.number for a, b in pauses] == [
+        round(gap_s * rate_hz) for gap_s, rate_hz in zip(gaps_s, (100, 50), strict=True)
+    ]
+    assert min(gaps_s) >= 0.1
+    assert [event.words for event in heard] == [
+        f"set to rate 50 frames/s, region (0, 0, 20, 16); {gaps_s[0]:.2f} s without frames",
+        f"it could not be set, and goes on as it was; {gaps_s[1]:.2f} s without frames",
+        "set to trigger software",
+    ]
 
 
 @pytest.mark.usefixtures("hasty")
