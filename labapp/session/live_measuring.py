@@ -36,12 +36,15 @@ class LiveMeasurement:
         How fit the frame is to be measured.
     measures
         Sizes; None where it could not be measured.
+    followed
+        Whether it was measured from the one before, in milliseconds; else by itself, in seconds.
     """
 
     status: str
     reason: str
     quality: Quality
     measures: Measures | None
+    followed: bool
 
 
 class LiveMeasuring:
@@ -107,7 +110,7 @@ def _begin(given: _Chain) -> None:
             found = chain.measure(image)
         quality = judge_quality(image, found, depth, pattern.rows * pattern.columns)
         sizes = found.measures if found.status == "ok" else None
-        return LiveMeasurement(found.status, found.reason, quality, sizes)
+        return LiveMeasurement(found.status, found.reason, quality, sizes, chain.broke is None)
 
     _measure[:] = [measure]
 

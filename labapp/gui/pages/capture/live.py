@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,9 @@ SHOW_S, LOOK_S = 0.025, 0.25
 """Dots are looked for in a frame, and a frame is judged, no more often."""
 
 IDLE_S = 0.005
+
+BURST = 32
+"""So many frames right after one that was measured by itself are measured one after the other."""
 
 RATE_S = 2.0
 """The rate that is shown is that of so long."""
@@ -134,7 +138,7 @@ class Live:
         self.plan = plan
         self.takes: list[Take] = []
         self.feed: Feed | None = None
-        self._place, self._wanted = place, wanted
+        self._place, self._folder, self._wanted = place, place().parent, wanted
         self._settings, self._setup = settings, setup
         self._dots = settings.dots
         self._measuring: LiveMeasuring | None = None
@@ -143,7 +147,8 @@ class Live:
         self._to_judge: deque[CameraFrame] = deque(maxlen=1)
         self._newest: deque[Shown] = deque(maxlen=1)
         self._judged: deque[Looked] = deque(maxlen=1)
-        self._to_measure: deque[CameraFrame] = deque(maxlen=1)
+        self._to_measure: deque[CameraFrame] = deque()
+        self._in_order = BURST
         self._measured: deque[LiveMeasurement] = deque(maxlen=1)
         self._recorders: list[Recorder] = []
         self._told: set[Path] = set()
@@ -156,9 +161,9 @@ class Live:
         self._workers = [
             threading.Thread(target=self._work_on, args=given, name=f"live {given[0]}", daemon=True)
             for given in (
-                ("dots", self._to_show, self._find_quickly, SHOW_S),
-                ("verdict", self._to_judge, self._judge, LOOK_S),
-                ("figures", self._to_measure, self._measure, SHOW_S),
+                ("dots", partial(_newest, self._to_show), self._find_quickly, SHOW_S),
+                ("verdict", partial(_newest, self._to_judge), self._judge, LOOK_S),
+                ("figures", self._next_to_measure, self._measure, SHOW_S),
             )
         ]
 
@@ -216,7 +221,8 @@ class Live:
             recorder.take(frame)
         self._to_show.append(frame)
         self._to_judge.append(frame)
-        self._to_measure.append(frame)
+        if len(self._to_measure) < BURST:
+            self._to_measure.append(frame)
 
     def _say(self, event: Event) -> None:
         self._events.put(event)
@@ -228,18 +234,19 @@ class Live:
     def _work_on(
         self,
         what: str,
-        frames: deque[CameraFrame],
+        following: Callable[[], CameraFrame | None],
         work: Callable[[CameraFrame], None],
         every_s: float,
     ) -> None:
-        """Do something with the newest frame, no more often than that, and half of the time."""
+        """Do something with one frame after the other, and no more than half of the time."""
         try:
             while not self._closing.is_set():
-                if not frames:
+                frame = following()
+                if frame is None:
                     self._closing.wait(IDLE_S)
                     continue
                 began_s = time.monotonic()
-                work(frames.popleft())
+                work(frame)
                 took_s = time.monotonic() - began_s
                 self._closing.wait(max(every_s - took_s, took_s))
         except Exception as error:
@@ -274,15 +281,28 @@ class Live:
         quality = judge_quality(frame.image, found, depth, rays_of(self._setup))
         self._frame_byte = frame.image.nbytes
         try:
-            room_byte = shutil.disk_usage(self._place().parent).free
+            room_byte = shutil.disk_usage(self._folder).free
         except OSError:
             room_byte = None
         places = None if quick else _places_px(dots)
         self._judged.append(Looked(places, quality, room_byte))
 
+    def _next_to_measure(self) -> CameraFrame | None:
+        """The newest frame; after one that was measured by itself those that came right after it.
+
+        That took seconds: the present frame would be too far from it to be measured from it.
+        """
+        if self._in_order and self._to_measure:
+            self._in_order -= 1
+            return self._to_measure.popleft()
+        return _newest(self._to_measure)
+
     def _measure(self, frame: CameraFrame) -> None:
         if self._measuring is not None:
-            self._measured.append(self._measuring.measure(frame.image))
+            found = self._measuring.measure(frame.image)
+            if not found.followed:
+                self._in_order = BURST
+            self._measured.append(found)
 
     # --- to look at ---------------------------------------------------------------------------
 
@@ -411,6 +431,13 @@ class Live:
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
         """Set the camera between two frames; what it is set to is answered when it is."""
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
+
+
+def _newest(frames: deque[CameraFrame]) -> CameraFrame | None:
+    """Take the newest frame; those before it are let go."""
+    while len(frames) > 1:
+        frames.popleft()
+    return frames.popleft() if frames else None
 
 
 def _places_px(dots: Dots | None) -> FloatArray:
