@@ -100,11 +100,11 @@ def begin(
         return None
     if settings.dots.method != "band-pass" or rig.pattern.marker is None:
         return None
-    bed, pool = Bed.of(rig, made.surface.basis, settings.fit), None
-    if former is not None and bed.at.shape == former.bed.at.shape:
+    own, pool = Bed.of(rig, made.surface.basis, settings.fit), None
+    if former is not None and np.array_equal(own.at, former.bed.at):
         bed, pool = former.bed, _moved_to(former, match, made)
     if pool is None:
-        former = None
+        former, bed = None, own
         pool = met(bed, made.surface.coefficients, bed.landing_mm, 4)
     witness = match.witness[tuple(bed.at.T)]
     told = witness != 0
@@ -176,10 +176,12 @@ def predictions(track: Track) -> Iterator[FloatArray]:
     yield past[-1]
 
 
-def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, bool]:
-    """A surface that finds the dots again, the rays that gives them, and whether it was foreseen.
+def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
+    """A surface that finds the dots again, the rays that gives them, and how far dots are off.
 
-    Where none that is foreseen does, one is grown from the last, and from those before it.
+    That is the median share of the way to the next dot, from where they were foreseen. Where none
+    that is foreseen finds them, one is grown from the last surface, and from those before it: then
+    dots were nowhere foreseen, and it is infinite.
     """
     bed, count = track.bed, int(track.lit.sum())
     looked_for = around(bed, track.lit, 2)
@@ -187,13 +189,13 @@ def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, bool]:
         pool = met(bed, coefficients, track.pool.points_mm, 1)
         labels, off = tracked(scene, pool, track.lit, looked_for)
         if len(off) >= FOUND * count and np.median(off) < STEADY:
-            return pool, labels, True
+            return pool, labels, float(np.median(off))
     found = 0
     for coefficients in track.past[: -GROWN_FROM - 1 : -1]:
         pool, labels = _grown(track, scene, coefficients)
         found = max(found, int(np.sum(labels != UNLABELLED)))
         if found >= max(FOUND * count, LEAST_DOTS):
-            return pool, labels, False
+            return pool, labels, np.inf
     raise Broken(f"{found} of {count} dots were found again")
 
 

@@ -44,6 +44,10 @@ WORSE = 2.0
 HELD = 8
 """For so many frames the datum is carried on while a dot beside the absent one is not seen."""
 
+FORESEEN = 0.1
+"""So near half of the dots must be to where they were foreseen, of the way to the next one, for the
+datum to be carried on: a pool that has gone on by a row lights other rays, and all of them fit."""
+
 SINKS_EVERY = 16
 """Every so many frames it is asked anew whether the rear sinks."""
 
@@ -134,7 +138,7 @@ def follow(
     dots = quick_dots(image, track.exposure, settings.dots.band_pass)
     passed("dots")
     scene = Scene.of(dots, bed.rig, calibration, (image.shape[0], image.shape[1]))
-    pool, labels, foreseen = found_again(track, scene)
+    pool, labels, off = found_again(track, scene)
     passed("match")
     pool, labels, lower = _fitted(bed, scene, pool, labels)
     passed("fit")
@@ -158,7 +162,7 @@ def follow(
         raise Broken(f"{heard.missed} rays amid the others have no dot")
     if not rms(residual) < WORSE * track.residual_mm:
         raise Broken("the surface no longer has the dots")
-    unseen = 0 if _datum_seen(bed, scene, pool, labels, foreseen) else track.unseen + 1
+    unseen = 0 if _datum_seen(bed, scene, pool, labels, off) else track.unseen + 1
     if unseen > HELD:
         raise Broken("the dots beside the absent one have not been seen for long")
     match = _match(track, scene, heard.witness, ray, dot, rms(residual))
@@ -225,14 +229,14 @@ def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, floa
     return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
 
 
-def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, foreseen: bool) -> bool:
+def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, off: float) -> bool:
     """Whether all four neighbours of the absent ray are lit.
 
     Raises
     ------
     Broken
-        If the absent ray's place is lit, or so many of its neighbours are dark that no hole tells
-        the rows (`lattice.find_holes`): two; three where the dots are where they were foreseen.
+        If the absent ray's place is lit; or a neighbour is dark and the dots are not where they
+        were foreseen, or three are: no hole tells the rows then (`lattice.find_holes`).
     """
     marker = np.array(bed.rig.pattern.marker) - 1
     place = [
@@ -249,7 +253,7 @@ def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, forese
     )
     if not np.linalg.norm(scene.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
         raise Broken("a dot is where the absent one should be dark")
-    if lit.sum() < (2 if foreseen else 3):
+    if lit.sum() < (2 if off < FORESEEN else 4):
         raise Broken("the dots beside the absent one are not seen")
     return bool(lit.all())
 

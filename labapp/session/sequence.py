@@ -11,7 +11,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -99,8 +99,9 @@ def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None
         workers = min(os.cpu_count() or 1, len(stretches))
     if workers == 0:
         for stretch in stretches:
-            for at in range(0, len(stretch), BATCH):
-                yield from _measured(job if at == 0 else None, stretch[at : at + BATCH])
+            with closing(Following(job)) as following:
+                for at in range(0, len(stretch), BATCH):
+                    yield from following.measure_all(stretch[at : at + BATCH])
         return
     with ExitStack() as at_end:
         pools = [measuring_pool(1) for _ in range(workers)]
@@ -196,6 +197,12 @@ class Following:
         rows = table_rows(number, time_s, measurement, self._job.setup.calibration)
         return Told(number, time_s, measurement, broke, rows)
 
+    def measure_all(self, numbers: Sequence[int]) -> list[Told]:
+        """Measure the next frames."""
+        # Matrices are small: more threads than one get in each other's way.
+        with ThreadpoolController().limit(limits=1, user_api="blas"):
+            return [self.measure(number) for number in numbers]
+
     def close(self) -> None:
         """Let go of the recording."""
         self._source.close()
@@ -213,6 +220,4 @@ def _measured(job: Job | None, numbers: Sequence[int]) -> list[Told]:
         cv2.setNumThreads(1)
         _following = Following(job)
     assert _following is not None
-    # Matrices are small: more threads than one get in each other's way.
-    with ThreadpoolController().limit(limits=1, user_api="blas"):
-        return [_following.measure(number) for number in numbers]
+    return _following.measure_all(numbers)

@@ -12,8 +12,9 @@ import pytest
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.values import FloatArray
-from labapp.core.warm import WarmChain
+from labapp.core.track import Broken
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.warm import WarmChain, follow
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Wave, egg
 from labapp.simulation.recording import RecordedFrame, Recording
@@ -187,6 +188,49 @@ def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() ->
     result = follower.measure(np.roll(frame.image, step, axis=1))
     assert follower.broke is not None
     assert wrong_rays(result, frame, shift_px=step) == 0
+
+
+@pytest.mark.parametrize("way", [-1, 1])
+def test_a_pool_that_goes_on_by_a_row_is_not_followed_to_the_wrong_rays(way: int) -> None:
+    """The dot that would tell, where the absent one was, is missing."""
+    track = chain()._track
+    assert track is not None
+    step = way * track.bed.spacing_mm[1]
+    for k, share in enumerate(np.linspace(0.6, 1.4, 17).tolist()):
+        pool = egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6 + share * step))
+        made = Recording(
+            file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(pool,), seed=8000 + k,
+            frame_rate_hz=RATE_HZ,
+        )  # fmt: skip
+        frame = made.frame(0)
+        image = without_dots(frame.image, frame.dot_px[[9 + way], [9]])
+        try:
+            result, _ = follow(image, track, CALIBRATION, Settings())
+        except (Broken, CannotMeasure):
+            continue
+        assert wrong_rays(result, frame) == 0
+
+
+def test_a_pool_elsewhere_with_as_many_rays_begins_a_track_of_its_own() -> None:
+    """Their splines are others: what was remembered of the former pool is of no use."""
+    follower = WarmChain(RIG, CALIBRATION, Settings())
+    for number, at in enumerate(
+        [
+            (5.57, 3.04, 3.73, 0.27, (-0.66, -0.39)),
+            *[(6.17, 2.56, 3.21, 0.27, (1.06, -0.12))] * 2,
+        ]
+    ):
+        made = Recording(
+            file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(egg(*at),),
+            seed=10 + number, frame_rate_hz=RATE_HZ,
+        )  # fmt: skip
+        frame = made.frame(0)
+        result = follower.measure(frame.image)
+        assert result.status == "ok"
+        assert wrong_rays(result, frame) == 0
+        if number == 1:
+            assert follower.broke is not None
+    assert follower.broke is None
 
 
 def test_a_pool_that_jumps_is_measured_anew() -> None:

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from labapp.cli import app
 from labapp.core.pipeline import Settings, start_correction
+from labapp.media import open_source
 from labapp.session import sequence
 from labapp.session.benchmark import SCENARIO
 from labapp.session.record import Record
@@ -33,6 +34,24 @@ def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
     simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
     setup = read_setup(folder / "made" / "setup.toml")
     return Job(folder / "made" / "recording.avi", None, setup, Settings())
+
+
+def test_two_sequences_in_turn_keep_apart(
+    job: Job, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sequence, "BATCH", 1)
+    with open_source(job.path) as source:
+        images = [source.frame(k).image for k in range(3)]
+    for name, order in (("a", (0, 1, 2)), ("b", (2, 1, 0))):
+        (tmp_path / name).mkdir()
+        for k, number in enumerate(order):
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), images[number])
+    jobs = [Job(tmp_path / name, None, job.setup, job.settings) for name in "ab"]
+    alone = [[one.rows for one in measure_sequence(each, range(3), 0)] for each in jobs]
+    in_turn = zip(*(measure_sequence(each, range(3), 0) for each in jobs), strict=True)
+    assert [[one.rows for one in pair] for pair in in_turn] == [
+        list(pair) for pair in zip(*alone, strict=True)
+    ]
 
 
 def test_stretches_are_measured_alike_here_and_by_processes(
