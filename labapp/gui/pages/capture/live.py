@@ -23,7 +23,7 @@ from labapp.core.quality import UNMEASURED, Quality, judge_quality
 from labapp.core.quick_dots import Exposure, quick_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
-from labapp.gui.digits import ResultRow
+from labapp.gui.digits import NOTHING, plain
 from labapp.gui.pages.capture.presenter import size_in_words
 from labapp.media import GreyImage
 from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
@@ -48,6 +48,9 @@ BURST = 32
 
 RATE_S = 2.0
 """The rate that is shown is that of so long."""
+
+DECIMALS = 3
+"""Of live figures, mm."""
 
 STATES = {
     "opening": ("○", "Opening the camera …"),
@@ -465,20 +468,20 @@ def setup_of(session: Session) -> Setup | None:
         return None
 
 
-def figures(found: LiveMeasurement | None) -> tuple[ResultRow, ...]:
-    """Width, length and height; of a hollow pool the depth."""
+def figures(found: LiveMeasurement | None) -> tuple[tuple[str, str, str, str], ...]:
+    """Width, length and height, of a hollow pool the depth: name, value, ± and unit.
+
+    All with as many decimals, whatever the ±: nothing jumps as they change.
+    """
     sizes = None if found is None else found.measures
     hollow = sizes is not None and -sizes.depth_mm > sizes.height_mm
-    names = ("width", "length", "depth" if hollow else "height")
-    return tuple(
-        ResultRow(
-            name.capitalize(),
-            getattr(sizes, f"{name}_mm", None),
-            getattr(sizes, f"{name}_sigma_mm", None),
-            "mm",
-        )
-        for name in names
-    )
+    rows = []
+    for name in ("width", "length", "depth" if hollow else "height"):
+        value, sigma = (getattr(sizes, f"{name}{end}", None) for end in ("_mm", "_sigma_mm"))
+        told = NOTHING if value is None else plain(value, DECIMALS)
+        known = "" if sigma is None or np.isnan(sigma) else f"± {plain(sigma, DECIMALS)}"
+        rows.append((name.capitalize(), told, known, "mm"))
+    return tuple(rows)
 
 
 def _lasting(seconds: float) -> str:

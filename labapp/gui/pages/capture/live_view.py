@@ -16,7 +16,15 @@ from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.pages.capture.live import SIMULATED, Live, choices, figures, setup_of
-from labapp.gui.pages.capture.parts import ExposureBars, Figures, button, headed, wrapped
+from labapp.gui.pages.capture.parts import (
+    ExposureBars,
+    Figures,
+    button,
+    headed,
+    show_recording,
+    wrapped,
+)
+from labapp.gui.pages.capture.plan_fields import PlanFields
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.views.picture import PictureView
@@ -32,7 +40,7 @@ from labapp.media.cameras import (
     open_camera,
 )
 from labapp.media.events import Event
-from labapp.media.recorder import Plan, recording_path
+from labapp.media.recorder import recording_path
 from labapp.session.session import Session
 from labapp.session.simulated_pool import pool_camera, simulated_pool
 
@@ -44,8 +52,6 @@ FRESH_S = 2.0
 
 TELL_S = 0.2
 """Figures are renewed no more often."""
-
-BEFORE_S = 2.0
 
 RING, RING_PX = "#2fd39b", 15
 """Round the dots that are found: a colour of the dots page; points of the screen."""
@@ -149,7 +155,7 @@ class LiveView(QObject):
         live = Live(
             name,
             lambda: recording_path(folder, stem),
-            self._plan(),
+            self.plan_fields.plan(),
             CameraSettings(),
             session.settings,
             setup_of(session),
@@ -249,16 +255,10 @@ class LiveView(QObject):
         if self.live is not None and self.live.running is not None:
             self.live.mark()
 
-    def _plan(self) -> Plan:
-        return Plan(
-            before_s=self.before.value() or 0.0,
-            after_s=self.after.value(),
-            every=int(self.every.value() or 1),
-        )
-
     def _replan(self) -> None:
-        if self.live is not None and self._plan() != self.live.plan:
-            self.live.set_plan(self._plan())
+        plan = self.plan_fields.plan()
+        if self.live is not None and plan != self.live.plan:
+            self.live.set_plan(plan)
 
     # --- while it runs ------------------------------------------------------------------------
 
@@ -381,9 +381,8 @@ class LiveView(QObject):
         self.settings.setVisible(runs)
         self.bar.setVisible(runs)
         self.mark_button.setEnabled(recording)
-        for field in (self.before, self.after, self.every):
-            field.setEnabled(not recording)
-        self.record_button.setText("■ End the recording" if recording else "● Record")
+        self.plan_fields.set_enabled(not recording)
+        show_recording(self.record_button, recording)
 
     def _make_group(self) -> None:
         self.group, layout = headed("Capture")
@@ -419,41 +418,10 @@ class LiveView(QObject):
             )
             field.edited.connect(partial(self._set, name))
             fields.add(field)
-        self._make_plan(fields)
+        self.plan_fields = PlanFields(fields)
+        self.plan_fields.edited.connect(self._replan)
         inner.addWidget(fields)
         layout.addWidget(self.settings)
-
-    def _make_plan(self, form: FieldForm) -> None:
-        form.add_heading("Recording")
-        self.before = NumberField(
-            "Before the trigger",
-            "s",
-            lowest=0,
-            highest=600,
-            decimals=1,
-            tooltip="So much from before the trigger is recorded, too: it is kept in memory",
-        )
-        self.before.set_value(BEFORE_S)
-        self.after = NumberField(
-            "After it",
-            "s",
-            lowest=0.1,
-            highest=86_400,
-            decimals=1,
-            optional=True,
-            tooltip="The recording ends so long after the trigger; empty: when you end it",
-        )
-        self.every = NumberField(
-            "Every n-th frame",
-            lowest=1,
-            highest=10_000,
-            decimals=0,
-            tooltip="1: every frame is recorded; 2: every second one …",
-        )
-        self.every.set_value(1)
-        for field in (self.before, self.after, self.every):
-            field.edited.connect(lambda _: self._replan())
-            form.add(field)
 
     def _make_bar(self) -> None:
         self.bar = QWidget()
@@ -483,9 +451,6 @@ class LiveView(QObject):
         self.stop_button = button(
             "Stop the camera", "Let go of the camera; a recording is written first", self.stop
         )
-        font = self.record_button.font()
-        font.setBold(True)
-        self.record_button.setFont(font)
         for each, wide in ((self.record_button, 3), (self.mark_button, 1), (self.stop_button, 2)):
             each.setMinimumHeight(BUTTON_PX)
             row.addWidget(each, wide)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor, QPalette
 from PySide6.QtWidgets import (
     QFormLayout,
     QGridLayout,
@@ -16,9 +17,12 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.core.exposure import Exposure
-from labapp.gui.digits import ResultRow
 from labapp.gui.pages.capture.presenter import bars
+from labapp.gui.theme import is_dark
 from labapp.gui.views.fields import NumberField
+
+RED = QColor("#b8321f"), QColor("#f0705a")
+"""Of what is under way, on a light and on a dark ground."""
 
 LARGE = 1.9
 """A figure that is read from afar is so many times as large as others."""
@@ -64,11 +68,9 @@ class Figures(QWidget):
         self._grid.setColumnStretch(1, 1)
         self._labels: dict[tuple[int, int], QLabel] = {}
 
-    def show_rows(self, rows: Iterable[ResultRow]) -> None:
-        """Show a row for each: name, value, ± and unit."""
-        for row, result in enumerate(rows):
-            name, value, sigma, unit = result.texts
-            texts = (name, value, f"± {sigma}" if sigma else "", unit)
+    def show_rows(self, rows: Iterable[tuple[str, str, str, str]]) -> None:
+        """Show rows of name, value, ± and unit."""
+        for row, texts in enumerate(rows):
             for column, text in enumerate(texts):
                 self._label(row, column).setText(text)
 
@@ -127,3 +129,14 @@ def button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
     button.setToolTip(tip)
     button.clicked.connect(lambda _: work())
     return button
+
+
+def show_recording(pressed: QPushButton, recording: bool) -> None:
+    """Let the button that records say whether it does: by its words, its sign, and in red."""
+    pressed.setText("■ End the recording" if recording else "● Record")
+    palette, font = QPalette(), pressed.font()
+    if recording:
+        palette.setColor(QPalette.ColorRole.ButtonText, RED[is_dark(palette)])
+    font.setBold(True)
+    pressed.setPalette(palette)
+    pressed.setFont(font)
