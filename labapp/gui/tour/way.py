@@ -155,6 +155,7 @@ def _film(hands: Hands) -> None:
     view = page.live_view
     hands.wait(lambda: view.updates > 20 and page.exposure.isVisible(), "live frames")
     hands.wait(lambda: view.ring.value() == 100, "the seconds before a trigger")
+    hands.wait(lambda: view.measured_s, "a live frame to be measured")
     hands.picture("live")
     hands.press("● Record")
     hands.wait(lambda: view.live and view.live.takes[0].frames > 150, "frames to be recorded")

@@ -94,6 +94,8 @@ class LiveView(QObject):
         What records, below the picture; seen while live.
     live
         The camera that runs; None without one.
+    measured_s
+        `time.monotonic` when the figures were renewed; 0 before they are there.
     """
 
     changed = Signal()
@@ -111,7 +113,7 @@ class LiveView(QObject):
         self._opening: Task | None = None
         self._finding: Task | None = None
         self._answers: list[tuple[str, float, Future[CameraSettings]]] = []
-        self._told_s = self._measured_s = 0.0
+        self._told_s = self.measured_s = 0.0
         self._room_byte: int | None = None
         self._timer = QTimer(self)
         self._timer.setInterval(TICK_MS)
@@ -194,7 +196,7 @@ class LiveView(QObject):
         self._show_settings(live.feed.settings, live.feed.camera.limits)
         self._room_byte = None
         self._rings.setData([])
-        self._measured_s = 0.0
+        self.measured_s = 0.0
         self.figures.setVisible(live.measures)
         self.figures.show_rows(figures(None))
         self._rings.show()
@@ -275,11 +277,11 @@ class LiveView(QObject):
         if looked is not None:
             self._room_byte = looked.room_byte
             self._ring_dots(looked.dots_px)
-            if time.monotonic() - self._measured_s > FRESH_S:
+            if time.monotonic() - self.measured_s > FRESH_S:
                 self._show_quality(looked.quality)
         measured = live.measured()
         if measured is not None:
-            self._measured_s = time.monotonic()
+            self.measured_s = time.monotonic()
             self.figures.show_rows(figures(measured))
             self._show_quality(measured.quality)
         if time.monotonic() - self._told_s > TELL_S:
