@@ -19,6 +19,15 @@ settings.load_profile("labapp")
 
 Run = Callable[..., tuple[int, str, str]]
 
+HEEDING = """
+import signal, sys
+from labapp.cli import main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+main(sys.argv[1:])
+"""
+"""The program, for ``python -c``: it heeds Ctrl-C also where the tests are run in the background."""
+
 
 def lacks(words: str) -> None:
     """Skip a test that cannot be run here; where everything has to be there, fail."""

@@ -15,7 +15,7 @@ from labapp.media import open_source
 from labapp.media.cameras import CameraInfo, CameraLost
 from labapp.session.cameras import simulated_device
 from labapp.session.session import Session
-from tests.conftest import Run
+from tests.conftest import HEEDING, Run
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE = ROOT / "sample_sessions/gtaw/recording.avi"
@@ -59,7 +59,7 @@ def test_it_is_recorded_into_a_session(tmp_path: Path, labapp: Run) -> None:
 def test_ctrl_c_ends_a_recording_and_keeps_it(tmp_path: Path) -> None:
     out = tmp_path / "run.nut"
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
-    command = [sys.executable, "-m", "labapp", "record", CAMERA, "--out", str(out)]
+    command = [sys.executable, "-c", HEEDING, "record", CAMERA, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         until_s = time.monotonic() + 60
         while not out.exists() or out.stat().st_size < 1_000_000:
@@ -83,7 +83,7 @@ def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None
         ((CAMERA,), "either --out or --session"),
         ((CAMERA, "--out", out, "--session", out), "either --out or --session"),
         ((CAMERA, "--session", tmp_path / "no.labsession"), "is not there"),
-        ((CAMERA, "--out", out.with_suffix(".avi")), "run.avi; expected a file that ends in .nut"),
+        ((CAMERA, "--out", out.with_suffix(".avi")), "; expected a file that ends in .nut"),
         ((CAMERA, "--out", out, "--rate", "0"), "rate_hz: 0.0; expected from 0.1 to 10000"),
         ((CAMERA, "--out", out, "--exposure", "5"), "exposure_us: 5.0; expected nothing"),
         ((CAMERA, "--out", tmp_path / "there.nut"), "recording: is there already"),

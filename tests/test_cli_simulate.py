@@ -21,7 +21,7 @@ from labapp.session.setup import parse_setup, read_setup
 from labapp.session.simulate import simulate
 from labapp.simulation.pools import Wave
 from labapp.simulation.torch import ConeTorch
-from tests.conftest import Run
+from tests.conftest import HEEDING, Run
 
 EXAMPLES = Path(__file__).parents[1] / "resources" / "simulations"
 SCENARIO = (EXAMPLES / "mode_11.toml").read_text("utf-8")
@@ -378,15 +378,6 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, labapp: Run) -> No
     assert code == 2
     assert f"{path / 'out'}: --out: " in err
     assert "expected a folder that can be written" in err
-
-
-HEEDING = """
-import signal, sys
-from labapp.cli import main
-
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-main(sys.argv[1:])
-"""
 
 
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:

@@ -120,8 +120,11 @@ def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
     wait
         Whether to return only when they are gone.
     """
-    # One may be half through telling its result: who listens must see that nobody goes on.
-    pool._result_queue._writer.close()  # type: ignore[attr-defined]
+    # One may be half through telling its result: who listens must see that nobody goes on. A pool
+    # that has ended listens no more.
+    results = getattr(pool, "_result_queue", None)
+    if results is not None:
+        results._writer.close()
     for process in list((pool._processes or {}).values()):
         process.terminate()
     pool.shutdown(wait, cancel_futures=True)
