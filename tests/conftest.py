@@ -26,7 +26,7 @@ from labapp.cli import main
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 main(sys.argv[1:])
 """
-"""The program, for ``python -c``: it heeds Ctrl-C also where the tests are run in the background."""
+"""The program for ``python -c``: it heeds Ctrl-C also where tests are run in the background."""
 
 
 def lacks(words: str) -> None:
