@@ -15,6 +15,7 @@ from labapp.core.ray_growth import (
     NEAR,
     UNLABELLED,
     Scene,
+    amid,
     blocked,
     grow_labels,
     predict,
@@ -22,7 +23,7 @@ from labapp.core.ray_growth import (
     try_fit,
     within_rings,
 )
-from labapp.core.values import BoolArray, CannotMeasure, IntArray
+from labapp.core.values import CannotMeasure, IntArray
 
 MODEL_MM = 0.03
 """How far the right surface's dots may be off for no fault of theirs, mm."""
@@ -234,7 +235,7 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int,
     Where the surface lets dots run into each other there is nothing to be told of either.
     """
     lit = labels != UNLABELLED
-    among = predict(scene, pool, _amid(lit) & ~scene.absent & ~scene.hidden)
+    among = predict(scene, pool, amid(lit) & ~scene.absent & ~scene.hidden)
     merged = among.spacing_mm < scene.resolution_mm
     rays = scene.rays[among.at[:, 0], among.at[:, 1]]
     hidden = blocked(among.points_mm, rays, scene.rig, pool)
@@ -247,16 +248,6 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int,
     return missed, len(stray)
 
 
-def _amid(lit: BoolArray) -> BoolArray:
-    """Rays between lit ones in their row or in their column."""
-    between = np.zeros_like(lit)
-    for axis in (0, 1):
-        before = np.logical_or.accumulate(lit, axis=axis)
-        after = np.flip(np.logical_or.accumulate(np.flip(lit, axis), axis=axis), axis)
-        between |= before & after
-    return between
-
-
 def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     """Say which rays came back, which did not, and which cannot tell (see `Match.witness`)."""
     lit = labels != UNLABELLED
@@ -267,7 +258,7 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     merged = around.spacing_mm < scene.resolution_mm
     seen = scene.in_view(around.plane_mm) & ~hidden & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
-    witness[_amid(lit) | scene.absent | scene.hidden] = 0
+    witness[amid(lit) | scene.absent | scene.hidden] = 0
     witness[lit] = 1
     # A dot that no ray was given may be the dot of a ray that seems dark.
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])

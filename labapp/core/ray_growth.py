@@ -274,18 +274,35 @@ def predict(scene: Scene, pool: FittedPool, where: BoolArray) -> Prediction:
 
 
 def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedPool) -> BoolArray:
-    """Whether the torch may hide reflections: the ray passes above its tip, or nearly (§4.2.1).
+    """Whether the torch may hide reflections of a pool; see `behind_torch`."""
+    x, y = np.clip(points_mm[:, :2], pool.surface.basis.low_mm, pool.surface.basis.high_mm).T
+    reflected = reflect(incident, surface_normal(pool.surface.gradient(x, y)))
+    return behind_torch(points_mm, incident, reflected, rig.electrode.height_mm)
+
+
+def behind_torch(
+    points_mm: FloatArray, incident: FloatArray, reflected: FloatArray, tip_mm: float
+) -> BoolArray:
+    """Whether rays pass above the torch's tip, or nearly (§4.2.1), shape (n,).
 
     The incident ray for points behind the electrode (y < 0), the reflected one before it.
     """
-    x, y = np.clip(points_mm[:, :2], pool.surface.basis.low_mm, pool.surface.basis.high_mm).T
-    reflected = reflect(incident, surface_normal(pool.surface.gradient(x, y)))
     way = np.where((points_mm[:, 1] < 0)[:, None], -incident, reflected)
     # Both ways lead towards y = 0 and up.
     height = points_mm[:, 2] - points_mm[:, 1] * way[:, 2] / np.where(
         way[:, 1] == 0, 1e-12, way[:, 1]
     )
-    return np.asarray(height > rig.electrode.height_mm - 0.3)
+    return np.asarray(height > tip_mm - 0.3)
+
+
+def amid(lit: BoolArray) -> BoolArray:
+    """Rays between lit ones in their row or in their column, shape (rows, columns)."""
+    between = np.zeros_like(lit)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(lit, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(lit, axis), axis=axis), axis)
+        between |= before & after
+    return between
 
 
 def within_rings(labels: IntArray, rings: int) -> BoolArray:

@@ -283,11 +283,6 @@ def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(dpbtrs(lower, right, lower=1)[0])
 
 
-def raised(pool: WarmPool, bed: Bed, by_mm: float) -> WarmPool:
-    """Shift the surface up, and meet the rays anew."""
-    return met(bed, pool.coefficients + by_mm, pool.points_mm)
-
-
 def lay(bed: Bed, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Height and slopes of a surface where the rays would land, shapes (R,) and (R, 2)."""
     z, *slope = (bed.values * coefficients[bed.splines]).sum(axis=-1)

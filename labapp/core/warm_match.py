@@ -21,6 +21,8 @@ from labapp.core.ray_growth import (
     NEAR,
     UNLABELLED,
     Scene,
+    amid,
+    behind_torch,
 )
 from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.core.warm_fit import Bed, WarmPool, lay, solve, spline_values
@@ -170,13 +172,13 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
     merged = next_mm < scene.resolution_mm
     way = reflect(bed.rays, surface_normal(pool.slopes))
-    hidden = _behind_torch(pool.points_mm, bed.rays, way, bed.rig.electrode.height_mm)
+    hidden = behind_torch(pool.points_mm, bed.rays, way, bed.rig.electrode.height_mm)
     seen = known & ~hidden & ~merged
     seen[seen] = scene.in_view(pool.plane_mm[seen])
     pattern = bed.rig.pattern
     grid = np.zeros((pattern.rows, pattern.columns), bool)
     grid[tuple(bed.at.T)] = lit
-    among = _amid(grid)[tuple(bed.at.T)]
+    among = amid(grid)[tuple(bed.at.T)]
     missed = int(np.sum(among & ~bed.absent & ~lit & seen))
     witness = np.where(seen & ~among & ~bed.absent, -1, 0)
     witness[lit] = 1
@@ -190,25 +192,6 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
         if run_together.any():
             stray = stray[apart[run_together].min(axis=0) > scene.resolution_mm]
     return Testimony(witness, len(stray), missed)
-
-
-def _amid(lit: BoolArray) -> BoolArray:
-    """Rays between lit ones in their row or in their column, shape (rows, columns)."""
-    between = np.zeros_like(lit)
-    for axis in (0, 1):
-        before = np.logical_or.accumulate(lit, axis=axis)
-        after = np.flip(np.logical_or.accumulate(np.flip(lit, axis), axis=axis), axis)
-        between |= before & after
-    return between
-
-
-def _behind_torch(
-    points: FloatArray, incident: FloatArray, reflected: FloatArray, tip_mm: float
-) -> BoolArray:
-    """Whether the torch may hide reflections (`ray_growth.blocked`)."""
-    way = np.where((points[:, 1] < 0)[:, None], -incident, reflected)
-    height = points[:, 2] - points[:, 1] * way[:, 2] / np.where(way[:, 1] == 0, 1e-12, way[:, 1])
-    return np.asarray(height > tip_mm - 0.3)
 
 
 def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray) -> IntArray:

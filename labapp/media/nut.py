@@ -1,6 +1,6 @@
 """Writes frames as a video that loses nothing and is whole up to wherever it is cut off.
 
-NUT (docs/adr/0014): every frame is written at once, with its own time to the microsecond.
+NUT (docs/adr/0015): every frame is written at once, with its own time to the microsecond.
 """
 
 from __future__ import annotations

@@ -228,15 +228,17 @@ def expected_pool(width: float, length: float, height: float) -> Pool:
     Raises
     ------
     InputError
-        If there is no such pool; its source is the size's option.
+        If there is no such pool.
     """
     from labapp.simulation.pools import ellipsoidal_cap
 
     for name, value, low in (("width", width, 1), ("length", length, 1), ("height", height, 0.01)):
         if not low <= abs(value) <= 30 or (low == 1 and value < 0):
             expected = f"{low} to 30 mm" + " or the same below 0" * (name == "height")
-            raise InputError(f"--{name}", name, value, expected)
+            raise InputError("the expected pool", name, value, expected)
     try:
         return ellipsoidal_cap(width, length, height)
     except ValueError as error:
-        raise InputError("--height", "height", height, f"a pool that can be: {error}") from error
+        raise InputError(
+            "the expected pool", "height", height, f"a pool that can be: {error}"
+        ) from error

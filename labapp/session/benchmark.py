@@ -29,6 +29,7 @@ from labapp.session.scenario import read_scenario
 from labapp.session.sequence import Job, measure_sequence
 from labapp.session.setup import Setup, read_setup
 from labapp.session.simulate import simulate
+from labapp.session.simulated_pool import BENCH
 from labapp.simulation.parallel import Progress
 
 RATE_HZ, WAVE_HZ = 200.0, 37.3
@@ -49,32 +50,7 @@ mode = [0, 1]
 amplitude_mm = 0.03
 frequency_hz = {WAVE_HZ}
 
-[laser]
-projection_angle_deg = 31.14
-distance_mm = 31.48
-
-[pattern]
-rows = 19
-columns = 19
-inter_beam_angle_deg = 0.77
-
-[electrode]
-height_mm = 5.0
-
-[imaging_plane]
-distance_mm = 50.0
-s_mm = 45.0
-h_mm = 3.0
-width_mm = 101.6
-height_mm = 101.6
-
-[image_calibration]
-origin_px = [44.0, 590.0]
-x_axis_px = [242.02, 590.0]
-x_axis_mm = 34.925
-z_axis_px = [44.0, 499.99]
-z_axis_mm = 15.875
-
+{BENCH}
 [look]
 hot_pixels = 2
 missing = 0.01

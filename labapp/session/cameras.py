@@ -19,6 +19,7 @@ from labapp.media.cameras import (
     Feed,
     SimulatedDevice,
     open_camera,
+    there_and_back,
 )
 from labapp.media.events import Event, Say, logged, silent
 from labapp.media.recorder import Plan, Recorder, Take
@@ -74,12 +75,9 @@ def simulated_device(
         images, depth, rate_hz = _rendered(path, progress)
     else:
         images, depth, rate_hz = _recorded(path)
-    last = len(images) - 1
-    # There and back: a recording's end is seldom like its beginning.
-    order = [*range(last), *range(last, 0, -1)] or [0]
     return SimulatedDevice(
         str(path),
-        lambda k: images[order[k % len(order)]],
+        there_and_back(images),
         bit_depth=depth,
         rate_hz=rate_hz or USUAL_HZ,
         faults=faults,

@@ -17,7 +17,7 @@ from labapp.core.quality import Quality, judge_quality
 from labapp.core.warm import WarmChain
 from labapp.media import GreyImage
 from labapp.session.setup import Setup
-from labapp.simulation.parallel import NICE, begin_worker
+from labapp.simulation.parallel import NICE, begin_worker, end_processes
 
 
 class LiveMeasuringEnded(Exception):
@@ -82,9 +82,7 @@ class LiveMeasuring:
 
     def close(self) -> None:
         """End the process, whatever it is at. Twice does no harm."""
-        for process in list((self._pool._processes or {}).values()):
-            process.terminate()
-        self._pool.shutdown(cancel_futures=True)
+        end_processes(self._pool)
 
 
 class _Chain(NamedTuple):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from labapp.errors import InputError
 from labapp.media import GreyImage
-from labapp.media.cameras import SimulatedDevice
+from labapp.media.cameras import SimulatedDevice, there_and_back
 from labapp.session.scenario import read_scenario
 from labapp.session.session import Session
 
@@ -101,6 +101,5 @@ def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDev
     for number in range(len(recording.pools)):
         progress(number, len(recording.pools))
         images.append(recording.frame(number).image)
-    loop = [*images, *images[-2:0:-1]]  # there and back: it swings
     rate_hz = recording.frame_rate_hz or 60.0
-    return SimulatedDevice("pool", lambda k: loop[k % len(loop)], rate_hz=rate_hz)
+    return SimulatedDevice("pool", there_and_back(images), rate_hz=rate_hz)

@@ -326,6 +326,8 @@ class RandomHand:
         text, good = self._text_for(chosen)
         _activate(chosen)
         chosen.editor.setFocus(Qt.FocusReason.MouseFocusReason)
+        focused = QApplication.focusWidget()
+        typed_on = "nothing" if focused is None else named(focused)
         self._press(KEY.Key_A, CONTROL)
         self._write(text, chosen.editor)
         enter = CONTROL if isinstance(chosen, TextField) else NONE
@@ -346,7 +348,11 @@ class RandomHand:
             wanted = text if isinstance(chosen, TextField) else float(text)
             held = run.witness.value(session.path, key)
             if held != wanted:
-                run.faults.append(f"{told}: {session.path.name} holds {held!r}")
+                unread = run.window.status_line.unread
+                run.faults.append(
+                    f"{told}: {session.path.name} holds {held!r}, the field {chosen.value()!r}; "
+                    f"typed on {typed_on}; problems not read: {unread}"
+                )
         return told
 
     def _text_for(self, chosen: Field) -> tuple[str, bool]:

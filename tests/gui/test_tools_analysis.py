@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PySide6.QtCore import Qt
@@ -132,7 +133,7 @@ def test_a_cancel_keeps_what_is_finished(
 ):
     gate, survey = threading.Event(), error_analysis.survey
 
-    def slow(kind, *given, **more):  # type: ignore[no-untyped-def]
+    def slow(kind: str, *given: Any, **more: Any) -> object:
         if kind == "LE":
             gate.wait(60)
         return survey(kind, *given, **more)

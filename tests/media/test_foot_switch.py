@@ -77,8 +77,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def switch(device: Device, info: HidInfo, do, say, **actions: int) -> FootSwitch:
     pedals = PedalMap(info.key, info.name, info.is_keyboard, {v: k for k, v in actions.items()})
-    found = lambda: [info] if device.plugged else []  # noqa: E731
-    return FootSwitch(pedals, do, say, found, device.open)
+    return FootSwitch(pedals, do, say, lambda: [info] if device.plugged else [], device.open)
 
 
 # --- reports ------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -323,9 +324,9 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path: Path, name: str) -> 
         ("memory_mb", 0),
     ],
 )
-def test_a_plan_that_cannot_be_is_refused(name: str, value: object) -> None:
+def test_a_plan_that_cannot_be_is_refused(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=f"recording: {name}: "):
-        Plan(**{name: value})  # type: ignore[arg-type]
+        Plan(**{name: value})
 
 
 def test_nothing_recorded_is_lost_through_unplugging_garbage_and_a_stalled_disk(

@@ -19,6 +19,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
 from labapp.gui.tools.tool import ToolWindow, told
 from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.labels import headed
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.views.sheet import Sheet
 from labapp.gui.views.tables import CellTable
@@ -216,14 +217,7 @@ class AdviserWindow(ToolWindow):
 
 def _titled(table: QWidget) -> QWidget:
     """A table below its name, which is what a screen reader says of it."""
-    group = QWidget()
-    layout = QVBoxLayout(group)
-    layout.setContentsMargins(0, 6, 0, 0)
-    heading = QLabel(table.accessibleName())
-    font = heading.font()
-    font.setBold(True)
-    heading.setFont(font)
-    layout.addWidget(heading)
+    group, layout = headed(table.accessibleName())
     layout.addWidget(table)
     return group
 

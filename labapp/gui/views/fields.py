@@ -33,6 +33,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import ResultRow, as_csv, as_text, entered, parsed
+from labapp.gui.views.labels import heading
 from labapp.gui.views.tables import ReadTable
 
 STEP_PAUSE_MS = 300
@@ -402,11 +403,7 @@ class FieldForm(QWidget):
 
     def add_heading(self, words: str) -> None:
         """Begin a group of fields."""
-        heading = QLabel(words)
-        font = heading.font()
-        font.setBold(True)
-        heading.setFont(font)
-        self._grid.addWidget(heading, self._grid.rowCount(), 0, 1, 2)
+        self._grid.addWidget(heading(words), self._grid.rowCount(), 0, 1, 2)
 
     def add_wide(self, widget: QWidget) -> None:
         """Put something else below the fields, over the whole width."""

@@ -17,7 +17,7 @@ from labapp.media.cameras.base import (
     Trigger,
 )
 from labapp.media.cameras.feed import Counts, Feed
-from labapp.media.cameras.simulated import Faults, SimulatedDevice
+from labapp.media.cameras.simulated import Faults, SimulatedDevice, there_and_back
 
 __all__ = [
     "BrokenFrame",
@@ -36,6 +36,7 @@ __all__ = [
     "Trigger",
     "find_cameras",
     "open_camera",
+    "there_and_back",
 ]
 
 

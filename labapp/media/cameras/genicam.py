@@ -1,6 +1,6 @@
 """What is called of Aravis and GLib, which GenICam cameras are reached by, through ctypes.
 
-No PyGObject: it would have to be built for every Python (docs/adr/0015). Loaded when first asked
+No PyGObject: it would have to be built for every Python (docs/adr/0014). Loaded when first asked
 for; everything here may be called from any thread.
 """
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -34,6 +34,13 @@ BUFFERED = 64
 LEAST_SIDE = 16
 
 HIGHEST_HZ = 10_000.0
+
+
+def there_and_back(images: Sequence[GreyImage]) -> Callable[[int], GreyImage]:
+    """Pictures of a film that is played without end: its end is seldom like its beginning."""
+    last = len(images) - 1
+    order = [*range(last), *range(last, 0, -1)] or [0]
+    return lambda number: images[order[number % len(order)]]
 
 
 @dataclass(frozen=True)

@@ -315,7 +315,7 @@ def test_start_record_and_import_by_mouse_and_keys(
 
 
 def test_large_figures_where_the_set_up_is_complete(
-    window: MainWindow, page: CapturePage, device: SimulatedDevice, qtbot: QtBot
+    window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     with open_source(SAMPLES / "gtaw" / "recording.avi") as video:
         image = video.frame(0).image
@@ -323,7 +323,7 @@ def test_large_figures_where_the_set_up_is_complete(
         lambda session: session.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
     )
     film = SimulatedDevice("pool", lambda _: image, rate_hz=20)
-    device.open = film.open  # type: ignore[method-assign]
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
     start(page, qtbot)
     view = page.live_view
     assert view.figures.isVisible()

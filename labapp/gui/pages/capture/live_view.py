@@ -20,13 +20,13 @@ from labapp.gui.pages.capture.parts import (
     ExposureBars,
     Figures,
     button,
-    headed,
     show_recording,
     wrapped,
 )
 from labapp.gui.pages.capture.plan_fields import PlanFields
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.labels import headed
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
@@ -43,6 +43,7 @@ from labapp.media.events import Event
 from labapp.media.recorder import recording_path
 from labapp.session.session import Session
 from labapp.session.simulated_pool import pool_camera, simulated_pool
+from labapp.words import several
 
 TICK_MS = 33
 """The picture is renewed no more often; less often where that takes long."""
@@ -138,7 +139,7 @@ class LiveView(QObject):
             found, problems = answer
             self._choices = choices(found)
             self.camera.set_choices(self._choices)
-            told = f"{len(found)} camera{'s' * (len(found) != 1)} found"
+            told = f"{several(len(found), 'camera')} found"
             self.workspace.said.emit(". ".join([told, *problems]), False)
 
         if self._finding not in self.workspace.tasks.active:

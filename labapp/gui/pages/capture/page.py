@@ -18,7 +18,7 @@ from PySide6.QtWidgets import (
 from labapp.gui.dialogs import EVERYTHING, recordings
 from labapp.gui.pages.capture.live import told_of
 from labapp.gui.pages.capture.live_view import LiveView
-from labapp.gui.pages.capture.parts import ExposureBars, button, headed, whole, wrapped
+from labapp.gui.pages.capture.parts import ExposureBars, button, whole, wrapped
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
@@ -33,6 +33,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import FieldForm, NumberField
+from labapp.gui.views.labels import headed
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media.recorder import Take

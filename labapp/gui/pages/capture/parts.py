@@ -20,6 +20,7 @@ from labapp.core.exposure import Exposure
 from labapp.gui.pages.capture.presenter import bars
 from labapp.gui.theme import is_dark
 from labapp.gui.views.fields import NumberField
+from labapp.gui.views.labels import headed
 
 RED = QColor("#b8321f"), QColor("#f0705a")
 """Of what is under way, on a light and on a dark ground."""
@@ -86,19 +87,6 @@ class Figures(QWidget):
                 label.setFont(font)
             self._grid.addWidget(label, row, column)
         return self._labels[row, column]
-
-
-def headed(words: str) -> tuple[QWidget, QVBoxLayout]:
-    """A group of widgets under a heading, and its layout."""
-    group = QWidget()
-    layout = QVBoxLayout(group)
-    layout.setContentsMargins(0, 6, 0, 0)
-    heading = QLabel(words)
-    font = heading.font()
-    font.setBold(True)
-    heading.setFont(font)
-    layout.addWidget(heading)
-    return group, layout
 
 
 def wrapped(text: str = "") -> QLabel:

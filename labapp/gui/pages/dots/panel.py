@@ -23,6 +23,7 @@ from labapp.core.pipeline import Settings
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
+from labapp.gui.views.labels import heading, plain_words
 
 MOST_ROWS = 60
 COLUMNS_OF_BUTTONS = 3
@@ -56,25 +57,25 @@ class DotsPanel(QWidget):
         super().__init__()
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
-        self.seen, self.why, self.chosen = _words(), _words(), _words()
+        self.seen, self.why, self.chosen = plain_words(), plain_words(), plain_words()
         self.fit = ResultTable("Fit before the last edit and after it")
         for words in (self.seen, self.chosen):
             # The buttons stay under the hand, whatever there is to say.
             words.setMinimumHeight(2 * words.fontMetrics().lineSpacing())
             words.setAlignment(Qt.AlignmentFlag.AlignTop)
         layout.addWidget(self.seen)
-        layout.addWidget(_heading("Put right"))
+        layout.addWidget(heading("Put right"))
         layout.addWidget(self.chosen)
         layout.addLayout(self._sites())
         layout.addLayout(_buttons(edits))
-        layout.addWidget(_heading("Fit"))
+        layout.addWidget(heading("Fit"))
         layout.addWidget(self.why)
         layout.addWidget(self.fit)
-        layout.addWidget(_heading("Rows"))
+        layout.addWidget(heading("Rows"))
         self.rows = _RowList()
         self.rows.itemSelectionChanged.connect(lambda: self.rows_chosen.emit(self.rows.chosen()))
         layout.addWidget(self.rows)
-        layout.addWidget(_heading("Following frames"))
+        layout.addWidget(heading("Following frames"))
         self.most = NumberField(
             "At most", "frames", lowest=1, highest=1_000_000, decimals=0, optional=True,
             tooltip="Carry on over no more frames than this; empty: to the end of the recording",
@@ -83,7 +84,7 @@ class DotsPanel(QWidget):
         form.add(self.most)
         layout.addWidget(form)
         layout.addLayout(_buttons(frames))
-        layout.addWidget(_heading("Detector"))
+        layout.addWidget(heading("Detector"))
         layout.addWidget(self._detector())
         layout.addStretch(1)
 
@@ -250,21 +251,6 @@ class _RowList(QTableWidget):
 def _told(signal: SignalInstance, value: float | None) -> None:
     if value is not None:
         signal.emit(int(value))
-
-
-def _words() -> QLabel:
-    label = QLabel()
-    label.setWordWrap(True)
-    label.setTextFormat(Qt.TextFormat.PlainText)
-    return label
-
-
-def _heading(text: str) -> QLabel:
-    label = QLabel(text)
-    font = label.font()
-    font.setBold(True)
-    label.setFont(font)
-    return label
 
 
 def _buttons(actions: Sequence[QAction]) -> QGridLayout:

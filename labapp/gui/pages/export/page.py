@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from PySide6.QtCore import Qt, QUrl
+from PySide6.QtCore import QUrl
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import (
     QCheckBox,
@@ -14,7 +14,6 @@ from PySide6.QtWidgets import (
     QFrame,
     QGridLayout,
     QHBoxLayout,
-    QLabel,
     QPushButton,
     QScrollArea,
     QVBoxLayout,
@@ -38,6 +37,7 @@ from labapp.gui.pages.export.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.labels import heading, plain_words
 from labapp.gui.views.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.meshes import SMALLEST_SPACING_MM
@@ -206,7 +206,7 @@ class ExportPage(Page):
         grid.setVerticalSpacing(18)
         for number, (title, items) in enumerate(GROUPS):
             column = QVBoxLayout()
-            column.addWidget(_heading(title))
+            column.addWidget(heading(title))
             for item in items:
                 box = QCheckBox(item.name)
                 box.setToolTip(item.tip)
@@ -218,8 +218,8 @@ class ExportPage(Page):
             column.addStretch(1)
             grid.addLayout(column, number // 2, number % 2)
         will = QVBoxLayout()
-        will.addWidget(_heading("In the folder there will be"))
-        self.files = _words()
+        will.addWidget(heading("In the folder there will be"))
+        self.files = plain_words()
         will.addWidget(self.files)
         grid.addLayout(will, 2, 0, 1, 2)
         grid.addWidget(self._make_result(), 3, 0, 1, 2)
@@ -238,8 +238,8 @@ class ExportPage(Page):
         self.result_group = QWidget()
         layout = QVBoxLayout(self.result_group)
         layout.setContentsMargins(0, 8, 0, 0)
-        layout.addWidget(_heading("Written"))
-        self.result = _words()
+        layout.addWidget(heading("Written"))
+        self.result = plain_words()
         layout.addWidget(self.result)
         row = QHBoxLayout()
         row.addWidget(_button("Open the folder", "Show it in the file manager", self.open_folder))
@@ -288,8 +288,8 @@ class ExportPage(Page):
         self.panel_layout.addWidget(
             _button("Choose a folder …", "Choose where to write", self.choose_folder)
         )
-        self.notes = _words()
-        self.why_not = _words()
+        self.notes = plain_words()
+        self.why_not = plain_words()
         self.again_button = _button(
             "Measure now",
             "Measure the chosen frames that are not measured, or no longer stand",
@@ -329,22 +329,6 @@ def _whole(label: str, lowest: int, tip: str, name: str, wish: Callable[..., Non
     field = NumberField(label, lowest=lowest, highest=10**9, decimals=0, tooltip=tip)
     field.edited.connect(lambda value: wish(**{name: value}) if value is not None else None)
     return field
-
-
-def _heading(words: str) -> QLabel:
-    label = QLabel(words)
-    font = label.font()
-    font.setBold(True)
-    label.setFont(font)
-    return label
-
-
-def _words() -> QLabel:
-    label = QLabel()
-    label.setWordWrap(True)
-    label.setTextFormat(Qt.TextFormat.PlainText)
-    label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-    return label
 
 
 def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:

@@ -16,6 +16,7 @@ from labapp.gui.pages.surface.presenter import (
 )
 from labapp.gui.tasks import Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, ResultTable
+from labapp.gui.views.labels import heading
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
 
@@ -81,11 +82,7 @@ class SurfacePanel:
         self.progress.setToolTip("How far the measurement is")
         self.cancel = _button("&Cancel", "Stop measuring; what is done stays (Ctrl+.)", self.stop)
         grid = QGridLayout()
-        heading = QLabel("Measure")
-        font = heading.font()
-        font.setBold(True)
-        heading.setFont(font)
-        grid.addWidget(heading, 0, 0)
+        grid.addWidget(heading("Measure"), 0, 0)
         grid.addWidget(self.one, 0, 1)
         grid.addWidget(self.missing, 1, 0)
         grid.addWidget(self.all, 1, 1)

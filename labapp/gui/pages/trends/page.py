@@ -23,6 +23,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
 from labapp.gui.tasks import Control
 from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.labels import heading, plain_words
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.workspace import Workspace
 from labapp.session.signals import Signals, read_signals
@@ -172,12 +173,12 @@ class TrendsPage(Page):
         self.nothing.setWordWrap(True)
         self.canvas_layout.addWidget(self.nothing, 1)
         layout = self.panel_layout
-        layout.addWidget(_heading("Shown"))
+        layout.addWidget(heading("Shown"))
         layout.addLayout(self._make_choice())
-        layout.addWidget(_heading("Mean ± standard deviation, range"))
+        layout.addWidget(heading("Mean ± standard deviation, range"))
         self.table = ResultTable("Statistics of the measures")
         layout.addWidget(self.table)
-        self.counted = _words()
+        self.counted = plain_words()
         layout.addWidget(self.counted)
         self.without = QCheckBox("Leave out frames that stand out")
         self.without.setToolTip(
@@ -215,18 +216,18 @@ class TrendsPage(Page):
         return grid
 
     def _make_spectrum(self) -> None:
-        self.panel_layout.addWidget(_heading("Spectrum"))
+        self.panel_layout.addWidget(heading("Spectrum"))
         choices = [("", "none"), *((q.key, q.label) for q in QUANTITIES)]
         self.of = ChoiceField("Spectrum of", choices, tooltip="Shows oscillations of a measure")
         self.of.edited.connect(lambda key: self._wish(spectrum_of=key))
         self.panel_layout.addLayout(_labelled(self.of))
-        self.spectrum_words = _words()
+        self.spectrum_words = plain_words()
         self.spectrum_words.hide()
         self.panel_layout.addWidget(self.spectrum_words)
 
     def _make_signals(self) -> None:
-        self.panel_layout.addWidget(_heading("Current and voltage"))
-        self.signals_words = _words()
+        self.panel_layout.addWidget(heading("Current and voltage"))
+        self.signals_words = plain_words()
         self.panel_layout.addWidget(self.signals_words)
         self.start = NumberField(
             "Starts at",
@@ -253,22 +254,6 @@ class TrendsPage(Page):
         row.addWidget(self.read_button)
         row.addWidget(self.forget_button)
         self.panel_layout.addLayout(row)
-
-
-def _heading(words: str) -> QLabel:
-    label = QLabel(words)
-    font = label.font()
-    font.setBold(True)
-    label.setFont(font)
-    label.setWordWrap(True)
-    return label
-
-
-def _words() -> QLabel:
-    label = QLabel()
-    label.setWordWrap(True)
-    label.setTextFormat(Qt.TextFormat.PlainText)
-    return label
 
 
 def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
