@@ -14,6 +14,7 @@ from labapp.media.cameras.base import (
     CameraSettings,
     Limits,
     Range,
+    Region,
     Trigger,
 )
 from labapp.media.cameras.feed import Counts, Feed
@@ -32,6 +33,7 @@ __all__ = [
     "Feed",
     "Limits",
     "Range",
+    "Region",
     "SimulatedDevice",
     "Trigger",
     "find_cameras",

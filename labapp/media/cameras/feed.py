@@ -30,6 +30,9 @@ from labapp.words import several
 WAIT_S = 0.1
 """So long a frame is waited for before it is seen whether the feed is to end."""
 
+SOON_S = 0.01
+"""… and so long where the next frame is taken only when it is asked for."""
+
 SILENT_S = 2.0
 """A camera that gives no frame by itself for so long, or for 20 frames, is said to stall."""
 
@@ -111,6 +114,7 @@ class Feed:
         self._ending = threading.Event()
         self._asked: queue.SimpleQueue[tuple[CameraSettings, Future[CameraSettings]]]
         self._asked = queue.SimpleQueue()
+        self._pulls = threading.Semaphore(0)
         self._frames = self._lost = 0
         self._broken = Tally(
             lambda n: self._tell("loss", f"{several(n, 'frame')} not whole, left out")
@@ -160,6 +164,10 @@ class Feed:
         if self.state == "ended":
             self._refuse_asked()
         return answer
+
+    def trigger(self) -> None:
+        """Have a frame taken now; without effect where the trigger is not "software"."""
+        self._pulls.release()
 
     def stop(self) -> None:
         """Take no more frames and let go of the camera. Twice does no harm."""
@@ -215,8 +223,12 @@ class Feed:
         self.state = "running"
         while not self._ending.is_set():
             self._set_asked()
+            told = self._connection.settings.trigger == "software"
+            while self._pulls.acquire(blocking=False):
+                if told:
+                    self.camera.trigger()
             try:
-                frame = self.camera.read(WAIT_S)
+                frame = self.camera.read(SOON_S if told else WAIT_S)
             except BrokenFrame:
                 self._leave_out()
                 heard_s = time.monotonic()

@@ -346,13 +346,13 @@ def test_space_plays_where_no_camera_is_live(window: MainWindow, copy_sample, qt
 def test_settings_show_what_was_really_set(page: CapturePage, device, qtbot: QtBot):
     view = page.live_view
     start(page, qtbot)
-    assert view.fields["rate_hz"].value() == 100
-    assert view.fields["exposure_us"].isHidden()
+    assert view.camera_fields.fields["rate_hz"].value() == 100
+    assert view.camera_fields.fields["exposure_us"].isHidden()
     hand = Hand(page.window())
-    hand.enter(view.fields["rate_hz"], "40")
-    qtbot.waitUntil(lambda: device.settings.rate_hz == 40 and not view._answers)
-    hand.enter(view.fields["rate_hz"], "0.001")
-    assert "is not from 0.1 to 10000" in view.fields["rate_hz"].problem.text()
+    hand.enter(view.camera_fields.fields["rate_hz"], "40")
+    qtbot.waitUntil(lambda: device.settings.rate_hz == 40 and not view.camera_fields.waiting)
+    hand.enter(view.camera_fields.fields["rate_hz"], "0.001")
+    assert "is not from 0.1 to 10000" in view.camera_fields.fields["rate_hz"].problem.text()
     assert device.settings.rate_hz == 40
     view.plan_fields.before.set_value(0.5)
     view.plan_fields.before.edited.emit(0.5)
@@ -468,7 +468,7 @@ def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePag
     assert QApplication.focusWidget() is page.live_view.record_button
     reached = check_round(window)
     assert page.live_view.record_button in reached
-    assert page.live_view.fields["rate_hz"].editor in reached
+    assert page.live_view.camera_fields.fields["rate_hz"].editor in reached
     window.resize(911, 512)  # 1366 × 768 at 150 %
     QTest.qWait(20)
     for button in window.findChildren(QAbstractButton):

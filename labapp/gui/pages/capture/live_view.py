@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
 from functools import partial
-from typing import Any
 
 import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
@@ -14,7 +12,7 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QW
 
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.gui.pages.capture.camera_fields import CameraFields
 from labapp.gui.pages.capture.live import SIMULATED, Live, choices, figures, setup_of
 from labapp.gui.pages.capture.parts import (
     ExposureBars,
@@ -25,7 +23,7 @@ from labapp.gui.pages.capture.parts import (
 )
 from labapp.gui.pages.capture.plan_fields import PlanFields
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.fields import ChoiceField, FieldForm
 from labapp.gui.views.labels import headed
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
@@ -34,7 +32,6 @@ from labapp.media.cameras import (
     CameraError,
     CameraInfo,
     CameraSettings,
-    Limits,
     SimulatedDevice,
     find_cameras,
     open_camera,
@@ -59,13 +56,6 @@ RING, RING_PX = "#2fd39b", 15
 
 BUTTON_PX, RING_BAR_PX = 44, 130
 """Least height of the buttons that are pressed in gloves; width of the bar beside them."""
-
-SETTINGS = {
-    "exposure_us": ("Exposure", "µs", 0, 100.0, "How long light is gathered for a frame"),
-    "gain_db": ("Gain", "dB", 1, 1.0, "Amplification: it brightens the noise, too"),
-    "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames a second"),
-}
-"""Label, unit, decimals, step and tip of what can be set."""
 
 
 class LiveView(QObject):
@@ -113,7 +103,6 @@ class LiveView(QObject):
         self._pools: dict[str, SimulatedDevice] = {}
         self._opening: Task | None = None
         self._finding: Task | None = None
-        self._answers: list[tuple[str, float, Future[CameraSettings]]] = []
         self._told_s = self.measured_s = 0.0
         self._room_byte: int | None = None
         self._timer = QTimer(self)
@@ -194,7 +183,7 @@ class LiveView(QObject):
     def _opened(self, live: Live) -> None:
         if self.live is not live or live.feed is None:
             return
-        self._show_settings(live.feed.settings, live.feed.camera.limits)
+        self.camera_fields.show_camera(live.feed)
         self._room_byte = None
         self._rings.setData([])
         self.measured_s = 0.0
@@ -263,6 +252,11 @@ class LiveView(QObject):
         if self.live is not None and plan != self.live.plan:
             self.live.set_plan(plan)
 
+    def _begin_anew(self) -> None:
+        """Keep no frames from before the camera was set otherwise."""
+        if self.live is not None:
+            self.live.set_plan(self.live.plan)
+
     # --- while it runs ------------------------------------------------------------------------
 
     def _tick(self) -> None:
@@ -288,7 +282,7 @@ class LiveView(QObject):
         if time.monotonic() - self._told_s > TELL_S:
             self._tell_figures(live)
         self._hear(live)
-        self._take_answers(live)
+        self.camera_fields.take_answers()
         took_ms = (time.perf_counter() - began_s) * 1000
         wanted = max(TICK_MS, round(2 * took_ms))
         if abs(wanted - self._timer.interval()) > TICK_MS / 4:
@@ -324,47 +318,13 @@ class LiveView(QObject):
         self.ring.setFormat(told)
         self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
         self.recording.setText(live.recording_in_words(self._room_byte))
+        picture = self._picture.picture
+        if live.feed is not None and picture is not None:
+            set_to = live.feed.settings
+            rate_hz = set_to.rate_hz if set_to.trigger == "free" else None
+            self.plan_fields.show_cost(picture.nbytes, rate_hz or live.rate_hz())
         if self._shown != (live.running is not None):
             self._show_state()
-
-    # --- settings -----------------------------------------------------------------------------
-
-    def _set(self, name: str, value: float | None) -> None:
-        if self.live is not None and value is not None:
-            wanted: dict[str, Any] = {name: value}
-            answer = self.live.apply(CameraSettings(**wanted))
-            if answer is not None:
-                self._answers.append((name, value, answer))
-
-    def _take_answers(self, live: Live) -> None:
-        """Show what was really set."""
-        for each in [each for each in self._answers if each[2].done()]:
-            self._answers.remove(each)
-            name, wanted, answer = each
-            try:
-                settings = answer.result()
-            except (CameraError, InputError) as error:
-                self.fields[name].set_value(None)
-                if live.feed is not None:
-                    self._show_settings(live.feed.settings, live.feed.camera.limits)
-                self.fields[name].set_problem(str(error))
-                continue
-            if live.feed is not None:
-                self._show_settings(settings, live.feed.camera.limits)
-            now = getattr(settings, name)
-            if now is not None and abs(now - wanted) > 1e-3 * abs(wanted):
-                self.fields[name].set_problem(f"The camera takes {now:.6g}, not {wanted:.6g}")
-            if name == "rate_hz":
-                live.set_plan(live.plan)
-
-    def _show_settings(self, settings: CameraSettings, limits: Limits) -> None:
-        for name, field in self.fields.items():
-            span = getattr(limits, name)
-            if span is not None:
-                field.lowest, field.highest = span.lowest, span.highest
-            field.set_value(getattr(settings, name))
-            for part in (field, field.label):
-                part.setVisible(span is not None)
 
     # --- widgets ------------------------------------------------------------------------------
 
@@ -385,6 +345,7 @@ class LiveView(QObject):
         self.bar.setVisible(runs)
         self.mark_button.setEnabled(recording)
         self.plan_fields.set_enabled(not recording)
+        self.camera_fields.set_recording(recording)
         show_recording(self.record_button, recording)
 
     def _make_group(self) -> None:
@@ -414,13 +375,10 @@ class LiveView(QObject):
         inner.addWidget(self.figures)
         inner.addWidget(self.counts)
         fields = FieldForm()
-        self.fields: dict[str, NumberField] = {}
-        for name, (label, unit, decimals, step, tip) in SETTINGS.items():
-            self.fields[name] = field = NumberField(
-                label, unit, lowest=0, highest=1e9, decimals=decimals, step=step, tooltip=tip
-            )
-            field.edited.connect(partial(self._set, name))
-            fields.add(field)
+        self.camera_fields = CameraFields(
+            fields, lambda wanted: None if self.live is None else self.live.apply(wanted)
+        )
+        self.camera_fields.reset.connect(self._begin_anew)
         self.plan_fields = PlanFields(fields)
         self.plan_fields.edited.connect(self._replan)
         inner.addWidget(fields)
