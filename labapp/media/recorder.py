@@ -255,11 +255,11 @@ class Recorder:
             if self._running is not None:
                 self._end(self._running)
 
-    def note(self, event: Event) -> None:
-        """Keep what happened beside the recording that runs: a mark, a camera that was gone."""
+    def note(self, event: Event, time_s: float | None = None) -> None:
+        """Keep what happened beside the recording that runs, by the camera's clock; None: now."""
         with self._turn:
             if self._running is not None:
-                self._add_note(self._running, event)
+                self._add_note(self._running, event, time_s)
                 self._turn.notify()
 
     def close(self) -> None:
@@ -335,8 +335,8 @@ class Recorder:
         self._running = None
         self._turn.notify()
 
-    def _add_note(self, take: Take, event: Event) -> None:
-        self._queue.append((take, _Note(self._newest_s, event)))
+    def _add_note(self, take: Take, event: Event, time_s: float | None = None) -> None:
+        self._queue.append((take, _Note(self._newest_s if time_s is None else time_s, event)))
 
     def _tell_lost(self, count: int) -> None:
         faster = "; raw is written faster" * (self.plan.codec == "ffv1")

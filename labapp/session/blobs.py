@@ -36,6 +36,7 @@ from labapp.core.surface import FlatSurface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.session.kinds import check_fields, is_a
+from labapp.session.limits import Limits
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.signals import Signals
 
@@ -47,7 +48,7 @@ DATACLASSES: dict[str, Any] = {
     for kind in (
         *(Boundary, Correction, dots.Dots, ImageCalibration, lattice.Lattice, LaserCalibration),
         *(LaserReadings, Match, Measurement, Measures, PlaneCalibration, PlanePicture, Record),
-        *(Reconstruction, Recording, Signals, SplineBasis, SplineSurface, Trial),
+        *(Limits, Reconstruction, Recording, Signals, SplineBasis, SplineSurface, Trial),
         *(DotPattern, Electrode, ImagingPlane, Laser, Rig),
         *(Settings, MatchSettings, detection.DotSettings, detection.LatticeSettings),
         *(dots.BandPassSettings, threshold_dots.BlockThresholdSettings),

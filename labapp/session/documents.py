@@ -1,8 +1,8 @@
 """What the operator says, and every change of it: undo, redo, saved with the session.
 
 A document is one thing the operator decides: the record, the setup, the settings, a calibration,
-the correction of one frame, the weld's current and voltage. A change sets some of them, in one
-transaction with what they were before.
+the correction of one frame, the weld's current and voltage, the limits of its sizes. A change sets
+some of them, in one transaction with what they were before.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from labapp.core.pipeline import Settings
 from labapp.session.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
 from labapp.session.database import Database
 from labapp.session.kept import Kept
+from labapp.session.limits import Limits
 from labapp.session.record import LaserReadings, PlanePicture, Record
 from labapp.session.signals import Signals
 
@@ -29,6 +30,7 @@ Kind = Literal[
     "plane-calibration",
     "correction",
     "signals",
+    "limits",
 ]
 Key = tuple[Kind, int]
 """Kind, and the frame of a correction; `WHOLE` for what belongs to no frame."""
@@ -43,6 +45,7 @@ CLASSES: dict[str, type] = {
     "plane-calibration": PlanePicture,
     "correction": Correction,
     "signals": Signals,
+    "limits": Limits,
 }
 """What a document of each kind is."""
 

@@ -16,6 +16,7 @@ from labapp.core.pipeline import Settings
 from labapp.core.quality import Quality, judge_quality
 from labapp.core.warm import WarmChain
 from labapp.media import GreyImage
+from labapp.session.scene import Scene, scene_of
 from labapp.session.setup import Setup
 from labapp.simulation.parallel import NICE, begin_worker, end_processes
 
@@ -38,6 +39,8 @@ class LiveMeasurement:
         Sizes; None where it could not be measured.
     followed
         Whether it was measured from the one before, in milliseconds; else by itself, in seconds.
+    scene
+        Its surface to be drawn, where that was asked for; None where it could not be measured.
     """
 
     status: str
@@ -45,6 +48,7 @@ class LiveMeasurement:
     quality: Quality
     measures: Measures | None
     followed: bool
+    scene: Scene | None = None
 
 
 class LiveMeasuring:
@@ -67,8 +71,15 @@ class LiveMeasuring:
             1, spawn, initializer=begin_worker, initargs=(NICE, _begin, given)
         )
 
-    def measure(self, image: GreyImage) -> LiveMeasurement:
+    def measure(self, image: GreyImage, drawn: bool = False) -> LiveMeasurement:
         """Measure the next frame.
+
+        Parameters
+        ----------
+        image
+            Grey levels, shape (rows, columns).
+        drawn
+            Whether its surface is to be drawn: that takes a millisecond more.
 
         Raises
         ------
@@ -76,7 +87,7 @@ class LiveMeasuring:
             If the process has ended.
         """
         try:
-            return self._pool.submit(_measured, image).result()
+            return self._pool.submit(_measured, image, drawn).result()
         except (BrokenProcessPool, CancelledError, RuntimeError) as error:
             raise LiveMeasuringEnded(str(error)) from error
 
@@ -93,7 +104,7 @@ class _Chain(NamedTuple):
     bit_depth: int
 
 
-_measure: list[Callable[[GreyImage], LiveMeasurement]] = []
+_measure: list[Callable[[GreyImage, bool], LiveMeasurement]] = []
 """In the process: what measures."""
 
 
@@ -102,16 +113,20 @@ def _begin(given: _Chain) -> None:
     chain = WarmChain(setup.rig, setup.calibration, settings)
     pattern = setup.rig.pattern
 
-    def measure(image: GreyImage) -> LiveMeasurement:
+    def measure(image: GreyImage, drawn: bool) -> LiveMeasurement:
         # The matrices are small: more threads than one get in each other's way.
         with ThreadpoolController().limit(limits=1, user_api="blas"):
             found = chain.measure(image)
         quality = judge_quality(image, found, depth, pattern.rows * pattern.columns)
         sizes = found.measures if found.status == "ok" else None
-        return LiveMeasurement(found.status, found.reason, quality, sizes, chain.broke is None)
+        surface = found.reconstruction if drawn and sizes is not None else None
+        scene = None if surface is None else scene_of(surface)
+        return LiveMeasurement(
+            found.status, found.reason, quality, sizes, chain.broke is None, scene
+        )
 
     _measure[:] = [measure]
 
 
-def _measured(image: GreyImage) -> LiveMeasurement:
-    return _measure[0](image)
+def _measured(image: GreyImage, drawn: bool) -> LiveMeasurement:
+    return _measure[0](image, drawn)

@@ -10,7 +10,6 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -31,6 +30,7 @@ from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Change, Documents, KeptSignals, Key
 from labapp.session.frames import THE_RECORDING, Frames, Progress
 from labapp.session.kept_pictures import KeptPictures
+from labapp.session.limits import Limits
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
 from labapp.session.overviews import Overviews
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
@@ -100,12 +100,7 @@ class Session:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # --- what the operator says; every change can be undone ---------------------------------
@@ -185,13 +180,9 @@ class Session:
         lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
         readings = LaserReadings(*lengths, fan_angle_deg, found, kept)
         laser = {"projection_angle_deg": found.angle_deg, "distance_mm": found.distance_mm}
-        self._change(
-            "laser calibration",
-            {
-                ("laser-calibration", WHOLE): readings,
-                ("setup", WHOLE): self._updated({"laser": laser}),
-            },
-        )
+        setup = self._updated({"laser": laser})
+        values: dict[Key, Any] = {("laser-calibration", WHOLE): readings, ("setup", WHOLE): setup}
+        self._change("laser calibration", values)
         return found
 
     @property
@@ -235,13 +226,9 @@ class Session:
         """
         _ = found.image_calibration  # which refuses such points
         readings = PlanePicture(unit_mm, found, self._pictures.keep(name, image))
-        self._change(
-            "imaging-plane calibration",
-            {
-                ("plane-calibration", WHOLE): readings,
-                ("setup", WHOLE): self._updated({"image_calibration": found.setup_keys}),
-            },
-        )
+        setup = self._updated({"image_calibration": found.setup_keys})
+        values: dict[Key, Any] = {("plane-calibration", WHOLE): readings, ("setup", WHOLE): setup}
+        self._change("imaging-plane calibration", values)
 
     def picture(self, sha256: str) -> GreyImage:
         """A calibration picture that the session keeps, grey levels, shape (rows, columns).
@@ -290,6 +277,16 @@ class Session:
     def set_signals(self, signals: Signals | None) -> None:
         """Keep current and voltage (`read_signals`); None lets go of them."""
         self._change("current and voltage", {("signals", WHOLE): signals})
+
+    @property
+    def limits(self) -> Limits:
+        """Between what the pool's sizes are to be while it is filmed."""
+        found = self._documents.get("limits")
+        return Limits() if found is None else found
+
+    def set_limits(self, limits: Limits) -> None:
+        """Choose the limits of the pool's sizes; beyond one is an alarm (`alarms`)."""
+        self._change("limits", {("limits", WHOLE): limits})
 
     def undo(self) -> Change | None:
         """Take back the last change that stands; None if there is none."""

@@ -14,12 +14,13 @@ import logging
 import math
 import os
 import threading
-from collections.abc import Coroutine, Mapping
+from collections.abc import Coroutine, Iterable, Mapping
 from typing import Any, Protocol
 
 import labapp
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
+from labapp.session.alarms import Alarm
 from labapp.session.log import NAME
 from labapp.session.tables import SIZES
 
@@ -28,6 +29,9 @@ MOST_WAITING = 1_000_000
 
 OPCUA_S = 0.05
 """The variables of OPC UA take the newest frame so often: clients sample them."""
+
+ALARMS = ("alarm", "unacknowledged")
+"""What is told of alarms, while a camera is live."""
 
 NAMESPACE = "urn:labapp:measures"
 
@@ -56,11 +60,33 @@ def told_values(frame: int, time_s: float | None, measurement: Measurement) -> V
     }
 
 
+def live_values(
+    frame: int, time_s: float | None, measurement: Measurement, alarms: Iterable[Alarm]
+) -> Values:
+    """The same of a frame of a live camera, and the alarms by their codes, with spaces between.
+
+    ``alarm``: what is so now; ``unacknowledged``: what the operator has not said to have seen.
+    """
+    shown = tuple(alarms)
+    return {
+        **told_values(frame, time_s, measurement),
+        ALARMS[0]: " ".join(each.code for each in shown if each.holds),
+        ALARMS[1]: " ".join(each.code for each in shown if not each.acknowledged),
+    }
+
+
 class Stream(Protocol):
     """Somebody to tell measures to."""
 
     address: str
     """Where it is heard, for who connects."""
+
+    told: int
+    """How many frames were told while somebody listened."""
+
+    @property
+    def listeners(self) -> int:
+        """How many programs are connected."""
 
     def publish(self, values: Values) -> None:
         """Tell a frame; does not wait."""
@@ -90,6 +116,7 @@ class LineStream:
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, anywhere: bool = False) -> None:
         check_host(host, anywhere)
+        self.told = 0
         self._missed: dict[asyncio.StreamWriter, int] = {}
         self._loop = _Loop("labapp line stream")
         try:
@@ -99,6 +126,11 @@ class LineStream:
             raise _taken(host, port, error) from error
         self.port: int = self._server.sockets[0].getsockname()[1]
         self.address = f"{host}:{self.port}"
+
+    @property
+    def listeners(self) -> int:
+        """How many programs are connected."""
+        return len(self._missed)
 
     def publish(self, values: Values) -> None:
         """Tell a frame; does not wait."""
@@ -124,6 +156,7 @@ class LineStream:
             writer.close()
 
     def _send(self, line: bytes) -> None:
+        self.told += bool(self._missed)
         for writer, missed in self._missed.items():
             if writer.transport.get_write_buffer_size() > MOST_WAITING:
                 self._missed[writer] += 1
@@ -182,6 +215,7 @@ class OpcuaStream:
         self._newest: Values | None = None
         self._variables: dict[str, Any] = {}
         self._ended = False
+        self.told = 0
         self._loop = _Loop("labapp OPC UA stream")
         self.address = f"opc.tcp://{host}:{port}/labapp"
         try:
@@ -190,6 +224,11 @@ class OpcuaStream:
             self._loop.close()
             raise _taken(host, port, error) from error
         self._telling = self._loop.start(self._tell())
+
+    @property
+    def listeners(self) -> int:
+        """How many programs are connected."""
+        return len(self._server.bserver.clients)
 
     def publish(self, values: Values) -> None:
         """Tell a frame; does not wait. A frame that another follows at once may be left out."""
@@ -210,8 +249,9 @@ class OpcuaStream:
         server.allow_remote_admin(False)  # or anybody could write, and take variables away
         space = await server.register_namespace(NAMESPACE)
         pool = await server.nodes.objects.add_object(space, "Pool")
-        kinds = {"frame": -1, "time_s": math.nan, "status": "", "reason": "", "scheme": ""}
-        for name, empty in {**kinds, **dict.fromkeys(SIZES, math.nan)}.items():
+        words = dict.fromkeys(("status", "reason", "scheme", *ALARMS), "")
+        sizes = dict.fromkeys(SIZES, math.nan)
+        for name, empty in {"frame": -1, "time_s": math.nan, **words, **sizes}.items():
             self._variables[name] = await pool.add_variable(space, name, empty)
         await server.start()
         return server
@@ -222,6 +262,7 @@ class OpcuaStream:
             try:
                 for name, value in (values or {}).items():
                     await self._variables[name].write_value(math.nan if value is None else value)
+                self.told += values is not None and self.listeners > 0
             except Exception as error:  # what one frame does must not end the telling
                 logging.getLogger(NAME).error("not told by OPC UA", exc_info=error)
             if not self._ended:

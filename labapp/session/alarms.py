@@ -1,0 +1,177 @@
+"""Alarms while a pool is filmed: raised, over, and acknowledged by the operator.
+
+One is raised when a size is beyond its limit by more than chance, or when so many frames in a row
+cannot be measured; it is over when the size is within its limits again, or a frame is measured. It
+is shown until it is both over and acknowledged: none goes by unseen.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+
+from labapp.core.measures import Measures
+from labapp.session.limits import NAMES, Limits, Size, Standing, sizes_of, standing
+from labapp.words import several
+
+NOT_MEASURED = "not-measured"
+"""Code of the alarm of frames that cannot be measured; others are as ``width-high``."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Something that the operator must see.
+
+    Parameters
+    ----------
+    code
+        ``width-low``, ``width-high`` … ``height-high`` or ``not-measured``.
+    words
+        What is wrong, in a sentence without its end.
+    frame, time_s
+        The camera's number of the frame that raised it, and its time by the camera's clock, s.
+    holds
+        Whether it is so still.
+    acknowledged
+        Whether the operator has said that it was seen.
+    at
+        When it was raised.
+    """
+
+    code: str
+    words: str
+    frame: int
+    time_s: float
+    holds: bool = True
+    acknowledged: bool = False
+    at: datetime = field(default_factory=lambda: datetime.now().astimezone())
+
+    @property
+    def told(self) -> str:
+        """What is wrong, since which frame."""
+        return f"{self.words} (frame {self.frame}, {self.at:%H:%M:%S})"
+
+
+class Alarms:
+    """Watches the sizes of one frame after the other. May be used from several threads.
+
+    Parameters
+    ----------
+    limits
+        What is watched; without any limit nothing is.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._shown: dict[str, Alarm] = {}
+        self._unmeasured = 0
+        self._turn = threading.Lock()
+
+    @property
+    def limits(self) -> Limits:
+        """What is watched."""
+        return self._limits
+
+    def set_limits(self, limits: Limits) -> None:
+        """Watch other limits from the next frame on; alarms of those that were changed are over."""
+        with self._turn:
+            former, self._limits = self._limits, limits
+            for name in NAMES:
+                if former.of(name) != limits.of(name):
+                    self._end(f"{name}-{end}" for end in ("low", "high"))
+            if not limits.are_set:
+                self._unmeasured = 0
+                self._end([NOT_MEASURED])
+
+    @property
+    def shown(self) -> tuple[Alarm, ...]:
+        """Those that hold, or were not acknowledged; the oldest first."""
+        return tuple(self._shown.values())
+
+    def judge(
+        self, frame: int, time_s: float, measures: Measures | None, reason: str
+    ) -> list[Alarm]:
+        """Look at the next frame.
+
+        Parameters
+        ----------
+        frame, time_s
+            The camera's number of it, and its time, s.
+        measures
+            Sizes; None where it could not be measured.
+        reason
+            Why not.
+
+        Returns
+        -------
+        list of Alarm
+            Those that it raised, and those that are over (they hold no more).
+        """
+        with self._turn:
+            if not self._limits.are_set:
+                return []
+            self._unmeasured = self._unmeasured + 1 if measures is None else 0
+            changed: list[Alarm] = []
+            if self._unmeasured >= self._limits.unmeasured:
+                words = f"{several(self._unmeasured, 'frame')} in a row could not be measured"
+                changed += self._raise(NOT_MEASURED, f"{words}: {reason}", frame, time_s)
+            if measures is None:
+                return changed
+            changed += self._end([NOT_MEASURED])
+            for name, size in zip(NAMES, sizes_of(measures), strict=True):
+                stands = standing(size, self._limits.of(name))
+                changed += self._take(name, size, stands, frame, time_s)
+            return changed
+
+    def acknowledge(self) -> list[Alarm]:
+        """Take it that the operator has seen all that is shown; gives those not seen before."""
+        with self._turn:
+            seen = [alarm for alarm in self._shown.values() if not alarm.acknowledged]
+            kept = (alarm for alarm in self._shown.values() if alarm.holds)
+            self._shown = {alarm.code: replace(alarm, acknowledged=True) for alarm in kept}
+            return seen
+
+    def _take(
+        self, name: str, size: Size, stands: Standing, frame: int, time_s: float
+    ) -> list[Alarm]:
+        """What the standing of one size changes; one in doubt leaves everything as it was."""
+        if stands in ("", "in doubt"):
+            return []
+        low, high = f"{name}-low", f"{name}-high"
+        if stands == "in order":
+            return self._end([low, high])
+        ended = self._end([high if stands == "low" else low])
+        words = in_words(size, stands, self._limits)
+        return ended + self._raise(f"{name}-{stands}", words, frame, time_s)
+
+    def _raise(self, code: str, words: str, frame: int, time_s: float) -> list[Alarm]:
+        """Raise an alarm; none if it is raised already, also one that is over but was not seen."""
+        held = self._shown.get(code)
+        if held is None:
+            alarm = self._shown[code] = Alarm(code, words, frame, time_s)
+            return [alarm]
+        self._shown[code] = replace(held, holds=True)
+        return []
+
+    def _end(self, codes: Iterable[str]) -> list[Alarm]:
+        ended = []
+        for code in codes:
+            held = self._shown.get(code)
+            if held is not None and held.holds:
+                over = replace(held, holds=False)
+                ended.append(over)
+                if held.acknowledged:
+                    del self._shown[code]
+                else:
+                    self._shown[code] = over
+        return ended
+
+
+def in_words(size: Size, stands: Standing, limits: Limits) -> str:
+    """A size that is beyond its limit: "Width 7.051 ± 0.028 mm is above 6.9 mm"."""
+    low, high = limits.of(size.name)
+    limit, way = (low, "below") if stands == "low" else (high, "above")
+    sigma = f" ± {size.sigma_mm:.3f}" if size.sigma_mm == size.sigma_mm else ""
+    return f"{size.name.capitalize()} {size.value_mm:.3f}{sigma} mm is {way} {limit:g} mm"

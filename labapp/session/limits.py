@@ -1,0 +1,125 @@
+"""Limits of a pool's sizes while it is filmed, and whether a size is beyond one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from labapp.core.measures import Measures
+from labapp.errors import InputError
+
+CHANCE = 2.0
+"""Beyond a limit by no more than so many σ, a size may be there by chance: that is no alarm."""
+
+UNMEASURED = 3
+"""So many frames in a row that cannot be measured are an alarm, unless told otherwise."""
+
+LARGEST_MM = 1000.0
+
+Standing = Literal["", "unknown", "in order", "in doubt", "low", "high"]
+"""How a size stands to its limits: it has none; it could not be measured; within them; beyond one,
+but by chance perhaps; below the lower one; above the upper one."""
+
+NAMES = ("width", "length", "height")
+"""What has limits. For a hollow pool, height is its depth, which is negative."""
+
+Ends = tuple[float | None, float | None]
+
+
+class Size(NamedTuple):
+    """A size of a pool, mm.
+
+    Parameters
+    ----------
+    name
+        ``width``, ``length``, ``height``; of a hollow pool ``depth``.
+    value_mm, sigma_mm
+        NaN where they are not known.
+    """
+
+    name: str
+    value_mm: float
+    sigma_mm: float
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Between what the sizes of a pool are to be; the ends are mm, None where there is none.
+
+    Parameters
+    ----------
+    width_mm, length_mm
+        Lowest and highest.
+    height_mm
+        The same of the height; of a hollow pool of the depth, which is negative.
+    unmeasured
+        So many frames in a row that cannot be measured are an alarm.
+
+    Raises
+    ------
+    InputError
+        If the lowest is not below the highest, or one is out of range.
+    """
+
+    width_mm: Ends = (None, None)
+    length_mm: Ends = (None, None)
+    height_mm: Ends = (None, None)
+    unmeasured: int = UNMEASURED
+
+    def __post_init__(self) -> None:
+        problems = []
+        for name in NAMES:
+            low, high = self.of(name)
+            given = [end for end in (low, high) if end is not None]
+            if not all(abs(end) <= LARGEST_MM for end in given):
+                expected = f"-{LARGEST_MM:g} to {LARGEST_MM:g} (mm)"
+                problems.append(InputError("limits", f"{name}_mm", given, expected))
+            elif low is not None and high is not None and low >= high:
+                expected = f"the lowest below the highest, {high:g} mm"
+                problems.append(InputError("limits", f"{name}_mm", f"{low:g} mm", expected))
+        if self.unmeasured < 1:
+            problems.append(InputError("limits", "unmeasured", self.unmeasured, "1 or more frames"))
+        if problems:
+            raise InputError.gather(problems)
+
+    def of(self, name: str) -> Ends:
+        """Lowest and highest of a size by its name, mm; ``depth`` is ``height``."""
+        ends: Ends = getattr(self, f"{'height' if name == 'depth' else name}_mm")
+        return ends
+
+    @property
+    def are_set(self) -> bool:
+        """Whether there is any."""
+        return any(end is not None for name in NAMES for end in self.of(name))
+
+
+def sizes_of(measures: Measures | None) -> tuple[Size, Size, Size]:
+    """Width, length and height, of a hollow pool the depth; NaN where nothing was measured."""
+    hollow = measures is not None and -measures.depth_mm > measures.height_mm
+    width, length, height = (
+        Size(name, *(getattr(measures, f"{name}{end}", math.nan) for end in ("_mm", "_sigma_mm")))
+        for name in ("width", "length", "depth" if hollow else "height")
+    )
+    return width, length, height
+
+
+def standing(size: Size, ends: Ends) -> Standing:
+    """How a size stands to its limits; beyond one only if by more than `CHANCE` times its σ.
+
+    A size whose σ is not known is beyond a limit as soon as it has passed it.
+    """
+    low, high = ends
+    if low is None and high is None:
+        return ""
+    if not math.isfinite(size.value_mm):
+        return "unknown"
+    below = 0.0 if low is None else low - size.value_mm
+    above = 0.0 if high is None else size.value_mm - high
+    beyond = max(below, above)
+    if beyond <= 0:
+        return "in order"
+    chance = CHANCE * size.sigma_mm if math.isfinite(size.sigma_mm) else 0.0
+    if beyond <= chance:
+        return "in doubt"
+    return "low" if below > above else "high"

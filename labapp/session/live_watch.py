@@ -1,0 +1,290 @@
+"""Frames of a live camera measured while they come: figures, their trend, alarms, who is told."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.media.cameras import CameraFrame
+from labapp.media.events import Event, Kind
+from labapp.session.alarms import Alarm, Alarms
+from labapp.session.limits import NAMES, Limits, Size, sizes_of, standing
+from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring
+from labapp.session.setup import Setup
+from labapp.session.streams import Stream, live_values
+
+BURST = 32
+"""So many frames right after one that was measured by itself are measured one after the other."""
+
+RATE_S = 2.0
+"""Rates are those of so long."""
+
+TREND_S = 120.0
+"""The trend goes back so far."""
+
+MOST_KEPT = 12_000
+"""Frames of the trend at most: a hundred a second."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A frame of the camera, and what it gave.
+
+    Parameters
+    ----------
+    number, time_s
+        The camera's number of it, and its time by the camera's clock, s.
+    arrived_s
+        `time.monotonic` when it came, s: the figures are as old.
+    found
+        What it gave.
+    """
+
+    number: int
+    time_s: float
+    arrived_s: float
+    found: LiveMeasurement
+
+    @property
+    def sizes(self) -> tuple[Size, Size, Size]:
+        """Width, length and height."""
+        return sizes_of(self.found.measures)
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Sizes of the last frames that were tried; n frames, the oldest first.
+
+    Parameters
+    ----------
+    number
+        The camera's numbers of them, shape (n,).
+    since_s
+        When they came, from now on and so negative, shape (n,), s.
+    value_mm, sigma_mm
+        Of width, length and height, shape (3, n); NaN where they are not known.
+    beyond
+        Which of them are beyond a limit, shape (3, n).
+    """
+
+    number: IntArray
+    since_s: FloatArray
+    value_mm: FloatArray
+    sigma_mm: FloatArray
+    beyond: BoolArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How measuring keeps up, of late.
+
+    Parameters
+    ----------
+    measured_hz
+        Frames measured a second.
+    tried, failed
+        How many frames were tried, and of them could not be measured.
+    """
+
+    measured_hz: float
+    tried: int
+    failed: int
+
+
+class _Past(NamedTuple):
+    """What the trend keeps of a frame: little, for there are thousands."""
+
+    done_s: float
+    arrived_s: float
+    number: int
+    is_measured: bool
+    sizes: tuple[Size, Size, Size]
+
+
+class LiveWatch:
+    """Measures a camera's frames as they come, each from the one before, and watches the sizes.
+
+    `take` never waits. `next_frame` and `measure` belong into one thread; what is looked at may be
+    looked at from any.
+
+    Parameters
+    ----------
+    name
+        Of the camera, for what is said.
+    setup, settings, bit_depth
+        As of `LiveMeasuring`.
+    limits
+        Of the sizes.
+    say
+        Called with alarms that are raised, over, or acknowledged, and the time of their frame by
+        the camera's clock, s; from any thread.
+
+    Attributes
+    ----------
+    alarms
+        What is watched, and what the operator must see.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        setup: Setup,
+        settings: Settings,
+        bit_depth: int,
+        limits: Limits,
+        say: Callable[[Event, float], None],
+    ) -> None:
+        self.alarms = Alarms(limits)
+        self._name, self._scheme, self._say = name, settings.scheme, say
+        self._measuring = LiveMeasuring(setup, settings, bit_depth)
+        self._to_measure: deque[CameraFrame] = deque()
+        self._in_order = BURST
+        self._newest: deque[Followed] = deque(maxlen=1)
+        self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
+        self._turn = threading.Lock()
+        self._streams: tuple[Stream, ...] = ()
+        self._is_drawn = threading.Event()
+
+    def take(self, frame: CameraFrame) -> None:
+        """Take a frame of the camera; never waits."""
+        if len(self._to_measure) < BURST:
+            self._to_measure.append(frame)
+
+    def close(self) -> None:
+        """End the measuring, whatever it is at, and who is told is told so. Twice does no harm."""
+        self._measuring.close()
+        with self._turn:
+            streams, self._streams = self._streams, ()
+        for stream in streams:
+            stream.close()
+
+    # --- in a thread of its own ---------------------------------------------------------------
+
+    def next_frame(self) -> CameraFrame | None:
+        """The newest frame; after one that was measured by itself those that came right after it.
+
+        That took seconds: the present frame would be too far from it to be measured from it.
+        """
+        if self._in_order and self._to_measure:
+            self._in_order -= 1
+            return self._to_measure.popleft()
+        return newest_of(self._to_measure)
+
+    def measure(self, frame: CameraFrame) -> None:
+        """Measure a frame, watch its sizes, and tell them.
+
+        Raises
+        ------
+        LiveMeasuringEnded
+            If the process that measures has ended.
+        """
+        drawn = self._is_drawn.is_set()
+        found = self._measuring.measure(frame.image, drawn)
+        if found.scene is not None:
+            self._is_drawn.clear()
+        if not found.followed:
+            self._in_order = BURST
+        followed = Followed(frame.number, frame.time_s, frame.arrived_s, found)
+        for alarm in self.alarms.judge(frame.number, frame.time_s, found.measures, found.reason):
+            self._say(Event(self._name, *_told(alarm)), frame.time_s)
+        done_s, sizes = time.monotonic(), followed.sizes
+        is_measured = found.measures is not None
+        with self._turn:
+            past = _Past(done_s, frame.arrived_s, frame.number, is_measured, sizes)
+            self._past.append(past)
+            while self._past[0].done_s < done_s - TREND_S:
+                self._past.popleft()
+        self._newest.append(followed)
+        self._tell(followed)
+
+    def _tell(self, followed: Followed) -> None:
+        found = followed.found
+        measured = Measurement(found.status, found.reason, self._scheme, measures=found.measures)
+        values = live_values(followed.number, followed.time_s, measured, self.alarms.shown)
+        with self._turn:  # one that is told must not be closed meanwhile
+            for stream in self._streams:
+                stream.publish(values)
+
+    # --- to look at ---------------------------------------------------------------------------
+
+    def newest(self) -> Followed | None:
+        """The frame measured last; None if it was given already."""
+        return self._newest.popleft() if self._newest else None
+
+    def ask_for_scene(self) -> None:
+        """Have the surface of the next frame that is measured be drawn, too: once."""
+        self._is_drawn.set()
+
+    def pace(self) -> Pace:
+        """How measuring keeps up."""
+        since_s = time.monotonic() - RATE_S
+        with self._turn:
+            late = list(takewhile(lambda each: each.done_s > since_s, reversed(self._past)))
+        failed = sum(not each.is_measured for each in late)
+        return Pace((len(late) - failed) / RATE_S, len(late), failed)
+
+    def trend(self, last_s: float) -> Trend:
+        """Sizes of the frames that came in the last so many seconds."""
+        now_s, limits = time.monotonic(), self.alarms.limits
+        with self._turn:
+            late = [each for each in self._past if each.arrived_s > now_s - last_s]
+
+        def of_each(told: Callable[[Size], float], kind: type) -> Any:
+            table = [[told(size) for size in each.sizes] for each in late]
+            return np.array(table, kind).reshape(len(late), len(NAMES)).T
+
+        def beyond(size: Size) -> bool:
+            return standing(size, limits.of(size.name)) in ("low", "high")
+
+        return Trend(
+            np.array([each.number for each in late], np.int64),
+            np.array([each.arrived_s - now_s for each in late], float),
+            of_each(lambda size: size.value_mm, float),
+            of_each(lambda size: size.sigma_mm, float),
+            of_each(beyond, bool),
+        )
+
+    # --- to do --------------------------------------------------------------------------------
+
+    def acknowledge(self) -> None:
+        """Take it that the operator has seen all alarms."""
+        for alarm in self.alarms.acknowledge():
+            words = f"acknowledged: {alarm.told}"
+            self._say(Event(self._name, "note", words), alarm.time_s)
+
+    def tell_to(self, stream: Stream) -> None:
+        """Tell every frame that is measured to a stream; `close` closes it."""
+        with self._turn:
+            self._streams += (stream,)
+
+    def tell_no_more(self, stream: Stream) -> None:
+        """Close a stream."""
+        with self._turn:
+            self._streams = tuple(each for each in self._streams if each is not stream)
+        stream.close()
+
+
+def newest_of(frames: deque[CameraFrame]) -> CameraFrame | None:
+    """Take the newest frame; those before it are let go."""
+    while len(frames) > 1:
+        frames.popleft()
+    return frames.popleft() if frames else None
+
+
+def _told(alarm: Alarm) -> tuple[Kind, str]:
+    """How bad it is that an alarm has changed, and that in words."""
+    if alarm.holds:
+        return "warning", f"ALARM: {alarm.words} (frame {alarm.frame})"
+    return "note", f"alarm over: {alarm.told}"
