@@ -26,6 +26,9 @@ KEPT_MESSAGES = 1000
 PROBLEM = "▲"
 """Before a problem: what is wrong is told by shape too."""
 
+TOLD = Qt.ItemDataRole.UserRole
+"""Of a line of the log: what it tells, since when, and how often it was said."""
+
 
 class ElidedLabel(QLabel):
     """A line of text that ends in … where there is no room for all of it; the tip has it all."""
@@ -85,9 +88,17 @@ class LogPanel(QListWidget):
         return QSize(400, self.fontMetrics().height() * 6)
 
     def add(self, text: str, problem: bool) -> None:
-        """Add what was said."""
+        """Add what was said; the same again in the same line, with how often."""
         now = datetime.datetime.now().strftime("%H:%M:%S")
-        item = QListWidgetItem(f"{now}  {PROBLEM + ' ' if problem else ''}{text}")
+        told = f"{PROBLEM + ' ' if problem else ''}{text}"
+        last = self.item(self.count() - 1)
+        if last is not None and last.data(TOLD)[0] == told:
+            _, first, times = last.data(TOLD)
+            last.setData(TOLD, (told, first, times + 1))
+            last.setText(f"{now}  {told} ({times + 1} times since {first})")
+            return
+        item = QListWidgetItem(f"{now}  {told}")
+        item.setData(TOLD, (told, now, 1))
         font = item.font()
         font.setBold(problem)
         item.setFont(font)
@@ -155,9 +166,9 @@ class StatusLine(QWidget):
         self._show_message("")
 
     def say(self, text: str, problem: bool) -> None:
-        """Show a message, unless a problem is there that nobody has read."""
+        """Show a message, unless a problem is there that nobody has read; each counts once."""
         if problem:
-            self.unread.append(text)
+            self.unread[:] = [*(each for each in self.unread if each != text), text]
         elif self.unread:
             return
         self._show_message(text)

@@ -174,8 +174,6 @@ class MainWindow(QMainWindow):
 
     def say(self, text: str, problem: bool = False) -> None:
         """Tell the operator something; a problem stays in the status line until it was read."""
-        if problem and text in self.status_line.unread:
-            return
         self.log_panel.add(text, problem)
         self.status_line.say(text, problem)
         if problem:

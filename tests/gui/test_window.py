@@ -235,6 +235,24 @@ def test_what_was_said_of_another_session_goes_but_no_problem(
     assert "The disk is full" in plain.status_line.message.text()
 
 
+def test_the_same_again_is_one_line_with_how_often(plain: MainWindow):
+    before = plain.log_panel.count()
+    for _ in range(3):
+        plain.say("the camera was unplugged", True)
+    plain.say("it is back")
+    plain.say("the camera was unplugged", True)
+    first, back, again = plain.log_panel.texts()[before:]
+    assert "▲ the camera was unplugged (3 times since " in first
+    assert back.endswith("  it is back")
+    assert again.endswith("  ▲ the camera was unplugged")
+    # On the line it is one problem, and the last.
+    assert plain.status_line.unread == ["the camera was unplugged"]
+    plain.say("the disk is full", True)
+    plain.say("the camera was unplugged", True)
+    assert plain.status_line.unread == ["the disk is full", "the camera was unplugged"]
+    assert plain.status_line.message.text() == "▲ the camera was unplugged (2 problems)"
+
+
 def test_the_status_line_is_as_high_with_a_problem(plain: MainWindow):
     height = plain.status_line.minimumHeight()
     plain.say("The disk is full:\nnothing\ncan be\nwritten", True)

@@ -1,0 +1,452 @@
+"""The live camera for long: filmed, measured and recorded in the window, with and without faults.
+
+Run as ``xvfb-run -a -s "-screen 0 1366x768x24" python tests/benchmarks/live.py [MINUTES]
+[FRAMES_A_SECOND] [plain] [faults] [FOLDER]``: 1 minute, 200 frames/s, both, a temporary folder. A
+minute of 480×640 px at 200 frames/s takes 3.7 GB there.
+
+The simulated camera films a pool, each frame with its number in it. What it gave, and when, is kept
+where it is read, and is the truth: of the window's and the recording's counts, of what the window
+says, and of the file, every frame of which is compared. Each figure is told with the load of the
+machine.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("LIBGL_ALWAYS_SOFTWARE", "1")
+
+import csv
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from filming import Agenda, Disk, FilmedDevice, compare, moments, number_in
+from PySide6.QtCore import QEvent, QObject, Qt
+from PySide6.QtWidgets import QApplication
+from stall_meter import run_for, run_until
+
+from labapp.gui.pages.capture import live as live_module
+from labapp.gui.pages.capture import live_view
+from labapp.gui.preferences import Preferences
+from labapp.gui.window import MainWindow
+from labapp.media.cameras import Faults
+from labapp.media.nut import NutWriter
+from labapp.media.recorder import Recorder, Take
+from labapp.session.live_measuring import LiveMeasuring
+from labapp.session.samples import sample_folder
+
+LEAST_UPDATES = 20.0
+"""Of the window, a second, in every minute."""
+
+FLAT = 1.03
+"""What memory the last third of the time takes is flat, of that of the third before."""
+
+STALL_S, STALLS = 5.0, 3
+"""The disk takes nothing for so long, so many times."""
+
+DISCONNECTS, GARBAGE, NOISE, SEED = 50, 0.0075, 0.0025, 4803
+"""Garbage arrives cut off, of another size or type; noise is a whole frame, but of nothing."""
+
+PARTS = ("plain", "faults")
+
+
+class Sample(NamedTuple):
+    """What is counted at one time; frames are since the beginning.
+
+    Parameters
+    ----------
+    at_s
+        `time.monotonic`.
+    made, given, taken, written, lost
+        By the camera, to its reader, by the window's feed, to the file; lost by the recorder.
+    waiting_mb
+        What waits for the disk, or for a trigger.
+    measured, good
+        Frames measured, and those of them that have a surface.
+    age_s
+        Of the frame that the newest figures are of.
+    updates, longest_s
+        Frames painted; the longest time between two since the sample before.
+    window_mb, measuring_mb
+        Resident memory, of the window's process and of those it began.
+    busy_s
+        Time of the processor, of all processes.
+    """
+
+    at_s: float
+    made: int
+    given: int
+    taken: int
+    written: int
+    lost: int
+    waiting_mb: float
+    measured: int
+    good: int
+    age_s: float
+    updates: int
+    longest_s: float
+    window_mb: float
+    measuring_mb: float
+    busy_s: float
+
+
+class Measured(LiveMeasuring):
+    """Measures, and keeps account of it."""
+
+    frames = good = newest = 0
+
+    def measure(self, image: Any) -> Any:
+        found = super().measure(image)
+        Measured.frames += 1
+        Measured.good += found.status == "ok"
+        Measured.newest = number_in(image)
+        return found
+
+
+class Painted(QObject):
+    """Counts how often a picture is painted with another frame."""
+
+    def __init__(self, view: Any, viewport: QObject) -> None:
+        super().__init__(viewport)
+        self.updates, self._shown, self._view = 0, 0, view
+        self._longest_s, self._last_s = 0.0, time.monotonic()
+        viewport.installEventFilter(self)
+
+    def eventFilter(self, _: QObject, event: QEvent) -> bool:  # noqa: N802
+        if event.type() == QEvent.Type.Paint and self._view.updates != self._shown:
+            self._shown, now_s = self._view.updates, time.monotonic()
+            self._longest_s = max(self._longest_s, now_s - self._last_s)
+            self._last_s = now_s
+            self.updates += 1
+        return False
+
+    def longest_s(self) -> float:
+        """The longest time between two since it was asked last."""
+        longest_s = max(self._longest_s, time.monotonic() - self._last_s)
+        self._longest_s = 0.0
+        return longest_s
+
+
+# --- what processes take ----------------------------------------------------------------------
+
+
+def children() -> list[int]:
+    """Processes that this one began."""
+    found = [each.read_text() for each in Path("/proc/self/task").glob("*/children")]
+    return [int(word) for words in found for word in words.split()]
+
+
+def resident_mb(process: int) -> float:
+    try:
+        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    except OSError:  # it has ended
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def busy_s(process: int) -> float:
+    try:
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+# --- the run ----------------------------------------------------------------------------------
+
+
+class Run:
+    """The window with its camera.
+
+    Parameters
+    ----------
+    folder
+        Where it records to.
+    seconds, rate_hz
+        How long, and how fast it films.
+    faulty
+        Whether everything goes wrong that can.
+    """
+
+    def __init__(self, folder: Path, seconds: float, rate_hz: float, faulty: bool) -> None:
+        self.seconds, self.rate_hz, self.faulty = seconds, rate_hz, faulty
+        self.samples: list[Sample] = []
+        self.said: list[str] = []
+        self.stalls = 0
+        self._goes = threading.Event()
+        self._goes.set()
+        self._put_camera_in()
+        shutil.copytree(sample_folder("gtaw"), folder / "run")
+        self.window = MainWindow(Preferences(theme="dark"), folder / "preferences.json")
+        self.window.apply_theme()
+        self.window.resize(1366, 768)
+        self.window.show()
+        self.log: Any = self.window.log_panel
+        self.log.model().rowsInserted.connect(self._hear)
+        self.window.workspace.open(folder / "run" / "gtaw.labsession")
+        self.window.show_step("capture")
+        self.page: Any = self.window.page
+        self.view = self.page.live_view
+        self.painted = Painted(self.view, self.page.picture_view.canvas.viewport())
+
+    def _put_camera_in(self) -> None:
+        """Have the window film with a camera, and record on a disk, that are known."""
+        pool_camera = live_view.pool_camera
+        faults = Faults(garbage=GARBAGE, seed=SEED) if self.faulty else Faults()
+        most = round((self.seconds + 600) * self.rate_hz)
+
+        def filmed(text: str, progress: Any) -> FilmedDevice:
+            # As many pictures as it films in the same time: the pool swings as ever.
+            rate = f"frames = {round(self.rate_hz / 5)}\nframe_rate_hz = {self.rate_hz:.1f}"
+            text = re.sub(r"frames = \d+\nframe_rate_hz = [\d.]+", rate, text)
+            film, noise = pool_camera(text, progress).picture, NOISE * self.faulty
+            self.device = FilmedDevice(film, self.rate_hz, most, faults, noise)
+            return self.device
+
+        def writer(path: Path, *given: Any) -> NutWriter:
+            return NutWriter(path, *given, file=Disk(path, self._goes))
+
+        live_view.pool_camera = filmed
+        live_module.Recorder = partial(Recorder, writer=writer)
+        live_module.LiveMeasuring = Measured
+
+    def _hear(self, _: object, first: int, last: int) -> None:
+        self.said += [self.log.item(row).text() for row in range(first, last + 1)]
+
+    def _stall(self) -> None:
+        self._goes.clear()
+        time.sleep(STALL_S)
+        self._goes.set()
+        self.stalls += 1
+
+    def _agenda(self) -> Agenda:
+        """Disconnects and stalls of the disk at moments that follow from the seed."""
+        if not self.faulty:
+            return Agenda([])
+        random = np.random.default_rng(SEED)
+        step_s = self.seconds / DISCONNECTS
+        out = [
+            (at_s, partial(self.device.unplug, random.uniform(0.2, max(0.25, min(3, step_s / 4)))))
+            for at_s in moments(self.seconds, DISCONNECTS, random)
+        ]
+        count = min(STALLS, int(self.seconds / (4 * STALL_S)))
+        # Each in a thread of its own: the cable is pulled while the disk stalls, too.
+        stalls = [
+            (at_s, threading.Thread(target=self._stall, daemon=True).start)
+            for at_s in (moments(self.seconds, count, random) if count else [])
+        ]
+        return Agenda([*out, *stalls])
+
+    def do(self) -> Take:
+        """Film, measure and record, with a sample each second."""
+        self.view.start()
+        run_until(lambda: self.view.updates > 2, 120)
+        self.live = self.view.live
+        run_until(lambda: Measured.good > 1, 120)
+        run_for(2.0)
+        self.painted.updates = 0
+        self.view.trigger()
+        self.begun_s = time.monotonic()
+        self._sample()
+        ended = threading.Event()
+        sampling = threading.Thread(target=self._sample_on, args=(ended,), daemon=True)
+        sampling.start()
+        with self._agenda():
+            run_for(self.seconds)
+        ended.set()
+        sampling.join()
+        if left := (len(self.samples) - 1) % 60:
+            self.tell_minute(self.samples[-left - 1 :])
+        self.ended_s = time.monotonic()
+        take: Take = self.live.takes[-1]
+        self.view.trigger()
+        self.view.stop()
+        run_until(lambda: not self.window.workspace.tasks.active, 120)
+        run_for(0.5)
+        return take
+
+    def _sample_on(self, ended: threading.Event) -> None:
+        while not ended.wait(max(0.0, self.samples[-1].at_s + 1 - time.monotonic())):
+            self._sample()
+            if len(self.samples) % 60 == 1:
+                self.tell_minute(self.samples[-61:])
+
+    def _sample(self) -> None:
+        truth, take = self.device.truth, self.live.takes[-1]
+        given, now_s = truth.frames, time.monotonic()
+        place = int(np.searchsorted(truth.numbers[:given], Measured.newest))
+        mine, others = os.getpid(), children()
+        self.samples.append(
+            Sample(
+                now_s,
+                self.device.taken,
+                given,
+                self.live.feed.counts.frames,
+                take.frames,
+                take.lost,
+                self.live._recorders[-1].waiting_mb,
+                Measured.frames,
+                Measured.good,
+                now_s - truth.arrived_s[min(place, given - 1)],
+                self.painted.updates,
+                self.painted.longest_s(),
+                resident_mb(mine),
+                sum(resident_mb(each) for each in others),
+                sum(busy_s(each) for each in (mine, *others)),
+            )
+        )
+
+    # --- what is told -------------------------------------------------------------------------
+
+    def tell_minute(self, samples: Sequence[Sample]) -> None:
+        """A row of the table, of the samples of a minute."""
+        if len(self.samples) <= 61:
+            print(
+                "  min   made  given  taken written lost waiting  measured  without  age,most"
+                "  updates,least longest  window measuring  cores load\n"
+                "                                          at most  a second  surface         s"
+                "       a second       s      MB        MB"
+            )
+        first, last = samples[0], samples[-1]
+        lasted_s = last.at_s - first.at_s
+        made = np.subtract(last[1:6], first[1:6]).astype(int).tolist()
+        measured, good = last.measured - first.measured, last.good - first.good
+        ages = [each.age_s for each in samples[1:]]
+        least = min(self.rates(samples), default=0.0)
+        print(
+            f"{(last.at_s - self.begun_s) / 60:5.1f} {made[0]:6} {made[1]:6} {made[2]:6} "
+            f"{made[3]:7} {made[4]:4} {max(each.waiting_mb for each in samples):4.0f} MB "
+            f"{measured / lasted_s:9.1f} {measured - good:8} "
+            f"{np.median(ages):4.1f},{max(ages):4.1f} "
+            f"{(last.updates - first.updates) / lasted_s:8.1f},{least:5.1f} "
+            f"{max(each.longest_s for each in samples[1:]):7.2f} {last.window_mb:7.0f} "
+            f"{last.measuring_mb:9.0f} {(last.busy_s - first.busy_s) / lasted_s:6.2f} "
+            f"{os.getloadavg()[0]:4.1f}",
+            flush=True,
+        )
+
+    def rates(self, samples: Sequence[Sample], over: int = 1) -> list[float]:
+        """Updates a second, over so many samples each."""
+        pairs = zip(samples[::over], samples[over::over], strict=False)
+        return [(b.updates - a.updates) / (b.at_s - a.at_s) for a, b in pairs]
+
+    def judge(self, take: Take) -> bool:
+        """Hold all that was counted and said against what is true; a line a bar."""
+        truth, counts, all_right = self.device.truth, self.live.feed.counts, []
+
+        def line(right: bool, words: str) -> None:
+            all_right.append(right)
+            print(f"    {'right' if right else 'WRONG'}  {words}", flush=True)
+
+        unread = self.device.taken - truth.frames - truth.broken
+        line(unread == 0, f"{self.device.taken} frames made, {unread} not read in time")
+        line(
+            (counts.frames, counts.broken, counts.lost) == (truth.frames, truth.broken, truth.lost),
+            f"{truth.frames} whole and {truth.broken} broken given, disconnected {truth.lost} "
+            f"times; the window counts {counts.frames}, {counts.broken} and {counts.lost}, "
+            f"{counts.dropped} dropped",
+        )
+        line(take.lost == 0 and not take.trouble, f"{take.summary.words} {take.trouble}")
+        found = compare(take.path, self.device, self.begun_s, self.ended_s)
+        line(
+            found.right and found.frames == take.frames,
+            f"{found.frames} in the file: {found.missing} missing, {found.strange} twice or in "
+            f"another order, {found.wrong} with another content, times {found.off_us:.1f} µs off",
+        )
+        self._judge_memory(line)
+        least = min(self.rates(self.samples, 60), default=min(self.rates(self.samples), default=0))
+        line(least >= LEAST_UPDATES, f"{least:.1f} updates a second in the slowest minute")
+        measured = self.samples[-1].measured - self.samples[0].measured
+        rate = measured / (self.samples[-1].at_s - self.samples[0].at_s)
+        line(measured > 0, f"{measured} measured, {rate:.1f} a second")
+        self._judge_words(take, line)
+        return all(all_right)
+
+    def _judge_memory(self, line: Any) -> None:
+        third = len(self.samples) // 3
+        for name in ("window_mb", "measuring_mb"):
+            values = [getattr(each, name) for each in self.samples]
+            began, mid, end = (np.median(values[k * third : (k + 1) * third]) for k in range(3))
+            most = max(values)
+            words = f"{name}: {began:.0f}, {mid:.0f}, {end:.0f} in thirds of the time, at most"
+            line(end <= FLAT * mid, f"{words} {most:.0f}")
+
+    def _judge_words(self, take: Take, line: Any) -> None:
+        """Every fault is in the window's messages and beside the recording."""
+        truth = self.device.truth
+        with take.notes.open(encoding="utf-8", newline="") as file:
+            noted = [row["what"] for row in csv.DictReader(file)]
+        for where, told in (("messages", times_told(self.log.texts())), ("notes", noted)):
+            wanted = {
+                "was unplugged": truth.lost,
+                "it is back after": truth.lost,
+                "not whole, left out": truth.broken,
+                "writing does not keep up": self.stalls,
+                "writing has caught up": self.stalls,
+            }
+            found = {words: how_many(told, words) for words in wanted}
+            wrong = {words for words in wanted if found[words] != wanted[words]}
+            words = ", ".join(f"“{each}” {found[each]} of {wanted[each]}" for each in wanted)
+            line(not wrong, f"{where}: {words}")
+
+
+def times_told(lines: Sequence[str]) -> list[str]:
+    """The messages, those that were said several times in a row as often."""
+    told = []
+    for each in lines:
+        found = re.search(r" \((\d+) times since [\d:]+\)$", each)
+        told += [each] * (int(found[1]) if found else 1)
+    return told
+
+
+def how_many(told: Sequence[str], words: str) -> int:
+    """How often it is said, or of how many frames."""
+    found = [re.search(rf"(\d+) frames? {words}|{words}", each) for each in told]
+    return sum(int(each[1] or 1) for each in found if each)
+
+
+def run(folder: Path, seconds: float, rate_hz: float, part: str) -> bool:
+    """One part, in a process of its own."""
+    for variable in ("XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_DOCUMENTS_DIR"):
+        os.environ[variable] = str(folder / "home")
+    app = QApplication(["labapp"])
+    print(f"{part}: {seconds / 60:g} min, {rate_hz:g} frames/s, load {os.getloadavg()[0]:.1f}")
+    made = Run(folder, seconds, rate_hz, part == "faults")
+    right = made.judge(made.do())
+    made.window.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose, False)
+    made.window.close()
+    app.processEvents()
+    return right
+
+
+def main(arguments: Sequence[str]) -> int:
+    numbers = [float(each) for each in arguments if re.fullmatch(r"[\d.]+", each)]
+    minutes, rate_hz = [*numbers, *(1.0, 200.0)[len(numbers) :]]
+    parts = [each for each in arguments if each in PARTS] or list(PARTS)
+    folders = [each for each in arguments if each not in PARTS and Path(each).is_dir()]
+    with tempfile.TemporaryDirectory(dir=folders[0] if folders else None) as name:
+        if len(parts) == 1:
+            return not run(Path(name), 60 * minutes, rate_hz, parts[0])
+    ends = [
+        subprocess.run(
+            [sys.executable, __file__, str(minutes), str(rate_hz), part, *folders], check=False
+        )
+        for part in parts
+    ]
+    return any(each.returncode for each in ends)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
