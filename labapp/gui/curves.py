@@ -59,6 +59,11 @@ class Curve:
         Of y where no σ says how many.
     from_zero
         Whether the axis begins at 0.
+    limits
+        Lines at the lowest and the highest that y is to be, which are always seen; None for none.
+    quick
+        Whether points have a mark only where it is not the usual one: the curve is drawn anew many
+        times a second.
     """
 
     name: str
@@ -72,6 +77,8 @@ class Curve:
     level: float = float("nan")
     decimals: int = 3
     from_zero: bool = False
+    limits: tuple[float | None, float | None] = (None, None)
+    quick: bool = False
 
     def __post_init__(self) -> None:
         freeze(self)

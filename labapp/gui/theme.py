@@ -54,6 +54,9 @@ DARK = {
     Role.Dark: "#14171a",
     Role.Shadow: "#0b0c0e",
 }
+RED = QColor("#b8321f"), QColor("#f0705a")
+"""Of alarms, limits, and a recording under way: on a light and on a dark ground."""
+
 DISABLED = {False: "#8b939d", True: "#767e88"}
 """Text of what is disabled, light and dark."""
 

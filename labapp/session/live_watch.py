@@ -66,6 +66,8 @@ class Trend:
 
     Parameters
     ----------
+    names
+        What the three sizes are: the last is ``height``, or of a hollow pool ``depth``.
     number
         The camera's numbers of them, shape (n,).
     since_s
@@ -76,6 +78,7 @@ class Trend:
         Which of them are beyond a limit, shape (3, n).
     """
 
+    names: tuple[str, ...]
     number: IntArray
     since_s: FloatArray
     value_mm: FloatArray
@@ -154,7 +157,8 @@ class LiveWatch:
         self._newest: deque[Followed] = deque(maxlen=1)
         self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
         self._turn = threading.Lock()
-        self._streams: tuple[Stream, ...] = ()
+        self._streams: dict[str, Stream] = {}
+        self._is_closed = False
         self._is_drawn = threading.Event()
 
     def take(self, frame: CameraFrame) -> None:
@@ -166,8 +170,9 @@ class LiveWatch:
         """End the measuring, whatever it is at, and who is told is told so. Twice does no harm."""
         self._measuring.close()
         with self._turn:
-            streams, self._streams = self._streams, ()
-        for stream in streams:
+            self._is_closed = True
+            streams, self._streams = self._streams, {}
+        for stream in streams.values():
             stream.close()
 
     # --- in a thread of its own ---------------------------------------------------------------
@@ -214,7 +219,7 @@ class LiveWatch:
         measured = Measurement(found.status, found.reason, self._scheme, measures=found.measures)
         values = live_values(followed.number, followed.time_s, measured, self.alarms.shown)
         with self._turn:  # one that is told must not be closed meanwhile
-            for stream in self._streams:
+            for stream in self._streams.values():
                 stream.publish(values)
 
     # --- to look at ---------------------------------------------------------------------------
@@ -226,6 +231,10 @@ class LiveWatch:
     def ask_for_scene(self) -> None:
         """Have the surface of the next frame that is measured be drawn, too: once."""
         self._is_drawn.set()
+
+    def stream(self, kind: str) -> Stream | None:
+        """What tells by this kind; None: nothing does."""
+        return self._streams.get(kind)
 
     def pace(self) -> Pace:
         """How measuring keeps up."""
@@ -248,7 +257,10 @@ class LiveWatch:
         def beyond(size: Size) -> bool:
             return standing(size, limits.of(size.name)) in ("low", "high")
 
+        measured = (each for each in reversed(late) if each.is_measured)
+        last = next(measured, None)
         return Trend(
+            NAMES if last is None else tuple(size.name for size in last.sizes),
             np.array([each.number for each in late], np.int64),
             np.array([each.arrived_s - now_s for each in late], float),
             of_each(lambda size: size.value_mm, float),
@@ -264,16 +276,18 @@ class LiveWatch:
             words = f"acknowledged: {alarm.told}"
             self._say(Event(self._name, "note", words), alarm.time_s)
 
-    def tell_to(self, stream: Stream) -> None:
-        """Tell every frame that is measured to a stream; `close` closes it."""
-        with self._turn:
-            self._streams += (stream,)
+    def tell_by(self, kind: str, stream: Stream | None) -> None:
+        """Tell every frame that is measured by a stream in place of the one of its kind.
 
-    def tell_no_more(self, stream: Stream) -> None:
-        """Close a stream."""
+        That one is closed; `close` closes all. None tells no more by that kind.
+        """
         with self._turn:
-            self._streams = tuple(each for each in self._streams if each is not stream)
-        stream.close()
+            former = self._streams.pop(kind, None)
+            if stream is not None and not self._is_closed:
+                self._streams[kind], stream = stream, None
+        for each in (former, stream):
+            if each is not None:
+                each.close()
 
 
 def newest_of(frames: deque[CameraFrame]) -> CameraFrame | None:

@@ -25,6 +25,7 @@ from PySide6.QtWidgets import QFrame, QGraphicsItem, QLabel, QScrollArea, QSizeP
 
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in_words
+from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.canvas import Plotted
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -115,7 +116,8 @@ class PlotStack(Plotted):
         if not same:
             self.fit()
         self._show_legend()
-        self.set_current(self._current, self._place)
+        if not (same and self._current is None and self._place is None):
+            self.set_current(self._current, self._place)  # else what the pointer is at stays told
 
     def set_current(self, key: int | None, place: float | None = None) -> None:
         """Mark the point with a key in every plot, or a place where no curve has it."""
@@ -306,12 +308,16 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         self.bars = pg.PlotCurveItem(connect="pairs")
         self.points = pg.ScatterPlotItem(pxMode=True)
         self.level = pg.InfiniteLine(angle=0)
+        self.limits = pg.InfiniteLine(angle=0), pg.InfiniteLine(angle=0)
         self.current = pg.InfiniteLine(angle=90)
         self.cross = pg.InfiniteLine(angle=90)
         for item in (self.bars, self.line, self.points):
             self.addItem(item)
         for item in (self.level, self.current, self.cross):
             self.addItem(item, ignoreBounds=True)
+            item.hide()
+        for item in self.limits:
+            self.addItem(item)
             item.hide()
         box.sigXRangeChanged.connect(lambda *_: self._show_points())
 
@@ -333,6 +339,8 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         self.line.setPen(pg.mkPen(line, width=1))
         self.bars.setPen(pg.mkPen(_faint(accent, 150), width=1))
         self.level.setPen(pg.mkPen(_faint(text, 150), width=1, style=Qt.PenStyle.DashLine))
+        for line in self.limits:
+            line.setPen(pg.mkPen(RED[is_dark(look)], width=1.5, style=Qt.PenStyle.DashLine))
         self.current.setPen(pg.mkPen(accent, width=1.5))
         self.cross.setPen(pg.mkPen(_faint(text, 90), width=1))
         if curve.from_zero:
@@ -351,6 +359,10 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         self.level.setVisible(bool(np.isfinite(curve.level)))
         if np.isfinite(curve.level):
             self.level.setValue(curve.level)
+        for item, limit in zip(self.limits, curve.limits, strict=True):
+            item.setVisible(limit is not None)
+            if limit is not None:
+                item.setValue(limit)
         self._show_points()
 
     def mark_place(self, x: float | None) -> None:
@@ -375,7 +387,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         low, high = self.getViewBox().viewRange()[0]
         first, end = np.searchsorted(curve.x, [low, high]).tolist()
         seen = np.arange(max(first - 1, 0), min(end + 1, len(curve.x)))
-        many = len(seen) > MOST_POINTS
+        many = curve.quick or len(seen) > MOST_POINTS
         drawn = seen[curve.mark[seen] > 0][:MOST_POINTS] if many else seen
         looks = [self._brushed(curve.marks[number].sign) for number in range(len(curve.marks))]
         marks = curve.mark[drawn].tolist()
@@ -387,7 +399,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             pen=[looks[k][2] for k in marks],
             brush=[looks[k][3] for k in marks],
         )
-        self._show_bars(curve, seen[:0] if many else seen)
+        self._show_bars(curve, seen if curve.quick or not many else seen[:0])
 
     def _show_bars(self, curve: Curve, seen: IntArray) -> None:
         if not len(curve.sigma) or not len(seen):

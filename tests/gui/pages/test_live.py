@@ -18,13 +18,14 @@ from pytestqt.qtbot import QtBot
 
 from labapp.core.pipeline import Settings
 from labapp.gui.pages.capture import live_view
-from labapp.gui.pages.capture.live import SIMULATED, Live, choices, figures
+from labapp.gui.pages.capture.live import SIMULATED, Live, choices
+from labapp.gui.pages.capture.live_figures import Figure, figures
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.window import MainWindow
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import CameraInfo, CameraSettings, Faults, SimulatedDevice
 from labapp.media.recorder import Plan
-from labapp.session.live_measuring import LiveMeasurement
+from labapp.session.live_watch import Followed
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from labapp.session.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
@@ -183,8 +184,8 @@ def test_another_plan_holds_from_then_on(live: Live):
 
 
 def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
-    assert not live.measures
-    assert figures(None)[0] == ("Width", "–", "", "mm")
+    assert live.watch is None
+    assert figures(None)[0] == Figure("Width", "–", "", "mm")
     folder = SAMPLES / "gtaw"
     with open_source(folder / "recording.avi") as video:
         image = video.frame(0).image
@@ -193,22 +194,23 @@ def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
     device = SimulatedDevice("test", lambda _: image, rate_hz=20)
     try:
         with_setup.open(device.open)
-        assert with_setup.measures
-        found: list[LiveMeasurement | None] = []
-        wait_until(lambda: bool(found.append(with_setup.measured()) or found[-1]), 120)
+        watch = with_setup.watch
+        assert watch is not None
+        found: list[Followed | None] = []
+        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]), 120)
         # The first is measured by itself, those right after it from the one before.
-        wait_until(lambda: bool(found.append(with_setup.measured()) or found[-1]), 120)
+        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]), 120)
     finally:
         with_setup.close()
     first, measured = [each for each in found if each is not None]
-    assert (first.status, measured.status) == ("ok", "ok")
-    assert (first.followed, measured.followed) == (False, True)
-    assert measured.quality.reference
+    assert (first.found.status, measured.found.status) == ("ok", "ok")
+    assert (first.found.followed, measured.found.followed) == (False, True)
+    assert measured.found.quality.reference
     width, length, height = figures(measured)
     with (folder / "truth.csv").open() as file:
         truth = next(csv.DictReader(file))
     for row, name in ((width, "width_mm"), (length, "length_mm"), (height, "height_mm")):
-        value, sigma = float(row[1]), float(row[2].removeprefix("± "))
+        value, sigma = float(row.value), float(row.sigma.removeprefix("± "))
         assert abs(value - float(truth[name])) < max(5 * sigma, 0.02 * value), row
 
 

@@ -23,13 +23,14 @@ from labapp.core.quality import UNMEASURED, Quality, judge_quality
 from labapp.core.quick_dots import Exposure, quick_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
-from labapp.gui.digits import NOTHING, plain
 from labapp.gui.pages.capture.presenter import size_in_words
 from labapp.media import GreyImage
 from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
 from labapp.media.events import Event
 from labapp.media.recorder import Plan, Recorder, Take
-from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring, LiveMeasuringEnded
+from labapp.session.limits import Limits
+from labapp.session.live_measuring import LiveMeasuringEnded
+from labapp.session.live_watch import RATE_S, LiveWatch, newest_of
 from labapp.session.log import NAME
 from labapp.session.session import Session
 from labapp.session.setup import Setup
@@ -43,15 +44,6 @@ SHOW_S, LOOK_S = 0.025, 0.25
 
 IDLE_S = 0.005
 
-BURST = 32
-"""So many frames right after one that was measured by itself are measured one after the other."""
-
-RATE_S = 2.0
-"""The rate that is shown is that of so long."""
-
-DECIMALS = 3
-"""Of live figures, mm."""
-
 STATES = {
     "opening": ("○", "Opening the camera …"),
     "running": ("●", "Live"),
@@ -59,6 +51,9 @@ STATES = {
     "lost": ("▲", "Not connected: it is tried again and again. What was recorded is kept"),
     "ended": ("▲", "It has ended: start it again"),
 }
+
+_Work = tuple[str, Callable[[], CameraFrame | None], Callable[[CameraFrame], None], float]
+"""What a thread does: its name, which frame is next, what is done with it, how often at most."""
 
 
 def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
@@ -121,9 +116,13 @@ class Live:
         Of the measurement.
     setup
         Rig and image calibration that frames are measured by; None: they are only looked at.
+    limits
+        Of the sizes that are measured.
 
     Attributes
     ----------
+    watch
+        Measures the frames; None where there is no set-up, and before the camera is open.
     takes
         The recordings made, in their order.
     """
@@ -136,23 +135,21 @@ class Live:
         wanted: CameraSettings,
         settings: Settings,
         setup: Setup | None = None,
+        limits: Limits | None = None,
     ) -> None:
         self.name = name
         self.plan = plan
         self.takes: list[Take] = []
         self.feed: Feed | None = None
+        self.watch: LiveWatch | None = None
         self._place, self._folder, self._wanted = place, place().parent, wanted
-        self._settings, self._setup = settings, setup
+        self._settings, self._setup, self._limits = settings, setup, limits or Limits()
         self._dots = settings.dots
-        self._measuring: LiveMeasuring | None = None
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._to_show: deque[CameraFrame] = deque(maxlen=1)
         self._to_judge: deque[CameraFrame] = deque(maxlen=1)
         self._newest: deque[Shown] = deque(maxlen=1)
         self._judged: deque[Looked] = deque(maxlen=1)
-        self._to_measure: deque[CameraFrame] = deque()
-        self._in_order = BURST
-        self._measured: deque[LiveMeasurement] = deque(maxlen=1)
         self._recorders: list[Recorder] = []
         self._told: set[Path] = set()
         self._counted: deque[tuple[float, int]] = deque()
@@ -161,14 +158,7 @@ class Live:
         self._closing = threading.Event()
         self._turn = threading.Lock()
         self._light: Exposure | None = None
-        self._workers = [
-            threading.Thread(target=self._work_on, args=given, name=f"live {given[0]}", daemon=True)
-            for given in (
-                ("dots", partial(_newest, self._to_show), self._find_quickly, SHOW_S),
-                ("verdict", partial(_newest, self._to_judge), self._judge, LOOK_S),
-                ("figures", self._next_to_measure, self._measure, SHOW_S),
-            )
-        ]
+        self._workers: list[threading.Thread] = []
 
     # --- begin and end ------------------------------------------------------------------------
 
@@ -186,10 +176,9 @@ class Live:
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
                 if self._setup is not None:
-                    given = (self._setup, self._settings, feed.bit_depth)
-                    self._measuring = LiveMeasuring(*given)
-                for worker in self._workers:
-                    worker.start()
+                    given = (self._setup, self._settings, feed.bit_depth, self._limits)
+                    self.watch = LiveWatch(self.name, *given, self._say)
+                self._begin_work()
                 return
         feed.stop()
 
@@ -199,8 +188,8 @@ class Live:
             self._closing.set()
         if self.feed is not None:
             self.feed.stop()
-            if self._measuring is not None:
-                self._measuring.close()
+            if self.watch is not None:
+                self.watch.close()
             for worker in self._workers:
                 worker.join()
         for recorder in self._recorders:
@@ -224,15 +213,28 @@ class Live:
             recorder.take(frame)
         self._to_show.append(frame)
         self._to_judge.append(frame)
-        if len(self._to_measure) < BURST:
-            self._to_measure.append(frame)
+        if self.watch is not None:
+            self.watch.take(frame)
 
-    def _say(self, event: Event) -> None:
+    def _say(self, event: Event, time_s: float | None = None) -> None:
         self._events.put(event)
         for recorder in self._recorders[-1:]:
-            recorder.note(event)
+            recorder.note(event, time_s)
 
     # --- in threads of their own --------------------------------------------------------------
+
+    def _begin_work(self) -> None:
+        works: list[_Work] = [
+            ("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S),
+            ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S),
+        ]
+        if self.watch is not None:
+            works.append(("figures", self.watch.next_frame, self.watch.measure, SHOW_S))
+        for work in works:
+            name = f"live {work[0]}"
+            worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
+            self._workers.append(worker)
+            worker.start()
 
     def _work_on(
         self,
@@ -290,23 +292,6 @@ class Live:
         places = None if quick else _places_px(dots)
         self._judged.append(Looked(places, quality, room_byte))
 
-    def _next_to_measure(self) -> CameraFrame | None:
-        """The newest frame; after one that was measured by itself those that came right after it.
-
-        That took seconds: the present frame would be too far from it to be measured from it.
-        """
-        if self._in_order and self._to_measure:
-            self._in_order -= 1
-            return self._to_measure.popleft()
-        return _newest(self._to_measure)
-
-    def _measure(self, frame: CameraFrame) -> None:
-        if self._measuring is not None:
-            found = self._measuring.measure(frame.image)
-            if not found.followed:
-                self._in_order = BURST
-            self._measured.append(found)
-
     # --- to look at ---------------------------------------------------------------------------
 
     def newest(self) -> Shown | None:
@@ -316,15 +301,6 @@ class Live:
     def looked(self) -> Looked | None:
         """What was found in the frame judged last; None if it was given already."""
         return self._judged.popleft() if self._judged else None
-
-    @property
-    def measures(self) -> bool:
-        """Whether frames are measured."""
-        return self._measuring is not None
-
-    def measured(self) -> LiveMeasurement | None:
-        """What the frame measured last gave; None if it was given already."""
-        return self._measured.popleft() if self._measured else None
 
     def events(self) -> list[Event]:
         """What has happened since it was asked last."""
@@ -436,13 +412,6 @@ class Live:
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
 
 
-def _newest(frames: deque[CameraFrame]) -> CameraFrame | None:
-    """Take the newest frame; those before it are let go."""
-    while len(frames) > 1:
-        frames.popleft()
-    return frames.popleft() if frames else None
-
-
 def _places_px(dots: Dots | None) -> FloatArray:
     return np.zeros((0, 2)) if dots is None else dots.image_px
 
@@ -466,22 +435,6 @@ def setup_of(session: Session) -> Setup | None:
         return session.setup
     except InputError:
         return None
-
-
-def figures(found: LiveMeasurement | None) -> tuple[tuple[str, str, str, str], ...]:
-    """Width, length and height, of a hollow pool the depth: name, value, ± and unit.
-
-    All with as many decimals, whatever the ±: nothing jumps as they change.
-    """
-    sizes = None if found is None else found.measures
-    hollow = sizes is not None and -sizes.depth_mm > sizes.height_mm
-    rows = []
-    for name in ("width", "length", "depth" if hollow else "height"):
-        value, sigma = (getattr(sizes, f"{name}{end}", None) for end in ("_mm", "_sigma_mm"))
-        told = NOTHING if value is None else plain(value, DECIMALS)
-        known = "" if sigma is None or np.isnan(sigma) else f"± {plain(sigma, DECIMALS)}"
-        rows.append((name.capitalize(), told, known, "mm"))
-    return tuple(rows)
 
 
 def _lasting(seconds: float) -> str:

@@ -13,14 +13,10 @@ from PySide6.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QW
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
 from labapp.gui.pages.capture.camera_fields import CameraFields
-from labapp.gui.pages.capture.live import SIMULATED, Live, choices, figures, setup_of
-from labapp.gui.pages.capture.parts import (
-    ExposureBars,
-    Figures,
-    button,
-    show_recording,
-    wrapped,
-)
+from labapp.gui.pages.capture.live import SIMULATED, Live, choices, setup_of
+from labapp.gui.pages.capture.live_canvas import LiveCanvas
+from labapp.gui.pages.capture.live_figures import NO_SETUP, LiveFigures, figures, pace_in_words
+from labapp.gui.pages.capture.parts import ExposureBars, button, show_recording, wrapped
 from labapp.gui.pages.capture.plan_fields import PlanFields
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm
@@ -38,6 +34,7 @@ from labapp.media.cameras import (
 )
 from labapp.media.events import Event
 from labapp.media.recorder import recording_path
+from labapp.session.live_watch import Followed, LiveWatch
 from labapp.session.session import Session
 from labapp.session.simulated_pool import pool_camera, simulated_pool
 from labapp.words import several
@@ -81,8 +78,10 @@ class LiveView(QObject):
     ----------
     group
         Choice and settings, for the panel.
+    canvas
+        The picture and what else is seen of the camera.
     bar
-        What records, below the picture; seen while live.
+        What records, below the canvas; seen while live.
     live
         The camera that runs; None without one.
     measured_s
@@ -97,13 +96,14 @@ class LiveView(QObject):
         self.workspace = workspace
         self.live: Live | None = None
         self.updates = 0
-        """How many live frames were shown."""
+        """How often a live frame was shown, as a picture or as a surface."""
         self._picture, self._exposure = picture, exposure
         self._ending: list[Live] = []
         self._pools: dict[str, SimulatedDevice] = {}
         self._opening: Task | None = None
         self._finding: Task | None = None
         self._told_s = self.measured_s = 0.0
+        self._followed: Followed | None = None
         self._room_byte: int | None = None
         self._timer = QTimer(self)
         self._timer.setInterval(TICK_MS)
@@ -113,8 +113,10 @@ class LiveView(QObject):
         )
         self._rings.hide()
         picture.add(self._rings)
+        self.canvas = LiveCanvas(workspace, picture, self._watch, self.acknowledge)
         self._make_group()
         self._make_bar()
+        workspace.changed.connect(self._set_limits)
         workspace.closing.connect(self._session_closes)
         workspace.tasks.changed.connect(self._show_state)
         self._show_state()
@@ -151,6 +153,7 @@ class LiveView(QObject):
             CameraSettings(),
             session.settings,
             setup_of(session),
+            session.limits,
         )
         opener = self._opener(chosen, session)
 
@@ -186,9 +189,10 @@ class LiveView(QObject):
         self.camera_fields.show_camera(live.feed)
         self._room_byte = None
         self._rings.setData([])
-        self.measured_s = 0.0
-        self.figures.setVisible(live.measures)
-        self.figures.show_rows(figures(None))
+        self.measured_s, self._followed = 0.0, None
+        self.figures.show_figures(figures(None) if live.watch is not None else ())
+        self.figures.show_words(NO_SETUP if live.watch is None else "")
+        self.canvas.set_live(live.watch is not None)
         self._rings.show()
         self._timer.start(TICK_MS)
         self._show_state()
@@ -202,6 +206,7 @@ class LiveView(QObject):
             return
         self._timer.stop()
         self._rings.hide()
+        self.canvas.set_live(False)
         self._ending.append(live)
         title = "Stopping the camera" if live.running is None else "Finishing the recording"
 
@@ -223,6 +228,7 @@ class LiveView(QObject):
                 self.workspace.said.emit(f"Recorded beside the session: {take.path.name}", False)
         self._ending.clear()
         self.live = None
+        self.canvas.set_live(False)
         self._timer.stop()
         self._rings.hide()
         self._show_state()
@@ -242,10 +248,32 @@ class LiveView(QObject):
             self._tell_figures(live)
             self._show_state()
 
-    def mark(self) -> None:
-        """Note the present frame beside the recording that runs."""
-        if self.live is not None and self.live.running is not None:
+    def mark(self) -> bool:
+        """Note the present frame beside the recording that runs; False if none does."""
+        recorded = self.live is not None and self.live.running is not None
+        if self.live is not None and recorded:
             self.live.mark()
+        return recorded
+
+    def acknowledge(self) -> None:
+        """Take it that the operator has seen the alarms."""
+        watch = self._watch()
+        if watch is not None:
+            watch.acknowledge()
+            self.canvas.tell(watch)
+
+    def _watch(self) -> LiveWatch | None:
+        return None if self.live is None else self.live.watch
+
+    def _set_limits(self) -> None:
+        """Watch the session's limits: they may have been changed."""
+        session, watch = self.workspace.session, self._watch()
+        if session is not None and watch is not None:
+            limits = session.limits
+            if limits != watch.alarms.limits:
+                watch.alarms.set_limits(limits)
+                self._show_figures(watch)
+                self.canvas.tell(watch)
 
     def _replan(self) -> None:
         plan = self.plan_fields.plan()
@@ -264,7 +292,7 @@ class LiveView(QObject):
         if live is None:
             return
         shown = live.newest()
-        if shown is not None:
+        if shown is not None and self._picture.isVisible():
             self._picture.show_picture(shown.frame.image)
             self._ring_dots(shown.dots_px)
             self.updates += 1
@@ -274,11 +302,8 @@ class LiveView(QObject):
             self._ring_dots(looked.dots_px)
             if time.monotonic() - self.measured_s > FRESH_S:
                 self._show_quality(looked.quality)
-        measured = live.measured()
-        if measured is not None:
-            self.measured_s = time.monotonic()
-            self.figures.show_rows(figures(measured))
-            self._show_quality(measured.quality)
+        if live.watch is not None:
+            self._follow(live.watch)
         if time.monotonic() - self._told_s > TELL_S:
             self._tell_figures(live)
         self._hear(live)
@@ -287,6 +312,24 @@ class LiveView(QObject):
         wanted = max(TICK_MS, round(2 * took_ms))
         if abs(wanted - self._timer.interval()) > TICK_MS / 4:
             self._timer.setInterval(wanted)
+
+    def _follow(self, watch: LiveWatch) -> None:
+        """Show what was measured since it was asked last."""
+        followed = watch.newest()
+        if followed is not None:
+            self._followed, self.measured_s = followed, time.monotonic()
+            self._show_figures(watch)
+            self._show_quality(followed.found.quality)
+        self.updates += self.canvas.follow(followed, watch)
+
+    def _show_figures(self, watch: LiveWatch) -> None:
+        self.figures.show_figures(figures(self._followed, watch.alarms.limits, self._age_s))
+
+    @property
+    def _age_s(self) -> float:
+        """How old the figures are, s."""
+        followed = self._followed
+        return 0.0 if followed is None else time.monotonic() - followed.arrived_s
 
     def _show_quality(self, quality: Quality) -> None:
         self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
@@ -318,6 +361,11 @@ class LiveView(QObject):
         self.ring.setFormat(told)
         self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
         self.recording.setText(live.recording_in_words(self._room_byte))
+        if live.watch is not None:
+            pace, came_hz = live.watch.pace(), live.rate_hz()
+            self._show_figures(live.watch)
+            self.figures.show_words(pace_in_words(self._followed, pace, came_hz, self._age_s))
+            self.canvas.tell(live.watch)
         picture = self._picture.picture
         if live.feed is not None and picture is not None:
             set_to = live.feed.settings
@@ -370,7 +418,7 @@ class LiveView(QObject):
         self.settings = QWidget()
         inner = QVBoxLayout(self.settings)
         inner.setContentsMargins(0, 0, 0, 0)
-        self.figures = Figures()
+        self.figures = LiveFigures()
         self.counts = wrapped()
         inner.addWidget(self.figures)
         inner.addWidget(self.counts)
@@ -419,7 +467,12 @@ class LiveView(QObject):
 
     def take_key(self, key: Qt.Key) -> bool:
         """Do what a plain key means while live; whether it means anything."""
-        if not self.is_live or key not in (Qt.Key.Key_Space, Qt.Key.Key_M):
+        works = {
+            Qt.Key.Key_Space: self.trigger,
+            Qt.Key.Key_M: self.mark,
+            Qt.Key.Key_A: self.acknowledge,
+        }
+        if not self.is_live or key not in works:
             return False
-        (self.trigger if key == Qt.Key.Key_Space else self.mark)()
+        works[key]()
         return True

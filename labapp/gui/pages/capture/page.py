@@ -80,10 +80,10 @@ class CapturePage(Page):
         self.slider.setToolTip("Which frame of the recording to look at before importing it")
         self.slider.valueChanged.connect(lambda _: self._look())
         self.canvas_layout.addWidget(self.title)
-        self.canvas_layout.addWidget(self.picture_view, 1)
-        self.canvas_layout.addWidget(self.slider)
         self.exposure = ExposureBars()
         self.live_view = LiveView(workspace, self.picture_view, self.exposure)
+        self.canvas_layout.addWidget(self.live_view.canvas, 1)
+        self.canvas_layout.addWidget(self.slider)
         self.live_view.changed.connect(self._live_changed)
         self.live_view.recorded.connect(self._recorded)
         self.canvas_layout.addWidget(self.live_view.bar)
@@ -144,7 +144,7 @@ class CapturePage(Page):
         self.live_view.trigger()
 
     def takes_key(self, event: QKeyEvent) -> bool:
-        """Space records and M marks while a camera is watched."""
+        """Space records, M marks and A acknowledges alarms while a camera is watched."""
         plain = event.modifiers() in (Qt.KeyboardModifier.NoModifier, KEYPAD)
         if not plain or not self.live:
             return False

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QColor, QPalette
+from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import (
     QFormLayout,
-    QGridLayout,
     QLabel,
     QProgressBar,
     QPushButton,
@@ -18,15 +17,9 @@ from PySide6.QtWidgets import (
 
 from labapp.core.exposure import Exposure
 from labapp.gui.pages.capture.presenter import bars
-from labapp.gui.theme import is_dark
+from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.fields import NumberField
 from labapp.gui.views.labels import headed
-
-RED = QColor("#b8321f"), QColor("#f0705a")
-"""Of what is under way, on a light and on a dark ground."""
-
-LARGE = 1.9
-"""A figure that is read from afar is so many times as large as others."""
 
 
 class ExposureBars(QWidget):
@@ -57,36 +50,6 @@ class ExposureBars(QWidget):
             widget.setAccessibleName(f"{bar.name}: {bar.words}")
             widget.setToolTip(bar.tip)
         self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
-
-
-class Figures(QWidget):
-    """Results in large figures, to be read from where the work is."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._grid = QGridLayout(self)
-        self._grid.setContentsMargins(0, 0, 0, 0)
-        self._grid.setColumnStretch(1, 1)
-        self._labels: dict[tuple[int, int], QLabel] = {}
-
-    def show_rows(self, rows: Iterable[tuple[str, str, str, str]]) -> None:
-        """Show rows of name, value, ± and unit."""
-        for row, texts in enumerate(rows):
-            for column, text in enumerate(texts):
-                self._label(row, column).setText(text)
-
-    def _label(self, row: int, column: int) -> QLabel:
-        if (row, column) not in self._labels:
-            label = self._labels[row, column] = QLabel()
-            if column in (1, 2):
-                label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-            if column == 1:
-                font = label.font()
-                font.setPointSizeF(LARGE * font.pointSizeF())
-                font.setBold(True)
-                label.setFont(font)
-            self._grid.addWidget(label, row, column)
-        return self._labels[row, column]
 
 
 def wrapped(text: str = "") -> QLabel:

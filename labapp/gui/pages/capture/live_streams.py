@@ -1,0 +1,183 @@
+"""Telling live measures to control software: switched on, and what became of it in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from PySide6.QtWidgets import QCheckBox, QGridLayout, QVBoxLayout, QWidget
+
+from labapp.errors import InputError
+from labapp.gui.pages.capture.parts import wrapped
+from labapp.gui.tasks import Control
+from labapp.gui.views.fields import NumberField
+from labapp.gui.views.labels import headed
+from labapp.gui.workspace import Workspace
+from labapp.session.live_watch import LiveWatch
+from labapp.session.streams import Stream, open_stream
+from labapp.words import several
+
+KINDS = {
+    "lines": (
+        "Lines of JSON over TCP",
+        5020,
+        "A line a frame, to every program that connects",
+    ),
+    "opcua": (
+        "OPC UA",
+        4840,
+        "The newest frame as variables in Objects/Pool, some twenty times a second",
+    ),
+}
+"""What can be switched on: words, usual port, tip."""
+
+OWN, ANY = "127.0.0.1", "0.0.0.0"
+
+WARNING = (
+    "⚠ Any machine that reaches this one can read the measures then: nobody is asked who they are, "
+    "and nothing is hidden. Keep a firewall round it."
+)
+
+IN_USE = "Choose another port, or end the program that has this one."
+
+
+class LiveStreams(QWidget):
+    """What is told while a camera is watched; all of it is off at every start.
+
+    Parameters
+    ----------
+    workspace
+        Where work is done and problems are said.
+    watch
+        Gives what measures now; None while nothing does.
+    """
+
+    def __init__(self, workspace: Workspace, watch: Callable[[], LiveWatch | None]) -> None:
+        super().__init__()
+        self._workspace, self._watch = workspace, watch
+        self.boxes: dict[str, QCheckBox] = {}
+        self.ports: dict[str, NumberField] = {}
+        self.words = {kind: wrapped() for kind in KINDS}
+        self._problems: dict[str, str] = {}
+        outer = QVBoxLayout(self)
+        outer.setContentsMargins(8, 8, 8, 8)
+        group, layout = headed("Tell control software every frame that is measured")
+        outer.addWidget(group)
+        grid = QGridLayout()
+        grid.setColumnStretch(2, 1)
+        layout.addLayout(grid)
+        for row, (kind, (words, port, tip)) in enumerate(KINDS.items()):
+            box = self.boxes[kind] = QCheckBox(words)
+            box.setToolTip(tip)
+            box.toggled.connect(partial(self._switch, kind))
+            field = self.ports[kind] = NumberField(
+                "port", lowest=1024, highest=65_535, decimals=0, tooltip=f"Port of {words}"
+            )
+            field.editor.setAccessibleName(f"Port of {words}")
+            field.set_value(port)
+            field.edited.connect(partial(self._again, kind))
+            for column, widget in enumerate((box, field.label, field)):
+                grid.addWidget(widget, 2 * row, column)
+            grid.addWidget(self.words[kind], 2 * row + 1, 0, 1, 3)
+        self.anywhere = QCheckBox("Other machines may connect")
+        self.anywhere.setToolTip("Otherwise only programs on this machine can")
+        self.anywhere.toggled.connect(lambda _: self._open_to_all())
+        self.warning = wrapped()
+        layout.addWidget(self.anywhere)
+        layout.addWidget(self.warning)
+        outer.addStretch(1)
+        self.show_state()
+
+    # --- what is done -------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Switch on what is ticked: a camera has been started."""
+        for kind, box in self.boxes.items():
+            if box.isChecked():
+                self._open(kind)
+
+    def _switch(self, kind: str, on: bool) -> None:
+        self._problems.pop(kind, None)
+        watch = self._watch()
+        if on:
+            self._open(kind)
+        elif watch is not None and watch.stream(kind) is not None:
+            title = f"Ending {KINDS[kind][0]}"
+            self._workspace.tasks.start(
+                title, lambda _: watch.tell_by(kind, None), lambda _: self.show_state()
+            )
+        self.show_state()
+
+    def _again(self, kind: str, _: object = None) -> None:
+        if self.boxes[kind].isChecked():
+            self._open(kind)
+
+    def _open_to_all(self) -> None:
+        for kind in KINDS:
+            self._again(kind)
+        self.show_state()
+
+    def _open(self, kind: str) -> None:
+        """Open a stream in the background, in place of the one that there is."""
+        watch = self._watch()
+        if watch is None:
+            return
+        anywhere, port = self.anywhere.isChecked(), int(self.ports[kind].value() or 0)
+        place = f"{ANY if anywhere else OWN}:{port}"
+
+        def work(_: Control) -> str:
+            watch.tell_by(kind, None)  # it may have this very port
+            try:
+                watch.tell_by(kind, open_stream(kind, place, anywhere))
+            except InputError as error:
+                return problem_in_words(error)
+            return ""
+
+        def done(problem: str) -> None:
+            if problem:
+                self._problems[kind] = problem
+                self.boxes[kind].blockSignals(True)
+                self.boxes[kind].setChecked(False)
+                self.boxes[kind].blockSignals(False)
+                self._workspace.said.emit(f"{KINDS[kind][0]}: {problem}", True)
+            elif not self.boxes[kind].isChecked():
+                self._switch(kind, False)  # it was switched off meanwhile
+            else:
+                self._workspace.said.emit(f"{KINDS[kind][0]}: measures are told at {place}", False)
+            self.show_state()
+
+        self._problems.pop(kind, None)
+        self._workspace.tasks.start(f"Opening {KINDS[kind][0]}", work, done)
+
+    # --- what it shows ------------------------------------------------------------------------
+
+    def show_state(self) -> None:
+        """Show who listens and how much was told."""
+        watch = self._watch()
+        for kind, box in self.boxes.items():
+            stream = None if watch is None else watch.stream(kind)
+            told = stream_in_words(stream, box.isChecked(), self._problems.get(kind, ""))
+            if told != self.words[kind].text():
+                self.words[kind].setText(told)
+        warning = WARNING if self.anywhere.isChecked() else ""
+        if warning != self.warning.text():
+            self.warning.setText(warning)
+        self.warning.setVisible(bool(warning))
+
+
+def stream_in_words(stream: Stream | None, wanted: bool, problem: str) -> str:
+    """Where a stream is heard, by how many, and what was told."""
+    if problem:
+        return f"⚠ {problem}"
+    if stream is None:
+        return "○ Opening …" if wanted else "○ Off"
+    listen = "program listens" if stream.listeners == 1 else "programs listen"
+    told = several(stream.told, "frame")
+    return f"● {stream.address}: {stream.listeners} {listen}, {told} told"
+
+
+def problem_in_words(error: InputError) -> str:
+    """Why a stream cannot be opened, and what to do."""
+    if error.field == "port":
+        return f"{error.value}. {IN_USE}"
+    return f"{error.value}: it needs {error.expected}."
