@@ -5,8 +5,6 @@ Frames go through a queue to a thread that writes; queue and ring buffer share a
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import logging
 import threading
@@ -20,13 +18,14 @@ from labapp.errors import InputError
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Kind, Say, Tally, silent
 from labapp.media.nut import TICKS_HZ, Codec, NutWriter, WrongFrame
+from labapp.media.take_files import Note, TakeFiles, notes_of
 from labapp.words import several
-
-NOTES = ("time_s", "frame", "source", "kind", "what")
-"""Columns of the notes beside a recording."""
 
 FRAME_BYTE = 200
 """What a frame takes in memory besides its levels, about."""
+
+STALL_S = 1.0
+"""A disk that takes longer for a frame is said to stall."""
 
 RATE_HZ = 25.0
 """Stands in the video's header where the camera does not say its rate."""
@@ -121,18 +120,10 @@ class Take:
     @property
     def notes(self) -> Path:
         """Table of what happened meanwhile: trigger, marks, frames lost (CSV)."""
-        return _notes_of(self.path)
+        return notes_of(self.path)
 
 
-@dataclass(frozen=True)
-class _Note:
-    """A row of the notes."""
-
-    time_s: float
-    event: Event
-
-
-_Item = tuple[Take, CameraFrame | _Note | None]
+_Item = tuple[Take, CameraFrame | Note | None]
 """What is to be done for a recording: write a frame or a note, or end it."""
 
 
@@ -180,6 +171,7 @@ class Recorder:
         self._newest_s = 0.0
         self._running: Take | None = None
         self._closing = self._is_short = self._is_behind = False
+        self._writing_since_s = float("inf")
         self._lost = Tally(self._tell_lost)
         self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
         self._thread.start()
@@ -219,7 +211,7 @@ class Recorder:
             elif running is not None:
                 told += self._record(running, frame, size if has_room else None)
         for kind, words in told:
-            self._say(Event("recording", kind, words))
+            self._tell(kind, words)
         self._lost.flush()
 
     def trigger(self) -> Take:
@@ -299,13 +291,19 @@ class Recorder:
             return told
         self._queue.append((take, frame))
         self._held_byte += size
-        if not self._is_behind and self._held_byte > self._memory_byte / 2:
-            self._is_behind = True
-            megabytes = self._held_byte / 1e6
-            words = f"writing does not keep up: {megabytes:.0f} MB wait in memory"
-            told.append(("warning", words))
+        told += self._falls_behind()
         self._turn.notify()
         return told
+
+    def _falls_behind(self) -> list[tuple[Kind, str]]:
+        """Say that frames wait, the first time that they do."""
+        writing_s = time.monotonic() - self._writing_since_s
+        if self._is_behind or (self._held_byte <= self._memory_byte / 2 and writing_s < STALL_S):
+            return []
+        self._is_behind = True
+        stalls = f", the disk has taken nothing for {writing_s:.1f} s" * (writing_s >= STALL_S)
+        megabytes = self._held_byte / 1e6
+        return [("warning", f"writing does not keep up{stalls}: {megabytes:.0f} MB wait in memory")]
 
     def _ring_is_short(self, frame: CameraFrame) -> list[tuple[Kind, str]]:
         if self._is_short:
@@ -325,7 +323,7 @@ class Recorder:
             if path not in own:
                 break
             path = wanted.with_stem(f"{wanted.stem}-{number}")
-        for there in (path, _notes_of(path)):
+        for there in (path, notes_of(path)):
             if there.exists():
                 raise InputError(there, "recording", "is there already", "another name")
         return path
@@ -336,28 +334,31 @@ class Recorder:
         self._turn.notify()
 
     def _add_note(self, take: Take, event: Event, time_s: float | None = None) -> None:
-        self._queue.append((take, _Note(self._newest_s if time_s is None else time_s, event)))
+        self._queue.append((take, Note(self._newest_s if time_s is None else time_s, event)))
+
+    def _tell(self, kind: Kind, words: str) -> None:
+        event = Event("recording", kind, words)
+        self._say(event)
+        self.note(event)
 
     def _tell_lost(self, count: int) -> None:
         faster = "; raw is written faster" * (self.plan.codec == "ffv1")
         lost = several(count, "frame")
-        words = f"{lost} lost: writing does not keep up, and memory is full{faster}"
-        event = Event("recording", "loss", words)
-        self._say(event)
-        self.note(event)
+        self._tell("loss", f"{lost} lost: writing does not keep up, and memory is full{faster}")
 
     # --- in the writer's thread ---------------------------------------------------------------
 
     def _write_on(self) -> None:
-        video: _Video | None = None
+        video: TakeFiles | None = None
         while True:
             with self._turn:
                 self._turn.wait_for(lambda: self._queue or self._closing)
                 if not self._queue:
                     break
                 take, item = self._queue.popleft()
+                self._writing_since_s = time.monotonic()
             if video is None or video.take is not take:
-                video = _Video(take, self._new_video, self._say)
+                video = TakeFiles(take, self._new_video, self._say)
             try:
                 video.do(item)
             except Exception as error:
@@ -375,16 +376,17 @@ class Recorder:
     def _new_video(self, take: Take, shape: tuple[int, int]) -> NutWriter:
         return self._open(take.path, shape, self._bit_depth, self._rate_hz, self.plan.codec)
 
-    def _forget(self, item: CameraFrame | _Note | None, take: Take) -> None:
+    def _forget(self, item: CameraFrame | Note | None, take: Take) -> None:
         """Give the memory of what was written free; say when all was caught up with."""
         caught_up = False
         with self._turn:
+            self._writing_since_s = float("inf")
             if isinstance(item, CameraFrame):
                 self._held_byte -= _size(item)
-            if self._is_behind and self._held_byte < self._memory_byte / 8:
+            if self._is_behind and not self._queue:
                 self._is_behind, caught_up = False, True
         if caught_up:
-            self._say(Event("recording", "note", "writing has caught up"))
+            self._tell("note", "writing has caught up")
         if item is None:
             self._lost.flush(now=True)
             self._say(take.summary)
@@ -399,99 +401,16 @@ class Recorder:
         self._say(Event(take.path.name, "loss", words))
 
 
-def _notes_of(path: Path) -> Path:
-    return path.with_name(f"{path.stem}-notes.csv")
-
-
 def _size(frame: CameraFrame) -> int:
     """What a frame takes in memory, bytes."""
     return frame.image.nbytes + FRAME_BYTE
-
-
-class _Video:
-    """A recording's files while they are written."""
-
-    def __init__(
-        self, take: Take, opened: Callable[[Take, tuple[int, int]], NutWriter], say: Say
-    ) -> None:
-        self.take = take
-        self.wrong = Tally(self._tell_wrong)
-        """Frames that are not as the others are."""
-        self._opened = opened
-        self._say = say
-        self._has_notes = True
-        self._video: NutWriter | None = None
-        self._early: list[_Note] = []
-        """Notes from before the first frame, whose time they are told by."""
-        self._first_s = self._last_s = take.triggered_s
-
-    def do(self, item: CameraFrame | _Note | None) -> None:
-        """Write a frame or a note; None: end it."""
-        if isinstance(item, CameraFrame):
-            self._write(item)
-        elif item is None:
-            try:
-                self.wrong.flush(now=True)
-                self._note_early()
-                if self._video is not None:
-                    self._note(_Note(self._last_s, self.take.summary))
-            finally:
-                if self._video is not None:
-                    self._video.close()
-        elif not self.take.frames:
-            self._early.append(item)
-        else:
-            self._note(item)
-
-    def _write(self, frame: CameraFrame) -> None:
-        if self.take.trouble:
-            raise OSError(0, self.take.trouble)
-        if self._video is None:
-            rows, columns = frame.image.shape
-            self._video = self._opened(self.take, (rows, columns))
-        if not self.take.frames:
-            self._first_s = frame.time_s
-        self._video.write(frame.image, frame.time_s - self._first_s)
-        self._note_early()
-        self.wrong.flush()
-        self.take.frames += 1
-        self._last_s = frame.time_s
-
-    def _tell_wrong(self, count: int) -> None:
-        frames = several(count, "frame")
-        words = f"{frames} left out: of another size, or brighter than the camera's bits allow"
-        event = Event(self.take.path.name, "loss", words)
-        self._say(event)
-        self.do(_Note(self._last_s, event))
-
-    def _note_early(self) -> None:
-        early, self._early = self._early, []
-        for note in early:
-            self._note(note)
-
-    def _note(self, note: _Note) -> None:
-        """Add a row to the notes; the video goes on where that cannot be, which is said once."""
-        time_s = note.time_s - self._first_s
-        event = note.event
-        row = (f"{time_s:.6f}", self.take.frames, event.source, event.kind, event.words)
-        text = io.StringIO(newline="")
-        try:
-            began = not self.take.notes.exists()
-            csv.writer(text, lineterminator="\n").writerows([NOTES, row] if began else [row])
-            with self.take.notes.open("a", encoding="utf-8", newline="") as file:
-                file.write(text.getvalue())
-        except OSError as error:
-            if self._has_notes:
-                self._has_notes = False
-                words = f"not all notes can be written beside it: {error.strerror}"
-                self._say(Event(self.take.path.name, "warning", words))
 
 
 def recording_path(folder: Path, stem: str) -> Path:
     """A file, not there yet, for a recording that begins now: its name ends in date and time."""
     begun = time.strftime("%Y-%m-%d-%H%M%S")
     path, count = folder / f"{stem}-{begun}.nut", 1
-    while path.exists() or _notes_of(path).exists():
+    while path.exists() or notes_of(path).exists():
         count += 1
         path = folder / f"{stem}-{begun}-{count}.nut"
     return path

@@ -14,6 +14,7 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.media import GreyImage, open_source
+from labapp.media import recorder as recorder_module
 from labapp.media.cameras import CameraFrame, Faults, Feed, SimulatedDevice, feed
 from labapp.media.events import Event
 from labapp.media.nut import NutWriter
@@ -182,6 +183,36 @@ def test_a_stalled_disk_loses_nothing_that_memory_has_room_for(
     assert (take.frames, take.lost) == (800, 0)
     with open_source(tmp_path / "disk.nut") as video:
         assert [number_in(each.image) for each in video] == list(range(800))
+
+
+def test_a_disk_that_takes_nothing_is_said_while_memory_lasts(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "STALL_S", 0.05)
+    disk = Disk(tmp_path / "disk.nut")
+    heard = Heard()
+    numbers_from = iter(range(1_000_000))
+    with start(heard.append, writer=partial(NutWriter, file=disk)) as recorder:
+        take = recorder.trigger()
+        for _ in range(2):
+            disk.goes.clear()
+            told = len(heard)
+
+            def is_said(told: int = told) -> bool:
+                recorder.take(frame(next(numbers_from)))
+                return len(heard) > told
+
+            wait_until(is_said)
+            disk.goes.set()
+            wait_until(lambda: heard[-1].words == "writing has caught up")
+    said = [event.words for event in heard if event.source == "recording"]
+    stalled, caught_up = said[::2], said[1::2]
+    assert caught_up == ["writing has caught up"] * 2
+    for words in stalled:
+        assert words.startswith("writing does not keep up, the disk has taken nothing for 0.")
+        assert words.endswith(" 0 MB wait in memory")
+    assert [row["what"] for row in notes(take)][1:-1] == said
+    assert (take.frames, take.lost) == (next(numbers_from), 0)
 
 
 def test_what_memory_has_no_room_for_is_left_out_and_said(start: Start, tmp_path: Path) -> None:
