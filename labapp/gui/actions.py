@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from labapp.gui import filming
 from labapp.gui.action import Action
 from labapp.gui.focus import go_to_part
 from labapp.gui.steps import STEPS
@@ -206,9 +207,18 @@ FRAMES = (
         "&Record, or end the recording",
         "Ctrl+R",
         "Record what the live camera sees, or end that; Space does it, too, while a camera is live",
-        lambda window: window.trigger(),
+        filming.trigger,
         needs="live",
         begins=True,
+    ),
+    Action(
+        "mark",
+        "F&rames",
+        "Mar&k this moment",
+        "Ctrl+K",
+        "Note this moment beside the recording that runs; M does it, too, while a camera is live",
+        filming.mark,
+        needs="live",
     ),
     Action(
         "next_doubtful",

@@ -11,6 +11,7 @@ from PySide6.QtWidgets import QMenu
 
 from labapp.gui.action import MENUS, Action
 from labapp.gui.actions import ACTIONS
+from labapp.gui.filming import live_page
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
@@ -91,7 +92,7 @@ class Menus:
             "undo": bool(undo),
             "redo": bool(redo),
             "work": bool(window.workspace.tasks.active),
-            "live": window.page is not None and window.page.live,
+            "live": live_page(window) is not None,
         }
         for name, made in self.actions.items():
             action = BY_NAME[name]

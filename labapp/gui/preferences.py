@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ class Preferences:
         Of the window, as Qt tells them, base64; empty for the default.
     last_folder
         Where a file was chosen last; empty for the documents folder.
+    foot_switches
+        What their pedals do, each as `PedalMap.as_dict` has it.
     """
 
     recent: tuple[str, ...] = ()
@@ -41,6 +44,7 @@ class Preferences:
     geometry: str = ""
     layout: str = ""
     last_folder: str = ""
+    foot_switches: tuple[Mapping[str, Any], ...] = ()
 
     def with_recent(self, path: Path) -> Preferences:
         """The same with a session as the last opened."""
@@ -117,10 +121,13 @@ def write_preferences(path: Path, preferences: Preferences) -> str:
 
 
 def _checked(held: dict[str, Any]) -> Preferences:
-    recent = held.get("recent", [])
-    if not isinstance(recent, list):
-        raise TypeError("recent")
-    found = Preferences(**{**held, "recent": tuple(recent)})
+    lists = {name: held.get(name, []) for name in ("recent", "foot_switches")}
+    if not all(isinstance(each, list) for each in lists.values()):
+        raise TypeError("a list")
+    recent = lists["recent"]
+    found = Preferences(**held | {name: tuple(each) for name, each in lists.items()})
+    if not all(isinstance(each, dict) for each in found.foot_switches):
+        raise TypeError("a foot switch")
     texts: list[Any] = [*recent, found.theme, found.geometry, found.layout, found.last_folder]
     if not all(isinstance(text, str) and "\0" not in text for text in texts):
         raise TypeError("a text")

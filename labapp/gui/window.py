@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PySide6.QtCore import QByteArray, QSize, Qt, QTimer, QUrl
@@ -117,6 +118,8 @@ class MainWindow(QMainWindow):
         self.setAcceptDrops(True)
         self._plain_layout = self.saveState(LAYOUT_VERSION)
         self._restore()
+        self.workspace.foot_switches.kept.connect(self._keep_foot_switches)
+        self.workspace.foot_switches.use(preferences.foot_switches)
         self._session_opened()
 
     def _make_views(self) -> None:
@@ -339,11 +342,6 @@ class MainWindow(QMainWindow):
             return
         self.workspace.measure(frames)
 
-    def trigger(self) -> None:
-        """Begin a recording of the live camera, or end it."""
-        if self.page is not None:
-            self.page.trigger()
-
     def copy_picture(self) -> None:
         """Copy the picture of the page in view."""
         if self.page is not None:
@@ -435,6 +433,9 @@ class MainWindow(QMainWindow):
         if problem:
             self.say(problem)
         self.menus.show_recent(preferences.recent)
+
+    def _keep_foot_switches(self, held: tuple[Mapping[str, Any], ...]) -> None:
+        self.remember(replace(self.preferences, foot_switches=held))
 
     # --- events -----------------------------------------------------------------------------
 

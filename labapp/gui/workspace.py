@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QObject, Signal
 
+from labapp.gui.foot_switches import FootSwitches
 from labapp.gui.tasks import Control, Task, Tasks, in_words
 from labapp.simulation import parallel
 
@@ -47,6 +48,13 @@ class Workspace(QObject):
         Something for the operator to read: a sentence, and whether it is a problem.
     asked
         An action of the window's menus is wanted, by its name.
+    next_wanted
+        A session like this one is wanted for a recording: its file.
+
+    Attributes
+    ----------
+    foot_switches
+        Those in use; they ask for actions of the menus.
     """
 
     closing = Signal()
@@ -56,6 +64,7 @@ class Workspace(QObject):
     frame_changed = Signal(int)
     said = Signal(str, bool)
     asked = Signal(str)
+    next_wanted = Signal(object)
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -70,6 +79,9 @@ class Workspace(QObject):
         self.tasks = Tasks(self)
         self.tasks.changed.connect(self._show_end)
         self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
+        self.foot_switches = FootSwitches(self.tasks, self)
+        self.foot_switches.pressed.connect(self.asked)
+        self.foot_switches.said.connect(self.said)
 
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""
@@ -107,6 +119,7 @@ class Workspace(QObject):
 
     def close(self) -> None:
         """Stop all work and close the session: the window goes."""
+        self.foot_switches.stop()
         self._stop_measuring()
         self.show(None)
 

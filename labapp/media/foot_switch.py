@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from labapp.errors import InputError
@@ -61,10 +61,12 @@ class PedalMap:
     keyboard: bool
     actions: Mapping[int, Action] = field(default_factory=dict)
 
-    def with_action(self, pedal: int, action: Action) -> PedalMap:
-        """The same with a pedal more; what did that before does nothing any more."""
-        kept = {key: value for key, value in self.actions.items() if value != action}
-        return PedalMap(self.device, self.name, self.keyboard, {**kept, pedal: action})
+    def with_action(self, pedal: int, action: Action | None) -> PedalMap:
+        """The same with a pedal that does something else; None: nothing."""
+        actions = {key: value for key, value in self.actions.items() if key != pedal}
+        if action is not None:
+            actions[pedal] = action
+        return replace(self, actions=actions)
 
     def as_dict(self) -> dict[str, Any]:
         """As plain values, to be kept."""
@@ -164,7 +166,7 @@ class FootSwitch:
     Parameters
     ----------
     pedals
-        Which it is, and what its pedals do.
+        Which it is, and what its pedals do; what they do may be set otherwise at any time.
     do
         Called with what is to be done, in a thread of the foot switch.
     say
@@ -185,7 +187,9 @@ class FootSwitch:
         self._do = do
         self._known = Pedals(pedals.keyboard)
         self._down_s: dict[int, float] = {}
-        self._reader = HidReader(pedals.device, pedals.name, self._hear, say, find, opened)
+        self._reader = HidReader(
+            lambda info: info.key == pedals.device, pedals.name, self._hear, say, find, opened
+        )
 
     @property
     def connected(self) -> bool:
@@ -222,7 +226,7 @@ def learn(
     opened: Open = open_hid,
     told: Callable[[list[str]], None] = lambda _: None,
 ) -> Learned | None:
-    """Wait until a pedal is pressed, on whatever device; 3-D controllers are left out.
+    """Wait until a pedal is pressed, on whatever device but 3-D controllers and mice.
 
     Parameters
     ----------
@@ -270,7 +274,7 @@ def _listen(
     infos: Iterable[HidInfo], opened: Open, devices: ExitStack, problems: list[str]
 ) -> Iterable[tuple[HidInfo, HidDevice, bool, Pedals]]:
     for info in infos:
-        if info.is_3d:
+        if info.is_3d or (info.is_mouse and not info.is_pedal):
             continue
         try:
             device = opened(info)

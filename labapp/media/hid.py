@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
+import labapp
 from labapp.errors import InputError
 from labapp.media.events import Event, Kind, Say, silent
 
 LONGEST = 64
 """Bytes of a report, at most."""
 
-WAIT_MS = 100
+WAIT_MS = 30
 """So long a report is waited for before it is seen whether reading is to end."""
 
 RETRY_S = 0.5
@@ -26,9 +29,7 @@ AWAY, UNPLUGGED = "it is not connected", "it was unplugged"
 
 RULES = "resources/udev/70-labapp.rules"
 
-INSTALL = (
-    f"sudo cp {RULES} /etc/udev/rules.d/ && sudo udevadm control --reload, and plug it in anew"
-)
+RULES_FOLDER = "/etc/udev/rules.d/"
 
 KNOWN: Mapping[tuple[int, int], str] = {
     (0x0C45, 0x7403): "PCsensor FootSwitch",
@@ -84,6 +85,11 @@ class HidInfo:
         return self.usage == (1, 8)
 
     @property
+    def is_mouse(self) -> bool:
+        """Whether it moves the pointer."""
+        return self.usage == (1, 2)
+
+    @property
     def is_keyboard(self) -> bool:
         """Whether it tells of keys, by their numbers, rather than of buttons, by bits."""
         return self.usage == (1, 6)
@@ -108,6 +114,9 @@ class HidDevice(Protocol):
 Find = Callable[[], Iterable[HidInfo]]
 Open = Callable[[HidInfo], HidDevice]
 
+_turn = threading.Lock()
+"""hidapi keeps one last error for all: it is not to be asked by several threads at once."""
+
 
 def find_hid() -> list[HidInfo]:
     """Devices that are connected, foot switches that are known first.
@@ -117,6 +126,9 @@ def find_hid() -> list[HidInfo]:
     HidError
         If hidapi is not installed.
     """
+    hidraw = _hidraw()
+    with _turn:
+        entries = hidraw.enumerate()
     found = [
         HidInfo(
             path=os.fsdecode(entry["path"]),
@@ -126,7 +138,7 @@ def find_hid() -> list[HidInfo]:
             usage=(entry["usage_page"], entry["usage"]),
             name=_name(entry),
         )
-        for entry in _hidraw().enumerate()
+        for entry in entries
     ]
     return sorted(found, key=lambda info: not info.is_pedal)
 
@@ -147,7 +159,8 @@ def open_hid(info: HidInfo) -> HidDevice:
     """
     device: HidDevice = _hidraw().device()
     try:
-        device.open_path(os.fsencode(info.path))  # type: ignore[attr-defined]
+        with _turn:
+            device.open_path(os.fsencode(info.path))  # type: ignore[attr-defined]
     except OSError as error:
         raise HidError(why_closed(info)) from error
     return device
@@ -157,15 +170,31 @@ def why_closed(info: HidInfo) -> str:
     """Why a device cannot be opened, and what to do."""
     if not os.path.exists(info.path):
         return f"{info.name} is not connected"
-    if os.access(info.path, os.R_OK | os.W_OK):
+    if may_be_read(info):
         return f"{info.name} does not answer: plug it in anew"
-    if info.is_pedal or info.is_3d:
-        return f"{info.name} may not be read. Install the rule that lets you: {INSTALL}"
-    rule = (
-        f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{info.vendor:04x}", '
-        f'ATTRS{{idProduct}}=="{info.product:04x}", TAG+="uaccess"'
+    return (
+        f"{info.name} may not be read. Install the rule that lets you: {commands(info)}, and plug "
+        "it in anew"
     )
-    return f"{info.name} may not be read. Add this line to {RULES}: {rule}. Then {INSTALL}"
+
+
+def may_be_read(info: HidInfo) -> bool:
+    """Whether the user has the right to."""
+    return os.access(info.path, os.R_OK | os.W_OK)
+
+
+def commands(info: HidInfo) -> str:
+    """What to type for the right to read a device: it installs `RULES`, or a rule of its own."""
+    rules = Path(labapp.__file__).parents[1] / RULES
+    if (info.is_pedal or info.is_3d) and rules.is_file():
+        install = f"sudo cp {shlex.quote(str(rules))} {RULES_FOLDER}"
+    else:
+        rule = (
+            f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{info.vendor:04x}", '
+            f'ATTRS{{idProduct}}=="{info.product:04x}", TAG+="uaccess"'
+        )
+        install = f"echo '{rule}' | sudo tee -a {RULES_FOLDER}{rules.name}"
+    return f"{install} && sudo udevadm control --reload"
 
 
 def has_numbers(descriptor: Iterable[int]) -> bool:
@@ -194,8 +223,8 @@ class HidReader:
 
     Parameters
     ----------
-    key
-        `HidInfo.key` of the device.
+    is_it
+        Tells the device from others.
     name
         What to call it in what is said.
     hear
@@ -205,19 +234,23 @@ class HidReader:
         Called with what happens.
     find, opened
         In tests others.
+    retry_s
+        Pause between looks for a device that is not there; None: `RETRY_S`.
     """
 
     def __init__(
         self,
-        key: str,
+        is_it: Callable[[HidInfo], bool],
         name: str,
         hear: Callable[[int, bytes], None],
         say: Say = silent,
         find: Find = find_hid,
         opened: Open = open_hid,
+        retry_s: float | None = None,
     ) -> None:
         self.connected = False
-        self._key, self._name = key, name
+        self._is_it, self._name = is_it, name
+        self._retry_s = retry_s
         self._hear, self._say = hear, say
         self._find, self._opened = find, opened
         self._told = ""
@@ -245,7 +278,7 @@ class HidReader:
                     self._read_on()
                 except (HidError, OSError, ValueError) as error:
                     self._is_gone(str(error) if isinstance(error, HidError) else UNPLUGGED)
-                    self._ending.wait(RETRY_S)
+                    self._ending.wait(self._retry_s or RETRY_S)
         except Exception as error:
             logging.getLogger("labapp").exception("reader of %s", self._name)
             self._tell("warning", f"a fault in the program: {error!r}")
@@ -262,7 +295,7 @@ class HidReader:
             self._told = words
 
     def _read_on(self) -> None:
-        info = next((info for info in self._find() if info.key == self._key), None)
+        info = next(filter(self._is_it, self._find()), None)
         if info is None:
             raise HidError(AWAY)
         device = self._opened(info)

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+
+from labapp.media.events import Event, Say, silent
+from labapp.media.hid import AWAY, Find, HidReader, Open, find_hid, open_hid
+
+RETRY_S = 2.0
+"""Pause between looks for one: most benches have none."""
 
 FULL = 350.0
 """What an axis gives at its stop."""
@@ -53,6 +60,52 @@ class SixAxes:
             bits = int.from_bytes(report, "little")
             buttons = frozenset(k for k in range(8 * len(report)) if bits >> k & 1)
         return SixAxes(*move, *turn, buttons)
+
+
+class SpaceMouse:
+    """The controller that is plugged in, if one is, read in a thread.
+
+    Parameters
+    ----------
+    hold
+        Called with how it is held whenever that changes, in the reader's thread.
+    say
+        Called with what happens; that there is none is not told.
+    find, opened
+        In tests others.
+    """
+
+    def __init__(
+        self,
+        hold: Callable[[SixAxes], None],
+        say: Say = silent,
+        find: Find = find_hid,
+        opened: Open = open_hid,
+    ) -> None:
+        self._hold, self._say = hold, say
+        self._held = SixAxes()
+        self._reader = HidReader(
+            lambda info: info.is_3d, "3-D controller", self._hear, self._tell, find, opened, RETRY_S
+        )
+
+    @property
+    def connected(self) -> bool:
+        """Whether one is plugged in and can be read."""
+        return self._reader.connected
+
+    def stop(self) -> None:
+        """Read no more. Twice does no harm."""
+        self._reader.stop()
+
+    def _tell(self, event: Event) -> None:
+        if event.words != AWAY:
+            self._say(event)
+
+    def _hear(self, number: int, report: bytes) -> None:
+        held = self._held.after(number, report)
+        if held != self._held:
+            self._held = held
+            self._hold(held)
 
 
 def _axes(report: bytes) -> tuple[float, float, float]:

@@ -3,69 +3,34 @@
 from __future__ import annotations
 
 import json
-import queue
 import re
+import subprocess
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from labapp.errors import InputError
-from labapp.media import foot_switch, hid
+from labapp.media import foot_switch, hid, space_mouse
 from labapp.media.foot_switch import Action, FootSwitch, Learned, PedalMap, Pedals, learn
-from labapp.media.hid import HidError, HidInfo, find_hid, has_numbers, open_hid, why_closed
-from labapp.media.space_mouse import SixAxes
+from labapp.media.hid import (
+    HidError,
+    HidInfo,
+    commands,
+    find_hid,
+    has_numbers,
+    open_hid,
+    why_closed,
+)
+from labapp.media.space_mouse import SixAxes, SpaceMouse
 from tests.media.cameras.watching import Heard, wait_until
+from tests.media.pedals import AXES, INFINITY, KEYBOARD, MOUSE_3D, PCSENSOR, THREE, Device
 
 ROOT = Path(__file__).parents[2]
 
-INFINITY = HidInfo("/dev/hidraw4", 0x05F3, 0x00FF, 0, (12, 3), "VEC Infinity foot pedal")
-PCSENSOR = HidInfo("/dev/hidraw5", 0x3553, 0xB001, 0, (1, 6), "PCsensor FootSwitch")
-MOUSE_3D = HidInfo("/dev/hidraw6", 0x256F, 0xC635, 0, (1, 8), "SpaceMouse Compact")
-
-# A boot keyboard's report descriptor (HID 1.11, appendix B.1), and with a report number.
-KEYBOARD = bytes.fromhex(
-    "05010906a101050719e029e71500250175019508810295017508810195057501050819012905910295017503"
-    "9101950675081500256505071900296581 00c0".replace(" ", "")
-)
-NUMBERED = KEYBOARD[:6] + b"\x85\x01" + KEYBOARD[6:]
-# Of the Infinity: no number (three buttons, padding).
-THREE = bytes.fromhex("050c0903a101050919012903150025017501950381029501750d8101c0")
-
-
-class Device:
-    """A device that sends what it is given, and fails when it is unplugged."""
-
-    def __init__(self, descriptor: bytes = THREE) -> None:
-        self.descriptor = descriptor
-        self.reports: queue.Queue[bytes] = queue.Queue()
-        self.plugged = True
-        self.opened = 0
-
-    def open(self, info: HidInfo) -> Device:
-        if not self.plugged:
-            raise HidError(f"{info.name} is not connected")
-        self.opened += 1
-        return self
-
-    def read(self, n: int, timeout_ms: int = 0) -> list[int]:
-        if not self.plugged:
-            raise OSError("read error")
-        try:
-            return list(self.reports.get(timeout=timeout_ms / 1000)[:n])
-        except queue.Empty:
-            return []
-
-    def send(self, *reports: str) -> None:
-        for report in reports:
-            self.reports.put(bytes.fromhex(report))
-
-    def get_report_descriptor(self) -> list[int]:
-        return list(self.descriptor)
-
-    def close(self) -> None:
-        pass
+NUMBERED = KEYBOARD[:6] + b"\x85\x01" + KEYBOARD[6:]  # with a report number
 
 
 @pytest.fixture(autouse=True)
@@ -73,6 +38,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Try again at once."""
     monkeypatch.setattr(hid, "RETRY_S", 0.01)
     monkeypatch.setattr(hid, "WAIT_MS", 10)
+    monkeypatch.setattr(space_mouse, "RETRY_S", 0.01)
 
 
 def switch(device: Device, info: HidInfo, do, say, **actions: int) -> FootSwitch:
@@ -234,8 +200,21 @@ def test_a_pedal_is_learned_by_pressing_it() -> None:
     )
     assert found == Learned(PCSENSOR, 5)
     pedals = found.mapped("trigger").with_action(6, "mark").with_action(7, "trigger")
-    assert pedals.actions == {6: "mark", 7: "trigger"}
+    assert pedals.actions == {5: "trigger", 6: "mark", 7: "trigger"}
+    assert pedals.with_action(5, "next").with_action(6, None).actions == {5: "next", 7: "trigger"}
     assert (pedals.device, pedals.keyboard) == ("3553:b001:0", True)
+
+
+def test_a_mouse_that_is_moved_is_no_pedal_but_a_pedal_may_be_a_mouse() -> None:
+    mouse = HidInfo("/dev/hidraw1", 0x046D, 0xC077, 0, (1, 2), "Some mouse")
+    clicking = replace(PCSENSOR, usage=(1, 2))
+    moved, pressed = Device(), Device()
+    moved.send("0102", "0104")
+    pressed.send("01000000")
+    devices = {mouse.path: moved, PCSENSOR.path: pressed}
+    found = learn(threading.Event(), lambda: [mouse, clicking], lambda i: devices[i.path])
+    assert found == Learned(clicking, 0)
+    assert moved.opened == 0
 
 
 def test_learning_can_be_given_up_and_says_what_cannot_be_read() -> None:
@@ -332,7 +311,34 @@ def test_which_rule_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.Monke
     known = HidInfo(str(node), 0x05F3, 0x00FF, 0, (12, 3), "VEC Infinity foot pedal")
     assert "resources/udev/70-labapp.rules /etc/udev/rules.d/" in why_closed(known)
     other = HidInfo(str(node), 0x1234, 0x00AB, 0, (1, 6), "Some pedal")
-    assert 'ATTRS{idVendor}=="1234", ATTRS{idProduct}=="00ab", TAG+="uaccess"' in why_closed(other)
+    rule = 'KERNEL=="hidraw*", ATTRS{idVendor}=="1234", ATTRS{idProduct}=="00ab", TAG+="uaccess"'
+    assert f"echo '{rule}' | sudo tee -a /etc/udev/rules.d/70-labapp.rules" in why_closed(other)
+    # Where the program is not in its repository the rule is written, not copied.
+    monkeypatch.setattr("labapp.__file__", str(tmp_path / "site-packages" / "labapp" / "x.py"))
+    assert 'ATTRS{idVendor}=="05f3"' in commands(known)
+    assert commands(known).startswith("echo '")
+
+
+def test_the_commands_are_what_a_shell_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With sudo and udevadm that only say what they were given."""
+    place = tmp_path / "a folder"
+    (place / "resources" / "udev").mkdir(parents=True)
+    (place / hid.RULES).write_text("a rule\n")
+    monkeypatch.setattr("labapp.__file__", str(place / "labapp" / "__init__.py"))
+    monkeypatch.setattr(hid, "RULES_FOLDER", f"{tmp_path}/")
+    for info in (INFINITY, replace(INFINITY, vendor=0x1234)):
+        subprocess.run(
+            ["/bin/sh", "-ec", f'sudo() {{ [ "$1" = udevadm ] || "$@"; }}; {commands(info)}'],
+            check=True,
+            capture_output=True,
+        )
+    lines = (tmp_path / "70-labapp.rules").read_text().splitlines()
+    assert lines == [
+        "a rule",
+        'KERNEL=="hidraw*", ATTRS{idVendor}=="1234", ATTRS{idProduct}=="00ff", TAG+="uaccess"',
+    ]
 
 
 def test_the_rules_let_in_every_device_that_is_known() -> None:
@@ -368,6 +374,25 @@ def test_six_axes_in_one_report_and_what_is_cut_off() -> None:
     assert (held.pitch, held.yaw) == (0.5, 1.0)
     assert held.after(1, b"\1\2") == held
     assert held.after(23, b"\x64") == held  # the battery
+
+
+def test_a_3d_controller_is_read_whenever_it_is_plugged_in() -> None:
+    mouse, held, heard = Device(AXES), [], Heard()
+    mouse.plugged = False
+    reader = SpaceMouse(
+        held.append, heard.append, lambda: [MOUSE_3D] if mouse.plugged else [], mouse.open
+    )
+    wait_until(lambda: reader._reader._told == hid.AWAY)
+    assert not heard  # most benches have none
+    mouse.plugged = True
+    wait_until(lambda: reader.connected)
+    mouse.send("01 5e01 0000 0000", "01 5e01 0000 0000", "01 0000 0000 0000", "03 01")
+    wait_until(lambda: len(held) == 3)
+    assert [(each.right, each.buttons) for each in held] == [(1, set()), (0, set()), (0, {0})]
+    mouse.plugged = False  # and pulled out while it is held
+    wait_until(lambda: held[-1] == SixAxes())
+    reader.stop()
+    assert "it was unplugged" in heard.words()
 
 
 def test_actions_are_those_that_the_types_name() -> None:

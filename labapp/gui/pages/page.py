@@ -66,6 +66,10 @@ class Page(QWidget):
     def trigger(self) -> None:
         """Begin a recording, or end the one that runs; while `live`."""
 
+    def mark(self) -> bool:
+        """Note the present moment beside the recording that runs; False if none does."""
+        return False
+
     def takes_key(self, event: QKeyEvent) -> bool:
         """Do what a plain key means here that nothing in view has taken; whether it did."""
         return False

@@ -378,18 +378,27 @@ def test_faults_are_told_in_words(window: MainWindow, page: CapturePage, device,
     qtbot.waitUntil(lambda: view.updates > updates + 2)
 
 
-def test_leaving_the_page_finishes_the_recording_and_imports_it(
+def test_on_another_page_the_recording_goes_on_and_is_imported_when_it_ends(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     start(page, qtbot)
     live = page.live_view.live
     page.live_view.trigger()
-    qtbot.waitUntil(lambda: live.takes[0].frames > 10)
     window.show_step("setup")
-    assert page.live_view.live is None
+    frames, updates = live.takes[0].frames, page.live_view.updates
+    qtbot.waitUntil(lambda: live.takes[0].frames > frames + 20)
+    assert page.live_view.updates == updates  # nobody sees them
+    assert window.menus.actions["record"].isEnabled()
+    Hand(window).press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     session = window.workspace.session
     qtbot.waitUntil(lambda: session.recording is not None)
     assert len(session.frames) == live.takes[0].frames
+    assert live.is_open
+    window.show_step("capture")
+    assert page.title.text() == "Live: Simulated camera"
+    qtbot.waitUntil(lambda: page.live_view.updates > updates + 2)
+    window.menus.do("close")
+    assert not live.is_open
     assert live.feed.state == "ended"
 
 

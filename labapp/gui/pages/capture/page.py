@@ -16,6 +16,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.dialogs import EVERYTHING, recordings
+from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.pages.capture.live import told_of
 from labapp.gui.pages.capture.live_view import LiveView
 from labapp.gui.pages.capture.parts import ExposureBars, button, whole, wrapped
@@ -118,12 +119,7 @@ class CapturePage(Page):
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
 
     def leave(self) -> None:
-        """Judge no frame that nobody sees; let go of the camera, a recording is finished first."""
-        if self.live_view.live is not None:
-            told = self.live_view.blockSignals(True)  # nobody sees what would be shown instead
-            self.live_view.stop()
-            self.live_view.blockSignals(told)
-            self._wanted = self._seen = None
+        """Judge no frame that nobody sees; a camera goes on, and so does its recording."""
         if self._rest.isActive():
             self._rest.stop()
             self._seen = None
@@ -142,6 +138,10 @@ class CapturePage(Page):
     def trigger(self) -> None:
         """Begin a recording, or end the one that runs."""
         self.live_view.trigger()
+
+    def mark(self) -> bool:
+        """Note the present moment beside the recording that runs; False if none does."""
+        return self.live_view.mark()
 
     def takes_key(self, event: QKeyEvent) -> bool:
         """Space records, M marks and A acknowledges alarms while a camera is watched."""
@@ -425,6 +425,8 @@ class CapturePage(Page):
         self.told.setColumnStretch(1, 1)
         layout.addLayout(self.told)
         self.panel_layout.addWidget(self.told_group)
+        self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
+        self.panel_layout.addWidget(self.foot_switch)
         self.panel_layout.addStretch(1)
 
     def _make_missing(self) -> None:

@@ -1,0 +1,340 @@
+"""The foot switches in use, whatever page is in view: found, learned, kept, and what is pressed."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from PySide6.QtCore import QObject, QTimer, Signal
+
+from labapp.errors import InputError
+from labapp.gui.tasks import Control, Task, Tasks
+
+if TYPE_CHECKING:
+    from labapp.media.events import Event
+    from labapp.media.foot_switch import Action, FootSwitch, Learned, PedalMap
+    from labapp.media.hid import HidInfo
+
+POLL_MS = 20
+"""What is pressed is done within this."""
+
+DEAF_S = 0.5
+"""A press that was learned does nothing besides: so long nothing else is heard."""
+
+DOES: dict[Action, str] = {
+    "trigger": "begin or end a recording",
+    "mark": "mark the moment",
+    "next": "go to the next step",
+}
+
+CALLS: dict[Action, str] = {"trigger": "record", "mark": "mark", "next": "next_step"}
+"""Actions of the window's menus."""
+
+
+@dataclass
+class InUse:
+    """A foot switch in use, and what was told of it last."""
+
+    switch: FootSwitch
+    told: Event | None = None
+
+    @property
+    def pedals(self) -> PedalMap:
+        """Which it is, and what its pedals do."""
+        return self.switch.pedals
+
+    @property
+    def words(self) -> str:
+        """Whether it can be pressed, and if not what to do."""
+        name = self.pedals.name
+        if self.switch.connected:
+            return f"● {name}: connected"
+        if self.told is None:
+            return f"○ {name}: being looked for"
+        from labapp.media.hid import AWAY, UNPLUGGED
+
+        if self.told.words in (AWAY, UNPLUGGED):
+            return f"▲ {name}: not connected. It goes on when it is plugged in"
+        return f"▲ {self.told.words}"
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found plugged in.
+
+    Parameters
+    ----------
+    usable
+        Names of the foot switches that are known and can be read.
+    closed
+        Devices that may not be read, those that are known first.
+    problem
+        Why nothing could be looked for; empty if it could.
+    """
+
+    usable: tuple[str, ...] = ()
+    closed: tuple[HidInfo, ...] = ()
+    problem: str = ""
+
+    @property
+    def words(self) -> str:
+        """What was found, a sentence or two."""
+        if self.problem:
+            return self.problem
+        told = [f"Found: {', '.join(self.usable)}."] if self.usable else []
+        known = [info.name for info in self.closed if info.is_pedal or info.is_3d]
+        if known:
+            told.append(f"▲ May not be read: {', '.join(known)}.")
+        if not told:
+            told = ["No foot switch that is known is plugged in; any other can be learned."]
+        return " ".join(told)
+
+
+class FootSwitches(QObject):
+    """Foot switches: what is pressed is asked of the window's menus.
+
+    Nothing runs while none is in use. Devices are read in threads of their own; what they tell is
+    taken from a queue.
+
+    Parameters
+    ----------
+    tasks
+        For what takes a while.
+
+    Signals
+    -------
+    changed
+        Something that is shown of them is otherwise.
+    kept
+        Others are in use, or their pedals do something else: as plain values, to be remembered.
+    pressed
+        The name of the menus' action that a pedal was pressed for.
+    said
+        Something for the operator to read: a sentence, and whether it is a problem.
+
+    Attributes
+    ----------
+    in_use
+        By the device's key.
+    found
+        What was plugged in at the last look; None before one.
+    learned
+        The pedal that was pressed to be learned, until it is said what it does.
+    """
+
+    changed = Signal()
+    kept = Signal(object)
+    pressed = Signal(str)
+    said = Signal(str, bool)
+
+    def __init__(self, tasks: Tasks, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self._tasks = tasks
+        self.in_use: dict[str, InUse] = {}
+        self.found: Found | None = None
+        self.learned: Learned | None = None
+        self.unheard: tuple[str, ...] = ()
+        """Why some devices cannot be listened to while a pedal is waited for."""
+        self._deaf_until_s = 0.0
+        self._learning: Task | None = None
+        self._looking: Task | None = None
+        self._heard: queue.SimpleQueue[tuple[str, Action | Event]] = queue.SimpleQueue()
+        self._timer = QTimer(self)
+        self._timer.setInterval(POLL_MS)
+        self._timer.timeout.connect(self._take)
+        tasks.changed.connect(self.changed)
+
+    # --- in use -------------------------------------------------------------------------------
+
+    def use(self, kept: Iterable[Mapping[str, Any]]) -> None:
+        """Take up the foot switches that were remembered; one that is damaged is said."""
+        for values in kept:
+            from labapp.media.foot_switch import PedalMap
+
+            try:
+                pedals = PedalMap.from_dict(values)
+            except InputError as error:
+                self.said.emit(f"A foot switch is to be learned anew: {error}", True)
+                continue
+            self._begin(pedals)
+        self.changed.emit()
+
+    def stop(self) -> None:
+        """Use none any more; they stay remembered."""
+        self._timer.stop()
+        for each in self.in_use.values():
+            each.switch.stop()
+        self.in_use.clear()
+
+    def assign(self, key: str, pedal: int, action: Action | None) -> None:
+        """Let a pedal of a device in use do something else; None: nothing."""
+        switch = self.in_use[key].switch
+        switch.pedals = switch.pedals.with_action(pedal, action)
+        if not switch.pedals.actions:
+            switch.stop()
+            del self.in_use[key]
+            if not self.in_use:
+                self._timer.stop()
+        self._keep()
+
+    def _begin(self, pedals: PedalMap) -> None:
+        from labapp.media.foot_switch import FootSwitch
+        from labapp.media.hid import find_hid, open_hid
+
+        if pedals.device in self.in_use or not pedals.actions:
+            return
+        # Calls come in the device's thread: it is given the queue, and nothing of Qt.
+        hear = partial(_put, self._heard, pedals.device)
+        switch = FootSwitch(pedals, hear, hear, find_hid, open_hid)
+        self.in_use[pedals.device] = InUse(switch)
+        if not self._timer.isActive():
+            self._timer.start()
+
+    def _keep(self) -> None:
+        self.kept.emit(tuple(each.pedals.as_dict() for each in self.in_use.values()))
+        self.changed.emit()
+
+    def _take(self) -> None:
+        """Do what was pressed, and tell what happened."""
+        from labapp.media.events import Event
+        from labapp.media.hid import AWAY, UNPLUGGED
+
+        deaf = self.learns or time.monotonic() < self._deaf_until_s
+        for _ in range(self._heard.qsize()):
+            key, heard = self._heard.get_nowait()
+            if key not in self.in_use:
+                continue
+            if isinstance(heard, Event):
+                self.in_use[key].told = heard
+                warned = heard.kind == "warning" and heard.words != AWAY
+                self.said.emit(str(heard), warned)
+                if warned and heard.words != UNPLUGGED:
+                    self.look()  # what it may not be read for
+                self.changed.emit()
+            elif not deaf:
+                self.pressed.emit(CALLS[heard])
+
+    # --- to find and learn them ---------------------------------------------------------------
+
+    @property
+    def looks(self) -> bool:
+        """Whether it is being looked what is plugged in."""
+        return self._looking in self._tasks.active
+
+    @property
+    def learns(self) -> bool:
+        """Whether a pedal is waited for."""
+        return self._learning is not None and self._learning in self._tasks.active
+
+    def look(self) -> None:
+        """See what is plugged in, in the background."""
+
+        def done(found: Found) -> None:
+            self.found = found
+            self.changed.emit()
+
+        if not self.looks:
+            self._looking = self._tasks.start("Looking for foot switches", lambda _: _found(), done)
+
+    def learn(self) -> None:
+        """Wait for a pedal to be pressed, in the background, until `give_up`."""
+        if self.learns:
+            return
+        self.learned, self.unheard = None, ()
+
+        def done(answer: Learned | str | None) -> None:
+            self._learning, self.unheard = None, ()
+            self._deaf_until_s = time.monotonic() + DEAF_S
+            if isinstance(answer, str):
+                self.said.emit(answer, True)
+                self.look()
+            else:
+                self.learned = answer
+            self.changed.emit()
+
+        def told(problems: list[str]) -> None:
+            self.unheard = tuple(problems)
+            self.changed.emit()
+
+        self._learning = self._tasks.start("Waiting for a pedal", _learned, done, told)
+        self.changed.emit()
+
+    def give_up(self) -> None:
+        """Wait for no pedal any more, or leave the one that was pressed."""
+        if self._learning is not None:
+            self._learning.cancel()
+        self.learned = None
+        self.changed.emit()
+
+    def use_learned(self, action: Action) -> None:
+        """Let the pedal that was pressed do something from now on, and remember it."""
+        learned, self.learned = self.learned, None
+        if learned is None:
+            return
+        if learned.info.key in self.in_use:
+            self.assign(learned.info.key, learned.pedal, action)
+        else:
+            self._begin(learned.mapped(action))
+            self._keep()
+
+    @property
+    def proposed(self) -> Action:
+        """What the pedal that was pressed does already, or else the first that none does yet."""
+        actions: dict[int, Action] = {}
+        if self.learned is not None and self.learned.info.key in self.in_use:
+            actions = dict(self.in_use[self.learned.info.key].pedals.actions)
+        if self.learned is not None and self.learned.pedal in actions:
+            return actions[self.learned.pedal]
+        taken = {does for each in self.in_use.values() for does in each.pedals.actions.values()}
+        return next((action for action in DOES if action not in taken), "trigger")
+
+
+def pedal_name(number: int, keyboard: bool) -> str:
+    """A pedal as it is called: of a device with buttons its number from 1, else its key."""
+    if not keyboard:
+        return f"pedal {number % BITS + 1}"
+    letters = {4 + k: letter for k, letter in enumerate("ABCDEFGHIJKLMNOPQRSTUVWXYZ1234567890")}
+    keys = {**letters, **{58 + k: f"F{k + 1}" for k in range(12)}}
+    keys |= {104 + k: f"F{k + 13}" for k in range(12)}
+    keys |= {40: "Enter", 41: "Esc", 43: "Tab", 44: "Space", 75: "Page Up", 78: "Page Down"}
+    return f"key {keys.get(number, f'number {number}')}"
+
+
+BITS = 512
+"""Numbers of pedals that a kind of report has room for."""
+
+
+def _put(heard: queue.SimpleQueue[tuple[str, Any]], key: str, what: object) -> None:
+    heard.put((key, what))
+
+
+def _found() -> Found:
+    from labapp.media.hid import HidError, find_hid, may_be_read
+
+    try:
+        devices = {info.key: info for info in find_hid()}
+    except HidError as error:
+        return Found(problem=str(error))
+    known_first = sorted(devices.values(), key=lambda info: not (info.is_pedal or info.is_3d))
+    usable = [info.name for info in known_first if info.is_pedal and may_be_read(info)]
+    closed = [info for info in known_first if not may_be_read(info)]
+    return Found(tuple(dict.fromkeys(usable)), tuple(closed))
+
+
+def _learned(control: Control) -> Learned | str | None:
+    """Wait for a pedal; why none can be heard, as words."""
+    from labapp.media.foot_switch import learn
+    from labapp.media.hid import HidError, find_hid, open_hid
+
+    def told(problems: list[str]) -> None:
+        if not control.cancelled.is_set():
+            control.part(problems)
+
+    try:
+        return learn(control.cancelled, find_hid, open_hid, told)
+    except HidError as error:
+        return str(error)

@@ -1,0 +1,198 @@
+"""Foot switches on the recording page: which are in use, what their pedals do, and new ones."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, cast
+
+from PySide6.QtGui import QGuiApplication, QTextOption
+from PySide6.QtWidgets import QHBoxLayout, QLabel, QPlainTextEdit, QVBoxLayout, QWidget
+
+from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
+from labapp.gui.pages.capture.parts import button, wrapped
+from labapp.gui.views.fields import ChoiceField, FieldForm
+from labapp.gui.views.labels import headed
+from labapp.media.hid import commands
+
+if TYPE_CHECKING:
+    from labapp.media.foot_switch import Action
+
+NOTHING = "nothing"
+
+CHOICES = [*((action, words) for action, words in DOES.items()), (NOTHING, "nothing any more")]
+
+NONE_YET = "No foot switch is in use. Plug one in, press Learn a pedal, and step on it."
+
+LINES = 5
+"""Of the commands."""
+
+LISTENING = "Step on the pedal that is to be used …"
+
+
+class FootSwitchPanel(QWidget):
+    """Shows and sets the foot switches of a window.
+
+    Parameters
+    ----------
+    switches
+        Of the window.
+    """
+
+    def __init__(self, switches: FootSwitches) -> None:
+        super().__init__()
+        self.switches = switches
+        self._shown: object = None
+        outer = QVBoxLayout(self)
+        outer.setContentsMargins(0, 0, 0, 0)
+        group, self._layout = headed("Foot switch")
+        outer.addWidget(group)
+        self.words = wrapped()
+        self.rows = QWidget()
+        self.pedals: dict[tuple[str, int], ChoiceField] = {}
+        self._layout.addWidget(self.words)
+        self._layout.addWidget(self.rows)
+        self._make_learning()
+        self._make_rights()
+        switches.changed.connect(self.refresh)
+        self.refresh()
+
+    def _make_learning(self) -> None:
+        row = QHBoxLayout()
+        self.learn_button = button(
+            "Learn a pedal", "Wait until a pedal is stepped on, of whatever device", self._learn
+        )
+        self.look_button = button(
+            "Look for devices", "See which foot switches are plugged in", self.switches.look
+        )
+        row.addWidget(self.learn_button)
+        row.addWidget(self.look_button)
+        self._layout.addLayout(row)
+        self.learned_words = wrapped()
+        self._layout.addWidget(self.learned_words)
+        self.learned = QWidget()
+        inner = QVBoxLayout(self.learned)
+        inner.setContentsMargins(0, 0, 0, 0)
+        form = FieldForm()
+        self.action = ChoiceField(
+            "It is to", list(DOES.items()), tooltip="What stepping on this pedal does from now on"
+        )
+        form.add(self.action)
+        inner.addWidget(form)
+        row = QHBoxLayout()
+        self.use_button = button("Use it", "Use the pedal so, now and after each start", self._use)
+        row.addWidget(self.use_button)
+        row.addWidget(button("Not this one", "Leave this pedal as it is", self.switches.give_up))
+        inner.addLayout(row)
+        self._layout.addWidget(self.learned)
+
+    def _make_rights(self) -> None:
+        self.rights = QWidget()
+        inner = QVBoxLayout(self.rights)
+        inner.setContentsMargins(0, 0, 0, 0)
+        form = FieldForm()
+        self.closed = ChoiceField(
+            "May not be read", tooltip="Devices that the system keeps from you: choose yours"
+        )
+        form.add(self.closed)
+        inner.addWidget(form)
+        self.commands = QPlainTextEdit()
+        self.commands.setReadOnly(True)
+        self.commands.setTabChangesFocus(True)
+        self.commands.setWordWrapMode(QTextOption.WrapMode.WrapAnywhere)
+        self.commands.setFixedHeight(LINES * self.commands.fontMetrics().lineSpacing() + 14)
+        self.commands.setAccessibleName("Commands that let you read it")
+        self.commands.setToolTip("Type them in a terminal, then plug the device in anew")
+        inner.addWidget(self.commands)
+        self.copy_button = button(
+            "Copy the commands",
+            "Copy what installs the rule that lets you read it, for a terminal",
+            self._copy,
+        )
+        inner.addWidget(self.copy_button)
+        self.closed.edited.connect(lambda _: self._show_commands())
+        inner.addWidget(wrapped("Then plug it in anew."))
+        self._layout.addWidget(self.rights)
+
+    # --- what is shown ------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Show how the foot switches are now."""
+        switches = self.switches
+        told = [each.words for each in switches.in_use.values()] or [NONE_YET]
+        if switches.found is not None:
+            told.append(switches.found.words)
+        _put(self.words, "\n".join(told))
+        self._show_rows()
+        self.learn_button.setText("Stop waiting" if switches.learns else "Learn a pedal")
+        self.look_button.setEnabled(not (switches.looks or switches.learns))
+        learned = switches.learned
+        words = "\n".join((LISTENING, *switches.unheard)) if switches.learns else ""
+        if learned is not None:
+            name = pedal_name(learned.pedal, learned.info.is_keyboard)
+            words = f"{learned.info.name}: {name} was pressed."
+        _put(self.learned_words, words)
+        if learned is not None and self.learned.isHidden():
+            self.action.set_value(switches.proposed)
+        self.learned.setVisible(learned is not None)
+        closed = () if switches.found is None else switches.found.closed
+        self.closed.set_choices([(info.key, info.name) for info in closed])
+        self.rights.setVisible(bool(closed))
+        self._show_commands()
+
+    def _show_rows(self) -> None:
+        """A field for each pedal; made anew only where there are others."""
+        held = {key: each.pedals for key, each in self.switches.in_use.items()}
+        wanted = {(key, pedal): does for key in held for pedal, does in held[key].actions.items()}
+        if wanted.keys() != self.pedals.keys():
+            former, form = self.rows, FieldForm()
+            self.pedals = {}
+            headed_by = ""
+            for key, pedal in sorted(wanted):
+                if len(held) > 1 and key != headed_by:
+                    form.add_heading(held[key].name)
+                    headed_by = key
+                name = pedal_name(pedal, held[key].keyboard)
+                field = self.pedals[key, pedal] = ChoiceField(
+                    name.capitalize(),
+                    CHOICES,
+                    tooltip=f"What {name} of {held[key].name} does",
+                )
+                field.edited.connect(partial(self._assign, key, pedal))
+                form.add(field)
+            self._layout.replaceWidget(former, form)
+            self.rows = form
+            former.hide()  # it is deleted only later
+            former.deleteLater()
+        for place, action in wanted.items():
+            self.pedals[place].set_value(action)
+        self.rows.setVisible(bool(wanted))
+
+    def _show_commands(self) -> None:
+        closed = () if self.switches.found is None else self.switches.found.closed
+        chosen = next((info for info in closed if info.key == self.closed.value()), None)
+        told = "" if chosen is None else commands(chosen)
+        if told != self.commands.toPlainText():
+            self.commands.setPlainText(told)
+
+    # --- what is done -------------------------------------------------------------------------
+
+    def _learn(self) -> None:
+        (self.switches.give_up if self.switches.learns else self.switches.learn)()
+
+    def _use(self) -> None:
+        self.switches.use_learned(cast("Action", self.action.value()))
+
+    def _assign(self, key: str, pedal: int, chosen: str) -> None:
+        action = None if chosen == NOTHING else cast("Action", chosen)
+        self.switches.assign(key, pedal, action)
+
+    def _copy(self) -> None:
+        QGuiApplication.clipboard().setText(self.commands.toPlainText())
+        self.switches.said.emit("The commands are on the clipboard, for a terminal", False)
+
+
+def _put(label: QLabel, words: str) -> None:
+    """Show words, or nothing of a label without any."""
+    if label.text() != words:
+        label.setText(words)
+    label.setVisible(bool(words))

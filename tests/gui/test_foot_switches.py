@@ -1,0 +1,420 @@
+"""Foot switches in the window: learned, kept, pressed on any page, pulled out, without rights."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QApplication
+from pytestqt.qtbot import QtBot
+
+from labapp.gui import foot_switches
+from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
+from labapp.gui.pages.capture import live_view
+from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
+from labapp.gui.preferences import Preferences, read_preferences
+from labapp.gui.window import MainWindow
+from labapp.media import hid, open_source
+from labapp.media.cameras import SimulatedDevice
+from labapp.media.foot_switch import PedalMap
+from labapp.media.hid import HidInfo
+from tests.gui.conftest import KEPT, CopySample
+from tests.gui.hand import Hand
+from tests.gui.test_accessibility import check_round
+from tests.media.pedals import INFINITY, KEYBOARD, MOUSE_3D, PCSENSOR, Bench, Device
+
+LEFT, MIDDLE, RIGHT = ("0100", "0000"), ("0200", "0000"), ("0400", "0000")
+"""Reports of the Infinity's pedals, down and up."""
+
+LEARNED = PedalMap(INFINITY.key, INFINITY.name, False, {0: "trigger", 1: "mark", 2: "next"})
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """An Infinity and a PCsensor, plugged in; everybody may read them."""
+    made = Bench({INFINITY: Device(), PCSENSOR: Device(KEYBOARD)})
+    monkeypatch.setattr(hid, "find_hid", made.find)
+    monkeypatch.setattr(hid, "open_hid", made.open)
+    monkeypatch.setattr(hid, "may_be_read", lambda info: info not in made.closed)
+    monkeypatch.setattr(hid, "RETRY_S", 0.02)
+    monkeypatch.setattr(hid, "WAIT_MS", 10)
+    monkeypatch.setattr(foot_switches, "DEAF_S", 0.1)
+    return made
+
+
+@pytest.fixture
+def start(qapp: QApplication, tmp_path: Path, state: Path) -> Iterator[Callable[..., MainWindow]]:
+    """Start the app as it is started: with what was remembered."""
+    file, made = tmp_path / "config" / "preferences.json", []
+
+    def started(*maps: PedalMap) -> MainWindow:
+        preferences, problem = read_preferences(file)
+        assert not problem
+        if maps:
+            preferences = Preferences(foot_switches=tuple(each.as_dict() for each in maps))
+        window = MainWindow(preferences, file)
+        made.append(window)
+        KEPT.append(window)
+        window.resize(1280, 760)
+        window.show()
+        window.activateWindow()
+        return window
+
+    yield started
+    for window in made:
+        window.close()
+
+
+def panel_of(window: MainWindow) -> FootSwitchPanel:
+    window.show_step("capture")
+    return window.page.foot_switch
+
+
+def said_in(window: MainWindow) -> str:
+    return "\n".join(window.log_panel.texts())
+
+
+def connected(window: MainWindow, info: HidInfo = INFINITY) -> Callable[[], bool]:
+    switches = window.workspace.foot_switches
+    return lambda: info.key in switches.in_use and switches.in_use[info.key].switch.connected
+
+
+def learn(window: MainWindow, bench: Bench, info: HidInfo, *reports: str, qtbot: QtBot) -> None:
+    """Press Learn, and step on a pedal when the devices are listened to."""
+    readers = len(bench.readers)
+    Hand(window).button("Learn a pedal")
+    qtbot.waitUntil(lambda: len(bench.readers) == readers + len(bench.devices))
+    bench.press(info, *reports)
+    qtbot.waitUntil(lambda: window.workspace.foot_switches.learned is not None)
+
+
+# --- learned and kept -----------------------------------------------------------------------------
+
+
+def test_a_pedal_is_learned_by_pressing_it_and_kept(
+    start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
+):
+    window = start()
+    window.files.open(copy_sample("thumb_tack"))
+    panel, hand = panel_of(window), Hand(window)
+    qtbot.waitUntil(window.isActiveWindow)
+    assert panel.words.text().startswith("No foot switch is in use")
+    learn(window, bench, INFINITY, *MIDDLE, qtbot=qtbot)
+    assert panel.learned_words.text() == "VEC Infinity foot pedal: pedal 2 was pressed."
+    assert panel.action.value() == "trigger"  # what none does yet
+    hand.choose(panel.action, DOES["next"])
+    hand.button("Use it")
+    assert panel.learned.isHidden()
+    qtbot.waitUntil(connected(window))
+    qtbot.waitUntil(lambda: panel.words.text() == "● VEC Infinity foot pedal: connected")
+    learn(window, bench, PCSENSOR, "0000050000000000", "0000000000000000", qtbot=qtbot)
+    assert panel.learned_words.text() == "PCsensor FootSwitch: key B was pressed."
+    hand.button("Use it")
+    qtbot.waitUntil(connected(window, PCSENSOR))
+    assert [field.value() for field in panel.pedals.values()] == ["next", "trigger"]
+    kept = read_preferences(window._preferences_file)[0].foot_switches
+    maps = [PedalMap.from_dict(each) for each in kept]
+    assert maps == [
+        PedalMap("05f3:00ff:0", "VEC Infinity foot pedal", False, {1: "next"}),
+        PedalMap("3553:b001:0", "PCsensor FootSwitch", True, {5: "trigger"}),
+    ]
+    window.close()
+    # At the next start it is in use at once.
+    again = start()
+    again.files.open(copy_sample("concave"))
+    qtbot.waitUntil(connected(again))
+    again.show_step("setup")
+    bench.press(INFINITY, *MIDDLE)
+    qtbot.waitUntil(lambda: again.page.key == "laser")
+
+
+def test_a_press_that_is_learned_does_nothing_else(
+    start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
+):
+    window = start(LEARNED)
+    window.files.open(copy_sample("thumb_tack"))
+    panel = panel_of(window)
+    qtbot.waitUntil(connected(window))
+    learn(window, bench, INFINITY, *RIGHT, qtbot=qtbot)
+    assert panel.action.value() == "next"  # what it does already
+    qtbot.wait(150)
+    assert window.page.key == "capture"
+    Hand(window).button("Not this one")
+    bench.press(INFINITY, *RIGHT)
+    qtbot.waitUntil(lambda: window.page.key == "dots")
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+
+
+def test_what_a_pedal_does_is_changed_and_taken_away(start, bench: Bench, copy_sample, qtbot):
+    window = start(LEARNED)
+    window.files.open(copy_sample("thumb_tack"))
+    panel, hand = panel_of(window), Hand(window)
+    qtbot.waitUntil(connected(window))
+    key = INFINITY.key
+    hand.choose(panel.pedals[key, 0], DOES["next"])
+    assert [field.value() for field in panel.pedals.values()] == ["next", "mark", "next"]
+    bench.press(INFINITY, *LEFT)
+    qtbot.waitUntil(lambda: window.page.key == "dots")
+    window.show_step("capture")
+    for pedal in (0, 1, 2):
+        hand.choose(panel.pedals[key, pedal], "nothing any more")
+        qtbot.waitUntil(lambda pedal=pedal: (key, pedal) not in panel.pedals)
+    assert window.workspace.foot_switches.in_use == {}
+    assert read_preferences(window._preferences_file)[0].foot_switches == ()
+    assert panel.words.text().startswith("No foot switch is in use")
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+
+
+def test_waiting_for_a_pedal_can_be_given_up(start, bench: Bench, copy_sample, qtbot: QtBot):
+    window = start()
+    window.files.open(copy_sample("thumb_tack"))
+    panel, hand = panel_of(window), Hand(window)
+    hand.button("Learn a pedal")
+    assert "Step on the pedal" in panel.learned_words.text()
+    hand.button("Stop waiting")
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert panel.learned_words.isHidden()
+    hand.button("Learn a pedal")
+    window.menus.do("close")  # the session, and with it what is under way
+    assert not window.workspace.foot_switches.learns
+
+
+# --- pressed --------------------------------------------------------------------------------------
+
+
+def test_pedals_act_on_the_live_recording_whatever_page_is_in_view(
+    start, bench: Bench, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    film = SimulatedDevice("test", lambda k: np.full((24, 32), k % 200, np.uint8), rate_hz=100)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
+    window = start(LEARNED)
+    assert window.workspace.create(tmp_path / "new.labsession")
+    qtbot.waitUntil(connected(window))
+    window.show_step("capture")
+    view = window.page.live_view
+    view.start()
+    qtbot.waitUntil(lambda: view.updates > 2)
+    window.show_step("setup")
+    bench.press(INFINITY, *LEFT)
+    qtbot.waitUntil(lambda: view.live.running is not None)
+    take = view.live.running
+    bench.press(INFINITY, *MIDDLE)
+    qtbot.waitUntil(lambda: take.frames > 20)
+    bench.press(INFINITY, *RIGHT)
+    qtbot.waitUntil(lambda: window.page.key == "laser")
+    assert view.live.running is take
+    bench.press(INFINITY, *LEFT)
+    session = window.workspace.session
+    qtbot.waitUntil(lambda: session.recording is not None)
+    assert "marked by hand" in take.notes.read_text()
+    assert len(session.frames) == take.frames
+    assert window.page.key == "laser"
+    with open_source(take.path) as video:
+        levels = [int(frame.image[0, 0]) for frame in video]
+    assert set(np.diff(levels) % 200) == {1}
+    # Ctrl+K marks, too: there is nothing to be marked now.
+    Hand(window).press(Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)
+    assert "Nothing is being recorded" in said_in(window)
+    view.stop()
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    bench.press(INFINITY, *LEFT)
+    qtbot.waitUntil(lambda: "No camera is watched: start one in the step" in said_in(window))
+
+
+def test_unplugged_is_said_and_it_comes_back_by_itself(start, bench: Bench, copy_sample, qtbot):
+    window = start(LEARNED)
+    window.files.open(copy_sample("thumb_tack"))
+    panel = panel_of(window)
+    qtbot.waitUntil(connected(window))
+    for count in (1, 2):
+        bench.devices[INFINITY].plugged = False
+        unplugged = "▲ VEC Infinity foot pedal: not connected. It goes on when it is plugged in"
+        qtbot.waitUntil(lambda: panel.words.text() == unplugged)  # noqa: B023
+        assert window.status_line.unread == ["VEC Infinity foot pedal: it was unplugged"]
+        bench.devices[INFINITY].plugged = True
+        qtbot.waitUntil(lambda: panel.words.text().startswith("● VEC"))
+        window.read_messages()
+        window.show_step("capture")
+        bench.press(INFINITY, *RIGHT)
+        qtbot.waitUntil(lambda: window.page.key == "dots")
+        assert said_in(window).count("connected after") == count
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+
+
+def test_one_that_is_not_plugged_in_at_the_start_is_no_problem(start, bench: Bench, qtbot: QtBot):
+    bench.devices[INFINITY].plugged = False
+    window = start(LEARNED)
+    qtbot.waitUntil(lambda: "VEC Infinity foot pedal: it is not connected" in said_in(window))
+    assert window.status_line.unread == []
+    bench.devices[INFINITY].plugged = True
+    qtbot.waitUntil(connected(window))
+
+
+# --- what is wrong --------------------------------------------------------------------------------
+
+
+def test_without_the_right_to_read_it_the_rule_is_told_and_copied(
+    start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
+):
+    other = replace(PCSENSOR, path="/dev/hidraw9", vendor=0x1234, product=0xAB, name="Odd pedal")
+    bench.devices[other] = Device()
+    bench.closed = {other, INFINITY}
+    window = start(LEARNED)
+    window.files.open(copy_sample("thumb_tack"))
+    panel, hand = panel_of(window), Hand(window)
+    # That it may not be read is a problem, and what to do is there without being asked for.
+    qtbot.waitUntil(lambda: bool(window.status_line.unread))
+    qtbot.waitUntil(panel.rights.isVisible)
+    assert "▲ May not be read: VEC Infinity foot pedal." in panel.words.text()
+    assert "Found: PCsensor FootSwitch." in panel.words.text()
+    hand.button("Copy the commands")
+    copied = QApplication.clipboard().text()
+    assert copied.startswith("sudo cp ")
+    assert copied.endswith(
+        "resources/udev/70-labapp.rules /etc/udev/rules.d/ && sudo udevadm control --reload"
+    )
+    hand.choose(panel.closed, "Odd pedal")
+    hand.button("Copy the commands")
+    assert 'ATTRS{idVendor}=="1234", ATTRS{idProduct}=="00ab"' in QApplication.clipboard().text()
+    bench.closed.clear()  # the rule is installed, and it was plugged in anew
+    qtbot.waitUntil(connected(window))
+    hand.button("Look for devices")
+    qtbot.waitUntil(panel.rights.isHidden)
+
+
+def test_where_there_is_no_foot_switch_it_is_said(start, bench: Bench, copy_sample, qtbot: QtBot):
+    bench.devices.clear()
+    window = start()
+    window.files.open(copy_sample("thumb_tack"))
+    panel, hand = panel_of(window), Hand(window)
+    hand.button("Look for devices")
+    qtbot.waitUntil(lambda: "No foot switch that is known" in panel.words.text())
+    hand.button("Learn a pedal")
+    told = "no foot switch is connected: plug it in"
+    qtbot.waitUntil(lambda: window.status_line.unread == [told])
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert panel.learn_button.text() == "Learn a pedal"
+
+
+def test_without_hidapi_it_is_said(start, copy_sample: CopySample, qtbot: QtBot, monkeypatch):
+    def missing() -> None:
+        raise hid.HidError("foot switches need hidapi: pip install 'labapp[gui]'")
+
+    monkeypatch.setattr(hid, "find_hid", missing)
+    window = start()
+    window.files.open(copy_sample("thumb_tack"))
+    panel = panel_of(window)
+    Hand(window).button("Look for devices")
+    qtbot.waitUntil(lambda: "need hidapi" in panel.words.text())
+
+
+def test_nothing_is_looked_for_where_none_was_learned(start, copy_sample, monkeypatch, qtbot):
+    looked = []
+    monkeypatch.setattr(hid, "find_hid", lambda: looked.append(1) or [])
+    threads = {thread.name for thread in threading.enumerate()}
+    window = start()
+    window.files.open(copy_sample("thumb_tack"))
+    panel_of(window)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert not looked
+    assert not window.workspace.foot_switches._timer.isActive()
+    assert {thread.name for thread in threading.enumerate()} <= threads
+
+
+def test_what_was_remembered_and_is_damaged_is_said(start, bench: Bench, qtbot: QtBot):
+    window = start(LEARNED)
+    window.close()
+    file = window._preferences_file
+    held = json.loads(file.read_text())
+    assert [each["device"] for each in held["foot_switches"]] == [INFINITY.key]
+    held["foot_switches"].insert(0, {"device": "x", "actions": {"0": "explode"}})
+    file.write_text(json.dumps(held))
+    again = start()
+    assert "A foot switch is to be learned anew" in said_in(again)
+    qtbot.waitUntil(connected(again))
+
+
+def test_a_system_that_is_slow_to_answer_holds_nothing_up(
+    start, bench: Bench, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    answer = threading.Event()
+
+    def slow() -> list[HidInfo]:
+        answer.wait(30)
+        return list(bench.find())
+
+    monkeypatch.setattr(hid, "find_hid", slow)
+    window = start(LEARNED)
+    window.files.open(copy_sample("thumb_tack"))
+    panel = panel_of(window)
+    panel.look_button.click()
+    panel.learn_button.click()
+    assert panel.words.text().startswith("○ VEC Infinity foot pedal: being looked for")
+    assert panel.learn_button.text() == "Stop waiting"
+    window.show_step("setup")
+    assert window.page.key == "setup"
+    panel.learn_button.click()
+    answer.set()
+    qtbot.waitUntil(connected(window))
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+
+
+# --- shown ----------------------------------------------------------------------------------------
+
+
+def test_the_panel_by_keyboard_and_screen_reader(
+    start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
+):
+    bench.devices[MOUSE_3D] = Device()
+    bench.closed = {MOUSE_3D}
+    window = start(LEARNED)
+    window.files.open(copy_sample("thumb_tack"))
+    panel = panel_of(window)
+    qtbot.waitUntil(connected(window))
+    panel.look_button.click()
+    qtbot.waitUntil(panel.rights.isVisible)
+    bench.devices.pop(MOUSE_3D)
+    learn(window, bench, PCSENSOR, "0000050000000000", "0000000000000000", qtbot=qtbot)
+    qtbot.waitUntil(lambda: window.isActiveWindow() and not window.workspace.tasks.active)
+    reached = check_round(window)
+    wanted = [each.editor for each in panel.pedals.values()]
+    wanted += [panel.action.editor, panel.use_button, panel.copy_button, panel.commands]
+    assert set(wanted) <= set(reached)
+    window.resize(911, 512)  # 1366 × 768 at 150 %
+    qtbot.wait(20)
+    area = window.side_panel.stack.currentWidget()
+    assert area.horizontalScrollBar().maximum() == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "keyboard", "name"),
+    [
+        (0, False, "pedal 1"),
+        (2, False, "pedal 3"),
+        (512, False, "pedal 1"),
+        (5, True, "key B"),
+        (30, True, "key 1"),
+        (58, True, "key F1"),
+        (104, True, "key F13"),
+        (0xE0, True, "key number 224"),
+    ],
+)
+def test_a_pedal_is_called_as_people_call_it(number: int, keyboard: bool, name: str):
+    assert pedal_name(number, keyboard) == name
+
+
+def test_another_device_begins_with_what_no_pedal_does_yet(qapp: QApplication):
+    from labapp.gui.tasks import Tasks
+    from labapp.media.foot_switch import Learned
+
+    tasks = Tasks()
+    switches = FootSwitches(tasks)
+    switches.learned = Learned(PCSENSOR, 5)
+    assert switches.proposed == "trigger"
+    switches.stop()
