@@ -326,10 +326,10 @@ class RandomHand:
         text, good = self._text_for(chosen)
         _activate(chosen)
         chosen.editor.setFocus(Qt.FocusReason.MouseFocusReason)
-        focused = QApplication.focusWidget()
-        typed_on = "nothing" if focused is None else named(focused)
+        typed_on = [QApplication.focusWidget()]
         self._press(KEY.Key_A, CONTROL)
         self._write(text, chosen.editor)
+        typed_on.append(QApplication.focusWidget())
         enter = CONTROL if isinstance(chosen, TextField) else NONE
         ways: dict[str, Callable[[], object]] = {
             "Enter": lambda: self._press(KEY.Key_Return, enter),
@@ -351,7 +351,8 @@ class RandomHand:
                 unread = run.window.status_line.unread
                 run.faults.append(
                     f"{told}: {session.path.name} holds {held!r}, the field {chosen.value()!r}; "
-                    f"typed on {typed_on}; problems not read: {unread}"
+                    f"typed on {typed_on[0]}, at the end on {typed_on[1]}; "
+                    f"problems not read: {unread}"
                 )
         return told
 
@@ -491,6 +492,8 @@ def _activate(widget: QWidget) -> None:
     if not widget.isActiveWindow():
         widget.window().activateWindow()
         QApplication.processEvents()
+    if not widget.isActiveWindow():  # offscreen, a menu that was closed may be left the active one
+        QApplication.setActiveWindow(widget.window())
 
 
 def _words(widget: QWidget) -> str:
