@@ -132,7 +132,7 @@ class LiveWatch:
         Of the sizes.
     say
         Called with alarms that are raised, over, or acknowledged, and the time of their frame by
-        the camera's clock, s; from any thread.
+        the camera's clock, s (None: now); from any thread.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class LiveWatch:
         settings: Settings,
         bit_depth: int,
         limits: Limits,
-        say: Callable[[Event, float], None],
+        say: Callable[[Event, float | None], None],
     ) -> None:
         self.alarms = Alarms(limits)
         self._name, self._scheme, self._say = name, settings.scheme, say
@@ -273,8 +273,7 @@ class LiveWatch:
     def acknowledge(self) -> None:
         """Take it that the operator has seen all alarms."""
         for alarm in self.alarms.acknowledge():
-            words = f"acknowledged: {alarm.told}"
-            self._say(Event(self._name, "note", words), alarm.time_s)
+            self._say(Event(self._name, "note", f"alarm acknowledged: {alarm.told}"), None)
 
     def tell_by(self, kind: str, stream: Stream | None) -> None:
         """Tell every frame that is measured by a stream in place of the one of its kind.

@@ -157,6 +157,9 @@ class LiveFigures(QWidget):
         """Say how measuring keeps up."""
         if words != self.words.text():
             self.words.setText(words)
+            # It grows where a line wraps, and does not shrink: what is below must not jump.
+            height = self.words.heightForWidth(self.words.width())
+            self.words.setMinimumHeight(max(self.words.minimumHeight(), height))
 
     def _label(self, row: int, column: int) -> QLabel:
         if (row, column) not in self._labels:

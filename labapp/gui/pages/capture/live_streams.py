@@ -38,6 +38,8 @@ WARNING = (
     "and nothing is hidden. Keep a firewall round it."
 )
 
+PORT_PX = 140
+
 IN_USE = "Choose another port, or end the program that has this one."
 
 
@@ -75,6 +77,7 @@ class LiveStreams(QWidget):
             )
             field.editor.setAccessibleName(f"Port of {words}")
             field.set_value(port)
+            field.setMaximumWidth(PORT_PX)
             field.edited.connect(partial(self._again, kind))
             for column, widget in enumerate((box, field.label, field)):
                 grid.addWidget(widget, 2 * row, column)
@@ -173,7 +176,8 @@ def stream_in_words(stream: Stream | None, wanted: bool, problem: str) -> str:
         return "○ Opening …" if wanted else "○ Off"
     listen = "program listens" if stream.listeners == 1 else "programs listen"
     told = several(stream.told, "frame")
-    return f"● {stream.address}: {stream.listeners} {listen}, {told} told"
+    where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
+    return f"● {where or stream.address}: {stream.listeners} {listen}, {told} told"
 
 
 def problem_in_words(error: InputError) -> str:

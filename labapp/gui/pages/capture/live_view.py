@@ -42,6 +42,9 @@ from labapp.words import several
 TICK_MS = 33
 """The picture is renewed no more often; less often where that takes long."""
 
+SLOW_MS = 300
+"""It is renewed so often in any case."""
+
 FRESH_S = 2.0
 """The verdict on a measured frame stands so long before that on one that was only looked at."""
 
@@ -309,7 +312,7 @@ class LiveView(QObject):
         self._hear(live)
         self.camera_fields.take_answers()
         took_ms = (time.perf_counter() - began_s) * 1000
-        wanted = max(TICK_MS, round(2 * took_ms))
+        wanted = min(max(TICK_MS, round(2 * took_ms)), SLOW_MS)
         if abs(wanted - self._timer.interval()) > TICK_MS / 4:
             self._timer.setInterval(wanted)
 
@@ -317,8 +320,11 @@ class LiveView(QObject):
         """Show what was measured since it was asked last."""
         followed = watch.newest()
         if followed is not None:
-            self._followed, self.measured_s = followed, time.monotonic()
+            former, self._followed = self._followed, followed
+            self.measured_s = time.monotonic()
             self._show_figures(watch)
+            if former is None or former.found.status != followed.found.status:
+                self._told_s = 0.0  # why there is a figure no more is said at once
             self._show_quality(followed.found.quality)
         self.updates += self.canvas.follow(followed, watch)
 

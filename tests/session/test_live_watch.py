@@ -1,0 +1,213 @@
+"""Live frames that are measured: their trend, how measuring keeps up, alarms, who is told."""
+
+from __future__ import annotations
+
+import csv
+import json
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labapp.core.measures import Measures
+from labapp.core.pipeline import Settings
+from labapp.media import open_source
+from labapp.media.cameras import CameraFrame
+from labapp.media.events import Event
+from labapp.session import live_watch
+from labapp.session.limits import Limits
+from labapp.session.live_measuring import LiveMeasurement
+from labapp.session.live_watch import LiveWatch
+from labapp.session.scene import Scene, empty_scene
+from labapp.session.setup import Setup, read_setup
+from labapp.session.streams import LineStream
+
+SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
+
+MEASURES = Measures(*[0.0] * 4, 6.7, 7.5, 0.30, -0.01, *[0.0] * 6, *[0.03, 0.04, 0.003] * 2)
+
+Told = list[tuple[Event, float | None]]
+
+
+class Prepared:
+    """Measures what it is told to: a width for each frame's number, None where it cannot be."""
+
+    def __init__(self, *_: object) -> None:
+        self.widths: dict[int, float | None] = {}
+        self.asked: list[bool] = []
+
+    def measure(self, image: np.ndarray, drawn: bool) -> LiveMeasurement:
+        self.asked.append(drawn)
+        width = self.widths.get(int(image[0, 0]), 6.7)
+        found = LiveMeasurement("ok", "", None, None, True)  # type: ignore[arg-type]
+        if width is None:
+            return replace(found, status="no-dots", reason="it is dark")
+        scene: Scene | None = empty_scene(np.zeros((1, 3)), (0, 1), "", "") if drawn else None
+        return replace(found, measures=replace(MEASURES, width_mm=width), scene=scene)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def setup() -> Setup:
+    return read_setup(SAMPLE / "setup.toml")
+
+
+@pytest.fixture
+def told() -> Told:
+    return []
+
+
+@pytest.fixture
+def watch(setup: Setup, told: Told, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveWatch]:
+    monkeypatch.setattr(live_watch, "LiveMeasuring", Prepared)
+    limits = Limits(width_mm=(6.0, 6.9), unmeasured=2)
+    made = LiveWatch("camera", setup, Settings(), 8, limits, lambda *each: told.append(each))
+    yield made
+    made.close()
+
+
+def frame(number: int, image: np.ndarray | None = None) -> CameraFrame:
+    if image is None:
+        image = np.full((2, 2), number, np.uint8)
+    return CameraFrame(number, 10 + 0.1 * number, time.monotonic(), image)
+
+
+def prepare(watch: LiveWatch, widths: dict[int, float | None]) -> Prepared:
+    prepared: Any = watch._measuring
+    prepared.widths = widths
+    return prepared
+
+
+def test_the_trend_has_every_frame_that_was_tried(watch: LiveWatch):
+    prepare(watch, {1: 7.2, 2: None})
+    assert watch.trend(60).names == ("width", "length", "height")
+    assert watch.trend(60).value_mm.shape == (3, 0)
+    for number in range(4):
+        watch.measure(frame(number))
+    trend = watch.trend(60)
+    assert trend.number.tolist() == [0, 1, 2, 3]
+    assert np.array_equal(trend.value_mm[0], [6.7, 7.2, np.nan, 6.7], equal_nan=True)
+    assert np.array_equal(trend.sigma_mm[1], [0.04, 0.04, np.nan, 0.04], equal_nan=True)
+    assert trend.beyond.tolist() == [[False, True, False, False], *[[False] * 4] * 2]
+    assert (trend.since_s <= 0).all()
+    assert (np.diff(trend.since_s) >= 0).all()
+    assert len(watch.trend(0.0).number) == 0
+    pace = watch.pace()
+    assert (pace.tried, pace.failed) == (4, 1)
+    assert pace.measured_hz == 3 / live_watch.RATE_S
+
+
+def test_the_trend_forgets_what_is_old(watch: LiveWatch, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(live_watch, "TREND_S", 0.0)
+    for number in range(50):
+        watch.measure(frame(number))
+    assert watch.trend(60).number.tolist() == [49]
+
+
+def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: Told):
+    prepare(watch, {3: 7.2, 4: 7.2, 6: None, 7: None})
+    for number in range(9):
+        watch.measure(frame(number))
+    watch.acknowledge()
+    watch.acknowledge()
+    kinds = [(event.kind, round(time_s, 6) if time_s else None) for event, time_s in told]
+    assert kinds == [
+        ("warning", 10.3),
+        ("note", 10.5),
+        ("warning", 10.7),
+        ("note", 10.8),
+        ("note", None),
+        ("note", None),
+    ]
+    words = [event.words for event, _ in told]
+    assert words[0] == "ALARM: Width 7.200 ± 0.030 mm is above 6.9 mm (frame 3)"
+    assert words[1].startswith("alarm over: Width 7.200")
+    assert words[2] == "ALARM: 2 frames in a row could not be measured: it is dark (frame 7)"
+    assert words[4].startswith("alarm acknowledged: Width")
+    assert watch.alarms.shown == ()
+
+
+def test_a_surface_is_drawn_when_it_is_asked_for_and_only_once(watch: LiveWatch):
+    prepared = prepare(watch, {1: None})
+    watch.measure(frame(0))
+    watch.ask_for_scene()
+    for number in (1, 2, 3):  # the first of them has none
+        watch.measure(frame(number))
+    assert prepared.asked == [False, True, True, False]
+    followed = watch.newest()
+    assert followed is not None
+    assert followed.number == 3
+    assert followed.found.scene is None
+    assert watch.newest() is None
+
+
+def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
+    prepare(watch, {1: 7.2, 2: None})
+    stream = LineStream()
+    watch.tell_by("lines", stream)
+    assert watch.stream("lines") is stream
+    with socket.create_connection(("127.0.0.1", stream.port), timeout=30) as connected:
+        file = connected.makefile("rb")
+        file.readline()
+        assert stream.listeners == 1
+        for number in range(3):
+            watch.measure(frame(number))
+        lines = [json.loads(file.readline()) for _ in range(3)]
+        watch.acknowledge()
+        watch.measure(frame(3))
+        lines.append(json.loads(file.readline()))
+        assert stream.told == 4
+        file.close()
+    assert [line["width_mm"] for line in lines] == [6.7, 7.2, None, 6.7]
+    assert [line["status"] for line in lines] == ["ok", "ok", "no-dots", "ok"]
+    assert [line["time_s"] for line in lines] == [frame(number).time_s for number in range(4)]
+    assert [line["alarm"] for line in lines] == ["", "width-high", "width-high", ""]
+    assert [line["unacknowledged"] for line in lines] == ["", "width-high", "width-high", ""]
+    assert lines[0]["scheme"] == "fit"
+    watch.tell_by("lines", None)
+    assert watch.stream("lines") is None
+
+
+def test_a_stream_that_comes_when_all_is_over_is_closed(watch: LiveWatch):
+    watch.close()
+    stream = LineStream()
+    watch.tell_by("lines", stream)
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", stream.port), timeout=30)
+
+
+def test_a_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, told: Told):
+    """Of a rendered pool whose width is known, measured in the process that measures."""
+    with (SAMPLE / "truth.csv").open() as file:
+        width = float(next(csv.DictReader(file))["width_mm"])
+    with open_source(SAMPLE / "recording.avi") as video:
+        image = video.frame(0).image
+    narrow = Limits(width_mm=(None, 0.9 * width), height_mm=(None, 5.0), unmeasured=2)
+    watch = LiveWatch("camera", setup, Settings(), 8, narrow, lambda *each: told.append(each))
+    try:
+        watch.ask_for_scene()
+        watch.measure(frame(0, image))
+        followed = watch.newest()
+        assert followed is not None
+        scene = followed.found.scene
+        assert scene is not None
+        assert np.ptp(scene.vertices_mm[:, 0]) == pytest.approx(width, rel=0.02)
+        assert [alarm.code for alarm in watch.alarms.shown] == ["width-high"]
+        watch.alarms.set_limits(replace(narrow, width_mm=(0.9 * width, 1.1 * width)))
+        watch.acknowledge()
+        watch.measure(frame(1, image))
+        assert watch.alarms.shown == ()
+        dark = np.random.default_rng(3).integers(0, 4, image.shape).astype(np.uint8)
+        for number in (2, 3):
+            watch.measure(frame(number, dark))
+        assert [alarm.code for alarm in watch.alarms.shown] == ["not-measured"]
+        assert told[-1][0].words.startswith("ALARM: 2 frames in a row could not be measured: ")
+    finally:
+        watch.close()
