@@ -91,7 +91,7 @@ class LogPanel(QListWidget):
         """Add what was said; the same again in the same line, with how often."""
         now = datetime.datetime.now().strftime("%H:%M:%S")
         told = f"{PROBLEM + ' ' if problem else ''}{text}"
-        last = self.item(self.count() - 1)
+        last = self.item(self.count() - 1) if self.count() else None
         if last is not None and last.data(TOLD)[0] == told:
             _, first, times = last.data(TOLD)
             last.setData(TOLD, (told, first, times + 1))

@@ -25,6 +25,10 @@ from labapp.session.streams import Stream, live_values
 BURST = 32
 """So many frames right after one that was measured by itself are measured one after the other."""
 
+STEP_S = 0.0125
+"""Of frames that wait, those that came sooner after another are left out: what a burst of them
+tells is then a whole swing, among which what comes next is found again."""
+
 RATE_S = 2.0
 """Rates are those of so long."""
 
@@ -153,7 +157,7 @@ class LiveWatch:
         self._name, self._scheme, self._say = name, settings.scheme, say
         self._measuring = LiveMeasuring(setup, settings, bit_depth)
         self._to_measure: deque[CameraFrame] = deque()
-        self._in_order = BURST
+        self._in_order, self._taken_s = BURST, 0.0
         self._newest: deque[Followed] = deque(maxlen=1)
         self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
         self._turn = threading.Lock()
@@ -163,8 +167,10 @@ class LiveWatch:
 
     def take(self, frame: CameraFrame) -> None:
         """Take a frame of the camera; never waits."""
-        if len(self._to_measure) < BURST:
-            self._to_measure.append(frame)
+        waiting = self._to_measure
+        if not waiting or (len(waiting) < BURST and frame.time_s > self._taken_s + STEP_S):
+            self._taken_s = frame.time_s
+            waiting.append(frame)
 
     def close(self) -> None:
         """End the measuring, whatever it is at, and who is told is told so. Twice does no harm."""

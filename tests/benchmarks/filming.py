@@ -85,30 +85,26 @@ class FilmedDevice(SimulatedDevice):
         Frames a second at first.
     most
         It is not read more often.
-    faults
-        What goes wrong by itself.
-    noise
-        Part of the frames that are whole, but nothing but noise.
     """
 
-    def __init__(
-        self,
-        film: Callable[[int], GreyImage],
-        rate_hz: float,
-        most: int,
-        faults: Faults,
-        noise: float = 0.0,
-    ) -> None:
-        random = np.random.default_rng([faults.seed, 7])
-        shape = film(0).shape
+    def __init__(self, film: Callable[[int], GreyImage], rate_hz: float, most: int) -> None:
         self.truth = Truth(most)
         self._film = film
+        self._is_noise = np.zeros(most, bool)
+        self._noises: list[GreyImage] = []
+        super().__init__("pool", self._numbered, rate_hz=rate_hz)
+
+    def spoil(self, faults: Faults, noise: float) -> None:
+        """Let things go wrong from now on; part of the frames be whole, but nothing but noise."""
+        random = np.random.default_rng([faults.seed, 7])
+        shape = self._film(0).shape
         self._noises = [random.integers(0, 256, shape, np.uint8) for _ in range(NOISES)]
-        self.is_noise = random.uniform(size=most) < noise
-        super().__init__("pool", self._numbered, rate_hz=rate_hz, faults=faults)
+        first = self.taken + 10
+        self._is_noise[first:] = random.uniform(size=len(self._is_noise))[first:] < noise
+        self.faults = faults
 
     def _numbered(self, k: int) -> GreyImage:
-        noisy = self.is_noise[k % len(self.is_noise)]
+        noisy = self._is_noise[k]
         return numbered(self._noises[k % NOISES] if noisy else self._film(k), k)
 
     def open(self) -> SimulatedCamera:

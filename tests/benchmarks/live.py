@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("LIBGL_ALWAYS_SOFTWARE", "1")
 
+import contextlib
 import csv
 import re
 import shutil
@@ -26,7 +27,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -102,17 +103,23 @@ class Sample(NamedTuple):
     busy_s: float
 
 
-class Measured(LiveMeasuring):
-    """Measures, and keeps account of it."""
+class Measured:
+    """Keeps account of what is measured."""
 
     frames = good = newest = 0
 
-    def measure(self, image: Any) -> Any:
-        found = super().measure(image)
-        Measured.frames += 1
-        Measured.good += found.status == "ok"
-        Measured.newest = number_in(image)
-        return found
+    @classmethod
+    def counted(cls, measure: Callable[..., Any]) -> Callable[..., Any]:
+        """The same, counted."""
+
+        def counting(measuring: LiveMeasuring, image: Any, *given: Any) -> Any:
+            found = measure(measuring, image, *given)
+            cls.frames += 1
+            cls.good += found.status == "ok"
+            cls.newest = number_in(image)
+            return found
+
+        return counting
 
 
 class Painted(QObject):
@@ -164,6 +171,19 @@ def busy_s(process: int) -> float:
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def busy_threads() -> dict[str, float]:
+    """Time of the processor of each of this process's threads, s, by their names."""
+    names = {each.native_id: each.name for each in threading.enumerate()}
+    found: dict[str, float] = {}
+    for each in Path("/proc/self/task").iterdir():
+        name = names.get(int(each.name), "others")
+        with contextlib.suppress(OSError):  # it has ended
+            words = (each / "stat").read_text().rpartition(")")[2].split()
+            ticks = int(words[11]) + int(words[12])
+            found[name] = found.get(name, 0.0) + ticks / os.sysconf("SC_CLK_TCK")
+    return found
+
+
 # --- the run ----------------------------------------------------------------------------------
 
 
@@ -204,15 +224,13 @@ class Run:
     def _put_camera_in(self) -> None:
         """Have the window film with a camera, and record on a disk, that are known."""
         pool_camera = live_view.pool_camera
-        faults = Faults(garbage=GARBAGE, seed=SEED) if self.faulty else Faults()
         most = round((self.seconds + 600) * self.rate_hz)
 
         def filmed(text: str, progress: Any) -> FilmedDevice:
             # As many pictures as it films in the same time: the pool swings as ever.
             rate = f"frames = {round(self.rate_hz / 5)}\nframe_rate_hz = {self.rate_hz:.1f}"
             text = re.sub(r"frames = \d+\nframe_rate_hz = [\d.]+", rate, text)
-            film, noise = pool_camera(text, progress).picture, NOISE * self.faulty
-            self.device = FilmedDevice(film, self.rate_hz, most, faults, noise)
+            self.device = FilmedDevice(pool_camera(text, progress).picture, self.rate_hz, most)
             return self.device
 
         def writer(path: Path, *given: Any) -> NutWriter:
@@ -220,7 +238,7 @@ class Run:
 
         live_view.pool_camera = filmed
         live_module.Recorder = partial(Recorder, writer=writer)
-        live_module.LiveMeasuring = Measured
+        LiveMeasuring.measure = Measured.counted(LiveMeasuring.measure)
 
     def _hear(self, _: object, first: int, last: int) -> None:
         self.said += [self.log.item(row).text() for row in range(first, last + 1)]
@@ -259,18 +277,27 @@ class Run:
         self.painted.updates = 0
         self.view.trigger()
         self.begun_s = time.monotonic()
+        if self.faulty:
+            self.device.spoil(Faults(garbage=GARBAGE, seed=SEED), NOISE)
         self._sample()
+        busy = busy_threads()
         ended = threading.Event()
         sampling = threading.Thread(target=self._sample_on, args=(ended,), daemon=True)
         sampling.start()
         with self._agenda():
             run_for(self.seconds)
+        self.shares = {
+            name: (after_s - busy.get(name, 0.0)) / self.seconds
+            for name, after_s in busy_threads().items()
+        }
         ended.set()
         sampling.join()
         if left := (len(self.samples) - 1) % 60:
             self.tell_minute(self.samples[-left - 1 :])
-        self.ended_s = time.monotonic()
         take: Take = self.live.takes[-1]
+        self.device.faults = Faults()
+        run_for(1.5)  # what happens often is told once a second
+        self.ended_s = time.monotonic()
         self.view.trigger()
         self.view.stop()
         run_until(lambda: not self.window.workspace.tasks.active, 120)
@@ -345,6 +372,9 @@ class Run:
     def judge(self, take: Take) -> bool:
         """Hold all that was counted and said against what is true; a line a bar."""
         truth, counts, all_right = self.device.truth, self.live.feed.counts, []
+        shares = sorted(self.shares.items(), key=lambda each: -each[1])
+        told = ", ".join(f"{name} {share:.2f}" for name, share in shares if share > 0.005)
+        print(f"    of a core: {told}")
 
         def line(right: bool, words: str) -> None:
             all_right.append(right)

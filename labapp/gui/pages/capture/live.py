@@ -52,8 +52,9 @@ STATES = {
     "ended": ("▲", "It has ended: start it again"),
 }
 
-_Work = tuple[str, Callable[[], CameraFrame | None], Callable[[CameraFrame], None], float]
-"""What a thread does: its name, which frame is next, what is done with it, how often at most."""
+_Work = tuple[str, Callable[[], CameraFrame | None], Callable[[CameraFrame], None], float, float]
+"""What a thread does: its name, which frame is next, what is done with it, how often at most, and
+how long it rests, of what that took."""
 
 
 def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
@@ -225,11 +226,12 @@ class Live:
 
     def _begin_work(self) -> None:
         works: list[_Work] = [
-            ("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S),
-            ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S),
+            ("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S, 1.0),
+            ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
         ]
         if self.watch is not None:
-            works.append(("figures", self.watch.next_frame, self.watch.measure, SHOW_S))
+            # That is done elsewhere: after a frame of seconds there is no time to rest.
+            works.append(("figures", self.watch.next_frame, self.watch.measure, SHOW_S, 0.0))
         for work in works:
             name = f"live {work[0]}"
             worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
@@ -242,8 +244,9 @@ class Live:
         following: Callable[[], CameraFrame | None],
         work: Callable[[CameraFrame], None],
         every_s: float,
+        rest: float,
     ) -> None:
-        """Do something with one frame after the other, and no more than half of the time."""
+        """Do something with one frame after the other, and nothing in between."""
         try:
             while not self._closing.is_set():
                 frame = following()
@@ -253,7 +256,7 @@ class Live:
                 began_s = time.monotonic()
                 work(frame)
                 took_s = time.monotonic() - began_s
-                self._closing.wait(max(every_s - took_s, took_s))
+                self._closing.wait(max(every_s - took_s, rest * took_s))
         except Exception as error:
             if self._closing.is_set() and isinstance(error, LiveMeasuringEnded):
                 return
