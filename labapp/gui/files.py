@@ -89,6 +89,23 @@ class Files:
                 lambda copied: self._window.say(f"A copy is in {copied}"),
             )
 
+    def begin_next(self, recording: Path) -> None:
+        """Ask for a file and make a session like this one in it, for a recording; show it."""
+        present = self._window.workspace.session
+        if present is None:
+            return
+        from labapp.session.copies import next_session
+
+        title = "New session from this recording"
+        proposed = dialogs.new_path(present.path.parent, recording.stem)
+        path = dialogs.ask_new_session(self._window, proposed, title)
+        if path is None:
+            return
+        session = self._window.workspace.tried(lambda: next_session(present, path))
+        if session is not None:
+            self._show(session)
+            self._window.show_step("capture")
+
     def try_sample(self) -> None:
         """Open a copy of the sample run, in a folder of the user's."""
         from labapp.session.copies import copy_sample

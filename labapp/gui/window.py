@@ -164,6 +164,7 @@ class MainWindow(QMainWindow):
         space.frame_changed.connect(self._frame_changed)
         space.said.connect(self.say)
         space.asked.connect(self.menus.do)
+        space.next_wanted.connect(self.files.begin_next)
         space.tasks.changed.connect(self.menus.refresh)
         self.step_list.chosen.connect(self.show_step)
         self.timeline.moved.connect(space.show_frame)

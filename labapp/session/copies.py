@@ -1,4 +1,4 @@
-"""Copies of sessions: one saved as it is now, and one of a sample to try things with."""
+"""Copies of sessions: saved as it is now, begun anew for another recording, or of a sample."""
 
 from __future__ import annotations
 
@@ -6,15 +6,21 @@ import os
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, get_args
 from urllib.parse import quote
 
 from labapp.errors import InputError
 from labapp.session.database import SUFFIX, new_session_path
+from labapp.session.documents import WHOLE, Key, Kind
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 
 BUSY_S = 30.0
+
+OF_A_RECORDING = ("correction", "signals")
+"""Kinds of documents that belong to what was filmed."""
 
 
 def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
@@ -56,6 +62,42 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
             if place.exists():
                 copy.relink(place)
     return path
+
+
+def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
+    """Make a session like another for the next recording on the same bench.
+
+    It has the other's record, set-up, calibrations with their pictures, settings and limits. The
+    safety list is to be gone through again; what was filmed and measured stays with the other.
+
+    Parameters
+    ----------
+    session
+        The one it is to be like; it is not changed.
+    path
+        The new file.
+
+    Raises
+    ------
+    InputError
+        If there is a file of that name, or it cannot be written, or the other is damaged.
+    """
+    held: dict[Key, Any] = {
+        (kind, WHOLE): session._documents.get(kind)
+        for kind in get_args(Kind)
+        if kind not in OF_A_RECORDING
+    }
+    if held["record", WHOLE] is not None:
+        held["record", WHOLE] = replace(session.record, safety=())
+    made = Session.create(path)
+    try:
+        made._pictures.take_over(session._pictures)
+        made._documents.change(f"as in {session.path.stem}", held)
+    except BaseException:
+        made.close()
+        made.path.unlink()
+        raise
+    return made
 
 
 def copy_sample(name: str, folder: Path) -> Path:

@@ -30,6 +30,12 @@ class KeptPictures:
             )
         return sha256
 
+    def take_over(self, other: KeptPictures) -> None:
+        """Keep what another session keeps, too."""
+        rows = other._database.rows("SELECT * FROM picture")
+        with self._database.transaction() as connection:
+            connection.executemany("INSERT OR IGNORE INTO picture VALUES (?, ?, ?)", rows)
+
     def get(self, sha256: str) -> GreyImage:
         """A kept picture; see `Session.picture`."""
         content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)

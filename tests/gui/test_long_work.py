@@ -83,7 +83,7 @@ def test_an_import_is_watched_cancelled_and_done_again(
     assert not len(session.frames)
     assert session.recording is None
     assert session.problems() == []
-    assert page.import_button.isEnabled()
+    assert page.chosen.import_button.isEnabled()
     page.import_chosen()
     idle(window, qtbot)
     assert session.frames.tolist() == list(range(FRAMES))

@@ -14,7 +14,9 @@ from labapp.gui.preferences import (
     write_preferences,
 )
 
-SOME = Preferences(("/a b.labsession", "/c.labsession"), "light", "AAA=", "BBB=", "/data")
+PEDAL = {"device": "05f3:00ff:0", "name": "A pedal", "keyboard": False, "actions": {"0": "mark"}}
+
+SOME = Preferences(("/a b.labsession", "/c.labsession"), "light", "AAA=", "BBB=", "/data", (PEDAL,))
 
 
 def test_what_is_written_is_read_again(tmp_path: Path):
@@ -43,6 +45,8 @@ def test_the_first_start_has_the_defaults(tmp_path: Path):
         b'{"version": 1, "recent": ["a\\u0000b"]}',
         b'{"version": 1, "geometry": null}',
         b'{"version": 1, "unknown": 2}',
+        b'{"version": 1, "foot_switches": {"0": "mark"}}',
+        b'{"version": 1, "foot_switches": ["05f3:00ff:0"]}',
         b'{"version": 99, "theme": "dark"}',
         b'{"theme": "dark"}',
         b'{"version": 1, "theme": "dark"}' + b" " * 2_000_000,

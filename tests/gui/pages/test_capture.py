@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 import threading
@@ -17,6 +18,7 @@ from pytestqt.qtbot import QtBot
 from labapp.core.detection import DotSettings
 from labapp.core.exposure import judge_exposure
 from labapp.errors import InputError
+from labapp.gui import dialogs
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.pages.capture.presenter import (
     Choice,
@@ -30,8 +32,12 @@ from labapp.gui.pages.capture.presenter import (
     size_in_words,
 )
 from labapp.gui.steps import Mark, State
+from labapp.gui.window import MainWindow
 from labapp.gui.workspace import Workspace
+from labapp.session.record import Record
 from labapp.session.session import Session
+from tests.gui.conftest import CopySample
+from tests.gui.hand import Hand
 
 KEPT: list[object] = []
 
@@ -149,7 +155,7 @@ def session_of(page: CapturePage) -> Session:
 
 def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
     assert page.picture_view.picture is None
-    assert not page.choice_group.isVisibleTo(page.panel)
+    assert not page.chosen.isVisibleTo(page.panel)
     assert page.state(NOTHING) is NOTHING
     page.take(stack)
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
@@ -159,19 +165,19 @@ def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) ->
     page.slider.setValue(7)
     qtbot.waitUntil(lambda: "frame 7" in page.title.text())
     assert page.picture_view.picture is not first
-    page.first.set_value(2)
-    page.every.set_value(2)
-    page.rate.set_value(50.0)
-    page.rate.edited.emit(50.0)
-    assert page.choice_words.text() == "5 of 12 frames, 0.200 s at 50 frames/s"
-    page.import_button.click()
-    assert not page.import_button.isEnabled()
+    page.chosen.first.set_value(2)
+    page.chosen.every.set_value(2)
+    page.chosen.rate.set_value(50.0)
+    page.chosen.rate.edited.emit(50.0)
+    assert page.chosen.choice_words.text() == "5 of 12 frames, 0.200 s at 50 frames/s"
+    page.chosen.import_button.click()
+    assert not page.chosen.import_button.isEnabled()
     qtbot.waitUntil(lambda: session_of(page).recording is not None)
     qtbot.waitUntil(lambda: "of the session" in page.title.text())
     assert session_of(page).frames.tolist() == [2, 4, 6, 8, 10]
     assert page.workspace.frame == 2
     assert page.told_group.isVisibleTo(page.panel)
-    assert not page.choice_group.isVisibleTo(page.panel)
+    assert not page.chosen.isVisibleTo(page.panel)
     assert page.state(NOTHING) is NOTHING
 
 
@@ -196,7 +202,7 @@ def test_an_import_that_is_cancelled_leaves_the_session_as_it_was(
     go_on.set()
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     assert session_of(page).recording is None
-    assert page.import_button.isEnabled()
+    assert page.chosen.import_button.isEnabled()
 
 
 def test_what_cannot_be_opened_is_said(page: CapturePage, tmp_path: Path, qtbot: QtBot) -> None:
@@ -244,3 +250,57 @@ def test_every_button_says_what_it_does(page: CapturePage) -> None:
     for button in page.panel.findChildren(QAbstractButton):
         if button.text():
             assert button.toolTip(), button.text()
+
+
+# --- a second recording ---------------------------------------------------------------------------
+
+
+def test_a_second_recording_goes_into_a_session_of_its_own(
+    window: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
+):
+    first = copy_sample("thumb_tack")
+    window.files.open(first)
+    window.workspace.attempt(lambda session: session.set_record(Record(operator="A. Welder")))
+    before = hashlib.sha256(first.read_bytes()).hexdigest()
+    window.show_step("capture")
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    page, hand = window.page, Hand(window)
+    former, setup = window.workspace.session, window.workspace.session.setup_text
+    assert not page.chosen.isVisible()
+    page.take(first.parent / "recording.tif")
+    qtbot.waitUntil(lambda: page.preview is not None)
+    assert page.chosen.replace_words.isVisible()
+    second = tmp_path / "second.labsession"
+    hand.answer(second)
+    hand.button("New session from this recording …")
+    qtbot.waitUntil(lambda: window.workspace.session is not former)
+    session = window.workspace.session
+    assert session.path == second
+    qtbot.waitUntil(lambda: session.recording is not None)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert session.record.operator == "A. Welder"
+    assert session.setup_text == setup
+    assert not page.chosen.isVisible()
+    assert window.page is page
+    assert window.preferences.recent[0] == str(second)
+    assert hashlib.sha256(first.read_bytes()).hexdigest() == before
+
+
+def test_a_new_session_that_is_given_up_changes_nothing(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    window.files.open(copy_sample("thumb_tack"))
+    window.show_step("capture")
+    page, former = window.page, window.workspace.session
+    page.take(former.path.parent / "recording.tif")
+    qtbot.waitUntil(lambda: page.preview is not None)
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: None)
+    page.chosen.next_button.click()
+    assert window.workspace.session is former
+    assert page.preview is not None
+    # One that is there already is refused in words, and stays.
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: former.path)
+    page.chosen.next_button.click()
+    assert window.workspace.session is former
+    assert window.status_line.unread

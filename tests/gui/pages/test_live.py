@@ -314,6 +314,17 @@ def test_start_record_and_import_by_mouse_and_keys(
     qtbot.waitUntil(lambda: "of the session" in page.title.text())
     assert not view.bar.isVisible()
     assert view.start_button.isVisible()
+    # It goes into a session of its own, with this one's set-up.
+    second = session.path.with_name("second.labsession")
+    hand.answer(second)
+    hand.button("New session from this recording …")
+    qtbot.waitUntil(lambda: window.workspace.session.path == second)
+    qtbot.waitUntil(lambda: window.workspace.session.recording is not None)
+    assert len(window.workspace.session.frames) > 5
+    assert not page.kept_group.isVisible()
+    with Session.open(session.path) as former:
+        assert len(former.frames) == take.frames
+        assert former.problems() == []
 
 
 def test_large_figures_where_the_set_up_is_complete(

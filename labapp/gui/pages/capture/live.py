@@ -425,8 +425,8 @@ def _places_px(dots: Dots | None) -> FloatArray:
 def told_of(take: Take, why_kept: str) -> str:
     """What became of a recording that is not imported."""
     return (
-        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, make a new "
-        "session (Ctrl+N) and choose the file there"
+        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, press New "
+        "session from this recording"
     )
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import (
-    QCheckBox,
     QFileDialog,
     QGridLayout,
     QHBoxLayout,
@@ -17,23 +16,21 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.dialogs import EVERYTHING, recordings
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
+from labapp.gui.pages.capture.import_choice import NEXT, NEXT_TIP, ImportChoice
 from labapp.gui.pages.capture.live import told_of
 from labapp.gui.pages.capture.live_view import LiveView
-from labapp.gui.pages.capture.parts import ExposureBars, button, whole, wrapped
+from labapp.gui.pages.capture.parts import ExposureBars, button, wrapped
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
     Seen,
-    choice_in_words,
     look,
     missing_in_words,
     recording_in_words,
-    refusal,
 )
 from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import FieldForm, NumberField
 from labapp.gui.views.labels import headed
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
@@ -41,7 +38,6 @@ from labapp.media.recorder import Take
 from labapp.session.record import Recording
 from labapp.words import several
 
-MOST_HZ = 1e7
 REST_MS = 120
 """Exposure is judged where a frame stays in view so long: not while frames rush by."""
 
@@ -72,6 +68,8 @@ class CapturePage(Page):
         self._rest.setInterval(REST_MS)
         self._rest.timeout.connect(self._judge)
         self._last_folder = Path()
+        self._kept: Path | None = None
+        """The last recording that was kept beside the session; of this session."""
         self.title = QLabel()
         self.title.setContentsMargins(8, 4, 8, 0)
         self.title.setWordWrap(True)
@@ -89,7 +87,7 @@ class CapturePage(Page):
         self.live_view.recorded.connect(self._recorded)
         self.canvas_layout.addWidget(self.live_view.bar)
         self._make_panel()
-        workspace.opened.connect(self._drop_preview)
+        workspace.opened.connect(self._forget)
         workspace.tasks.changed.connect(self._show_import)
 
     # --- what it shows ------------------------------------------------------------------------
@@ -174,7 +172,9 @@ class CapturePage(Page):
         elif session.recording is not None or self._importing in self.workspace.tasks.active:
             why_kept = "the session has a recording already"
         if why_kept:
+            self._kept = take.path
             self.workspace.said.emit(told_of(take, why_kept), False)
+            self._show_import()
         else:
             self._import(take.path, ":", None, False)
 
@@ -198,15 +198,11 @@ class CapturePage(Page):
 
     def _show_import(self) -> None:
         working = self._importing in self.workspace.tasks.active
-        choice = self.choice()
-        why_not = refusal(self.workspace.session, choice, working)
-        self.choice_group.setVisible(self.preview is not None)
+        self.chosen.show_choice(self.workspace.session, self.preview, working)
         self.slider.setVisible(self.preview is not None and self.preview.frames > 1)
-        self.import_button.setEnabled(not why_not)
-        self.import_button.setToolTip(why_not or "Read it through once, and take its frames in")
-        if self.preview is not None and choice is not None:
-            words = choice_in_words(self.preview, choice)
-            self.choice_words.setText(f"{words}. {why_not}" if why_not else words)
+        self.kept_group.setVisible(self._kept is not None)
+        if self._kept is not None:
+            self.kept_words.setText(f"{self._kept.name} is kept beside the session.")
 
     def _show_seen(self, seen: Seen) -> None:
         self.title.setText(seen.title)
@@ -306,12 +302,7 @@ class CapturePage(Page):
             self.slider.setRange(0, last)
             self.slider.setValue(0)
             self.slider.blockSignals(False)
-            for field, value in ((self.first, 0), (self.last, last), (self.every, 1)):
-                field.highest = max(1, last)
-                field.set_value(value)
-            self.rate.set_value(None)
-            told = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
-            self.source_words.setText(f"{path.name}\n{told}")
+            self.chosen.begin(preview)
             self._show_import()
             self._look()
             self.workspace.changed.emit()
@@ -322,12 +313,7 @@ class CapturePage(Page):
 
     def choice(self) -> Choice | None:
         """What is chosen to be imported; None before a recording was chosen."""
-        if self.preview is None:
-            return None
-        first, last, every = (
-            int(field.value() or 0) for field in (self.first, self.last, self.every)
-        )
-        return Choice(first, last, max(1, every), self.rate.value(), self.embed.isChecked())
+        return None if self.preview is None else self.chosen.choice()
 
     def import_chosen(self) -> None:
         """Import what was chosen, in the background."""
@@ -336,6 +322,22 @@ class CapturePage(Page):
             return
 
         self._import(preview.path, choice.frames, choice.rate_hz, choice.embed)
+
+    def begin_next(self) -> None:
+        """Import what was chosen into a new session, with this one's set-up."""
+        preview, choice = self.preview, self.choice()
+        if preview is not None and choice is not None and choice.count:
+            self._import_next(preview.path, choice.frames, choice.rate_hz, choice.embed)
+
+    def _import_kept(self) -> None:
+        if self._kept is not None:
+            self._import_next(self._kept, ":", None, False)
+
+    def _import_next(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
+        former = self.workspace.session
+        self.workspace.next_wanted.emit(path)
+        if self.workspace.session is not former:  # it was not given up
+            self._import(path, frames, rate_hz, embed)
 
     def _import(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
         session = self.workspace.session
@@ -372,6 +374,11 @@ class CapturePage(Page):
         elif preview is not None:
             preview.close()
         self._show_import()
+
+    def _forget(self) -> None:
+        """Forget what was to be imported into the session before."""
+        self._kept = None
+        self._drop_preview()
 
     def cancel_choice(self) -> None:
         """Look at the session's frames again; nothing is imported."""
@@ -417,7 +424,10 @@ class CapturePage(Page):
         self.panel_layout.addLayout(row)
         self.panel_layout.addWidget(self.live_view.group)
         self._make_missing()
-        self._make_choice()
+        self.chosen = ImportChoice(self.import_chosen, self.begin_next, self.cancel_choice)
+        self.chosen.edited.connect(self._show_import)
+        self.panel_layout.addWidget(self.chosen)
+        self._make_kept()
         self.exposure.hide()
         self.panel_layout.addWidget(self.exposure)
         self.told_group, layout = headed("What was read")
@@ -437,43 +447,10 @@ class CapturePage(Page):
         self.panel_layout.addWidget(self.missing)
         self.panel_layout.addWidget(self.find_button)
 
-    def _make_choice(self) -> None:
-        self.choice_group, layout = headed("To be imported")
-        self.source_words = wrapped()
-        layout.addWidget(self.source_words)
-        form = FieldForm()
-        self.first = whole("First frame", 0, "The first frame to use, counted from 0")
-        self.last = whole("Last frame", 0, "The last frame to use")
-        self.every = whole("Every n-th", 1, "1: every frame; 2: every second one …")
-        self.rate = NumberField(
-            "Frame rate",
-            "frames/s",
-            lowest=1e-6,
-            highest=MOST_HZ,
-            optional=True,
-            tooltip="The rate it was filmed at, where the recording does not say so, or says it "
-            "wrongly; empty: the recording's own",
-        )
-        for field in (self.first, self.last, self.every, self.rate):
-            form.add(field)
-            field.edited.connect(lambda _: self._show_import())
-        layout.addWidget(form)
-        self.embed = QCheckBox("Keep the frames in the session")
-        self.embed.setToolTip(
-            "The session then needs no other file, and is about as large as the recording; "
-            "otherwise the recording stays where it is and must not be changed"
-        )
-        self.embed.toggled.connect(lambda _: self._show_import())
-        layout.addWidget(self.embed)
-        self.choice_words = wrapped()
-        layout.addWidget(self.choice_words)
-        row = QHBoxLayout()
-        self.import_button = button("Import", "", self.import_chosen)
-        self.import_button.setDefault(True)
-        row.addWidget(self.import_button)
-        row.addWidget(
-            button("Not this one", "Leave it, and see the session's frames", self.cancel_choice)
-        )
-        layout.addLayout(row)
-        self.choice_group.hide()
-        self.panel_layout.addWidget(self.choice_group)
+    def _make_kept(self) -> None:
+        self.kept_group, layout = headed("Recorded besides")
+        self.kept_words = wrapped()
+        layout.addWidget(self.kept_words)
+        layout.addWidget(button(NEXT, NEXT_TIP, self._import_kept))
+        self.kept_group.hide()
+        self.panel_layout.addWidget(self.kept_group)

@@ -1,0 +1,126 @@
+"""What of a recording is imported, and into which session: fields of the recording page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from PySide6.QtCore import Signal
+from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QVBoxLayout, QWidget
+
+from labapp.gui.pages.capture.parts import button, whole, wrapped
+from labapp.gui.pages.capture.presenter import Choice, Preview, choice_in_words, refusal
+from labapp.gui.views.fields import FieldForm, NumberField
+from labapp.gui.views.labels import headed
+from labapp.session.session import Session
+
+MOST_HZ = 1e7
+
+NEXT = "New session from this recording …"
+NEXT_TIP = (
+    "Make a session with the same set-up and calibration, and import it there; this one stays whole"
+)
+
+
+class ImportChoice(QWidget):
+    """Which frames to import; seen while a recording is looked at.
+
+    Parameters
+    ----------
+    do_import, begin_next, leave
+        Import into the session, into a new one like it, or not at all.
+
+    Signals
+    -------
+    edited
+        Something else was chosen.
+    """
+
+    edited = Signal()
+
+    def __init__(
+        self,
+        do_import: Callable[[], object],
+        begin_next: Callable[[], object],
+        leave: Callable[[], object],
+    ) -> None:
+        super().__init__()
+        outer = QVBoxLayout(self)
+        outer.setContentsMargins(0, 0, 0, 0)
+        group, layout = headed("To be imported")
+        outer.addWidget(group)
+        self.source_words = wrapped()
+        layout.addWidget(self.source_words)
+        layout.addWidget(self._form())
+        self.embed = QCheckBox("Keep the frames in the session")
+        self.embed.setToolTip(
+            "The session then needs no other file, and is about as large as the recording; "
+            "otherwise the recording stays where it is and must not be changed"
+        )
+        self.embed.toggled.connect(lambda _: self.edited.emit())
+        layout.addWidget(self.embed)
+        self.choice_words = wrapped()
+        layout.addWidget(self.choice_words)
+        row = QHBoxLayout()
+        self.import_button = button("Import", "", do_import)
+        self.import_button.setDefault(True)
+        row.addWidget(self.import_button)
+        row.addWidget(button("Not this one", "Leave it, and see the session's frames", leave))
+        layout.addLayout(row)
+        self.replace_words = wrapped(
+            "The session has a recording already: Import puts this one in its place."
+        )
+        layout.addWidget(self.replace_words)
+        self.next_button = button(NEXT, NEXT_TIP, begin_next)
+        layout.addWidget(self.next_button)
+        self.hide()
+
+    def _form(self) -> FieldForm:
+        form = FieldForm()
+        self.first = whole("First frame", 0, "The first frame to use, counted from 0")
+        self.last = whole("Last frame", 0, "The last frame to use")
+        self.every = whole("Every n-th", 1, "1: every frame; 2: every second one …")
+        self.rate = NumberField(
+            "Frame rate",
+            "frames/s",
+            lowest=1e-6,
+            highest=MOST_HZ,
+            optional=True,
+            tooltip="The rate it was filmed at, where the recording does not say so, or says it "
+            "wrongly; empty: the recording's own",
+        )
+        for field in (self.first, self.last, self.every, self.rate):
+            form.add(field)
+            field.edited.connect(lambda _: self.edited.emit())
+        return form
+
+    def begin(self, preview: Preview) -> None:
+        """Begin with all frames of a recording."""
+        last = preview.frames - 1
+        for field, value in ((self.first, 0), (self.last, last), (self.every, 1)):
+            field.highest = max(1, last)
+            field.set_value(value)
+        self.rate.set_value(None)
+        told = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
+        self.source_words.setText(f"{preview.path.name}\n{told}")
+
+    def choice(self) -> Choice:
+        """What is chosen."""
+        first, last, every = (
+            int(field.value() or 0) for field in (self.first, self.last, self.every)
+        )
+        return Choice(first, last, max(1, every), self.rate.value(), self.embed.isChecked())
+
+    def show_choice(self, session: Session | None, preview: Preview | None, working: bool) -> None:
+        """Show what would be imported, and why it cannot be where it cannot."""
+        choice = None if preview is None else self.choice()
+        why_not = refusal(session, choice, working)
+        self.setVisible(preview is not None)
+        self.import_button.setEnabled(not why_not)
+        self.import_button.setToolTip(why_not or "Read it through once, and take its frames in")
+        if preview is not None and choice is not None:
+            words = choice_in_words(preview, choice)
+            self.choice_words.setText(f"{words}. {why_not}" if why_not else words)
+        has_one = session is not None and session.recording is not None
+        self.replace_words.setVisible(has_one and not why_not)
+        self.next_button.setVisible(has_one)
+        self.next_button.setEnabled(choice is not None and choice.count > 0 and not working)
