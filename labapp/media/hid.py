@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import labapp
 from labapp.errors import InputError
 from labapp.media.events import Event, Kind, Say, silent
 
@@ -28,6 +27,9 @@ RETRY_S = 0.5
 AWAY, UNPLUGGED = "it is not connected", "it was unplugged"
 
 RULES = "resources/udev/70-labapp.rules"
+
+REPOSITORY = Path(__file__).parents[2]
+"""Where the rules are, unless the package is installed without it."""
 
 RULES_FOLDER = "/etc/udev/rules.d/"
 
@@ -185,7 +187,7 @@ def may_be_read(info: HidInfo) -> bool:
 
 def commands(info: HidInfo) -> str:
     """What to type for the right to read a device: it installs `RULES`, or a rule of its own."""
-    rules = Path(labapp.__file__).parents[1] / RULES
+    rules = REPOSITORY / RULES
     if (info.is_pedal or info.is_3d) and rules.is_file():
         install = f"sudo cp {shlex.quote(str(rules))} {RULES_FOLDER}"
     else:
