@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from PySide6.QtWidgets import QStackedWidget, QTabBar, QVBoxLayout, QWidget
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QFrame, QScrollArea, QStackedWidget, QTabBar, QVBoxLayout, QWidget
 
 from labapp.gui.pages.capture.live_figures import AlarmStrip
 from labapp.gui.pages.capture.live_streams import LiveStreams
@@ -57,7 +58,7 @@ class LiveCanvas(QWidget):
             self.tabs.addTab(words)
             self.tabs.setTabToolTip(k, tip)
         self.stack = QStackedWidget()
-        for part in (picture, self.surface, self.trends, self.streams):
+        for part in (picture, self.surface, _scrolled(self.trends), _scrolled(self.streams)):
             self.stack.addWidget(part)
         self.tabs.currentChanged.connect(self._choose)
         layout = QVBoxLayout(self)
@@ -103,3 +104,14 @@ class LiveCanvas(QWidget):
         watch = self._watch()
         if watch is not None:
             self.tell(watch)
+
+
+def _scrolled(part: QWidget) -> QScrollArea:
+    """A part that scrolls where the screen is small."""
+    area = QScrollArea()
+    area.setWidget(part)
+    area.setWidgetResizable(True)
+    area.setFrameShape(QFrame.Shape.NoFrame)
+    area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+    area.setMinimumWidth(part.minimumSizeHint().width())
+    return area

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from PySide6.QtWidgets import QGridLayout, QLabel, QVBoxLayout, QWidget
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QResizeEvent
+from PySide6.QtWidgets import QBoxLayout, QGridLayout, QLabel, QVBoxLayout, QWidget
 
 from labapp.errors import InputError
 from labapp.gui.curves import PLAIN, Axis, Curve, Mark
-from labapp.gui.views.fields import NumberField
+from labapp.gui.views.fields import FieldForm, NumberField
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.workspace import Workspace
 from labapp.session.limits import LARGEST_MM, NAMES, Ends, Limits
@@ -19,6 +21,9 @@ LAST_S = 30.0
 """So much is seen at first."""
 
 MARKS = PLAIN, Mark("■", "beyond its limit")
+
+WIDE = 80
+"""So many letters wide it must be for all fields to stand beside each other."""
 
 RULE = (
     "An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ±, or when so "
@@ -108,28 +113,38 @@ class LiveTrends(QWidget):
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(self.plots, 1)
-        layout.addLayout(self._grid())
+        self._below = QBoxLayout(QBoxLayout.Direction.TopToBottom)
+        self._below.setContentsMargins(8, 0, 8, 0)
+        self._below.addLayout(self._limits(), 3)
+        self._below.addWidget(self._others(), 2, Qt.AlignmentFlag.AlignTop)
+        layout.addLayout(self._below)
         workspace.changed.connect(self.refresh)
 
-    def _grid(self) -> QGridLayout:
+    def _limits(self) -> QGridLayout:
         grid = QGridLayout()
-        grid.setContentsMargins(8, 0, 8, 0)
-        for column, (words, tip) in enumerate(
-            (("Limits (mm)", RULE), ("lowest", ""), ("highest", "")), 0
-        ):
+        for column, words in enumerate(("Limits (mm)", "lowest", "highest")):
             label = QLabel(words)
-            label.setToolTip(tip)
+            label.setToolTip(RULE)
             grid.addWidget(label, 0, column)
+            grid.setColumnStretch(column, int(column > 0))
         for row, name in enumerate(NAMES, 1):
             grid.addWidget(QLabel(name.capitalize()), row, 0)
             for end in (0, 1):
                 grid.addWidget(self.fields[name, end], row, 1 + end)
-        for row, field in ((1, self.last), (2, self.unmeasured)):
-            grid.addWidget(field.label, row, 3)
-            grid.addWidget(field, row, 4)
-        for column in (1, 2, 4):
-            grid.setColumnStretch(column, 1)
         return grid
+
+    def _others(self) -> FieldForm:
+        form = FieldForm()
+        for field in (self.last, self.unmeasured):
+            form.add(field)
+        return form
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Put all fields beside each other where there is room."""
+        super().resizeEvent(event)
+        way = QBoxLayout.Direction
+        is_wide = self.width() > WIDE * self.fontMetrics().averageCharWidth()
+        self._below.setDirection(way.LeftToRight if is_wide else way.TopToBottom)
 
     # --- what it shows ------------------------------------------------------------------------
 

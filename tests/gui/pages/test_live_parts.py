@@ -1,0 +1,388 @@
+"""Live measures on the recording page: surface, trends, limits, alarms, control software."""
+
+from __future__ import annotations
+
+import csv
+import json
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QPalette
+from PySide6.QtWidgets import QAbstractButton, QLabel
+from pytestqt.qtbot import QtBot
+
+from labapp.core.exposure import Exposure
+from labapp.core.measures import Measures
+from labapp.core.quality import Quality, Remark
+from labapp.gui.pages.capture import live_view
+from labapp.gui.pages.capture.live_figures import (
+    FIRST,
+    NO_SETUP,
+    OLD_S,
+    alarms_in_words,
+    figures,
+    pace_in_words,
+)
+from labapp.gui.pages.capture.live_surface import steady_limits
+from labapp.gui.pages.capture.live_trends import trend_curves
+from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.theme import RED, is_dark
+from labapp.gui.window import MainWindow
+from labapp.media.cameras import SimulatedDevice
+from labapp.session import live_watch
+from labapp.session.alarms import Alarm
+from labapp.session.limits import Limits
+from labapp.session.live_measuring import LiveMeasurement
+from labapp.session.live_watch import Followed, Pace, Trend
+from labapp.session.scene import HEIGHT, Scene
+from tests.gui.conftest import SAMPLES
+from tests.gui.hand import Hand
+from tests.gui.test_accessibility import check_round
+from tests.session.test_streams import free_port
+
+MEASURES = Measures(*[0.0] * 4, 6.7, 7.5, 0.30, -0.01, *[0.0] * 6, *[0.03, 0.04, 0.003] * 2)
+QUALITY = Quality(
+    Exposure(0.4, 0.0, 0.5, 20.0, 0.5, "good"),
+    100,
+    0,
+    True,
+    0.003,
+    (Remark("exposure", "good", "The dots stand out well."),),
+)
+OK = LiveMeasurement("ok", "", QUALITY, MEASURES, True)
+DARK = LiveMeasurement("no-dots", "it is dark", QUALITY, None, False)
+
+
+def followed(found: LiveMeasurement = OK) -> Followed:
+    return Followed(7, 0.7, time.monotonic(), found)
+
+
+# --- in words -------------------------------------------------------------------------------------
+
+
+def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known():
+    limits = Limits(width_mm=(6.0, 6.6), length_mm=(7.0, 8.0), height_mm=(0.301, None))
+    shown = figures(followed(), limits)
+    assert [(f.value, f.sigma, f.told, f.look) for f in shown] == [
+        ("6.700", "± 0.030", "▲ above 6.6", "alarm"),
+        ("7.500", "± 0.040", "✓ in order", "plain"),
+        ("0.300", "± 0.003", "◆ at its limit", "plain"),
+    ]
+    for unknown in (
+        figures(None, limits),
+        figures(followed(DARK), limits),
+        figures(followed(), limits, age_s=OLD_S + 0.1),
+    ):
+        assert [figure.told for figure in unknown] == ["? not known"] * 3
+        assert "alarm" not in [figure.look for figure in unknown]
+    assert [figure.value for figure in figures(followed(DARK), limits)] == ["–"] * 3
+    assert [figure.told for figure in figures(followed())] == [""] * 3
+
+
+def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():
+    assert pace_in_words(None, Pace(0.0, 0, 0), 60.0, 0.0) == FIRST
+    assert (
+        pace_in_words(followed(), Pace(38.0, 76, 0), 60.0, 0.04)
+        == "38.0 of 60.0 frames/s measured, the newest 0.04 s ago"
+    )
+    assert pace_in_words(followed(), Pace(38.0, 76, 2), None, 0.0).startswith(
+        "◆ 2 of the last 76 frames could not be measured. 38.0 frames/s measured"
+    )
+    dark = pace_in_words(followed(DARK), Pace(0.0, 3, 3), 60.0, 5.2)
+    assert dark.startswith("▲ Not measured (no-dots): it is dark. ▲ The figures are 5 s old.")
+
+
+def test_alarms_in_words():
+    alarm = Alarm("width-high", "Width 7.100 mm is above 6.9 mm", 312, 5.2)
+    told = alarms_in_words([alarm, replace(alarm, holds=False, acknowledged=True)]).split("\n")
+    assert told[0] == f"▲ ALARM: Width 7.100 mm is above 6.9 mm (frame 312, {alarm.at:%H:%M:%S})"
+    assert told[1].startswith("△ over: Width")
+    assert told[1].endswith(", acknowledged")
+
+
+def test_colours_of_the_surface_stay_while_it_fills_the_scale():
+    limits = steady_limits(None, (0.0, 0.4))
+    assert limits == (-0.05, 0.45)
+    assert steady_limits(limits, (0.02, 0.38)) == limits
+    higher = steady_limits(limits, (0.0, 0.5))
+    assert higher[1] > 0.5
+    assert steady_limits(limits, (0.0, 0.2)) == (-0.025, 0.225)
+
+
+def test_trends_have_the_limits_and_mark_what_is_beyond():
+    values = np.array([[6.7, np.nan, 7.0], [7.5] * 3, [-0.3] * 3])
+    trend = Trend(
+        ("width", "length", "depth"),
+        np.array([4, 5, 6]),
+        np.array([-2.0, -1.0, -0.1]),
+        values,
+        np.full((3, 3), 0.03),
+        np.array([[False, False, True], [False] * 3, [False] * 3]),
+    )
+    width, length, depth = trend_curves(
+        trend, Limits(width_mm=(6.0, 6.9), height_mm=(-0.4, None)), trend.names
+    )
+    assert (width.limits, length.limits, depth.limits) == ((6.0, 6.9), (None, None), (-0.4, None))
+    assert width.mark.tolist() == [0, 0, 1]
+    assert depth.title == "Depth (mm)"
+    assert width.key.tolist() == [4, 5, 6]
+
+
+# --- on the page ----------------------------------------------------------------------------------
+
+
+def surface() -> Scene:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.2]], float)
+    return Scene(corners, np.array([[0, 1, 2]]), corners[:, 2], HEIGHT, (0.0, 0.2))
+
+
+class Prepared:
+    """Measures what the test wants, in milliseconds."""
+
+    found = OK
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def measure(self, _image: Any, drawn: bool) -> LiveMeasurement:
+        drawn = drawn and Prepared.found.measures is not None
+        return replace(Prepared.found, scene=surface() if drawn else None)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def page(
+    window: MainWindow, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[CapturePage]:
+    image = np.random.default_rng(1).integers(0, 200, (48, 64)).astype(np.uint8)
+    device = SimulatedDevice("test", lambda _: image, rate_hz=100)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
+    monkeypatch.setattr(live_watch, "LiveMeasuring", Prepared)
+    monkeypatch.setattr(Prepared, "found", OK)
+    assert window.workspace.create(tmp_path / "new.labsession")
+    setup = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
+    window.workspace.attempt(lambda session: session.set_setup(setup))
+    window.show_step("capture")
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    made = window.page
+    assert isinstance(made, CapturePage)
+    yield made
+    made.live_view.stop()
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+
+
+def start(page: CapturePage, qtbot: QtBot) -> None:
+    view = page.live_view
+    view.measured_s = 0.0
+    view.start_button.click()
+    qtbot.waitUntil(lambda: view.measured_s > 0)
+
+
+def choose(page: CapturePage, part: str) -> None:
+    tabs = page.live_view.canvas.tabs
+    tabs.setCurrentIndex([tabs.tabText(k) for k in range(tabs.count())].index(part))
+
+
+def figure(page: CapturePage, row: int, column: int) -> QLabel:
+    return page.live_view.figures._label(row, column)
+
+
+def said_in(window: MainWindow) -> str:
+    return "\n".join(window.log_panel.texts())
+
+
+def test_without_a_set_up_the_picture_alone_and_why(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    window.workspace.undo()
+    assert window.workspace.session.setup_text == ""
+    page.live_view.start_button.click()
+    qtbot.waitUntil(lambda: page.live_view.updates > 2)
+    assert not page.live_view.canvas.tabs.isVisible()
+    assert page.live_view.figures.words.text() == NO_SETUP
+
+
+def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    hand, view = Hand(window), page.live_view
+    start(page, qtbot)
+    choose(page, "Trends and limits")
+    session = window.workspace.session
+    hand.enter(view.canvas.trends.fields["width", 1], "6.9")
+    assert session.limits == Limits(width_mm=(None, 6.9))
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ in order")
+    assert not view.canvas.alarms.isVisible()
+    Prepared.found = replace(OK, measures=replace(MEASURES, width_mm=7.1))
+    qtbot.waitUntil(view.canvas.alarms.isVisible)
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n▲ above 6.9")
+    for column in (0, 1):
+        colour = figure(page, 0, column).palette().color(QPalette.ColorRole.WindowText)
+        assert colour == RED[is_dark(window.palette())]
+    assert figure(page, 1, 1).palette().color(QPalette.ColorRole.WindowText) not in RED
+    told = view.canvas.alarms.words.text()
+    assert told.startswith("▲ ALARM: Width 7.100 ± 0.030 mm is above 6.9 mm (frame ")
+    qtbot.waitUntil(lambda: "ALARM: Width 7.100" in said_in(window))
+    assert "ALARM" in " ".join(map(str, window.status_line.unread))
+    qtbot.waitUntil(lambda: 1 in view.canvas.trends.plots.curves[0].mark)
+    assert view.canvas.trends.plots.curves[0].limits == (None, 6.9)
+    # One that holds when a recording begins stands in its notes; another is noted when it comes.
+    view.trigger()
+    Prepared.found = replace(OK, measures=replace(MEASURES, width_mm=6.8))
+    qtbot.waitUntil(lambda: view.canvas.alarms.words.text().startswith("△ over: Width"))
+    page.setFocus()
+    hand.press(Qt.Key.Key_A)
+    assert not view.canvas.alarms.isVisible()
+    Prepared.found = DARK
+    qtbot.waitUntil(view.canvas.alarms.isVisible)
+    assert "3 frames in a row could not be measured: it is dark" in view.canvas.alarms.words.text()
+    hand.button("Acknowledge")
+    assert view.canvas.alarms.isVisible()
+    assert not view.canvas.alarms.button.isEnabled()
+    view.trigger()
+    take = view.live.takes[0]
+    qtbot.waitUntil(take.finished.is_set)
+    with take.notes.open() as file:
+        notes = [(row["kind"], row["what"]) for row in csv.DictReader(file)]
+    words = [(kind, what.partition(":")[0]) for kind, what in notes if "larm" in what.lower()]
+    assert words == [
+        ("warning", "ALARM"),
+        ("note", "alarm over"),
+        ("note", "alarm acknowledged"),
+        ("warning", "ALARM"),
+        ("note", "alarm acknowledged"),
+    ]
+
+
+def test_limits_that_cannot_be_are_refused_and_others_undone(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    hand, view = Hand(window), page.live_view
+    start(page, qtbot)
+    choose(page, "Trends and limits")
+    fields = view.canvas.trends.fields
+    hand.enter(fields["length", 0], "7")
+    hand.enter(fields["length", 1], "6.5")
+    session = window.workspace.session
+    assert session.limits == Limits(length_mm=(7.0, None))
+    assert "the lowest below the highest" in fields["length", 1].problem.text()
+    assert fields["length", 1].value() is None
+    hand.enter(view.canvas.trends.unmeasured, "12")
+    assert session.limits.unmeasured == 12
+    assert view.live.watch.alarms.limits == session.limits
+    window.workspace.undo()
+    window.workspace.undo()
+    assert fields["length", 0].value() is None
+    assert view.live.watch.alarms.limits == Limits()
+
+
+def test_a_frame_that_cannot_be_measured_says_why_where_the_figures_stand(
+    page: CapturePage, qtbot: QtBot
+):
+    start(page, qtbot)
+    choose(page, "Surface")
+    view, shown = page.live_view, page.live_view.canvas.surface
+    qtbot.waitUntil(lambda: shown.view.scene is not None)
+    former = view.updates
+    qtbot.waitUntil(lambda: view.updates > former + 3)
+    assert not page.picture_view.isVisible()
+    Prepared.found = DARK
+    qtbot.waitUntil(lambda: figure(page, 0, 1).text() == "–")
+    qtbot.waitUntil(lambda: "Not measured (no-dots): it is dark" in view.figures.words.text())
+    qtbot.waitUntil(lambda: shown.view.scene is None)
+    assert "No surface (no-dots): it is dark" in shown.view.accessibleDescription()
+    Prepared.found = OK
+    qtbot.waitUntil(lambda: shown.view.scene is not None)
+    choose(page, "Picture")
+    qtbot.waitUntil(page.picture_view.isVisible)
+    assert shown.view.scene is None
+
+
+def test_control_software_is_told_while_a_camera_is_watched(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    hand, view = Hand(window), page.live_view
+    streams = view.canvas.streams
+    start(page, qtbot)
+    choose(page, "Control software")
+    assert streams.words["lines"].text() == "○ Off"
+    port = free_port()
+    hand.enter(streams.ports["lines"], str(port))
+    streams.boxes["lines"].click()
+    qtbot.waitUntil(lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}: 0 pro"))
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as connected:
+        file = connected.makefile("rb")
+    assert "labapp" in json.loads(file.readline())
+    told = json.loads(file.readline())
+    assert (told["width_mm"], told["alarm"], told["status"]) == (6.7, "", "ok")
+    qtbot.waitUntil(lambda: "1 program listens" in streams.words["lines"].text())
+    # Others are let in only where that is ticked, and then it is said what that means.
+    assert not streams.warning.isVisible()
+    streams.anywhere.click()
+    assert "Any machine that reaches this one" in streams.warning.text()
+    qtbot.waitUntil(lambda: "every address of this machine" in streams.words["lines"].text())
+    streams.anywhere.click()
+    assert not streams.warning.isVisible()
+    qtbot.waitUntil(lambda: streams.words["lines"].text().startswith("● 127.0.0.1"))
+    file.close()
+    # It ends with the camera, and begins again with it.
+    watch = view.live.watch
+    hand.button("Stop the camera")
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert watch.stream("lines") is None
+    start(page, qtbot)
+    qtbot.waitUntil(lambda: view.live.watch.stream("lines") is not None)
+    choose(page, "Control software")
+    streams.boxes["lines"].click()
+    qtbot.waitUntil(lambda: streams.words["lines"].text() == "○ Off")
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", port), timeout=30)
+
+
+def test_a_port_that_is_taken_is_said_with_what_to_do(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    hand, streams = Hand(window), page.live_view.canvas.streams
+    start(page, qtbot)
+    choose(page, "Control software")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        for kind in ("lines", "opcua"):
+            hand.enter(streams.ports[kind], str(port))
+            streams.boxes[kind].click()
+            qtbot.waitUntil(lambda kind=kind: not streams.boxes[kind].isChecked(), timeout=30_000)
+            assert "Choose another port" in streams.words[kind].text()
+    assert said_in(window).count("Choose another port") == 2
+    streams.boxes["lines"].click()
+    qtbot.waitUntil(lambda: streams.words["lines"].text().startswith("● 127.0.0.1"))
+    assert page.live_view.live.watch.stream("opcua") is None
+
+
+@pytest.mark.parametrize("part", ["Picture", "Surface", "Trends and limits", "Control software"])
+def test_every_part_by_keyboard_and_on_a_small_screen(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, part: str
+):
+    window.workspace.attempt(lambda session: session.set_limits(Limits(width_mm=(7.0, None))))
+    start(page, qtbot)
+    choose(page, part)
+    qtbot.waitUntil(page.live_view.canvas.alarms.isVisible)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    reached = check_round(window)
+    assert page.live_view.canvas.tabs in reached
+    assert page.live_view.canvas.alarms.button in reached
+    window.resize(911, 512)  # 1366 × 768 at 150 %
+    qtbot.waitUntil(lambda: (window.width(), window.height()) == (911, 512))
+    for button in window.findChildren(QAbstractButton):
+        if button.isVisible() and button.text():
+            assert button.width() >= button.sizeHint().width() - 1, button.text()
+    assert page.live_view.record_button.isVisible()
