@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -244,3 +245,18 @@ def compare(path: Path, device: FilmedDevice, begun_s: float, ended_s: float) ->
     off_s = np.where(same, np.abs(steps_s - clock_s), np.where(steps_s > 0, 0.0, np.inf))
     most_us = 1e6 * off_s.max() if len(off_s) else 0.0
     return Compared(len(numbers), len(missing), strange, int(wrong), float(most_us))
+
+
+def times_told(lines: Sequence[str]) -> list[str]:
+    """The messages, those that were said several times in a row as often."""
+    told = []
+    for each in lines:
+        found = re.search(r" \((\d+) times since [\d:]+\)$", each)
+        told += [each] * (int(found[1]) if found else 1)
+    return told
+
+
+def how_many(told: Sequence[str], words: str) -> int:
+    """How often it is said, or of how many frames."""
+    found = [re.search(rf"(\d+) frames? {words}|{words}", each) for each in told]
+    return sum(int(each[1] or 1) for each in found if each)

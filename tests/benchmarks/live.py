@@ -33,7 +33,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from filming import Agenda, Disk, FilmedDevice, compare, moments, number_in
+from filming import (
+    Agenda,
+    Disk,
+    FilmedDevice,
+    compare,
+    how_many,
+    moments,
+    number_in,
+    times_told,
+)
 from PySide6.QtCore import QEvent, QObject, Qt
 from PySide6.QtWidgets import QApplication
 from stall_meter import run_for, run_until
@@ -430,21 +439,6 @@ class Run:
             wrong = {words for words in wanted if found[words] != wanted[words]}
             words = ", ".join(f"“{each}” {found[each]} of {wanted[each]}" for each in wanted)
             line(not wrong, f"{where}: {words}")
-
-
-def times_told(lines: Sequence[str]) -> list[str]:
-    """The messages, those that were said several times in a row as often."""
-    told = []
-    for each in lines:
-        found = re.search(r" \((\d+) times since [\d:]+\)$", each)
-        told += [each] * (int(found[1]) if found else 1)
-    return told
-
-
-def how_many(told: Sequence[str], words: str) -> int:
-    """How often it is said, or of how many frames."""
-    found = [re.search(rf"(\d+) frames? {words}|{words}", each) for each in told]
-    return sum(int(each[1] or 1) for each in found if each)
 
 
 def run(folder: Path, seconds: float, rate_hz: float, part: str) -> bool:

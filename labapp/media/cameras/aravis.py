@@ -24,14 +24,12 @@ from labapp.media.cameras.base import (
     Limits,
     Range,
     Trigger,
+    buffered,
     check_settings,
 )
 from labapp.media.cameras.genicam import ControlLost, aravis
 
 PREFIX = "aravis:"
-
-BUFFERS = 32
-"""Frames that the driver can fill while nobody reads."""
 
 KINDS = {"GigEVision": "GigE Vision", "USB3Vision": "USB3 Vision", "Fake": "Aravis's own"}
 
@@ -233,8 +231,9 @@ class GenicamCamera(Camera):
             return
         self._ask("set_acquisition_mode", 0)
         stream = self._ask("create_stream", None, None)
-        for _ in range(BUFFERS):
-            buffer = self._aravis.arv.arv_buffer_new_allocate(self._ask("get_payload"))
+        frame_byte = self._ask("get_payload")
+        for _ in range(buffered(frame_byte, self.settings.rate_hz)):
+            buffer = self._aravis.arv.arv_buffer_new_allocate(frame_byte)
             self._aravis.arv.arv_stream_push_buffer(stream, buffer)
         self._stream = _Stream(stream)
         self._ask("start_acquisition")

@@ -22,6 +22,9 @@ Region = tuple[int, int, int, int]
 NUMBERS = {"exposure_us": "µs", "gain_db": "dB", "rate_hz": "frames/s"}
 """What is set by a number, and its unit."""
 
+BUFFERED_S, BUFFERED_BYTE, LEAST_BUFFERED = 2.0, 128_000_000, 32
+"""Frames that wait for their reader: those of so long, as far as so much memory holds them."""
+
 
 class CameraError(Exception):
     """A camera does not do what was asked; the message says what, and what to do about it."""
@@ -281,3 +284,9 @@ def _check_region(info: CameraInfo, limits: Limits, region: Region | None) -> li
 
 def _cannot(info: CameraInfo, name: str, value: object) -> InputError:
     return InputError(info.id, name, value, f"nothing: {info.name} does not let it be set")
+
+
+def buffered(frame_byte: int, rate_hz: float | None) -> int:
+    """How many frames are to wait for their reader, who comes late where a computer is busy."""
+    wanted = round(BUFFERED_S * (rate_hz or 0.0))
+    return max(LEAST_BUFFERED, min(wanted, BUFFERED_BYTE // frame_byte))

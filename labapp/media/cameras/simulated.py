@@ -25,11 +25,9 @@ from labapp.media.cameras.base import (
     CameraSettings,
     Limits,
     Range,
+    buffered,
     check_settings,
 )
-
-BUFFERED = 64
-"""Frames that wait for their reader; more are dropped, as a driver does."""
 
 LEAST_SIDE = 16
 
@@ -204,6 +202,9 @@ class SimulatedCamera(Camera):
         """Let frames come."""
         self._begun_s = time.monotonic()
         self._next = self._overrun = 0
+        columns, rows = (self.settings.region or (0, 0, *self.limits.sensor))[2:]
+        frame_byte = columns * rows * (1 if self.bit_depth <= 8 else 2)
+        self._buffered = buffered(frame_byte, self.settings.rate_hz)
 
     def read(self, timeout_s: float) -> CameraFrame | None:
         """Wait for the next frame; see `Camera.read`."""
@@ -265,7 +266,7 @@ class SimulatedCamera(Camera):
             return None
         due_s = self._begun_s + self._next * period_s
         late = int((now_s - due_s) / period_s)
-        if late > BUFFERED:
+        if late > self._buffered:
             self._overrun += late
             self._device.taken += late
             self._begun_s += late * period_s

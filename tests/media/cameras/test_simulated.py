@@ -14,6 +14,7 @@ from labapp.media.cameras import (
     CameraSettings,
     Faults,
     SimulatedDevice,
+    base,
 )
 from tests.media.cameras.watching import number_in, numbered
 
@@ -86,7 +87,19 @@ def test_it_is_not_set_while_it_runs_nor_read_before() -> None:
             camera.apply(CameraSettings(rate_hz=10))
 
 
-def test_a_reader_that_comes_too_late_finds_frames_dropped() -> None:
+def test_a_reader_that_comes_late_finds_all_frames() -> None:
+    with SimulatedDevice("test", numbered, rate_hz=1000).open() as camera:
+        camera.start()
+        read(camera, 1)
+        time.sleep(0.4)
+        assert [frame.number for frame in read(camera, 400)] == list(range(1, 401))
+        assert camera.dropped == 0
+
+
+def test_a_reader_that_comes_too_late_finds_frames_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(base, "BUFFERED_S", 0.01)
     with SimulatedDevice("test", numbered, rate_hz=5000).open() as camera:
         camera.start()
         read(camera, 1)

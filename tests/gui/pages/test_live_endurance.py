@@ -1,0 +1,98 @@
+"""A short way through what `tests/benchmarks/live.py` does for long: all faults, nothing lost."""
+
+from __future__ import annotations
+
+import csv
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.capture import live, live_view
+from labapp.gui.window import MainWindow
+from labapp.media import GreyImage, recorder
+from labapp.media.cameras import Faults, feed
+from labapp.media.nut import NutWriter
+from labapp.media.recorder import Recorder
+from tests.benchmarks.filming import Disk, FilmedDevice, compare, how_many, times_told
+
+ROUNDS = 12
+STALLED = (3, 8)
+"""Rounds in which the disk stalls, too, from before the camera is gone to after it is back."""
+
+BEHIND, CAUGHT_UP = "writing does not keep up", "writing has caught up"
+
+
+def film(k: int) -> GreyImage:
+    """Frame k: dots that wander."""
+    v, u = np.mgrid[:48, :64] + 3 * np.sin([[[k / 7]], [[k / 5]]])
+    return (40 + 80 * (np.sin(u) > 0.9) * (np.sin(v) > 0.9)).astype(np.uint8)
+
+
+def test_nothing_recorded_is_lost_and_all_is_said(
+    window: MainWindow, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    goes = threading.Event()
+    goes.set()
+
+    def writer(path: Path, *given: object) -> NutWriter:
+        return NutWriter(path, *given, file=Disk(path, goes))
+
+    device = FilmedDevice(film, 200, 1_000_000)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
+    monkeypatch.setattr(live, "Recorder", partial(Recorder, writer=writer))
+    monkeypatch.setattr(recorder, "STALL_S", 0.2)
+    monkeypatch.setattr(feed, "RETRY_S", (0.01,))
+    assert window.workspace.create(tmp_path / "new.labsession")
+    window.show_step("capture")
+    view, truth = window.page.live_view, device.truth
+
+    def told() -> list[str]:
+        return times_told(window.log_panel.texts())
+
+    view.start()
+    qtbot.waitUntil(lambda: view.updates > 2)
+    begun_s = time.monotonic()
+    view.trigger()
+    take = view.live.takes[0]
+    device.spoil(Faults(garbage=0.05, seed=4804), 0.05)
+    for k in range(ROUNDS):
+        seen = truth.frames
+        qtbot.waitUntil(lambda seen=seen: truth.frames > seen + 10)
+        if k in STALLED:
+            # A busy computer's disk stalls of itself, too.
+            qtbot.waitUntil(lambda: how_many(told(), BEHIND) == how_many(told(), CAUGHT_UP))
+            stalls = how_many(told(), BEHIND)
+            goes.clear()
+            qtbot.waitUntil(lambda n=stalls: how_many(told(), BEHIND) > n)
+        device.unplug()
+        qtbot.waitUntil(lambda k=k: how_many(told(), "was unplugged") == k + 1)
+        device.plug()
+        qtbot.waitUntil(lambda k=k: how_many(told(), "it is back after") == k + 1)
+        if k in STALLED:
+            goes.set()
+            qtbot.waitUntil(lambda n=stalls: how_many(told(), CAUGHT_UP) > n)
+    qtbot.waitUntil(lambda: truth.broken > 5, timeout=20_000)
+    device.faults = Faults()
+    qtbot.waitUntil(lambda: how_many(told(), "not whole, left out") == truth.broken)
+    ended_s = time.monotonic()
+    view.trigger()
+    qtbot.waitUntil(take.finished.is_set)
+    counts = view.live.feed.counts
+    view.stop()
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert (counts.broken, counts.lost) == (truth.broken, ROUNDS)
+    assert (take.lost, take.trouble) == (0, "")
+    found = compare(take.path, device, begun_s, ended_s)
+    assert found.right, found
+    assert found.frames == take.frames
+    with take.notes.open(encoding="utf-8", newline="") as file:
+        noted = [row["what"] for row in csv.DictReader(file)]
+    for words in ("was unplugged", "it is back after", "not whole, left out"):
+        assert how_many(noted, words) == how_many(told(), words), words
+    for words in (BEHIND, CAUGHT_UP):
+        assert how_many(noted, words) >= len(STALLED), words
