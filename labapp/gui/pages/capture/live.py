@@ -230,8 +230,8 @@ class Live:
             ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
         ]
         if self.watch is not None:
-            # That is done elsewhere: after a frame of seconds there is no time to rest.
-            works.append(("figures", self.watch.next_frame, self.watch.measure, SHOW_S, 0.0))
+            # That is done elsewhere, and every frame that is left out is a longer step: no rest.
+            works.append(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
         for work in works:
             name = f"live {work[0]}"
             worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
