@@ -24,6 +24,8 @@ WAIT_MS = 30
 RETRY_S = 0.5
 """Pause between attempts to open a device that is gone."""
 
+MISSING = "hidapi is needed to read foot switches: pip install 'labapp[gui]'"
+
 AWAY, UNPLUGGED = "it is not connected", "it was unplugged"
 
 RULES = "resources/udev/70-labapp.rules"
@@ -331,5 +333,5 @@ def _hidraw() -> Any:
     try:
         import hidraw
     except ImportError as error:
-        raise HidError("foot switches need hidapi: pip install 'labapp[gui]'") from error
+        raise HidError(MISSING) from error
     return hidraw

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from labapp.media.events import Event, Say, silent
-from labapp.media.hid import AWAY, Find, HidReader, Open, find_hid, open_hid
+from labapp.media.hid import AWAY, MISSING, Find, HidReader, Open, find_hid, open_hid
 
 RETRY_S = 2.0
 """Pause between looks for one: most benches have none."""
@@ -98,7 +98,7 @@ class SpaceMouse:
         self._reader.stop()
 
     def _tell(self, event: Event) -> None:
-        if event.words != AWAY:
+        if event.words not in (AWAY, MISSING):
             self._say(event)
 
     def _hear(self, number: int, report: bytes) -> None:

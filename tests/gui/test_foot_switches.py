@@ -304,14 +304,14 @@ def test_where_there_is_no_foot_switch_it_is_said(start, bench: Bench, copy_samp
 
 def test_without_hidapi_it_is_said(start, copy_sample: CopySample, qtbot: QtBot, monkeypatch):
     def missing() -> None:
-        raise hid.HidError("foot switches need hidapi: pip install 'labapp[gui]'")
+        raise hid.HidError(hid.MISSING)
 
     monkeypatch.setattr(hid, "find_hid", missing)
     window = start()
     window.files.open(copy_sample("thumb_tack"))
     panel = panel_of(window)
     Hand(window).button("Look for devices")
-    qtbot.waitUntil(lambda: "need hidapi" in panel.words.text())
+    qtbot.waitUntil(lambda: "hidapi is needed" in panel.words.text())
 
 
 def test_nothing_is_looked_for_where_none_was_learned(start, copy_sample, monkeypatch, qtbot):

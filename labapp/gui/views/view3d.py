@@ -220,13 +220,14 @@ class View3d(Drawn):
         self._refresh()
         self.camera_changed.emit(self.camera)
 
-    def turn(self, azimuth_deg: float, elevation_deg: float) -> None:
-        """Turn the scene to the right and down."""
+    def turn(self, azimuth_deg: float, elevation_deg: float, roll_deg: float = 0.0) -> None:
+        """Turn the scene to the right, down, and against the clock."""
         if self._drawing is not None:
             camera = self._drawing.plotter.camera
             camera.Azimuth(-azimuth_deg)
             camera.Elevation(elevation_deg)
             camera.OrthogonalizeViewUp()
+            camera.Roll(roll_deg)
             self._drawing.plotter.renderer.ResetCameraClippingRange()
             self._turned()
 
@@ -235,6 +236,22 @@ class View3d(Drawn):
         if self._drawing is not None:
             self._drawing.plotter.camera.Zoom(factor)
             self._turned()
+
+    def move_scene(self, way: QPointF) -> None:
+        """Move the scene to the right and down, by pixels of the layout."""
+        if self._drawing is None:
+            return
+        camera = self._drawing.plotter.camera
+        ahead = np.subtract(camera.focal_point, camera.position)
+        right = np.cross(ahead, camera.up)
+        right, up = right / np.linalg.norm(right), np.asarray(camera.up)
+        tall = 2 * camera.parallel_scale
+        if not camera.parallel_projection:
+            tall = 2 * np.linalg.norm(ahead) * np.tan(np.radians(camera.view_angle / 2))
+        step = (-way.x() * right + way.y() * up) * tall / max(self.height(), 1)
+        camera.position = tuple(np.add(camera.position, step))
+        camera.focal_point = tuple(np.add(camera.focal_point, step))
+        self._turned()
 
     def event(self, event: QEvent) -> bool:
         """Take the view's keys before the window's actions do."""
@@ -330,28 +347,13 @@ class OffscreenView(View3d):
         way, self._at = event.position() - self._at, event.position()
         shift = event.modifiers() & Qt.KeyboardModifier.ShiftModifier
         if shift or event.buttons() & Qt.MouseButton.MiddleButton:
-            self._move(way)
+            self.move_scene(way)
         elif event.buttons() & Qt.MouseButton.LeftButton:
             self.turn(way.x() * DEGREES_A_PIXEL, way.y() * DEGREES_A_PIXEL)
 
     def wheelEvent(self, event: QWheelEvent) -> None:
         """Zoom."""
         self.zoom(ZOOM ** (event.angleDelta().y() / 120))
-
-    def _move(self, way: QPointF) -> None:
-        if self._drawing is None:
-            return
-        camera = self._drawing.plotter.camera
-        ahead = np.subtract(camera.focal_point, camera.position)
-        right = np.cross(ahead, camera.up)
-        right, up = right / np.linalg.norm(right), np.asarray(camera.up)
-        tall = 2 * camera.parallel_scale
-        if not camera.parallel_projection:
-            tall = 2 * np.linalg.norm(ahead) * np.tan(np.radians(camera.view_angle / 2))
-        step = (-way.x() * right + way.y() * up) * tall / max(self.height(), 1)
-        camera.position = tuple(np.add(camera.position, step))
-        camera.focal_point = tuple(np.add(camera.focal_point, step))
-        self._turned()
 
 
 class InteractiveView(View3d):

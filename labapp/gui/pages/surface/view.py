@@ -8,7 +8,16 @@ from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QSize, Qt, QTimer
-from PySide6.QtGui import QAction, QGuiApplication, QKeySequence, QPalette, QPixmap, QResizeEvent
+from PySide6.QtGui import (
+    QAction,
+    QGuiApplication,
+    QHideEvent,
+    QKeySequence,
+    QPalette,
+    QPixmap,
+    QResizeEvent,
+    QShowEvent,
+)
 from PySide6.QtWidgets import (
     QBoxLayout,
     QFileDialog,
@@ -39,7 +48,8 @@ from labapp.gui.pages.surface.presenter import (
 )
 from labapp.gui.views.fields import ChoiceField, NumberField
 from labapp.gui.views.parts import PartsBar
-from labapp.gui.views.view3d import make_view3d
+from labapp.gui.views.steering import Steering
+from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.workspace import Workspace
 from labapp.session.drawing import Direction
 from labapp.session.heights import profile
@@ -92,6 +102,7 @@ class SurfacePage(Page):
         self.stack = QStackedWidget()
         self.stack.addWidget(self._single())
         self.stack.addWidget(self.compare)
+        self.steering = Steering(self._steered, lambda told: workspace.said.emit(told, False), self)
         self.canvas_layout.addWidget(self._tools())
         self.canvas_layout.addWidget(self.stack, 1)
 
@@ -238,8 +249,9 @@ class SurfacePage(Page):
             self._show_surface()
 
     def leave(self) -> None:
-        """Stop comparing and drawing; the measurement goes on."""
+        """Stop comparing, drawing and steering; the measurement goes on."""
         self._rest.stop()
+        self.steering.stop()
         self.compare.leave()
 
     def picture(self) -> QPixmap:
@@ -328,10 +340,22 @@ class SurfacePage(Page):
         self._set(section=(round(angle_deg, 1), round(offset_mm, 2)))
 
     def _look(self, direction: Direction) -> None:
-        if self.stack.currentWidget() is self.compare:
-            self.compare.first.view.look(direction)
-        else:
-            self.view.look(direction)
+        self._steered().look(direction)
+
+    def _steered(self) -> View3d:
+        """The view that is turned; the others of a comparison turn with it."""
+        comparing = self.stack.currentWidget() is self.compare
+        return self.compare.first.view if comparing else self.view
+
+    def showEvent(self, event: QShowEvent) -> None:
+        """Let a 3-D controller turn what is seen."""
+        super().showEvent(event)
+        self.steering.start()
+
+    def hideEvent(self, event: QHideEvent) -> None:
+        """Leave a 3-D controller to other programs."""
+        super().hideEvent(event)
+        self.steering.stop()
 
     def _toggle_compare(self) -> None:
         session = self.workspace.session
