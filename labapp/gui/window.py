@@ -294,7 +294,8 @@ class MainWindow(QMainWindow):
             self.timeline.set_frames(seen.frame, seen.time_s, self.standings)
         self.timeline.set_frame(self.workspace.frame)
         self._states = self.workspace.tried(lambda: states(session, seen)) or states(None)
-        self.step_list.show_states(self._states)
+        own = {key: page.state(self._states[key]) for key, page in self.pages.items()}
+        self.step_list.show_states(self._states | own)
 
     def _show_measured(self) -> None:
         """Show that frames were measured that are not in view."""

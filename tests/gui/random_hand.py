@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.gui.foot_switches import CALLS
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.setup import SetupPage
@@ -58,7 +59,10 @@ PURPOSES = {
     "setup": ("Usual values", "Load…", "Laser goggles are worn", "Water cooling is on"),
     "laser": ("Use these",),
     "plane": ("Load picture…", "Find O′ and the axes", "Use"),
-    "capture": ("Choose a file …", "Import", "Start", "● Record", "Mark", "Stop the camera"),
+    "capture": (
+        *("Choose a file …", "New session from this recording …", "Import"),
+        *("Start", "● Record", "Mark", "Take a frame", "Learn a pedal", "Stop the camera"),
+    ),
     "surface": ("Along X", "Compare", "&This frame", "Copy"),
     "trends": ("Read a table …", "Width", "Height"),
     "export": ("Measures", "PLY", "Export"),
@@ -163,7 +167,7 @@ class RandomHand:
             "choose": (7, self._choose), "undo": (6, self._undo), "frame": (5, self._frame),
             "measure": (3, self._measure), "cancel": (2, self._cancel), "wheel": (3, self._wheel),
             "drop": (3, self._drop), "reopen": (3, self._reopen), "quit": (1, self._quit),
-            "resize": (1, self._resize),
+            "resize": (1, self._resize), "pedal": (4, self._pedal),
         }  # fmt: skip
 
     def act(self, kind: str) -> str:
@@ -233,6 +237,12 @@ class RandomHand:
         held = self._run.random.choice([NONE, SHIFT])
         QTest.keyClick(self._run.window, KEY.Key_F5, held)
         return f"{held.name} F5"
+
+    def _pedal(self) -> str:
+        """Step on a pedal that was learned."""
+        name = self._run.random.choice(list(CALLS.values()))
+        self._run.window.workspace.foot_switches.pressed.emit(name)
+        return name
 
     def _cancel(self) -> str:
         QTest.keyClick(self._run.window, KEY.Key_Period, CONTROL)

@@ -111,7 +111,8 @@ class CapturePage(Page):
         """How far the step is: a recording may be chosen that the session does not have yet."""
         session = self.workspace.session
         if self.live_view.live is not None:
-            return State(Mark.READY, "A camera is watched: Space records, and ends the recording")
+            told = "A camera is watched: Space here, Ctrl+R and the pedal begin and end a recording"
+            return State(Mark.READY, told)
         if self.preview is None or session is None or session.recording is not None:
             return found
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
