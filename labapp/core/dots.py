@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import cKDTree
 
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
@@ -310,19 +311,27 @@ def hot_scale(size: float) -> float:
 
 
 def light_of(image: Grey, size: float) -> Grey:
-    """Light above its surroundings, hardly blurred: what centroids are weighted by."""
-    return np.asarray(np.maximum(gauss(image, 0.5 * size) - gauss(image, 3.0 * size), 0.0))
+    """Light over its surroundings', hardly blurred: where above 0, centroids are weighted by it."""
+    return np.asarray(gauss(image, 0.5 * size) - gauss(image, 3.0 * size))
 
 
-def _patches(light: Grey, u: IntArray, v: IntArray, margin: int) -> FloatArray:
-    """Squares round pixels, dark beyond the picture, shape (n, 2·margin + 1, 2·margin + 1)."""
-    step = np.arange(-margin, margin + 1)
-    rows, columns = v[:, None] + step, u[:, None] + step
-    height, width = light.shape
-    inside = [(at >= 0) & (at < n) for at, n in ((rows, height), (columns, width))]
-    rows, columns = rows.clip(0, height - 1), columns.clip(0, width - 1)
-    patches = light[rows[:, :, None], columns[:, None, :]].astype(float)
-    return np.asarray(patches * inside[0][:, :, None] * inside[1][:, None, :])
+def squares(
+    image: Grey, u: IntArray, v: IntArray, reach: int, beyond: int = cv2.BORDER_CONSTANT
+) -> Grey:
+    """Squares round pixels, dark beyond the picture unless OpenCV's ``beyond`` says otherwise.
+
+    Returns
+    -------
+    Grey
+        Shape (n, 2·reach + 1, 2·reach + 1).
+    """
+    height, width = image.shape
+    if len(u) and min(u.min(), v.min(), width - 1 - u.max(), height - 1 - v.max()) < reach:
+        wide = cv2.copyMakeBorder(image, reach, reach, reach, reach, beyond)
+        image = np.asarray(wide, np.float32)
+        u, v = u + reach, v + reach
+    side = 2 * reach + 1
+    return np.asarray(sliding_window_view(image, (side, side))[v - reach, u - reach])
 
 
 def describe(
@@ -349,7 +358,7 @@ def describe(
         width = np.minimum(width, np.maximum(0.275 * nearest, 0.75))
     margin = int(np.ceil(2.2 * reach)) + 1
     across = np.arange(-margin, margin + 1.0)
-    patches = _patches(light, u, v, margin)
+    patches = np.maximum(squares(light, u, v, margin), 0.0).astype(float)
     offset = np.zeros((2, len(u)))
     for _ in range(4):
         pull = np.exp(-0.5 * ((across - offset[..., None]) / width[:, None]) ** 2)
@@ -357,7 +366,7 @@ def describe(
         along_v = (patches @ pull[0][:, :, None])[:, :, 0] * pull[1]
         total = along_u.sum(axis=1) + 1e-12
         sums = along_u, along_v
-        mean = np.stack([part @ across for part in sums]) / total
+        mean = np.array([part @ across for part in sums]) / total
         # The window holds the mean back; half as much again brings it home in a few steps.
         offset = np.clip(offset + 1.5 * (mean - offset), -reach, reach)
     moment = sum(part @ across**2 for part in sums) / total - np.sum(mean**2, axis=0)

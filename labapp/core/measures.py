@@ -172,13 +172,13 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
 
 def _inner(ray: IntArray) -> BoolArray:
     """Which points are neither in the first or last row nor at an end of their row, shape (n,)."""
-    row, column = ray.T
-    inner = (row > row.min()) & (row < row.max())
-    for i in np.unique(row):
-        members = row == i
-        ends = (column == column[members].min()) | (column == column[members].max())
-        inner &= ~(members & ends)
-    return np.asarray(inner)
+    order = np.lexsort(ray.T[::-1])
+    row = ray[order, 0]
+    first = np.concatenate([[True], row[1:] > row[:-1]])
+    last = np.concatenate([first[1:], [True]])
+    inner = np.empty(len(ray), bool)
+    inner[order] = ~first & ~last & (row > row[0]) & (row < row[-1])
+    return inner
 
 
 def size_of(surface: Surface, boundary: Boundary) -> tuple[FloatArray, FloatArray]:
@@ -212,18 +212,22 @@ def _spokes(surface: Surface, boundary: Boundary, fraction: FloatArray) -> Float
     return np.concatenate([xy, surface.height(xy[..., 0], xy[..., 1])[..., None]], axis=-1)
 
 
+_PATCH = STENCIL_MM * np.mgrid[-1:2, -1:2].reshape(2, 9)
+_PARABOLOID = np.linalg.pinv(
+    np.stack([np.ones(9), *_PATCH, _PATCH[0] ** 2, _PATCH[0] * _PATCH[1], _PATCH[1] ** 2], axis=1)
+)[1:]
+"""Offsets of a patch's nine points; slopes and curvatures of the paraboloid through them."""
+
+
 def refined(surface: Surface, boundary: Boundary, start_mm: FloatArray, sign: float) -> FloatArray:
     """Extreme near a sample, shape (3,): the vertex of the paraboloid through a patch round it.
 
     An extreme at the boundary, or where the patch has no vertex, stays where it is.
     """
-    step = np.array([-1.0, 0.0, 1.0]) * STENCIL_MM
-    dx, dy = (grid.ravel() for grid in np.meshgrid(step, step))
-    z = surface.height(start_mm[0] + dx, start_mm[1] + dy)
+    z = surface.height(start_mm[0] + _PATCH[0], start_mm[1] + _PATCH[1])
     if not np.isfinite(z).all():
         return start_mm
-    terms = np.column_stack([np.ones(9), dx, dy, dx * dx, dx * dy, dy * dy])
-    _, b_x, b_y, c_xx, c_xy, c_yy = np.linalg.lstsq(terms, z, rcond=None)[0]
+    b_x, b_y, c_xx, c_xy, c_yy = _PARABOLOID @ z
     bend = np.array([[2 * c_xx, c_xy], [c_xy, 2 * c_yy]])
     if not (np.linalg.eigvalsh(-sign * bend) > 1e-9).all():
         return start_mm

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from labapp.core.rig import DotPattern, ImagingPlane, Laser
 from labapp.core.values import FloatArray
 
 
+@lru_cache(maxsize=16)
 def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
     """Unit direction of every projected ray (Eq. 4-1, tangent grid of Fig. 4-14).
 
     Returns
     -------
     FloatArray
-        Shape (rows, columns, 3); ray (i, j), counted from 1, is at ``[i - 1, j - 1]``. i grows
-        towards the head of the pool (+Y), j with X.
+        Shape (rows, columns, 3), not to be written to; ray (i, j), counted from 1, is at
+        ``[i - 1, j - 1]``. i grows towards the head of the pool (+Y), j with X.
     """
     angle = np.radians(laser.projection_angle_deg)
     axis = np.array([0.0, -np.cos(angle), -np.sin(angle)])
@@ -29,7 +32,9 @@ def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
         + np.tan((j - (pattern.columns + 1) / 2) * step) * across
         + np.tan(((pattern.rows + 1) / 2 - i) * step) * along
     )
-    return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction.flags.writeable = False
+    return np.asarray(direction)
 
 
 def surface_normal(gradient: FloatArray) -> FloatArray:
@@ -43,10 +48,8 @@ def reflect(direction: FloatArray, normal: FloatArray) -> FloatArray:
 
     The length of ``direction`` is kept; ``normal`` need not be a unit vector.
     """
-    k = np.sum(direction * normal, axis=-1, keepdims=True) / np.sum(
-        normal * normal, axis=-1, keepdims=True
-    )
-    return np.asarray(direction - 2.0 * k * normal)
+    k = np.vecdot(direction, normal) / np.vecdot(normal, normal)
+    return np.asarray(direction - 2.0 * k[..., None] * normal)
 
 
 def bisecting_gradient(incident: FloatArray, reflected: FloatArray) -> FloatArray:
@@ -55,9 +58,8 @@ def bisecting_gradient(incident: FloatArray, reflected: FloatArray) -> FloatArra
     The normal bisects the reversed incident ray and the reflected one (Eq. 4-3). Both
     directions, shape (…, 3), of any length.
     """
-    normal = reflected / np.linalg.norm(
-        reflected, axis=-1, keepdims=True
-    ) - incident / np.linalg.norm(incident, axis=-1, keepdims=True)
+    back, forth = (way / np.sqrt(np.vecdot(way, way))[..., None] for way in (incident, reflected))
+    normal = forth - back
     return np.asarray(-normal[..., :2] / normal[..., 2:])
 
 

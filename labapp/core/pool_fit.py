@@ -248,9 +248,9 @@ def meet_surface(surface: SplineSurface, rays: FloatArray, points: FloatArray) -
     """
     low, high = surface.basis.low_mm + 1e-9, surface.basis.high_mm - 1e-9
     for _ in range(4):
-        x, y = np.clip(points[:, :2], low, high).T
-        gap = points[:, 2] - surface.height(x, y)
-        descent = rays[:, 2] - np.sum(surface.gradient(x, y) * rays[:, :2], axis=-1)
+        height, gradient = surface.height_and_gradient(*np.clip(points[:, :2], low, high).T)
+        gap = points[:, 2] - height
+        descent = rays[:, 2] - np.vecdot(gradient, rays[:, :2])
         step = np.clip(gap / np.maximum(-descent, 0.05), -0.5, 0.5)
         points = points + step[:, None] * rays
     return points
@@ -326,7 +326,7 @@ def find_level(
     drop_mm
         How deep the rear lies, mm; None: found along with the level.
     """
-    height, slope = surface.height(*landing_mm.T), surface.gradient(*landing_mm.T)
+    height, slope = surface.height_and_gradient(*landing_mm.T)
     return place_level(height, slope, landing_mm[:, 1], witness, spacing_mm, drop_mm)
 
 
@@ -366,7 +366,7 @@ def place_level(
     for k, depth in enumerate(drops):
         over = height[near] - Rear(depth, start, end).height(y[near])
         inside = sign * witness[near, None] * (over[:, None] + shifts) / rise[near, None]
-        log_likelihood[k] = [-_doubt(inside / s) for s in _BLURS]
+        log_likelihood[k] = -_doubt(inside[:, None] / _BLURS[:, None])
     log_posterior = log_likelihood - _BLUR_PRIOR * np.log(_BLURS)[:, None]
     log_posterior[1:] += np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1))
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)

@@ -53,17 +53,14 @@ class Quadric:
     slope: FloatArray
     curvature: FloatArray
 
-    def gradient(self, xy: FloatArray) -> FloatArray:
-        """Slopes at (x, y), shape (…, 2), mm."""
-        x, y = xy[..., 0] - self.center[0], xy[..., 1] - self.center[1]
-        bend = np.moveaxis(self.curvature, -1, 0)
-        along_x = self.slope[0] + bend[0] * x + bend[1] * y
-        return np.stack([along_x, self.slope[1] + bend[1] * x + bend[2] * y], axis=-1)
-
-    def height(self, xy: FloatArray) -> FloatArray:
-        """Height at (x, y), shape (…), mm."""
-        mean = (self.slope + self.gradient(xy)) / 2
-        return np.asarray(np.sum(mean * (xy - self.center), axis=-1))
+    def height_and_gradient(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Height, shape (…), mm, and slopes at (x, y), shape (…, 2), mm."""
+        offset = xy - self.center
+        x, y = offset[..., 0], offset[..., 1]
+        k_x, k_xy, k_y = (self.curvature[..., k] for k in range(3))
+        along_x, along_y = self.slope[0] + k_x * x + k_xy * y, self.slope[1] + k_xy * x + k_y * y
+        gradient = np.concatenate([along_x[..., None], along_y[..., None]], axis=-1)
+        return np.vecdot(self.slope + gradient, offset) / 2, gradient
 
 
 @dataclass(frozen=True)
@@ -175,17 +172,17 @@ class _Window:
     def dots(self, quadric: Quadric, rays: FloatArray) -> FloatArray:
         """Dots that quadrics make of rays, shape (n, 3): IPCS, shape (…, n, 2), mm."""
         points = self._points(quadric, rays)
-        normal = surface_normal(quadric.gradient(points[..., :2]))
+        normal = surface_normal(quadric.height_and_gradient(points[..., :2])[1])
         return meet_plane(points, reflect(rays, normal), self.scene.rig.imaging_plane)
 
     def _points(self, quadric: Quadric, rays: FloatArray) -> FloatArray:
         laser = self.scene.rig.laser.position_mm
         points = laser - laser[2] / rays[..., 2:] * rays
         for _ in range(3):
-            xy = points[..., :2]
-            gap = points[..., 2] - quadric.height(xy)
-            descent = rays[..., 2] - np.sum(quadric.gradient(xy) * rays[..., :2], axis=-1)
-            step = np.clip(gap / np.maximum(-descent, 0.05), -1.0, 1.0)
+            height, gradient = quadric.height_and_gradient(points[..., :2])
+            gap = points[..., 2] - height
+            descent = rays[..., 2] - np.vecdot(gradient, rays[..., :2])
+            step = np.minimum(np.maximum(gap / np.maximum(-descent, 0.05), -1.0), 1.0)
             points = points + step[..., None] * rays
         return np.asarray(points)
 

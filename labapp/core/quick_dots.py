@@ -26,6 +26,7 @@ from labapp.core.dots import (
     hot_scale,
     local_noise,
     peak_disc,
+    squares,
     typical,
 )
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
@@ -147,8 +148,8 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     keep[keep] = first_of_each(u[keep], v[keep], size)
     u, v = u[keep], v[keep]
     pad.widen(narrow, wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
-    light = np.maximum(np.subtract(fine, wide, out=wide), 0.0, out=wide)
-    return describe(light, band, exposure.noise, u, v, size, settings.speckle_px, WHOLE)
+    cv2.subtract(fine, wide, dst=wide)
+    return describe(wide, band, exposure.noise, u, v, size, settings.speckle_px, WHOLE)
 
 
 def _peaks(band: Grey, floor: Grey, size: float, pad: Pad) -> tuple[IntArray, IntArray]:
@@ -160,41 +161,33 @@ def _peaks(band: Grey, floor: Grey, size: float, pad: Pad) -> tuple[IntArray, In
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     u, v = np.asarray(cv2.findNonZero(pad.peak)).reshape(-1, 2).T.astype(np.int64)
     disc = peak_disc(size).astype(bool)
-    around = _patches(band, u, v, disc.shape[0] // 2)[:, disc]
+    around = squares(band, u, v, disc.shape[0] // 2, cv2.BORDER_REFLECT)[:, disc]
     keep = (band[v, u] >= around.max(axis=1)) & (band[v, u] > floor[v, u])
     return u[keep], v[keep]
-
-
-def _patches(image: Grey, u: IntArray, v: IntArray, reach: int) -> Grey:
-    """Squares round pixels, shape (n, 2·reach + 1, 2·reach + 1), mirrored at the picture's rim."""
-    height, width = image.shape
-    step = np.arange(-reach, reach + 1)
-    rows, columns = _mirrored(v[:, None] + step, height), _mirrored(u[:, None] + step, width)
-    return np.asarray(image[rows[:, :, None], columns[:, None, :]])
-
-
-def _mirrored(place: IntArray, count: int) -> IntArray:
-    inside = np.where(place < 0, -1 - place, place)
-    return np.where(inside >= count, 2 * count - 1 - inside, inside)
 
 
 def _not_hot(image: Grey, band: Grey, u: IntArray, v: IntArray, size: float) -> BoolArray:
     """Not a hot pixel (`dots._dot_like`): the finer band is worked out round the peaks alone."""
     scale = hot_scale(size)
-    narrow, wide = (_nine(sigma) for sigma in (0.8 * scale, 1.6 * scale))
-    reach = wide.shape[1] // 2
-    patch = _patches(image, u, v, reach)
-    narrow = np.pad(narrow, ((0, 0), (reach - narrow.shape[1] // 2,) * 2))
+    taps = _taps(1.6 * scale)
+    narrow, wide = (_nine(sigma, taps) for sigma in (0.8 * scale, 1.6 * scale))
+    patch = squares(image, u, v, taps // 2 + 1, cv2.BORDER_REFLECT)
     fine = narrow @ patch @ narrow.T - wide @ patch @ wide.T
     return np.asarray(fine.max(axis=(1, 2)) < HOT * band[v, u])
 
 
+def _taps(sigma: float) -> int:
+    """Length of a Gaussian's kernel, as OpenCV takes it."""
+    return round(8 * sigma + 1) | 1
+
+
 @cache
-def _nine(sigma: float) -> FloatArray:
+def _nine(sigma: float, taps: int) -> FloatArray:
     """Gaussian weights of a pixel and its two neighbours on a line, shape (3, taps + 2).
 
     Kept, as a recording has one size of dot.
     """
-    taps = round(8 * sigma + 1) | 1
-    kernel = np.asarray(cv2.getGaussianKernel(taps, sigma, cv2.CV_32F), np.float32).ravel()
+    own = _taps(sigma)
+    kernel = np.asarray(cv2.getGaussianKernel(own, sigma, cv2.CV_32F), np.float32).ravel()
+    kernel = np.pad(kernel, (taps - own) // 2)
     return np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])

@@ -6,7 +6,8 @@ bow, fan out or cross; a dot that two predictions could claim is given to neithe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import binary_dilation, convolve
@@ -78,13 +79,6 @@ class Scene:
         Height and width of the frame, px.
     hidden_rows
         Rows i of the pattern whose missing dots the operator says are hidden.
-
-    Attributes
-    ----------
-    rays, landing_mm
-        Directions of the rays, and where they would land on z = 0, mm, shape (rows, columns, 3).
-    spacing_mm
-        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
     """
 
     plane_mm: FloatArray
@@ -94,16 +88,8 @@ class Scene:
     calibration: ImageCalibration
     frame_shape: tuple[int, int]
     hidden_rows: frozenset[int] = frozenset()
-    rays: FloatArray = field(init=False)
-    landing_mm: FloatArray = field(init=False)
-    spacing_mm: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        rays = ray_directions(self.rig.laser, self.rig.pattern)
-        landing = meet_level(self.rig.laser.position_mm, rays)
-        object.__setattr__(self, "rays", rays)
-        object.__setattr__(self, "landing_mm", landing)
-        object.__setattr__(self, "spacing_mm", landing_spacing(landing))
         freeze(self)
 
     @classmethod
@@ -114,14 +100,30 @@ class Scene:
         jacobian = calibration.jacobian(dots.image_px)
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
         spread = jacobian * sigma[:, None, :]
+        area = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
         return cls(
             calibration.to_plane(dots.image_px),
             spread @ np.swapaxes(spread, -1, -2),
-            RESOLVED * float(np.median(dots.size_px * np.sqrt(np.abs(np.linalg.det(jacobian))))),
+            RESOLVED * float(np.median(dots.size_px * np.sqrt(np.abs(area)))),
             rig,
             calibration,
             frame_shape,
         )
+
+    @cached_property
+    def rays(self) -> FloatArray:
+        """Directions of the rays, shape (rows, columns, 3)."""
+        return ray_directions(self.rig.laser, self.rig.pattern)
+
+    @cached_property
+    def landing_mm(self) -> FloatArray:
+        """Where the rays would land on z = 0, shape (rows, columns, 3), mm."""
+        return meet_level(self.rig.laser.position_mm, self.rays)
+
+    @cached_property
+    def spacing_mm(self) -> FloatArray:
+        """Distance between neighbouring landing points along X and along Y, shape (2,), mm."""
+        return landing_spacing(self.landing_mm)
 
     @property
     def absent(self) -> BoolArray:
@@ -186,10 +188,11 @@ class Prediction:
 
     def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
         """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
-        basis, (x, y) = pool.surface.basis, self.points_mm[:, :2].T
-        slopes = np.stack([basis.matrix(x, y, 1, 0), basis.matrix(x, y, 0, 1)], axis=1)
+        cells = pool.surface.basis.cells(*self.points_mm[:, :2].T)
+        slopes = np.swapaxes(cells.value_and_slopes()[1:], 0, 1)
         moved = np.linalg.inv(slope_of_dot(self.points_mm, self.plane_mm, rig)) @ slopes
-        return np.asarray(moved @ pool.covariance @ np.swapaxes(moved, -1, -2))
+        own = pool.covariance[cells.splines[:, :, None], cells.splines[:, None, :]]
+        return np.asarray(moved @ own @ np.swapaxes(moved, -1, -2))
 
 
 def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
@@ -298,10 +301,10 @@ def behind_torch(
 def amid(lit: BoolArray) -> BoolArray:
     """Rays between lit ones in their row or in their column, shape (rows, columns)."""
     between = np.zeros_like(lit)
-    for axis in (0, 1):
-        before = np.logical_or.accumulate(lit, axis=axis)
-        after = np.flip(np.logical_or.accumulate(np.flip(lit, axis), axis=axis), axis)
-        between |= before & after
+    for rays, among in ((lit, between), (lit.T, between.T)):
+        before = np.logical_or.accumulate(rays)
+        after = np.logical_or.accumulate(rays[::-1])[::-1]
+        np.logical_or(among, before & after, out=among)
     return between
 
 
@@ -321,8 +324,16 @@ def surprises(
     offset = scene.plane_mm[dots][:, None] - predicted.plane_mm
     uncertain = CAUTION**2 * predicted.covariance_mm2(pool, scene.rig)
     spread = scene.covariance_mm2[dots][:, None] + uncertain + MODEL_MM**2 * np.eye(2)
-    distance = np.einsum("nma,nmab,nmb->nm", offset, np.linalg.inv(spread), offset)
-    return distance, distance + np.log(np.linalg.det(spread))
+    return surprise_of(offset, spread)
+
+
+def surprise_of(offset: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared length in σ² of offsets, shape (…, 2), and −2 log likelihood but for a constant."""
+    x, y = offset[..., 0], offset[..., 1]
+    xx, xy, yy = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    area = xx * yy - xy * xy
+    distance = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
+    return distance, distance + np.log(area)
 
 
 def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:

@@ -64,7 +64,7 @@ class DotPattern:
         """The centre reference ray ``(i, j)``, counted from 1."""
         return (self.rows + 1) // 2, (self.columns + 1) // 2
 
-    @property
+    @cached_property
     def marker(self) -> tuple[int, int] | None:
         """The absent ray whose hole tells the rows: the one nearest the centre, or None."""
         center = np.array(self.reference)

@@ -23,8 +23,8 @@ from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
 from labapp.core.spline import SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
-from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, met
-from labapp.core.warm_match import around, tracked
+from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, lay, met
+from labapp.core.warm_match import around, filled, tracked
 
 FOUND = 0.85
 """Share of the dots of the frame before that must be found again."""
@@ -60,8 +60,9 @@ class Track:
         Root mean square residual there, mm.
     pool, lit, boundary, level
         The last surface, the rays that had dots, where the pool ends, and z = 0.
-    past
-        Spline coefficients of the last frames, the newest last, shape (frames, p), mm.
+    past, heights_mm
+        Spline coefficients of the last frames, the newest last, shape (frames, p), and the heights
+        of those surfaces where rays land, shape (frames, R), mm.
     open_mm
         How far the level was left open when it was last asked how deep the rear lies, mm.
     free_mm
@@ -82,6 +83,7 @@ class Track:
     boundary: Boundary
     level: Level
     past: FloatArray
+    heights_mm: FloatArray
     open_mm: float
     free_mm: FloatArray
     unseen: int = 0
@@ -111,6 +113,7 @@ def begin(
     surface = SplineSurface(bed.basis, pool.coefficients)
     level = find_level(surface, bed.landing_mm[told, :2], witness[told], bed.spacing_mm)
     past = np.empty((0, len(pool.coefficients))) if former is None else former.past[1 - MEMORY :]
+    past = np.vstack([past, pool.coefficients])
     return Track(
         bed=bed,
         exposure=Exposure.of(image, settings.dots.band_pass),
@@ -120,7 +123,8 @@ def begin(
         lit=witness > 0,
         boundary=made.boundary,
         level=level,
-        past=np.vstack([past, pool.coefficients]),
+        past=past,
+        heights_mm=np.stack([lay(bed, coefficients)[0] for coefficients in past]),
         open_mm=level.sigma_mm,
         free_mm=np.full(len(bed.at), np.nan),
     )
@@ -159,10 +163,8 @@ def predictions(track: Track) -> Iterator[FloatArray]:
     heights where lit rays land, carries any few oscillations on.
     """
     past = track.past
-    if len(past) > 3 * ORDER:
-        own = np.flatnonzero(track.lit)
-        value, splines = track.bed.values[0, own], track.bed.splines[own]
-        heights = np.einsum("rs,frs->fr", value, past[:, splines])
+    if len(past) > ORDER + 2:
+        heights = track.heights_mm[:, track.lit]
         heights = heights - heights.mean(axis=0)
         count = len(past) - ORDER
         steps = np.stack([heights[ORDER - k - 1 :][:count].ravel() for k in range(ORDER)])
@@ -184,10 +186,10 @@ def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
     dots were nowhere foreseen, and it is infinite.
     """
     bed, count = track.bed, int(track.lit.sum())
-    looked_for = around(bed, track.lit, 2)
+    own, looked_for = filled(bed, track.lit), around(bed, track.lit, 2)
     for coefficients in predictions(track):
         pool = met(bed, coefficients, track.pool.points_mm, 1)
-        labels, off = tracked(scene, pool, track.lit, looked_for)
+        labels, off = tracked(scene, pool, own, looked_for)
         if len(off) >= FOUND * count and np.median(off) < STEADY:
             return pool, labels, float(np.median(off))
     found = 0

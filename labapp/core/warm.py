@@ -54,6 +54,10 @@ SINKS_EVERY = 16
 POINTS_EVERY = 8
 """Every so many frames the uncertainty of the reflection points is worked out anew."""
 
+ROUGHLY_MM = 0.03
+"""Where no reflection point moved by more, what is left to move does not change which dots have
+which rays."""
+
 RAISED_MM = 0.01
 """After a shift of the level by more, the slopes are fitted once more."""
 
@@ -108,7 +112,8 @@ class WarmChain:
             self._track = begin(image, measurement, self.rig, self.settings, self._track)
         elif self._track is not None:
             track, unseen = self._track, self._track.unseen + 1
-            kept = replace(track, unseen=unseen, past=track.past[-1:])
+            past, heights = track.past[-1:], track.heights_mm[-1:]
+            kept = replace(track, unseen=unseen, past=past, heights_mm=heights)
             self._track = kept if unseen <= HELD else None
         return measurement
 
@@ -175,6 +180,7 @@ def follow(
         boundary=reconstruction.boundary,
         level=level,
         past=np.vstack([track.past[1 - MEMORY :], pool.coefficients]),
+        heights_mm=np.vstack([track.heights_mm[1 - MEMORY :], lay(bed, pool.coefficients)[0]]),
         open_mm=open_mm,
         unseen=unseen,
         count=track.count + 1,
@@ -192,23 +198,25 @@ def _shifted(pool: WarmPool, level: Level) -> WarmPool:
 def _fitted(
     bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, *, widen: bool = True
 ) -> tuple[WarmPool, IntArray, FloatArray]:
-    """Fit the surface, and once more with the labels that it bears out."""
-    for last in (not widen, True):
-        ray = np.flatnonzero(labels != UNLABELLED)
-        if len(ray) < LEAST_DOTS:
-            raise Broken("hardly a dot is left that has a ray")
-        dot = labels[ray]
-        slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
-        pool, lower, moved = fit_slopes_to(bed, pool, slopes)
-        if not moved < UNSETTLED_MM:
-            raise Broken("the surface does not settle")
-        if last:
-            break
+    """Fit the surface, roughly first, and then with the labels that it bears out."""
+    slopes = _slopes(bed, scene, labels)
+    if widen:
+        pool, lower, _ = fit_slopes_to(bed, pool, slopes, until_mm=ROUGHLY_MM)
         wider = widened(bed, scene, pool, lower, labels)
-        if np.array_equal(wider, labels):
-            break
-        labels = wider
+        if not np.array_equal(wider, labels):
+            labels, slopes = wider, _slopes(bed, scene, wider)
+    pool, lower, moved = fit_slopes_to(bed, pool, slopes)
+    if not moved < UNSETTLED_MM:
+        raise Broken("the surface does not settle")
     return pool, labels, lower
+
+
+def _slopes(bed: Bed, scene: Scene, labels: IntArray) -> Slopes:
+    ray = np.flatnonzero(labels != UNLABELLED)
+    if len(ray) < LEAST_DOTS:
+        raise Broken("hardly a dot is left that has a ray")
+    dot = labels[ray]
+    return Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
 
 
 def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, float]:

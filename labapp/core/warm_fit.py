@@ -38,8 +38,9 @@ LOWER = ROW * SIDE**2 + COLUMN
 """Products of two of a cell's splines: the lower triangle, and its flat places in the square."""
 
 ROUNDS = 8
-SETTLED_MM, NEAR_MM = 3e-4, 3e-3
-"""No reflection point moves by more in the last round; a factor serves for as small moves."""
+SETTLED_MM, SERVES_MM = 3e-4, 5e-3
+"""No reflection point moves by more in the last round; a factor serves for moves that are small
+beside the splines' cells."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ def spline_values(basis: SplineBasis, place_mm: FloatArray) -> tuple[IntArray, F
     splines, values
         Their numbers, shape (n, 16); value and derivatives by x and by y, shape (3, n, 16).
     """
-    x, y = np.clip(place_mm, basis.low_mm, basis.high_mm).T
+    x, y = np.minimum(np.maximum(place_mm, basis.low_mm), basis.high_mm).T
     cells = basis.cells(x, y)
     return cells.splines, cells.value_and_slopes()
 
@@ -160,21 +161,23 @@ class WarmPool:
 
 def met(bed: Bed, coefficients: FloatArray, points_mm: FloatArray, steps: int = 2) -> WarmPool:
     """Meet every ray with a surface, from points nearby, shape (R, 3)."""
-    points, slopes = points_mm, np.empty(0)
+    points, slope = points_mm, [np.empty(0)] * 2
     for _ in range(steps):
         splines, values = spline_values(bed.basis, points[:, :2])
-        z, slope_x, slope_y = (values * coefficients[splines]).sum(axis=-1)
-        slopes = np.stack([slope_x, slope_y], axis=-1)
-        points = points + _step(bed.rays, points[:, 2] - z, slopes)[:, None] * bed.rays
+        z, *slope = np.vecdot(values, coefficients[splines])
+        points = points + _step(bed.rays, points[:, 2] - z, *slope)[:, None] * bed.rays
+    slopes = np.array(slope).T
     plane = meet_plane(points, reflect(bed.rays, surface_normal(slopes)), bed.rig.imaging_plane)
     plane[~bed.basis.contains(*points[:, :2].T)] = np.nan
     return WarmPool(coefficients, points, slopes, plane)
 
 
-def _step(rays: FloatArray, gap: FloatArray, slopes: FloatArray) -> FloatArray:
+def _step(
+    rays: FloatArray, gap: FloatArray, slope_x: FloatArray, slope_y: FloatArray
+) -> FloatArray:
     """Bounded Newton step along rays that are ``gap`` above the surface (`meet_surface`)."""
-    descent = slopes[:, 0] * rays[:, 0] + slopes[:, 1] * rays[:, 1] - rays[:, 2]
-    return np.clip(gap / np.maximum(descent, 0.05), -0.5, 0.5)
+    descent = slope_x * rays[:, 0] + slope_y * rays[:, 1] - rays[:, 2]
+    return np.minimum(np.maximum(gap / np.maximum(descent, 0.05), -0.5), 0.5)
 
 
 @dataclass(frozen=True)
@@ -209,13 +212,14 @@ def fit_slopes_to(
     slopes: Slopes,
     rounds: int = ROUNDS,
     rest: FloatArray | float = 0.0,
+    until_mm: float = SETTLED_MM,
 ) -> tuple[WarmPool, FloatArray, float]:
     """Fit the surface to slopes, round by round from a pool that is near.
 
-    Each round takes the slopes where the rays now meet the surface, fits, and meets them anew. The
-    last ones, which hardly move anything, are solved with the factor of the one before. What is
-    held down is the roughness; of the difference to a surface where coefficients ``rest`` are
-    given.
+    Each round takes the slopes where the rays now meet the surface, fits, and meets them anew,
+    until no reflection point moves by ``until_mm``. A factor serves the next round, too, where
+    points hardly move. What is held down is the roughness; of the difference to a surface where
+    coefficients ``rest`` are given.
 
     Returns
     -------
@@ -234,10 +238,9 @@ def fit_slopes_to(
     lower, moved = np.empty(0), np.inf
     for _ in range(rounds):
         splines, values = spline_values(bed.basis, points[:, :2])
-        if moved > NEAR_MM:
+        if moved > SERVES_MM:
             lower = factor(bed, splines, values, slopes.weights)
-        z, *slope = (values * coefficients[splines]).sum(axis=-1)
-        slope = np.stack(slope, axis=-1)
+        slope = np.vecdot(values[1:], coefficients[splines]).T
         asked = bisecting_gradient(points - laser, slopes.dots_mm - points)
         pull = (slopes.weights @ (asked - slope)[:, :, None])[:, :, 0]
         right = pull[:, 0, None] * values[1] + pull[:, 1, None] * values[2]
@@ -245,11 +248,11 @@ def fit_slopes_to(
         target -= dsbmv(width, 1.0, bed.stiffness, coefficients - rest, lower=1)
         change = solve(lower, target)
         coefficients = coefficients + change
-        z, *slope = (values * coefficients[splines]).sum(axis=-1)
-        step = _step(rays, points[:, 2] - z, np.stack(slope, axis=-1))
+        z, *slope = np.vecdot(values, coefficients[splines])
+        step = _step(rays, points[:, 2] - z, *slope)
         points = points + step[:, None] * rays
         moved = float(np.abs(step).max())
-        if moved < SETTLED_MM:
+        if moved < until_mm:
             break
     every = pool.points_mm.copy()
     every[slopes.ray] = points
@@ -285,5 +288,5 @@ def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
 
 def lay(bed: Bed, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Height and slopes of a surface where the rays would land, shapes (R,) and (R, 2)."""
-    z, *slope = (bed.values * coefficients[bed.splines]).sum(axis=-1)
-    return z, np.stack(slope, axis=-1)
+    z, *slope = np.vecdot(bed.values, coefficients[bed.splines])
+    return z, np.array(slope).T

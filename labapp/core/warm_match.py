@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from scipy.ndimage import binary_dilation
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from labapp.core.hypothesis import BEYOND, FEW
@@ -23,6 +24,7 @@ from labapp.core.ray_growth import (
     Scene,
     amid,
     behind_torch,
+    surprise_of,
 )
 from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.core.warm_fit import Bed, WarmPool, lay, solve, spline_values
@@ -30,6 +32,10 @@ from labapp.core.warm_fit import Bed, WarmPool, lay, solve, spline_values
 GATE, CLEARLY = 0.35, 2.0
 """A dot is a tracked ray's within this share of the way to the next predicted dot, if no other dot
 is, and no other ray within so many times its distance."""
+
+RIVALS = 3
+"""So many of the nearest rays contend for a dot, and so many other dots for a ray: the next ones
+are farther off by a row or a column."""
 
 ASTRAY = 0.25
 """A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
@@ -51,11 +57,29 @@ def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
 
 def around(bed: Bed, lit: BoolArray, rings: int) -> BoolArray:
     """Rays in a mask, shape (R,), and their neighbours, so many rings of them."""
+    wide = cv2.dilate(on_pattern(bed, lit), np.ones((3, 3), np.uint8), iterations=rings)
+    return np.asarray(wide[tuple(bed.at.T)], bool)
+
+
+def on_pattern(bed: Bed, lit: BoolArray) -> npt.NDArray[np.uint8]:
+    """A mask of rays, shape (R,), over the whole pattern, shape (rows, columns)."""
     pattern = bed.rig.pattern
-    grid = np.zeros((pattern.rows, pattern.columns), bool)
+    grid = np.zeros((pattern.rows, pattern.columns), np.uint8)
     grid[tuple(bed.at.T)] = lit
-    wide = binary_dilation(grid, np.ones((3, 3), bool), iterations=rings)
-    return np.asarray(wide[tuple(bed.at.T)])
+    return grid
+
+
+def filled(bed: Bed, lit: BoolArray) -> BoolArray:
+    """Lit rays and those amid them, whose dots may have been missed: a surface is sure of both."""
+    among = amid(on_pattern(bed, lit).view(bool))[tuple(bed.at.T)]
+    return np.asarray((lit | among) & ~bed.absent)
+
+
+def unlabelled(count: int, labels: IntArray) -> IntArray:
+    """Dots of so many that no ray has."""
+    free = np.ones(count, bool)
+    free[labels[labels != UNLABELLED]] = False
+    return np.flatnonzero(free)
 
 
 def tracked(
@@ -110,30 +134,32 @@ def widened(
     astray = off > np.maximum(6.0 * np.median(off), ASTRAY * next_mm[rays])
     labels = labels.copy()
     labels[rays[astray]] = UNLABELLED
-    free = np.setdiff1d(np.arange(len(scene.plane_mm)), labels)
+    free = unlabelled(len(scene.plane_mm), labels)
     if len(free) == 0:
         return labels
     beside = np.flatnonzero(around(bed, lit, 1) & ~lit & ~bed.absent)
     if len(beside) == 0:
         return labels
     apart = apart_mm(pool.plane_mm[looked_for], scene.plane_mm[free])
-    near = looked_for[np.unique(np.argsort(apart, axis=0)[:3])]
-    cost, distance = _surprise(bed, scene, pool, lower, near)
-    for dot in free:
+    near = looked_for[np.unique(np.argsort(apart, axis=0)[:RIVALS])]
+    apart = apart_mm(pool.plane_mm[near], scene.plane_mm)
+    dots = np.union1d(free, np.argsort(apart, axis=1)[:, : RIVALS + 1])
+    distance, cost = _surprise(bed, scene, pool, lower, near, dots)
+    for dot in np.searchsorted(dots, free).tolist():
         best = int(np.argmin(cost[:, dot]))
         ray = int(near[best])
         rivals = np.delete(cost[:, dot], best), np.delete(cost[best], dot)
         clear = all(len(r) == 0 or r.min() > cost[best, dot] + CLEAR for r in rivals)
         known = ray in beside and next_mm[ray] > scene.resolution_mm
         if clear and known and distance[best, dot] < NEAR:
-            labels[ray] = dot
+            labels[ray] = dots[dot]
     return labels
 
 
 def _surprise(
-    bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, ray: IntArray
+    bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, ray: IntArray, dot: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """−2 log likelihood, and squared distance in σ², of rays making dots, shapes (rays, n)."""
+    """What `ray_growth.surprise_of` says of rays making dots, shapes (rays, dots)."""
     splines, values = spline_values(bed.basis, pool.points_mm[ray, :2])
     by = np.zeros((2, len(ray), len(pool.coefficients)))
     for axis in range(2):
@@ -142,10 +168,9 @@ def _surprise(
     rows = moved @ np.moveaxis(by, 0, 1)
     across = solve(lower, np.asfortranarray(rows.reshape(2 * len(ray), -1).T))
     spread = rows @ across.T.reshape(len(ray), 2, -1).swapaxes(1, 2)
-    spread = CAUTION**2 * spread[:, None] + scene.covariance_mm2 + MODEL_MM**2 * np.eye(2)
-    offset = scene.plane_mm - pool.plane_mm[ray, None]
-    distance = np.einsum("rna,rnab,rnb->rn", offset, np.linalg.inv(spread), offset)
-    return distance + np.log(np.linalg.det(spread)), distance
+    spread = CAUTION**2 * spread[:, None] + scene.covariance_mm2[dot] + MODEL_MM**2 * np.eye(2)
+    offset = scene.plane_mm[dot] - pool.plane_mm[ray, None]
+    return surprise_of(offset, spread)
 
 
 @dataclass(frozen=True)
@@ -175,14 +200,11 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
     hidden = behind_torch(pool.points_mm, bed.rays, way, bed.rig.electrode.height_mm)
     seen = known & ~hidden & ~merged
     seen[seen] = scene.in_view(pool.plane_mm[seen])
-    pattern = bed.rig.pattern
-    grid = np.zeros((pattern.rows, pattern.columns), bool)
-    grid[tuple(bed.at.T)] = lit
-    among = amid(grid)[tuple(bed.at.T)]
+    among = amid(on_pattern(bed, lit).view(bool))[tuple(bed.at.T)]
     missed = int(np.sum(among & ~bed.absent & ~lit & seen))
     witness = np.where(seen & ~among & ~bed.absent, -1, 0)
     witness[lit] = 1
-    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
+    stray = unlabelled(len(scene.plane_mm), labels)
     if len(stray):
         apart = np.full((len(lit), len(stray)), np.inf)
         apart[known] = apart_mm(pool.plane_mm[known], scene.plane_mm[stray])

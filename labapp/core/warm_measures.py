@@ -19,11 +19,15 @@ from labapp.core.spline import SplineSurface
 from labapp.core.values import FloatArray, IntArray
 from labapp.core.warm_fit import Bed, spline_values
 
-STEPS = 3
-"""Newton steps from the boundary of the frame before."""
+STEPS = 4
+"""Newton steps from the boundary of the frame before, at most."""
 
-ON_RIM_MM = 1e-6
-"""A boundary point is on the rim's height to within this, or the boundary is looked for anew."""
+LAST_MM = 3e-3
+"""After a step of no more the next one would be of some nanometres."""
+
+ON_RIM_MM = 1e-3
+"""Before the last step boundary points are on the rim's height to within this, or the boundary is
+looked for anew."""
 
 NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
 
@@ -65,18 +69,18 @@ def follow_rim(
     theta = np.radians(before.theta_deg)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     for attempt in range(2):
-        for _ in range(STEPS + 1):
+        for _ in range(STEPS):
             place = center_mm + radius[:, None] * way
             splines, values = spline_values(bed.basis, place)
-            z, slope_x, slope_y = (values * coefficients[splines]).sum(axis=-1)
+            z, slope_x, slope_y = np.vecdot(values, coefficients[splines])
             y = place[:, 1]
             climb = np.stack([slope_x, slope_y - level.rear.slope(y)], axis=-1)
-            outward = np.sum(climb * way, axis=-1)
+            outward = np.vecdot(climb, way)
             over = z - level.rear.height(y)
             change = -over / np.where(np.abs(outward) > 1e-6, outward, np.inf)
-            if np.abs(over).max() < ON_RIM_MM:
+            radius = radius + np.minimum(np.maximum(change, -0.3), 0.3)
+            if np.abs(change).max() < LAST_MM:
                 break
-            radius = radius + np.clip(change, -0.3, 0.3)
         inside = bool(bed.basis.contains(*place.T).all() and (radius > 0).all())
         if inside and np.abs(over).max() < ON_RIM_MM:
             break

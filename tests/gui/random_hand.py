@@ -360,7 +360,8 @@ class RandomHand:
             if held != wanted:
                 unread = run.window.status_line.unread
                 run.faults.append(
-                    f"{told}: {session.path.name} holds {held!r}, the field {chosen.value()!r}; "
+                    f"{told}: {session.path.name} holds {held!r}, the field {chosen.value()!r} "
+                    f"and says {chosen.problem.text()!r}; "
                     f"typed on {typed_on[0]}, at the end on {typed_on[1]}; "
                     f"problems not read: {unread}"
                 )
