@@ -18,7 +18,7 @@ class Mark:
     Parameters
     ----------
     sign
-        ● or ○ (circles, filled and open), ■ (a square), × (a cross).
+        ● or ○ (circles, filled and open), ■ or ▪ (squares, the small one red), × (a cross).
     words
         What it means.
     """

@@ -1,20 +1,23 @@
 """Alarms while a pool is filmed: raised, over, and acknowledged by the operator.
 
 One is raised when a size is beyond its limit by more than chance, or when so many frames in a row
-cannot be measured; it is over when the size is within its limits again, or a frame is measured. It
-is shown until it is both over and acknowledged: none goes by unseen.
+cannot be measured; it is over when the size has been within its limits, or frames have been
+measured, for a second: a pool that swings about a limit is one alarm. It is shown until it is both
+over and acknowledged: none goes by unseen.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 
 from labapp.core.measures import Measures
 from labapp.session.limits import NAMES, Limits, Size, Standing, sizes_of, standing
 from labapp.words import several
+
+CALM_S = 1.0
+"""An alarm is over when its cause has been away for so long, by the camera's clock."""
 
 NOT_MEASURED = "not-measured"
 """Code of the alarm of frames that cannot be measured; others are as ``width-high``."""
@@ -66,6 +69,8 @@ class Alarms:
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._shown: dict[str, Alarm] = {}
+        self._held_s: dict[str, float] = {}
+        """When the cause of each alarm was last there, or may have been."""
         self._unmeasured = 0
         self._turn = threading.Lock()
 
@@ -80,10 +85,11 @@ class Alarms:
             former, self._limits = self._limits, limits
             for name in NAMES:
                 if former.of(name) != limits.of(name):
-                    self._end(f"{name}-{end}" for end in ("low", "high"))
+                    for end in ("low", "high"):
+                        self._end(f"{name}-{end}")
             if not limits.are_set:
                 self._unmeasured = 0
-                self._end([NOT_MEASURED])
+                self._end(NOT_MEASURED)
 
     @property
     def shown(self) -> tuple[Alarm, ...]:
@@ -113,16 +119,19 @@ class Alarms:
             if not self._limits.are_set:
                 return []
             self._unmeasured = self._unmeasured + 1 if measures is None else 0
-            changed: list[Alarm] = []
-            if self._unmeasured >= self._limits.unmeasured:
-                words = f"{several(self._unmeasured, 'frame')} in a row could not be measured"
-                changed += self._raise(NOT_MEASURED, f"{words}: {reason}", frame, time_s)
-            if measures is None:
-                return changed
-            changed += self._end([NOT_MEASURED])
-            for name, size in zip(NAMES, sizes_of(measures), strict=True):
-                stands = standing(size, self._limits.of(name))
-                changed += self._take(name, size, stands, frame, time_s)
+            causes = self._causes(measures, reason)
+            for code, words in causes.items():
+                if words is not None or code in self._shown:
+                    self._held_s[code] = time_s
+            changed = [
+                alarm
+                for code, words in causes.items()
+                if words is not None
+                for alarm in self._raise(code, words, frame, time_s)
+            ]
+            for code in [code for code in self._shown if code not in causes]:
+                if time_s - self._held_s[code] >= CALM_S:
+                    changed += self._end(code)
             return changed
 
     def acknowledge(self) -> list[Alarm]:
@@ -133,40 +142,40 @@ class Alarms:
             self._shown = {alarm.code: replace(alarm, acknowledged=True) for alarm in kept}
             return seen
 
-    def _take(
-        self, name: str, size: Size, stands: Standing, frame: int, time_s: float
-    ) -> list[Alarm]:
-        """What the standing of one size changes; one in doubt leaves everything as it was."""
-        if stands in ("", "in doubt"):
-            return []
-        low, high = f"{name}-low", f"{name}-high"
-        if stands == "in order":
-            return self._end([low, high])
-        ended = self._end([high if stands == "low" else low])
-        words = in_words(size, stands, self._limits)
-        return ended + self._raise(f"{name}-{stands}", words, frame, time_s)
+    def _causes(self, measures: Measures | None, reason: str) -> dict[str, str | None]:
+        """Codes of what is wrong in a frame, in words; None: it may be, but cannot be told."""
+        if measures is None:
+            unknown: dict[str, str | None] = dict.fromkeys(self._shown)
+            if self._unmeasured < self._limits.unmeasured:
+                return unknown
+            words = f"{several(self._unmeasured, 'frame')} in a row could not be measured: {reason}"
+            return {**unknown, NOT_MEASURED: words}
+        found: dict[str, str | None] = {}
+        for name, size in zip(NAMES, sizes_of(measures), strict=True):
+            stands = standing(size, self._limits.of(name))
+            if stands in ("low", "high"):
+                found[f"{name}-{stands}"] = in_words(size, stands, self._limits)
+            elif stands == "in doubt":
+                found |= {f"{name}-low": None, f"{name}-high": None}
+        return found
 
     def _raise(self, code: str, words: str, frame: int, time_s: float) -> list[Alarm]:
-        """Raise an alarm; none if it is raised already, also one that is over but was not seen."""
+        """Raise an alarm; none if it holds already."""
         held = self._shown.get(code)
-        if held is None:
-            alarm = self._shown[code] = Alarm(code, words, frame, time_s)
-            return [alarm]
-        self._shown[code] = replace(held, holds=True)
-        return []
+        if held is not None and held.holds:
+            return []
+        alarm = self._shown[code] = Alarm(code, words, frame, time_s)
+        return [alarm]
 
-    def _end(self, codes: Iterable[str]) -> list[Alarm]:
-        ended = []
-        for code in codes:
-            held = self._shown.get(code)
-            if held is not None and held.holds:
-                over = replace(held, holds=False)
-                ended.append(over)
-                if held.acknowledged:
-                    del self._shown[code]
-                else:
-                    self._shown[code] = over
-        return ended
+    def _end(self, code: str) -> list[Alarm]:
+        """Take it that an alarm holds no more; none if it did not."""
+        held = self._shown.get(code)
+        if held is None or not held.holds:
+            return []
+        over = self._shown[code] = replace(held, holds=False)
+        if held.acknowledged:
+            del self._shown[code]
+        return [over]
 
 
 def in_words(size: Size, stands: Standing, limits: Limits) -> str:

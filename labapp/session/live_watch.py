@@ -19,6 +19,7 @@ from labapp.media.events import Event, Kind
 from labapp.session.alarms import Alarm, Alarms
 from labapp.session.limits import NAMES, Limits, Size, sizes_of, standing
 from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring
+from labapp.session.scene import Scene
 from labapp.session.setup import Setup
 from labapp.session.streams import Stream, live_values
 
@@ -159,6 +160,7 @@ class LiveWatch:
         self._to_measure: deque[CameraFrame] = deque()
         self._in_order, self._taken_s = BURST, 0.0
         self._newest: deque[Followed] = deque(maxlen=1)
+        self._scene: deque[Scene] = deque(maxlen=1)
         self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
         self._turn = threading.Lock()
         self._streams: dict[str, Stream] = {}
@@ -205,6 +207,7 @@ class LiveWatch:
         found = self._measuring.measure(frame.image, drawn)
         if found.scene is not None:
             self._is_drawn.clear()
+            self._scene.append(found.scene)
         if not found.followed:
             self._in_order = BURST
         followed = Followed(frame.number, frame.time_s, frame.arrived_s, found)
@@ -237,6 +240,10 @@ class LiveWatch:
     def ask_for_scene(self) -> None:
         """Have the surface of the next frame that is measured be drawn, too: once."""
         self._is_drawn.set()
+
+    def scene(self) -> Scene | None:
+        """The surface that was asked for; None before it is there, and if it was given already."""
+        return self._scene.popleft() if self._scene else None
 
     def stream(self, kind: str) -> Stream | None:
         """What tells by this kind; None: nothing does."""

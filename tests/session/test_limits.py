@@ -84,38 +84,56 @@ def test_noise_about_a_limit_is_rarely_an_alarm_and_a_pool_beyond_it_always():
 
 def test_an_alarm_is_raised_once_and_stays_until_it_is_over_and_seen():
     alarms = Alarms(Limits(width_mm=(None, 6.9)))
-    assert alarms.judge(1, 0.1, measured(6.8), "") == []
-    assert codes(alarms.judge(2, 0.2, measured(7.0), "")) == [("width-high", True)]
-    assert alarms.judge(3, 0.3, measured(7.1), "") == []
+    assert alarms.judge(1, 1.0, measured(6.8), "") == []
+    assert codes(alarms.judge(2, 2.0, measured(7.0), "")) == [("width-high", True)]
+    assert alarms.judge(3, 3.0, measured(7.1), "") == []
     # Beyond, but by chance perhaps: neither over nor raised again.
-    assert alarms.judge(4, 0.4, measured(6.95), "") == []
-    assert codes(alarms.judge(5, 0.5, measured(6.8), "")) == [("width-high", False)]
+    assert alarms.judge(4, 4.0, measured(6.95), "") == []
+    assert codes(alarms.judge(5, 5.0, measured(6.8), "")) == [("width-high", False)]
+    assert alarms.judge(6, 6.0, measured(6.8), "") == []
     assert codes(alarms.shown) == [("width-high", False)]
-    assert (alarms.shown[0].frame, alarms.shown[0].time_s) == (2, 0.2)
-    # Again before it was seen: the first stays.
-    assert alarms.judge(6, 0.6, measured(7.0), "") == []
-    assert codes(alarms.shown) == [("width-high", True)]
+    assert (alarms.shown[0].frame, alarms.shown[0].time_s) == (2, 2.0)
+    # Again before it was seen: it is told again.
+    assert codes(alarms.judge(7, 7.0, measured(7.0), "")) == [("width-high", True)]
+    assert [alarm.frame for alarm in alarms.shown] == [7]
     assert codes(alarms.acknowledge()) == [("width-high", True)]
     assert alarms.acknowledge() == []
     assert alarms.shown[0].acknowledged
-    assert codes(alarms.judge(7, 0.7, measured(6.8), "")) == [("width-high", False)]
+    assert codes(alarms.judge(8, 8.0, measured(6.8), "")) == [("width-high", False)]
     assert alarms.shown == ()
-    assert codes(alarms.judge(8, 0.8, measured(7.0), "")) == [("width-high", True)]
+    assert codes(alarms.judge(9, 9.0, measured(7.0), "")) == [("width-high", True)]
+
+
+def test_a_pool_that_swings_about_a_limit_is_one_alarm():
+    alarms, changed = Alarms(Limits(width_mm=(None, 6.9))), []
+    for frame in range(600):
+        time_s = frame / 100
+        swing = 0.3 * np.sin(2 * np.pi * 2.7 * time_s) if time_s < 4 else -0.3
+        changed += alarms.judge(frame, time_s, measured(6.9 + swing), "")
+    assert codes(changed) == [("width-high", True), ("width-high", False)]
+    assert changed[0].time_s < 0.1
+
+
+def test_from_too_wide_to_too_narrow():
+    alarms = Alarms(Limits(width_mm=(6.0, 6.9)))
+    alarms.judge(0, 0.0, measured(7.2), "")
+    assert codes(alarms.judge(1, 0.5, measured(5.5), "")) == [("width-low", True)]
+    assert codes(alarms.judge(2, 1.1, measured(5.5), "")) == [("width-high", False)]
 
 
 def test_frames_in_a_row_that_cannot_be_measured_are_an_alarm():
     alarms = Alarms(Limits(width_mm=(6.0, 6.9), unmeasured=3))
     alarms.judge(0, 0.0, measured(7.0), "")
     for frame in (1, 2):
-        assert alarms.judge(frame, 0.1 * frame, None, "no dots") == []
+        assert alarms.judge(frame, float(frame), None, "no dots") == []
     # One that could not be measured does not bring a size back in order.
     assert codes(alarms.shown) == [("width-high", True)]
-    assert alarms.judge(3, 0.3, measured(7.0), "") == []
-    raised = [alarms.judge(frame, 0.1 * frame, None, "no dots") for frame in range(4, 9)]
+    assert alarms.judge(3, 3.0, measured(7.0), "") == []
+    raised = [alarms.judge(frame, float(frame), None, "no dots") for frame in range(4, 9)]
     assert [codes(each) for each in raised] == [[], [], [("not-measured", True)], [], []]
     assert alarms.shown[1].words == "3 frames in a row could not be measured: no dots"
-    over = alarms.judge(9, 0.9, measured(6.5), "")
-    assert codes(over) == [("not-measured", False), ("width-high", False)]
+    over = alarms.judge(9, 9.0, measured(6.5), "")
+    assert codes(over) == [("width-high", False), ("not-measured", False)]
 
 
 def test_without_limits_nothing_is_watched():
@@ -139,7 +157,7 @@ def test_other_limits_end_the_alarms_of_the_former():
 def test_alarms_are_told_by_their_codes():
     alarms = Alarms(Limits(width_mm=(None, 6.9), length_mm=(None, 7.0)))
     alarms.judge(3, 0.0, measured(7.2), "")
-    alarms.judge(4, 0.0, measured(6.8), "")
+    alarms.judge(4, 1.0, measured(6.8), "")
     told = live_values(4, 0.0, Measurement("ok", "", "fit", measures=MEASURES), alarms.shown)
     assert told["alarm"] == "length-high"
     assert told["unacknowledged"] == "width-high length-high"

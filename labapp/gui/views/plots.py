@@ -44,7 +44,7 @@ NUMBER_LINES = 1.3
 LEAST_HEIGHT = 76
 """A plot is no lower than this; where they do not fit, they scroll."""
 
-SYMBOLS = {"●": "o", "○": "o", "■": "s", "×": "x"}
+SYMBOLS = {"●": "o", "○": "o", "■": "s", "▪": "s", "×": "x"}
 KEYS = "← → step through the points, Home End to the first and last, + − zoom, F shows all"
 Role = QPalette.ColorRole
 
@@ -418,6 +418,8 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             return SYMBOLS[sign], 11, pg.mkPen(text, width=1.8), pg.mkBrush(base)
         if sign == "■":
             return SYMBOLS[sign], 9, pg.mkPen(base, width=0.5), pg.mkBrush(text)
+        if sign == "▪":
+            return SYMBOLS[sign], 4, pg.mkPen(None), pg.mkBrush(RED[is_dark(look)])
         if sign == "×":
             return SYMBOLS[sign], 9, pg.mkPen(None), pg.mkBrush(look.color(Role.PlaceholderText))
         return SYMBOLS[sign], 7, pg.mkPen(base, width=0.5), pg.mkBrush(accent)

@@ -90,7 +90,7 @@ def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():
     assert pace_in_words(None, Pace(0.0, 0, 0), 60.0, 0.0) == FIRST
     assert (
         pace_in_words(followed(), Pace(38.0, 76, 0), 60.0, 0.04)
-        == "38.0 of 60.0 frames/s measured, the newest 0.04 s ago"
+        == "38.0 of 60.0 frames/s measured; 0.04 s old"
     )
     assert pace_in_words(followed(), Pace(38.0, 76, 2), None, 0.0).startswith(
         "◆ 2 of the last 76 frames could not be measured. 38.0 frames/s measured"
@@ -120,8 +120,8 @@ def test_trends_have_the_limits_and_mark_what_is_beyond():
     values = np.array([[6.7, np.nan, 7.0], [7.5] * 3, [-0.3] * 3])
     trend = Trend(
         ("width", "length", "depth"),
-        np.array([4, 5, 6]),
-        np.array([-2.0, -1.0, -0.1]),
+        np.array([4, 8, 10]),
+        np.array([-2.0, -1.6, -0.1]),
         values,
         np.full((3, 3), 0.03),
         np.array([[False, False, True], [False] * 3, [False] * 3]),
@@ -130,9 +130,11 @@ def test_trends_have_the_limits_and_mark_what_is_beyond():
         trend, Limits(width_mm=(6.0, 6.9), height_mm=(-0.4, None)), trend.names
     )
     assert (width.limits, length.limits, depth.limits) == ((6.0, 6.9), (None, None), (-0.4, None))
-    assert width.mark.tolist() == [0, 0, 1]
+    assert width.mark.tolist() == [0, 0, 0, 1]
     assert depth.title == "Depth (mm)"
-    assert width.key.tolist() == [4, 5, 6]
+    # Nothing is known of the time between frames that came far apart.
+    assert width.key.tolist() == [4, 8, 9, 10]
+    assert np.array_equal(length.y, [7.5, 7.5, np.nan, 7.5], equal_nan=True)
 
 
 # --- on the page ----------------------------------------------------------------------------------
@@ -320,8 +322,9 @@ def test_control_software_is_told_while_a_camera_is_watched(
     hand.enter(streams.ports["lines"], str(port))
     streams.boxes["lines"].click()
     qtbot.waitUntil(lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}: 0 pro"))
-    with socket.create_connection(("127.0.0.1", port), timeout=30) as connected:
-        file = connected.makefile("rb")
+    connected = socket.create_connection(("127.0.0.1", port), timeout=30)
+    file = connected.makefile("rb")
+    connected.close()
     assert "labapp" in json.loads(file.readline())
     told = json.loads(file.readline())
     assert (told["width_mm"], told["alarm"], told["status"]) == (6.7, "", "ok")
@@ -345,6 +348,7 @@ def test_control_software_is_told_while_a_camera_is_watched(
     choose(page, "Control software")
     streams.boxes["lines"].click()
     qtbot.waitUntil(lambda: streams.words["lines"].text() == "○ Off")
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", port), timeout=30)
 

@@ -124,7 +124,7 @@ def pace_in_words(
     came = f" of {came_hz:.1f}" if came_hz is not None else ""
     told.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
     if age_s <= OLD_S:
-        told[-1] += f", the newest {age_s:.2f} s ago"
+        told[-1] += f"; {age_s:.2f} s old"
     return " ".join(told)
 
 

@@ -50,7 +50,7 @@ class LiveSurface(QWidget):
         layout.addWidget(self.view, 1)
 
     def follow(self, followed: Followed | None, watch: LiveWatch) -> bool:
-        """Show the surface of a frame, if it was drawn, and ask for the next; whether it did.
+        """Show the newest surface that was drawn, and ask for the next; whether there was one.
 
         Parameters
         ----------
@@ -59,18 +59,18 @@ class LiveSurface(QWidget):
         watch
             Which measures.
         """
+        scene = watch.scene()
         watch.ask_for_scene()
-        if followed is None:
-            return False
-        scene, found = followed.found.scene, followed.found
         if scene is not None:
             self._limits = steady_limits(self._limits, scene.limits)
             self._show(replace(scene, limits=self._limits))
             self._shown_s = time.monotonic()
             return True
-        if found.measures is None and time.monotonic() - self._shown_s > LASTS_S:
-            self.view.set_words(f"No surface ({found.status}): {found.reason}")
-            self._show(None)
+        if followed is not None and time.monotonic() - self._shown_s > LASTS_S:
+            found = followed.found
+            if found.measures is None:
+                self.view.set_words(f"No surface ({found.status}): {found.reason}")
+                self._show(None)
         return False
 
     def clear(self) -> None:

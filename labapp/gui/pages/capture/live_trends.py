@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import QBoxLayout, QGridLayout, QLabel, QVBoxLayout, QWidget
@@ -20,9 +21,12 @@ from labapp.session.live_watch import TREND_S, LiveWatch, Trend
 LAST_S = 30.0
 """So much is seen at first."""
 
-MARKS = PLAIN, Mark("■", "beyond its limit")
+GAP_S = 0.5
+"""Over a longer time without a frame no line is drawn."""
 
-WIDE = 80
+MARKS = PLAIN, Mark("▪", "beyond its limit")
+
+WIDE = 100
 """So many letters wide it must be for all fields to stand beside each other."""
 
 RULE = (
@@ -44,15 +48,19 @@ def trend_curves(trend: Trend, limits: Limits, names: tuple[str, ...]) -> tuple[
     names
         What the sizes are called.
     """
+    # Nothing was measured in a gap: a frame in it, without values, keeps a line from crossing it.
+    gap = np.flatnonzero(np.diff(trend.since_s) > GAP_S) + 1
+    since_s = np.insert(trend.since_s, gap, trend.since_s[gap - 1] + GAP_S / 2)
+    number = np.insert(trend.number, gap, trend.number[gap - 1] + 1)
     return tuple(
         Curve(
             name.capitalize(),
             "mm",
-            trend.since_s,
-            trend.value_mm[k],
-            sigma=trend.sigma_mm[k],
-            key=trend.number,
-            mark=trend.beyond[k].astype(int),
+            since_s,
+            np.insert(trend.value_mm[k], gap, np.nan),
+            sigma=np.insert(trend.sigma_mm[k], gap, np.nan),
+            key=number,
+            mark=np.insert(trend.beyond[k].astype(int), gap, 0),
             marks=MARKS,
             limits=limits.of(name),
             quick=True,
