@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import NamedTuple
-
-from threadpoolctl import ThreadpoolController
 
 from labapp.core.measures import Measures
 from labapp.core.pipeline import Settings
@@ -19,6 +18,9 @@ from labapp.media import GreyImage
 from labapp.session.scene import Scene, scene_of
 from labapp.session.setup import Setup
 from labapp.simulation.parallel import NICE, begin_worker, end_processes
+
+JUDGED_S = 0.2
+"""So long the verdict on a frame stands for those that are followed from it."""
 
 
 class LiveMeasuringEnded(Exception):
@@ -34,7 +36,7 @@ class LiveMeasurement:
     status, reason
         As in `pipeline.Measurement`.
     quality
-        How fit the frame is to be measured.
+        How fit frames are to be measured; while each is followed, of one some times a second.
     measures
         Sizes; None where it could not be measured.
     followed
@@ -111,18 +113,23 @@ _measure: list[Callable[[GreyImage, bool], LiveMeasurement]] = []
 def _begin(given: _Chain) -> None:
     setup, settings, depth = given
     chain = WarmChain(setup.rig, setup.calibration, settings)
-    pattern = setup.rig.pattern
+    rays = setup.rig.pattern.rows * setup.rig.pattern.columns
+    verdict: list[tuple[float, Quality]] = []
 
     def measure(image: GreyImage, drawn: bool) -> LiveMeasurement:
-        # The matrices are small: more threads than one get in each other's way.
-        with ThreadpoolController().limit(limits=1, user_api="blas"):
-            found = chain.measure(image)
-        quality = judge_quality(image, found, depth, pattern.rows * pattern.columns)
-        sizes = found.measures if found.status == "ok" else None
-        surface = found.reconstruction if drawn and sizes is not None else None
-        scene = None if surface is None else scene_of(surface)
+        found, now_s = chain.measure(image), time.monotonic()
+        followed, ok = chain.broke is None, found.status == "ok"
+        if not (verdict and followed and ok and now_s < verdict[0][0] + JUDGED_S):
+            # It takes nearly half as long as measuring.
+            verdict[:] = [(now_s, judge_quality(image, found, depth, rays))]
+        surface = found.reconstruction if drawn and ok else None
         return LiveMeasurement(
-            found.status, found.reason, quality, sizes, chain.broke is None, scene
+            found.status,
+            found.reason,
+            verdict[0][1],
+            found.measures if ok else None,
+            followed,
+            None if surface is None else scene_of(surface),
         )
 
     _measure[:] = [measure]

@@ -405,7 +405,7 @@ class Run:
             f"another order, {found.wrong} with another content, times {found.off_us:.1f} µs off",
         )
         self._judge_memory(line)
-        least = min(self.rates(self.samples, 60), default=min(self.rates(self.samples), default=0))
+        least = min(self.rates(self.samples, min(60, len(self.samples) - 1)))
         line(least >= LEAST_UPDATES, f"{least:.1f} updates a second in the slowest minute")
         measured = self.samples[-1].measured - self.samples[0].measured
         rate = measured / (self.samples[-1].at_s - self.samples[0].at_s)

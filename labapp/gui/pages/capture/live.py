@@ -39,8 +39,8 @@ from labapp.words import several
 SIMULATED = "simulated"
 """Id of the simulated camera."""
 
-SHOW_S, LOOK_S = 0.025, 0.25
-"""Dots are looked for in a frame, and a frame is judged, no more often."""
+SHOW_S, LOOK_S, MEASURE_S = 0.025, 0.25, 0.0125
+"""Dots are looked for in a frame, a frame is judged, and one is measured no more often."""
 
 IDLE_S = 0.005
 
