@@ -26,7 +26,7 @@ DEAF_S = 0.5
 """A press that was learned does nothing besides: so long nothing else is heard."""
 
 DOES: dict[Action, str] = {
-    "trigger": "begin or end a recording",
+    "trigger": "record, or end it",
     "mark": "mark the moment",
     "next": "go to the next step",
 }
@@ -91,7 +91,7 @@ class Found:
             told.append(f"▲ May not be read: {', '.join(known)}.")
         if not told:
             told = ["No foot switch that is known is plugged in; any other can be learned."]
-        return " ".join(told)
+        return "\n".join(told)
 
 
 class FootSwitches(QObject):

@@ -33,8 +33,8 @@ APPART = 1e-3
 """What the camera takes is said where it is so far, as a part, from what was asked for."""
 
 PART_WORDS = (
-    "⚠ Calibrate the imaging plane with a picture of this very region: u and v of its dots count "
-    "from its upper left corner"
+    "⚠ Sizes are right only where the imaging plane was calibrated with a picture of this very "
+    "region: dots are counted from its upper left corner"
 )
 
 Apply = Callable[[CameraSettings], "Future[CameraSettings] | None"]

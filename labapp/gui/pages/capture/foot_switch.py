@@ -98,7 +98,7 @@ class FootSwitchPanel(QWidget):
         self.commands = QPlainTextEdit()
         self.commands.setReadOnly(True)
         self.commands.setTabChangesFocus(True)
-        self.commands.setWordWrapMode(QTextOption.WrapMode.WrapAnywhere)
+        self.commands.setWordWrapMode(QTextOption.WrapMode.WrapAtWordBoundaryOrAnywhere)
         self.commands.setFixedHeight(LINES * self.commands.fontMetrics().lineSpacing() + 14)
         self.commands.setAccessibleName("Commands that let you read it")
         self.commands.setToolTip("Type them in a terminal, then plug the device in anew")
@@ -153,7 +153,7 @@ class FootSwitchPanel(QWidget):
                     headed_by = key
                 name = pedal_name(pedal, held[key].keyboard)
                 field = self.pedals[key, pedal] = ChoiceField(
-                    name.capitalize(),
+                    name[:1].upper() + name[1:],
                     CHOICES,
                     tooltip=f"What {name} of {held[key].name} does",
                 )

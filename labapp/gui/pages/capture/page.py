@@ -431,13 +431,13 @@ class CapturePage(Page):
         self._make_kept()
         self.exposure.hide()
         self.panel_layout.addWidget(self.exposure)
+        self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
+        self.panel_layout.addWidget(self.foot_switch)
         self.told_group, layout = headed("What was read")
         self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
         self.told.setColumnStretch(1, 1)
         layout.addLayout(self.told)
         self.panel_layout.addWidget(self.told_group)
-        self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
-        self.panel_layout.addWidget(self.foot_switch)
         self.panel_layout.addStretch(1)
 
     def _make_missing(self) -> None:
