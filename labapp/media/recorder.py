@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import sys
 import threading
 import time
 from collections import deque
@@ -23,6 +24,10 @@ from labapp.words import several
 
 FRAME_BYTE = 200
 """What a frame takes in memory besides its levels, about."""
+
+SWITCH_S = 5e-4
+"""So soon a thread of Python gives way to another; after its own 5 ms a frame would be written
+slower than 200 of them come a second, while a window draws."""
 
 STALL_S = 1.0
 """A disk that takes longer for a frame is said to stall."""
@@ -173,6 +178,7 @@ class Recorder:
         self._closing = self._is_short = self._is_behind = False
         self._writing_since_s = float("inf")
         self._lost = Tally(self._tell_lost)
+        sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))
         self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
         self._thread.start()
 

@@ -432,7 +432,7 @@ class Run:
                 "was unplugged": truth.lost,
                 "it is back after": truth.lost,
                 "not whole, left out": truth.broken,
-                "writing does not keep up": self.stalls,
+                "MB wait in memory": self.stalls,
                 "writing has caught up": self.stalls,
             }
             found = {words: how_many(told, words) for words in wanted}

@@ -42,6 +42,9 @@ SIMULATED = "simulated"
 SHOW_S, LOOK_S, MEASURE_S = 0.025, 0.25, 0.0125
 """Dots are looked for in a frame, a frame is judged, and one is measured no more often."""
 
+LIGHT_S = 1.0
+"""Noise and size of the dots are told anew so often: it takes a seventh of a second."""
+
 IDLE_S = 0.005
 
 STATES = {
@@ -159,6 +162,7 @@ class Live:
         self._closing = threading.Event()
         self._turn = threading.Lock()
         self._light: Exposure | None = None
+        self._light_s = 0.0
         self._workers: list[threading.Thread] = []
 
     # --- begin and end ------------------------------------------------------------------------
@@ -266,7 +270,7 @@ class Live:
 
     def _find_quickly(self, frame: CameraFrame) -> None:
         light, places = self._light, None
-        if light is not None and light.noise.shape == frame.image.shape:
+        if light is not None and _fits(light, frame.image):
             places = _places_px(self._dots_in(frame.image, light))
         self._newest.append(Shown(frame, places))
 
@@ -281,8 +285,10 @@ class Live:
 
     def _judge(self, frame: CameraFrame) -> None:
         quick = self._dots.method == "band-pass"
-        if quick:
+        now_s, known = time.monotonic(), self._light
+        if quick and (known is None or now_s > self._light_s or not _fits(known, frame.image)):
             self._light = Exposure.of(frame.image, self._dots.band_pass)
+            self._light_s = now_s + LIGHT_S
         dots = self._dots_in(frame.image, self._light)
         found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
         depth = None if self.feed is None else self.feed.bit_depth
@@ -416,6 +422,10 @@ class Live:
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
         """Set the camera between two frames; what it is set to is answered when it is."""
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
+
+
+def _fits(light: Exposure, image: GreyImage) -> bool:
+    return light.noise.shape == image.shape
 
 
 def _places_px(dots: Dots | None) -> FloatArray:
