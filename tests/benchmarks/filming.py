@@ -91,7 +91,7 @@ class FilmedDevice(SimulatedDevice):
     def __init__(self, film: Callable[[int], GreyImage], rate_hz: float, most: int) -> None:
         self.truth = Truth(most)
         self._film = film
-        self._is_noise = np.zeros(most, bool)
+        self.is_noise = np.zeros(most, bool)
         self._noises: list[GreyImage] = []
         super().__init__("pool", self._numbered, rate_hz=rate_hz)
 
@@ -101,11 +101,11 @@ class FilmedDevice(SimulatedDevice):
         shape = self._film(0).shape
         self._noises = [random.integers(0, 256, shape, np.uint8) for _ in range(NOISES)]
         first = self.taken + 10
-        self._is_noise[first:] = random.uniform(size=len(self._is_noise))[first:] < noise
+        self.is_noise[first:] = random.uniform(size=len(self.is_noise))[first:] < noise
         self.faults = faults
 
     def _numbered(self, k: int) -> GreyImage:
-        noisy = self._is_noise[k]
+        noisy = self.is_noise[k]
         return numbered(self._noises[k % NOISES] if noisy else self._film(k), k)
 
     def open(self) -> SimulatedCamera:

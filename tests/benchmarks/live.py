@@ -30,7 +30,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from filming import (
@@ -83,8 +83,8 @@ class Sample(NamedTuple):
         By the camera, to its reader, by the window's feed, to the file; lost by the recorder.
     waiting_mb
         What waits for the disk, or for a trigger.
-    measured, good
-        Frames measured, and those of them that have a surface.
+    measured, good, cold
+        Frames measured, those of them that have a surface, and those measured by themselves.
     age_s
         Of the frame that the newest figures are of.
     updates, longest_s
@@ -104,6 +104,7 @@ class Sample(NamedTuple):
     waiting_mb: float
     measured: int
     good: int
+    cold: int
     age_s: float
     updates: int
     longest_s: float
@@ -115,17 +116,24 @@ class Sample(NamedTuple):
 class Measured:
     """Keeps account of what is measured."""
 
-    frames = good = newest = 0
+    frames = good = cold = newest = 0
+    noise: ClassVar[list[tuple[int, str]]] = []
+    """Numbers of the frames of noise that were measured, and what that gave."""
 
     @classmethod
-    def counted(cls, measure: Callable[..., Any]) -> Callable[..., Any]:
+    def counted(
+        cls, measure: Callable[..., Any], is_noise: Callable[[int], bool]
+    ) -> Callable[..., Any]:
         """The same, counted."""
 
         def counting(measuring: LiveMeasuring, image: Any, *given: Any) -> Any:
             found = measure(measuring, image, *given)
             cls.frames += 1
             cls.good += found.status == "ok"
+            cls.cold += not found.followed
             cls.newest = number_in(image)
+            if is_noise(cls.newest):
+                cls.noise.append((cls.newest, found.status))
             return found
 
         return counting
@@ -247,7 +255,8 @@ class Run:
 
         live_view.pool_camera = filmed
         live_module.Recorder = partial(Recorder, writer=writer)
-        LiveMeasuring.measure = Measured.counted(LiveMeasuring.measure)
+        counted = Measured.counted(LiveMeasuring.measure, lambda k: self.device.is_noise[k])
+        LiveMeasuring.measure = counted
 
     def _hear(self, _: object, first: int, last: int) -> None:
         self.said += [self.log.item(row).text() for row in range(first, last + 1)]
@@ -335,6 +344,7 @@ class Run:
                 self.live._recorders[-1].waiting_mb,
                 Measured.frames,
                 Measured.good,
+                Measured.cold,
                 now_s - truth.arrived_s[min(place, given - 1)],
                 self.painted.updates,
                 self.painted.longest_s(),
@@ -350,10 +360,10 @@ class Run:
         """A row of the table, of the samples of a minute."""
         if len(self.samples) <= 61:
             print(
-                "  min   made  given  taken written lost waiting  measured  without  age,most"
-                "  updates,least longest  window measuring  cores load\n"
-                "                                          at most  a second  surface         s"
-                "       a second       s      MB        MB"
+                "  min   made  given  taken written lost waiting  measured  by itself,without"
+                "  age,most  updates,least longest  window measuring  cores load\n"
+                "                                          at most  a second          surface"
+                "         s       a second       s      MB        MB"
             )
         first, last = samples[0], samples[-1]
         lasted_s = last.at_s - first.at_s
@@ -364,7 +374,7 @@ class Run:
         print(
             f"{(last.at_s - self.begun_s) / 60:5.1f} {made[0]:6} {made[1]:6} {made[2]:6} "
             f"{made[3]:7} {made[4]:4} {max(each.waiting_mb for each in samples):4.0f} MB "
-            f"{measured / lasted_s:9.1f} {measured - good:8} "
+            f"{measured / lasted_s:9.1f} {last.cold - first.cold:10},{measured - good:7} "
             f"{np.median(ages):4.1f},{max(ages):4.1f} "
             f"{(last.updates - first.updates) / lasted_s:8.1f},{least:5.1f} "
             f"{max(each.longest_s for each in samples[1:]):7.2f} {last.window_mb:7.0f} "
@@ -410,6 +420,8 @@ class Run:
         measured = self.samples[-1].measured - self.samples[0].measured
         rate = measured / (self.samples[-1].at_s - self.samples[0].at_s)
         line(measured > 0, f"{measured} measured, {rate:.1f} a second")
+        fooled = [k for k, status in Measured.noise if status == "ok"]
+        line(not fooled, f"{len(Measured.noise)} of noise, surfaces given to them: {len(fooled)}")
         self._judge_words(take, line)
         return all(all_right)
 
