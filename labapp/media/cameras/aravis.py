@@ -45,8 +45,8 @@ BROKEN = {
 }
 """What is wrong with a frame, by Aravis's status."""
 
-SOURCES: dict[Trigger, bytes] = {"software": b"Software", "line": b"Line1"}
-"""The triggers, by GenICam's names."""
+SOFTWARE, USUAL_LINE = b"Software", b"Line1"
+"""What a trigger may come from, by GenICam's names."""
 
 LARGEST_SHORT_ID = 0xFFFF
 """GigE Vision numbers frames from 1 to this and begins again, unless it has 64 bits for it."""
@@ -97,6 +97,8 @@ class GenicamCamera(Camera):
             raise CameraLost(f"{info.name} cannot be opened: {error}") from error
         self._stream: _Stream | None = None
         self._is_lost = False
+        self._line = b""
+        """The input that a trigger's signal is taken from; empty where there is none."""
         self._hook = 0
         self._on_lost = ControlLost(self._note_loss)
         try:
@@ -105,6 +107,9 @@ class GenicamCamera(Camera):
             self.bit_depth = self._choose_format()
             for name in ("exposure", "gain"):
                 self._switch_auto_off(name)
+            sources = self._aravis.texts(self._camera, "dup_available_trigger_sources")
+            lines = [name for name in sources if name.startswith(b"Line")]
+            self._line = USUAL_LINE if USUAL_LINE in lines else b"".join(lines[:1])
             self.limits = self._limits()
         except BaseException:
             self.close()
@@ -153,7 +158,7 @@ class GenicamCamera(Camera):
             check_settings(self.info, self.limits, CameraSettings(rate_hz=wanted.rate_hz))
             self._ask("set_frame_rate", wanted.rate_hz)
         if wanted.trigger is not None and wanted.trigger != "free":
-            self._ask("set_trigger", SOURCES[wanted.trigger])
+            self._ask("set_trigger", SOFTWARE if wanted.trigger == "software" else self._line)
         elif wanted.trigger is not None and len(self.limits.triggers) > 1:
             self._ask("clear_triggers")
         self.limits = self._limits()
@@ -177,7 +182,8 @@ class GenicamCamera(Camera):
         if self._ask("is_feature_available", b"TriggerMode"):
             if self._ask("is_software_trigger_supported"):
                 triggers.append("software")
-            triggers.append("line")
+            if self._line:
+                triggers.append("line")
         width, _ = self._aravis.pair(self._camera, "get_width_bounds")
         height, _ = self._aravis.pair(self._camera, "get_height_bounds")
         return Limits(
@@ -193,7 +199,7 @@ class GenicamCamera(Camera):
         if "line" not in self.limits.triggers or self._ask("get_string", b"TriggerMode") != b"On":
             return "free"
         source = self._ask("get_string", b"TriggerSource")
-        return "software" if source == SOURCES["software"] else "line"
+        return "software" if source == SOFTWARE else "line"
 
     def _choose_format(self) -> int:
         """Bits of the pixel format: the camera's own where it is grey, else that with 8 bits."""

@@ -79,6 +79,7 @@ OF_CAMERA: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "get_string": (c_char_p, (c_char_p,)),
     "is_feature_available": (c_int, (c_char_p,)),
     "is_software_trigger_supported": YES,
+    "dup_available_trigger_sources": (c_void_p, (POINTER(c_uint),)),
     "set_trigger": (VOID, (c_char_p,)),
     "clear_triggers": (VOID, ()),
     "software_trigger": (VOID, ()),
@@ -124,6 +125,8 @@ class Aravis:
         self._gobject.g_object_unref.restype = None
         self._glib.g_error_free.argtypes = (c_void_p,)
         self._glib.g_error_free.restype = None
+        self._glib.g_free.argtypes = (c_void_p,)
+        self._glib.g_free.restype = None
         connect = self._gobject.g_signal_connect_data
         connect.argtypes = (c_void_p, c_char_p, ControlLost, c_void_p, c_void_p, c_int)
         connect.restype = ctypes.c_ulong
@@ -154,6 +157,18 @@ class Aravis:
         first, second = kind(), kind()
         self.ask(camera, name, byref(first), byref(second))
         return first.value, second.value
+
+    def texts(self, camera: int, name: str) -> list[bytes]:
+        """Call arv_camera_NAME, which gives texts; none where the camera has no such feature."""
+        count = c_uint()
+        try:
+            found = self.ask(camera, name, byref(count))
+        except CameraError:
+            return []
+        texts = ctypes.cast(found, POINTER(c_char_p))
+        told = [texts[k] or b"" for k in range(count.value)]
+        self._glib.g_free(found)
+        return told
 
     def release(self, thing: int) -> None:
         """Let go of a camera, a stream or a buffer."""

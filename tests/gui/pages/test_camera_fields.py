@@ -119,7 +119,7 @@ def test_a_value_that_the_camera_rounds_is_told(page: CapturePage, fields, devic
     qtbot.waitUntil(lambda: device.settings.exposure_us == 900 and not fields.waiting)
     assert problem(exposure) == ""
     Hand(page.window()).enter(exposure, "9000")
-    assert problem(exposure) == "⚠ “9000” is not from 20 to 5000 µs; 900 stays"
+    assert problem(exposure) == "⚠ “9000” is not from 20 to 5000 µs; 900.0 stays"
     assert device.settings.exposure_us == 900
 
 

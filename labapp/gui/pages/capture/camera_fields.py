@@ -17,7 +17,7 @@ from labapp.gui.views.fields import ChoiceField, Field, FieldForm, NumberField, 
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
 
 NUMBERS = {
-    "exposure_us": ("Exposure", "µs", 0, 100.0, "How long light is gathered for a frame"),
+    "exposure_us": ("Exposure", "µs", 1, 100.0, "How long light is gathered for a frame"),
     "gain_db": ("Gain", "dB", 1, 1.0, "Amplification: it brightens the noise, too"),
     "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames a second"),
 }
