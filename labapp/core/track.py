@@ -23,7 +23,7 @@ from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
 from labapp.core.spline import SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
-from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, lay, met
+from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, met
 from labapp.core.warm_match import around, filled, tracked
 
 FOUND = 0.85
@@ -36,8 +36,9 @@ FIRST_RING, GROWING_ROUNDS, GROWN_FROM = 2, 3, 12
 """Where no prediction finds the dots, they are first looked for so near the absent one, in so many
 rounds a ring, from so many surfaces of the past."""
 
-MEMORY, ORDER = 48, 4
-"""Frames that predictions are learnt from, and how many of them one is made from."""
+MEMORY, ORDER, TEACHERS = 32, 8, 3
+"""Frames that predictions are learnt from, and from how many of them, at most, one is made; every
+so-many-th lit ray tells as much as all."""
 
 
 class Broken(Exception):
@@ -60,9 +61,9 @@ class Track:
         Root mean square residual there, mm.
     pool, lit, boundary, level
         The last surface, the rays that had dots, where the pool ends, and z = 0.
-    past, heights_mm
-        Spline coefficients of the last frames, the newest last, shape (frames, p), and the heights
-        of those surfaces where rays land, shape (frames, R), mm.
+    past, slopes
+        Spline coefficients of the last frames, the newest last, shape (frames, p), mm, and the
+        slopes of those surfaces where rays met them, shape (frames, R, 2).
     open_mm
         How far the level was left open when it was last asked how deep the rear lies, mm.
     free_mm
@@ -83,7 +84,7 @@ class Track:
     boundary: Boundary
     level: Level
     past: FloatArray
-    heights_mm: FloatArray
+    slopes: FloatArray
     open_mm: float
     free_mm: FloatArray
     unseen: int = 0
@@ -112,8 +113,10 @@ def begin(
     told = witness != 0
     surface = SplineSurface(bed.basis, pool.coefficients)
     level = find_level(surface, bed.landing_mm[told, :2], witness[told], bed.spacing_mm)
-    past = np.empty((0, len(pool.coefficients))) if former is None else former.past[1 - MEMORY :]
-    past = np.vstack([past, pool.coefficients])
+    if former is None:
+        past, before = np.empty((0, len(pool.coefficients))), np.empty((0, *pool.slopes.shape))
+    else:
+        past, before = former.past[1 - MEMORY :], former.slopes[1 - MEMORY :]
     return Track(
         bed=bed,
         exposure=Exposure.of(image, settings.dots.band_pass),
@@ -123,8 +126,8 @@ def begin(
         lit=witness > 0,
         boundary=made.boundary,
         level=level,
-        past=past,
-        heights_mm=np.stack([lay(bed, coefficients)[0] for coefficients in past]),
+        past=np.vstack([past, pool.coefficients]),
+        slopes=np.concatenate([before, pool.slopes[None]]),
         open_mm=level.sigma_mm,
         free_mm=np.full(len(bed.at), np.nan),
     )
@@ -160,19 +163,19 @@ def predictions(track: Track) -> Iterator[FloatArray]:
     """Spline coefficients that the next frame may have, the likeliest first.
 
     A pool that swings goes on as it did: a linear recurrence, learnt from the frames before on the
-    heights where lit rays land, carries any few oscillations on.
+    slopes at lit rays, carries any few oscillations on.
     """
-    past = track.past
-    if len(past) > ORDER + 2:
-        heights = track.heights_mm[:, track.lit]
-        heights = heights - heights.mean(axis=0)
-        count = len(past) - ORDER
-        steps = np.stack([heights[ORDER - k - 1 :][:count].ravel() for k in range(ORDER)])
+    past, order = track.past, min(ORDER, len(track.past) // 2)
+    if order > 2:
+        slopes = track.slopes[:, np.flatnonzero(track.lit)[::TEACHERS]]
+        slopes = slopes - slopes.mean(axis=0)
+        count = len(past) - order
+        steps = np.stack([slopes[order - k - 1 :][:count].ravel() for k in range(order)])
         gram = steps @ steps.T
-        gram[np.diag_indices(ORDER)] += 1e-4 * np.trace(gram)
-        ratio = np.linalg.solve(gram, steps @ heights[ORDER:].ravel())
+        gram[np.diag_indices(order)] += 1e-4 * np.trace(gram)
+        ratio = np.linalg.solve(gram, steps @ slopes[order:].ravel())
         mean = past.mean(axis=0)
-        yield mean + ratio @ (past[: -ORDER - 1 : -1] - mean)
+        yield mean + ratio @ (past[: -order - 1 : -1] - mean)
     if len(past) > 1:
         yield 2 * past[-1] - past[-2]
     yield past[-1]

@@ -58,6 +58,10 @@ ROUGHLY_MM = 0.03
 """Where no reflection point moved by more, what is left to move does not change which dots have
 which rays."""
 
+WIDENINGS, MANY = 3, 4
+"""Where so many dots at once are found to have rays, others beyond them may: it is looked again, so
+often at most."""
+
 RAISED_MM = 0.01
 """After a shift of the level by more, the slopes are fitted once more."""
 
@@ -112,8 +116,8 @@ class WarmChain:
             self._track = begin(image, measurement, self.rig, self.settings, self._track)
         elif self._track is not None:
             track, unseen = self._track, self._track.unseen + 1
-            past, heights = track.past[-1:], track.heights_mm[-1:]
-            kept = replace(track, unseen=unseen, past=past, heights_mm=heights)
+            past, slopes = track.past[-1:], track.slopes[-1:]
+            kept = replace(track, unseen=unseen, past=past, slopes=slopes)
             self._track = kept if unseen <= HELD else None
         return measurement
 
@@ -180,7 +184,7 @@ def follow(
         boundary=reconstruction.boundary,
         level=level,
         past=np.vstack([track.past[1 - MEMORY :], pool.coefficients]),
-        heights_mm=np.vstack([track.heights_mm[1 - MEMORY :], lay(bed, pool.coefficients)[0]]),
+        slopes=np.concatenate([track.slopes[1 - MEMORY :], pool.slopes[None]]),
         open_mm=open_mm,
         unseen=unseen,
         count=track.count + 1,
@@ -200,11 +204,14 @@ def _fitted(
 ) -> tuple[WarmPool, IntArray, FloatArray]:
     """Fit the surface, roughly first, and then with the labels that it bears out."""
     slopes = _slopes(bed, scene, labels)
-    if widen:
+    for _ in range(WIDENINGS if widen else 0):
         pool, lower, _ = fit_slopes_to(bed, pool, slopes, until_mm=ROUGHLY_MM)
-        wider = widened(bed, scene, pool, lower, labels)
-        if not np.array_equal(wider, labels):
-            labels, slopes = wider, _slopes(bed, scene, wider)
+        before, labels = labels, widened(bed, scene, pool, lower, labels)
+        if np.array_equal(labels, before):
+            break
+        slopes = _slopes(bed, scene, labels)
+        if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
+            break
     pool, lower, moved = fit_slopes_to(bed, pool, slopes)
     if not moved < UNSETTLED_MM:
         raise Broken("the surface does not settle")
