@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from PySide6.QtCore import QObject, QTimer, Signal
+from PySide6.QtWidgets import QApplication
 
 from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task, Tasks
@@ -216,7 +217,13 @@ class FootSwitches(QObject):
                     self.look()  # what it may not be read for
                 self.changed.emit()
             elif not deaf:
-                self.pressed.emit(CALLS[heard])
+                self._do(heard)
+
+    def _do(self, action: Action) -> None:
+        if action == "next" and QApplication.activeModalWidget() is not None:
+            self.said.emit("The pedal goes to the next step when the question is answered", False)
+        else:
+            self.pressed.emit(CALLS[action])
 
     # --- to find and learn them ---------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QApplication
+from PySide6.QtWidgets import QApplication, QDialog
 from pytestqt.qtbot import QtBot
 
 from labapp.gui import foot_switches
@@ -225,6 +225,22 @@ def test_pedals_act_on_the_live_recording_whatever_page_is_in_view(
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     bench.press(INFINITY, *LEFT)
     qtbot.waitUntil(lambda: "No camera is watched: start one in the step" in said_in(window))
+
+
+def test_a_question_is_answered_before_the_next_step(start, bench: Bench, copy_sample, qtbot):
+    window = start(LEARNED)
+    window.files.open(copy_sample("thumb_tack"))
+    panel_of(window)
+    qtbot.waitUntil(connected(window))
+    question = QDialog(window)
+    question.open()
+    bench.press(INFINITY, *RIGHT)
+    qtbot.waitUntil(lambda: "when the question is answered" in said_in(window))
+    assert window.page.key == "capture"
+    question.close()
+    bench.press(INFINITY, *RIGHT)
+    qtbot.waitUntil(lambda: window.page.key == "dots")
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
 def test_unplugged_is_said_and_it_comes_back_by_itself(start, bench: Bench, copy_sample, qtbot):

@@ -134,8 +134,9 @@ def take_frames(hand: Hand, qtbot: QtBot, recording: Path) -> None:
     capture = page(hand, CapturePage)
     hand.answer(recording)
     hand.button("Choose a file …")
-    qtbot.waitUntil(capture.chosen.isVisible)
-    for field, number in zip((capture.chosen.first, capture.chosen.last, capture.chosen.every), FRAMES, strict=True):
+    chosen = capture.chosen
+    qtbot.waitUntil(chosen.isVisible)
+    for field, number in zip((chosen.first, chosen.last, chosen.every), FRAMES, strict=True):
         hand.enter(field, str(number))
     settle(hand, qtbot)
     hand.button("Import")

@@ -109,6 +109,14 @@ def test_only_what_the_camera_has_is_shown(fields: CameraFields):
     assert fields.trigger.editor.count() == 2
 
 
+def test_the_gain_of_usb_video_has_no_unit(fields: CameraFields, monkeypatch: pytest.MonkeyPatch):
+    assert fields.fields["gain_db"].unit.text() == "dB"
+    camera = fields._feed.camera
+    monkeypatch.setattr(camera, "info", replace(camera.info, kind="USB video"))
+    fields.show_camera(fields._feed)
+    assert fields.fields["gain_db"].unit.text() == ""
+
+
 def test_a_value_that_the_camera_rounds_is_told(page: CapturePage, fields, device, qtbot: QtBot):
     exposure = fields.fields["exposure_us"]
     Hand(page.window()).enter(exposure, "804")
@@ -176,6 +184,7 @@ def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, dev
     hand.choose(fields.trigger, "when told: Take a frame")
     qtbot.waitUntil(lambda: device.settings.trigger == "software" and not fields.waiting)
     qtbot.waitUntil(fields.shoot_button.isVisible)
+    qtbot.waitUntil(lambda: view.state.text().startswith("● Live, takes a frame when it is told"))
     taken = device.taken
     for count in (1, 2, 3):
         hand.click(fields.shoot_button)

@@ -15,6 +15,7 @@ from labapp.errors import InputError
 from labapp.gui.pages.capture.parts import button, wrapped
 from labapp.gui.views.fields import ChoiceField, Field, FieldForm, NumberField, TextField
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
+from labapp.media.cameras.uvc import KIND
 
 NUMBERS = {
     "exposure_us": ("Exposure", "µs", 1, 100.0, "How long light is gathered for a frame"),
@@ -103,6 +104,8 @@ class CameraFields(QObject):
         """Show what a camera that was opened is set to, and only what it lets be set."""
         self._feed = feed
         self._answers.clear()
+        own_steps = feed.camera.info.kind == KIND  # which its driver does not tell in dB
+        self.fields["gain_db"].unit.setText("" if own_steps else NUMBERS["gain_db"][1])
         self._show(feed.settings, feed.camera.limits)
 
     def set_recording(self, recording: bool) -> None:

@@ -55,6 +55,12 @@ STATES = {
     "ended": ("▲", "It has ended: start it again"),
 }
 
+WAITS = {
+    "software": "Live, takes a frame when it is told to",
+    "line": "Live, takes a frame at a signal on its input",
+}
+"""Of a camera that takes none by itself, by its trigger."""
+
 _Work = tuple[str, Callable[[], CameraFrame | None], Callable[[CameraFrame], None], float, float]
 """What a thread does: its name, which frame is next, what is done with it, how often at most, and
 how long it rests, of what that took."""
@@ -340,6 +346,8 @@ class Live:
         state = "opening" if self.feed is None else self.feed.state
         rate = self.rate_hz()
         sign, words = STATES[state]
+        if state == "running" and self.feed is not None:
+            words = WAITS.get(self.feed.settings.trigger or "", words)
         fast = f", {rate:.1f} frames/s" if state == "running" and rate is not None else ""
         return f"{sign} {words}{fast}"
 
