@@ -22,7 +22,7 @@ head_mm = 3.0
 tail_mm = 4.4
 height_mm = 0.29
 center_mm = [0.0, -0.6]
-wander_percent = 2.0
+wander_percent = 0.3
 
 [[pool.wave]]
 mode = [0, 1]

@@ -10,6 +10,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox, QTabBar, QToolButton
 
 from labapp.gui.pages.capture import CapturePage
+from labapp.gui.pages.capture.live_canvas import PARTS
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.plane import PlanePage
@@ -146,6 +147,8 @@ def _record(hands: Hands, files: Path) -> None:
     hands.press("Import")
     hands.picture("imported")
     hands.asked("import", lambda: hands.do("import"))
+    hands.press("Look for devices")
+    hands.picture("foot-switch")
 
 
 def _film(hands: Hands) -> None:
@@ -157,12 +160,35 @@ def _film(hands: Hands) -> None:
     hands.wait(lambda: view.ring.value() == 100, "the seconds before a trigger")
     hands.wait(lambda: view.measured_s, "a live frame to be measured")
     hands.picture("live")
+    _look_on(hands, page)
     hands.press("● Record")
     hands.wait(lambda: view.live and view.live.takes[0].frames > 150, "frames to be recorded")
     hands.picture("recording")
     hands.press("■ End the recording")
     hands.press("Stop the camera")
     hands.settle()
+    hands.picture("second")
+    hands.asked("next-session", lambda: hands.press("New session from this recording …"))
+
+
+def _look_on(hands: Hands, page: CapturePage) -> None:
+    """The live pool in 3-D, its trend, a limit that it passes, and who can be told."""
+    canvas = page.live_view.canvas
+    surface, streams = (list(PARTS).index(part) for part in ("surface", "streams"))
+    canvas.tabs.setCurrentIndex(surface)
+    hands.wait(lambda: canvas.surface.view.scene, "a live surface")
+    hands.picture("live-surface")
+    canvas.tabs.setCurrentIndex(list(PARTS).index("trends"))
+    hands.enter("Width, highest", "6.5")
+    hands.wait(canvas.alarms.isVisible, "an alarm")
+    hands.picture("live-alarm", trouble=True)
+    hands.press("Acknowledge")
+    hands.enter("Width, highest", "9")
+    hands.wait(lambda: not canvas.alarms.isVisible(), "the alarm to go")
+    hands.read()
+    canvas.tabs.setCurrentIndex(streams)
+    hands.picture("live-control")
+    canvas.tabs.setCurrentIndex(0)
 
 
 def _measure(hands: Hands) -> None:

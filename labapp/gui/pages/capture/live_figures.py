@@ -210,6 +210,7 @@ class AlarmStrip(QFrame):
         )
         self.button.setMinimumHeight(ACKNOWLEDGE_PX)
         row = QHBoxLayout(self)
+        row.setContentsMargins(6, 2, 6, 2)
         row.addWidget(self.words, 1)
         row.addWidget(self.button)
         self.hide()

@@ -66,7 +66,7 @@ class LiveStreams(QWidget):
         group, layout = headed("Tell control software every frame that is measured")
         outer.addWidget(group)
         grid = QGridLayout()
-        grid.setColumnStretch(2, 1)
+        grid.setColumnStretch(3, 1)
         layout.addLayout(grid)
         for row, (kind, (words, port, tip)) in enumerate(KINDS.items()):
             box = self.boxes[kind] = QCheckBox(words)
@@ -77,11 +77,11 @@ class LiveStreams(QWidget):
             )
             field.editor.setAccessibleName(f"Port of {words}")
             field.set_value(port)
-            field.setMaximumWidth(PORT_PX)
+            field.setFixedWidth(PORT_PX)
             field.edited.connect(partial(self._again, kind))
             for column, widget in enumerate((box, field.label, field)):
                 grid.addWidget(widget, 2 * row, column)
-            grid.addWidget(self.words[kind], 2 * row + 1, 0, 1, 3)
+            grid.addWidget(self.words[kind], 2 * row + 1, 0, 1, 4)
         self.anywhere = QCheckBox("Other machines may connect")
         self.anywhere.setToolTip("Otherwise only programs on this machine can")
         self.anywhere.toggled.connect(lambda _: self._open_to_all())

@@ -26,8 +26,8 @@ GAP_S = 0.5
 
 MARKS = PLAIN, Mark("▪", "beyond its limit")
 
-WIDE = 100
-"""So many letters wide it must be for all fields to stand beside each other."""
+ROOM_PX = 40
+"""All fields stand beside each other where so much is left beside them."""
 
 RULE = (
     "An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ±, or when so "
@@ -123,8 +123,9 @@ class LiveTrends(QWidget):
         layout.addWidget(self.plots, 1)
         self._below = QBoxLayout(QBoxLayout.Direction.TopToBottom)
         self._below.setContentsMargins(8, 0, 8, 0)
-        self._below.addLayout(self._limits(), 3)
-        self._below.addWidget(self._others(), 2, Qt.AlignmentFlag.AlignTop)
+        self._parts = limits, others = self._limits(), self._others()
+        self._below.addLayout(limits, 3)
+        self._below.addWidget(others, 2, Qt.AlignmentFlag.AlignTop)
         layout.addLayout(self._below)
         workspace.changed.connect(self.refresh)
 
@@ -145,14 +146,19 @@ class LiveTrends(QWidget):
         form = FieldForm()
         for field in (self.last, self.unmeasured):
             form.add(field)
+        form.setMinimumWidth(form.minimumSizeHint().width())
         return form
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Put all fields beside each other where there is room."""
         super().resizeEvent(event)
         way = QBoxLayout.Direction
-        is_wide = self.width() > WIDE * self.fontMetrics().averageCharWidth()
+        is_wide = self.width() >= sum(part.minimumSize().width() for part in self._parts) + ROOM_PX
         self._below.setDirection(way.LeftToRight if is_wide else way.TopToBottom)
+
+    def heightForWidth(self, _width: int) -> int:
+        """Be as low as there is room for: the plots scroll in themselves."""
+        return self.minimumSizeHint().height()
 
     # --- what it shows ------------------------------------------------------------------------
 

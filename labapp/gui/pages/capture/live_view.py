@@ -15,9 +15,16 @@ from labapp.core.values import FloatArray
 from labapp.gui.pages.capture.camera_fields import CameraFields
 from labapp.gui.pages.capture.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.pages.capture.live_canvas import LiveCanvas
-from labapp.gui.pages.capture.live_figures import NO_SETUP, LiveFigures, figures, pace_in_words
+from labapp.gui.pages.capture.live_figures import (
+    NO_SETUP,
+    OLD_S,
+    LiveFigures,
+    figures,
+    pace_in_words,
+)
 from labapp.gui.pages.capture.parts import ExposureBars, button, show_recording, wrapped
 from labapp.gui.pages.capture.plan_fields import PlanFields
+from labapp.gui.pages.capture.presenter import calibrated_px
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm
 from labapp.gui.views.labels import headed
@@ -189,7 +196,10 @@ class LiveView(QObject):
     def _opened(self, live: Live) -> None:
         if self.live is not live or live.feed is None:
             return
-        self.camera_fields.show_camera(live.feed)
+        session = self.workspace.session
+        self.camera_fields.show_camera(
+            live.feed, None if session is None else calibrated_px(session)
+        )
         self._room_byte = None
         self._rings.setData([])
         self.measured_s, self._followed = 0.0, None
@@ -320,11 +330,11 @@ class LiveView(QObject):
         """Show what was measured since it was asked last."""
         followed = watch.newest()
         if followed is not None:
-            former, self._followed = self._followed, followed
-            self.measured_s = time.monotonic()
+            former, was_old = self._followed, self._age_s > OLD_S
+            self._followed, self.measured_s = followed, time.monotonic()
             self._show_figures(watch)
-            if former is None or former.found.status != followed.found.status:
-                self._told_s = 0.0  # why there is a figure no more is said at once
+            if was_old or former is None or former.found.status != followed.found.status:
+                self._told_s = 0.0  # what is said of the figures goes with them
             self._show_quality(followed.found.quality)
         self.updates += self.canvas.follow(followed, watch)
 
