@@ -159,6 +159,11 @@ def test_a_region_is_what_is_seen_and_recorded(page: CapturePage, fields, device
     assert fields.region.value() == "8, 4, 32, 20"
     assert fields.part_words.isVisible()
     qtbot.waitUntil(lambda: np.shape(page.picture_view.picture) == (20, 32))
+    assert "with a picture of this very region" in fields.part_words.text()
+    fields.show_camera(view.live.feed, (20, 32))  # it may have been of another place
+    assert "with a picture of this very region" in fields.part_words.text()
+    fields.show_camera(view.live.feed, SHAPE)
+    assert "a picture of 64×48 px, and frames have 32×20 px" in fields.part_words.text()
     # The seconds before the trigger are of the new size, too.
     view.trigger()
     assert not fields.region.editor.isEnabled()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PySide6.QtWidgets import QAbstractButton
+from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
 from labapp.core.detection import DotSettings
@@ -24,9 +24,11 @@ from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
     bars,
+    calibrated_px,
     choice_in_words,
     look,
     missing_in_words,
+    other_size,
     recording_in_words,
     refusal,
     size_in_words,
@@ -34,6 +36,7 @@ from labapp.gui.pages.capture.presenter import (
 from labapp.gui.steps import Mark, State
 from labapp.gui.window import MainWindow
 from labapp.gui.workspace import Workspace
+from labapp.session.copies import next_session
 from labapp.session.record import Record
 from labapp.session.session import Session
 from tests.gui.conftest import CopySample
@@ -270,6 +273,7 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     assert not page.chosen.isVisible()
     page.take(first.parent / "recording.tif")
     qtbot.waitUntil(lambda: page.preview is not None)
+    assert "wants a session of its own" in page.chosen.replace_words.text()
     assert page.chosen.replace_words.isVisible()
     second = tmp_path / "second.labsession"
     hand.answer(second)
@@ -304,3 +308,38 @@ def test_a_new_session_that_is_given_up_changes_nothing(
     page.chosen.next_button.click()
     assert window.workspace.session is former
     assert window.status_line.unread
+
+
+# --- calibrated with another region ---------------------------------------------------------------
+
+
+def test_frames_of_another_size_than_the_calibration_picture_are_told(
+    window: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
+):
+    first = copy_sample("thumb_tack")
+    with Session.open(first) as measured:
+        next_session(measured, tmp_path / "next.labsession").close()
+    window.files.open(tmp_path / "next.labsession")
+    window.show_step("capture")
+    page, session = window.page, window.workspace.session
+    assert calibrated_px(session) == (480, 460)
+    session.import_recording(first.parent / "recording.tif")
+    window.workspace.changed.emit()
+
+    def told() -> str:
+        return " ".join(label.text() for label in page.told_group.findChildren(QLabel))
+
+    qtbot.waitUntil(lambda: "recording.tif" in told())
+    assert "calibrated with" not in told()
+    half = tmp_path / "half.npy"
+    np.save(half, np.zeros((2, 240, 460), np.uint8))
+    session.import_recording(half)
+    window.workspace.changed.emit()
+    qtbot.waitUntil(lambda: "a picture of 460×480 px, and frames have 460×240 px" in told())
+    # A calibration that is not in use tells nothing.
+    point = {"image_calibration": {"origin_px": [1.0, 2.0]}}
+    window.workspace.attempt(lambda session: session.update_setup(point))
+    assert calibrated_px(session) is None
+    qtbot.waitUntil(lambda: "calibrated with" not in told())
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert other_size(None, (1, 2)) == other_size((1, 2), (1, 2)) == ""

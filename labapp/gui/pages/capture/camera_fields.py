@@ -13,6 +13,7 @@ from PySide6.QtWidgets import QHBoxLayout, QWidget
 
 from labapp.errors import InputError
 from labapp.gui.pages.capture.parts import button, wrapped
+from labapp.gui.pages.capture.presenter import other_size
 from labapp.gui.views.fields import ChoiceField, Field, FieldForm, NumberField, TextField
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
 from labapp.media.cameras.uvc import KIND
@@ -34,7 +35,7 @@ APPART = 1e-3
 """What the camera takes is said where it is so far, as a part, from what was asked for."""
 
 PART_WORDS = (
-    "⚠ Sizes are right only where the imaging plane was calibrated with a picture of this very "
+    "Sizes are right only where the imaging plane was calibrated with a picture of this very "
     "region: dots are counted from its upper left corner"
 )
 
@@ -63,6 +64,7 @@ class CameraFields(QObject):
         super().__init__(form)
         self._apply = apply
         self._feed: Feed | None = None
+        self._calibrated: tuple[int, int] | None = None
         self._answers: list[tuple[str, object, Future[CameraSettings]]] = []
         self.fields: dict[str, Field] = {}
         for name, (label, unit, decimals, step, tip) in NUMBERS.items():
@@ -95,14 +97,23 @@ class CameraFields(QObject):
         for each in (self.shoot_button, self.whole_button):
             line.addWidget(each)
         form.add_wide(row)
-        self.part_words = wrapped(PART_WORDS)
+        self.part_words = wrapped()
         form.add_wide(self.part_words)
 
     # --- what the camera is set to ------------------------------------------------------------
 
-    def show_camera(self, feed: Feed) -> None:
-        """Show what a camera that was opened is set to, and only what it lets be set."""
-        self._feed = feed
+    def show_camera(self, feed: Feed, calibrated: tuple[int, int] | None = None) -> None:
+        """Show what a camera that was opened is set to, and only what it lets be set.
+
+        Parameters
+        ----------
+        feed
+            The camera's.
+        calibrated
+            (rows, columns) of the picture that the imaging plane was calibrated with, px; None:
+            not known.
+        """
+        self._feed, self._calibrated = feed, calibrated
         self._answers.clear()
         own_steps = feed.camera.info.kind == KIND  # which its driver does not tell in dB
         self.fields["gain_db"].unit.setText("" if own_steps else NUMBERS["gain_db"][1])
@@ -136,7 +147,12 @@ class CameraFields(QObject):
                 part.setVisible(there[name])
         is_part = settings.region not in (None, whole)
         self.whole_button.setVisible(there["region"] and is_part)
-        self.part_words.setVisible(is_part)
+        _, _, width, height = settings.region or whole
+        unlike = other_size(self._calibrated, (height, width))
+        if not unlike and is_part:
+            unlike = PART_WORDS
+        self.part_words.setText(f"⚠ {unlike}")
+        self.part_words.setVisible(bool(unlike))
         self.shoot_button.setVisible(settings.trigger == "software")
 
     # --- to set it ----------------------------------------------------------------------------

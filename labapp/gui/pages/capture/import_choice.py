@@ -15,6 +15,12 @@ from labapp.session.session import Session
 
 MOST_HZ = 1e7
 
+REPLACED = "The session has a recording already: Import puts this one in its place."
+MEASURED = (
+    "Frames of the session's recording are measured or corrected: another one wants a session of "
+    "its own."
+)
+
 NEXT = "New session from this recording …"
 NEXT_TIP = (
     "Make a session with the same set-up and calibration, and import it there; this one stays whole"
@@ -66,9 +72,7 @@ class ImportChoice(QWidget):
         row.addWidget(self.import_button)
         row.addWidget(button("Not this one", "Leave it, and see the session's frames", leave))
         layout.addLayout(row)
-        self.replace_words = wrapped(
-            "The session has a recording already: Import puts this one in its place."
-        )
+        self.replace_words = wrapped()
         layout.addWidget(self.replace_words)
         self.next_button = button(NEXT, NEXT_TIP, begin_next)
         layout.addWidget(self.next_button)
@@ -110,8 +114,20 @@ class ImportChoice(QWidget):
         )
         return Choice(first, last, max(1, every), self.rate.value(), self.embed.isChecked())
 
-    def show_choice(self, session: Session | None, preview: Preview | None, working: bool) -> None:
-        """Show what would be imported, and why it cannot be where it cannot."""
+    def show_choice(
+        self, session: Session | None, preview: Preview | None, working: bool, measured: bool
+    ) -> None:
+        """Show what would be imported, and why it cannot be where it cannot.
+
+        Parameters
+        ----------
+        session, preview
+            Where to, and what; None: there is none.
+        working
+            Whether a recording is being imported.
+        measured
+            Whether frames of the session are measured or corrected.
+        """
         choice = None if preview is None else self.choice()
         why_not = refusal(session, choice, working)
         self.setVisible(preview is not None)
@@ -121,6 +137,7 @@ class ImportChoice(QWidget):
             words = choice_in_words(preview, choice)
             self.choice_words.setText(f"{words}. {why_not}" if why_not else words)
         has_one = session is not None and session.recording is not None
+        self.replace_words.setText(MEASURED if measured else REPLACED)
         self.replace_words.setVisible(has_one and not why_not)
         self.next_button.setVisible(has_one)
         self.next_button.setEnabled(choice is not None and choice.count > 0 and not working)

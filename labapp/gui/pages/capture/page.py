@@ -24,8 +24,10 @@ from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
     Seen,
+    calibrated_px,
     look,
     missing_in_words,
+    other_size,
     recording_in_words,
 )
 from labapp.gui.pages.page import Page
@@ -62,7 +64,7 @@ class CapturePage(Page):
         self._reading: Task | None = None
         self._wanted: tuple[Preview | None, int] | None = None
         self._seen: tuple[Preview | None, int] | None = None
-        self._told: Recording | None = None
+        self._told: object = None
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)
         self._rest.setInterval(REST_MS)
@@ -181,9 +183,13 @@ class CapturePage(Page):
 
     def _show_recording(self, recording: Recording | None) -> None:
         self.told_group.setVisible(recording is not None and self.live_view.live is None)
-        if recording is None or recording == self._told:
+        session = self.workspace.session
+        if recording is None or session is None:
             return
-        self._told = recording
+        shown = (recording, session.setup_text, session.plane_calibration)
+        if shown == self._told:
+            return
+        self._told = shown
         while self.told.count():
             item = self.told.takeAt(0)
             widget = None if item is None else item.widget()
@@ -194,12 +200,18 @@ class CapturePage(Page):
         for row, (name, words) in enumerate(rows):
             self.told.addWidget(QLabel(f"{name}:"), row, 0)
             self.told.addWidget(wrapped(words), row, 1)
-        for row, sentence in enumerate(recording.warnings, len(rows)):
+        unlike = other_size(calibrated_px(session), (recording.rows, recording.columns))
+        warnings = (*recording.warnings, *[unlike] * bool(unlike))
+        for row, sentence in enumerate(warnings, len(rows)):
             self.told.addWidget(wrapped(f"⚠ {sentence}"), row, 0, 1, 2)
 
     def _show_import(self) -> None:
         working = self._importing in self.workspace.tasks.active
-        self.chosen.show_choice(self.workspace.session, self.preview, working)
+        session, seen = self.workspace.session, None
+        if self.preview is not None:
+            seen = self.workspace.tried(self.workspace.overview)
+        measured = seen is not None and (any(seen.status) or bool(seen.corrected.any()))
+        self.chosen.show_choice(session, self.preview, working, measured)
         self.slider.setVisible(self.preview is not None and self.preview.frames > 1)
         self.kept_group.setVisible(self._kept is not None)
         if self._kept is not None:

@@ -11,7 +11,7 @@ from labapp.core.detection import DotSettings, find_dots
 from labapp.core.exposure import Exposure, judge_exposure
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.gui.steps import recording_gone
+from labapp.gui.steps import calibrations_in_use, recording_gone
 from labapp.media import GreyImage, open_source
 from labapp.media.base import rate_in_words
 from labapp.session.record import Recording
@@ -231,6 +231,29 @@ def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
         ("Size", size_in_words(recording.size)),
         ("SHA-256", recording.sha256),
         ("Imported", local_time(recording.imported)),
+    )
+
+
+def calibrated_px(session: Session) -> tuple[int, int] | None:
+    """(rows, columns) of the picture that the imaging plane in use was found in; None: unknown."""
+    kept = session.plane_calibration
+    if kept is None or not calibrations_in_use(session)[1]:
+        return None
+    try:
+        rows, columns = session.picture(kept.picture_sha256).shape
+    except InputError:
+        return None
+    return rows, columns
+
+
+def other_size(calibrated: tuple[int, int] | None, shape: tuple[int, int]) -> str:
+    """That frames, shape (rows, columns), are not as the calibration picture; empty if they are."""
+    if calibrated is None or calibrated == shape:
+        return ""
+    (rows, columns), (height, width) = calibrated, shape
+    return (
+        f"The imaging plane was calibrated with a picture of {columns}×{rows} px, and frames have "
+        f"{width}×{height} px: sizes are wrong. Calibrate with a picture of the same region"
     )
 
 
