@@ -8,13 +8,15 @@ import math
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.session.streams import LineStream, OpcuaStream, open_stream, told_values
+from labapp.session.alarms import Alarm
+from labapp.session.streams import LineStream, OpcuaStream, live_values, open_stream, told_values
 from labapp.session.tables import SIZES
 
 
@@ -192,7 +194,9 @@ def test_opc_ua_clients_cannot_write(caplog: pytest.LogCaptureFixture) -> None:
 def test_opc_ua_clients_read_the_newest_frame(measured: Measurement) -> None:
     asyncua = pytest.importorskip("asyncua")
     stream = OpcuaStream(port=free_port())
-    wanted = told_values(41, 0.5, measured)
+    alarm = Alarm("width-high", "Width 7.1 mm is above 6.9 mm", 40, 0.4, acknowledged=True)
+    wanted = live_values(41, 0.5, measured, [alarm, replace(alarm, code="height-low")])
+    assert wanted["alarm"] == "width-high height-low"
 
     async def read() -> dict[str, Any]:
         async with asyncua.Client(stream.address) as client:
