@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.foot_switches import CALLS
+from labapp.gui.pages.capture import CapturePage
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.setup import SetupPage
@@ -61,7 +62,9 @@ PURPOSES = {
     "plane": ("Load picture…", "Find O′ and the axes", "Use"),
     "capture": (
         *("Choose a file …", "New session from this recording …", "Import"),
-        *("Start", "● Record", "Mark", "Take a frame", "Learn a pedal", "Stop the camera"),
+        *("Start", "● Record", "Mark", "Take a frame", "Learn a pedal"),
+        *("Lines of JSON over TCP", "Other machines may connect", "Acknowledge"),
+        "Stop the camera",
     ),
     "surface": ("Along X", "Compare", "&This frame", "Copy"),
     "trends": ("Read a table …", "Width", "Height"),
@@ -432,6 +435,9 @@ class RandomHand:
             return f"{key.name}, {edit[0].name} {edit[1].name}"
         if isinstance(page, SetupPage):
             page.tabs.setCurrentIndex(rng.randrange(3))
+        if isinstance(page, CapturePage):
+            parts = page.live_view.canvas.tabs
+            parts.setCurrentIndex(rng.randrange(parts.count()) if parts.isVisible() else 0)
         if isinstance(page, LaserPage):
             for column, text in enumerate(("4.65", "6.22", "2.75")):
                 page.table.setFocus()
