@@ -139,8 +139,9 @@ def note(run: Run, what: str) -> None:
 def look(run: Run) -> object:
     """What the operator sees."""
     window = run.window
+    image = window.grab().toImage()  # kept: its bits go with it
     return (
-        hash(bytes(window.grab().toImage().constBits())),
+        hash(bytes(image.constBits())),
         id(QApplication.focusWidget()),
         len(window.workspace.tasks.active),
         tuple(window.log_panel.texts()[-1:]),
