@@ -93,6 +93,17 @@ class Limits:
         """Whether there is any."""
         return any(end is not None for name in NAMES for end in self.of(name))
 
+    @property
+    def words(self) -> str:
+        """What they are: "width 6 to 6.9 mm, height from 0.2 mm"."""
+        told = []
+        for name in NAMES:
+            low, high = self.of(name)
+            parts = [f"{'from ' * (high is None)}{low:g}"] if low is not None else []
+            parts += [f"to {high:g}"] if high is not None else []
+            told += [f"{name} {' '.join(parts)} mm"] if parts else []
+        return ", ".join(told) or "none"
+
 
 def sizes_of(measures: Measures | None) -> tuple[Size, Size, Size]:
     """Width, length and height, of a hollow pool the depth; NaN where nothing was measured."""

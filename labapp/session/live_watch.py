@@ -136,8 +136,8 @@ class LiveWatch:
     limits
         Of the sizes.
     say
-        Called with alarms that are raised, over, or acknowledged, and the time of their frame by
-        the camera's clock, s (None: now); from any thread.
+        Called with alarms that are raised, over, or acknowledged, and with other limits, and the
+        time of the frame by the camera's clock, s (None: now); from any thread.
 
     Attributes
     ----------
@@ -282,6 +282,23 @@ class LiveWatch:
         )
 
     # --- to do --------------------------------------------------------------------------------
+
+    def standing(self) -> list[tuple[Event, float | None]]:
+        """What a recording that begins is to be told: the limits, and the alarms that hold."""
+        limits = self.alarms.limits
+        told: list[tuple[Event, float | None]] = []
+        if limits.are_set:
+            told.append((Event(self._name, "note", f"limits: {limits.words}"), None))
+        for alarm in self.alarms.shown:
+            if alarm.holds:
+                told.append((Event(self._name, "warning", f"ALARM: {alarm.told}"), alarm.time_s))
+        return told
+
+    def set_limits(self, limits: Limits) -> None:
+        """Watch other limits from the next frame on, which is said."""
+        if limits != self.alarms.limits:
+            self.alarms.set_limits(limits)
+            self._say(Event(self._name, "note", f"limits now: {limits.words}"), None)
 
     def acknowledge(self) -> None:
         """Take it that the operator has seen all alarms."""

@@ -66,6 +66,9 @@ def test_limits_that_cannot_be_are_refused():
     with pytest.raises(InputError, match="unmeasured"):
         Limits(unmeasured=0)
     assert not Limits().are_set
+    assert Limits().words == "none"
+    some = Limits(width_mm=(6, 6.9), length_mm=(None, 8), height_mm=(-0.3, None))
+    assert some.words == "width 6 to 6.9 mm, length to 8 mm, height from -0.3 mm"
     assert Limits(height_mm=(None, 1.0)).are_set
 
 

@@ -131,6 +131,9 @@ def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: To
     assert words[2] == "ALARM: 2 frames in a row could not be measured: it is dark (frame 7)"
     assert words[4].startswith("alarm acknowledged: Width")
     assert watch.alarms.shown == ()
+    for _ in range(2):
+        watch.set_limits(Limits(width_mm=(6.0, None)))
+    assert [event.words for event, _ in told[6:]] == ["limits now: width from 6 mm"]
 
 
 def test_a_surface_is_drawn_when_it_is_asked_for_and_only_once(watch: LiveWatch):

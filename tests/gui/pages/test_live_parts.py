@@ -256,6 +256,7 @@ def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
     qtbot.waitUntil(take.finished.is_set)
     with take.notes.open() as file:
         notes = [(row["kind"], row["what"]) for row in csv.DictReader(file)]
+    assert ("note", "limits: width to 6.9 mm") in notes
     words = [(kind, what.partition(":")[0]) for kind, what in notes if "larm" in what.lower()]
     assert words == [
         ("warning", "ALARM"),

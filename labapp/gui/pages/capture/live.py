@@ -407,9 +407,9 @@ class Live:
         recorder = self._recorders[-1]
         if recorder.running is None:
             self.takes.append(recorder.trigger())
-            for alarm in () if self.watch is None else self.watch.alarms.shown:
-                if alarm.holds:
-                    recorder.note(Event(self.name, "warning", f"ALARM: {alarm.told}"), alarm.time_s)
+            if self.watch is not None:
+                for event, time_s in self.watch.standing():
+                    recorder.note(event, time_s)
         else:
             recorder.stop()
             self._ring_since_s = time.monotonic()

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QPalette
+from PySide6.QtGui import QAccessible, QAccessibleEvent, QPalette
 from PySide6.QtWidgets import QFrame, QGridLayout, QHBoxLayout, QLabel, QVBoxLayout, QWidget
 
 from labapp.gui.digits import NOTHING, plain
@@ -220,6 +220,9 @@ class AlarmStrip(QFrame):
         told = alarms_in_words(alarms)
         if told != self.words.text():
             self.words.setText(told)
+            # A screen reader says it at once.
+            alert = QAccessibleEvent(self.words, QAccessible.Event.Alert)
+            QAccessible.updateAccessibility(alert)
             colours = QPalette()
             colours.setColor(QPalette.ColorRole.WindowText, RED[is_dark(colours)])
             for widget in (self, self.words):

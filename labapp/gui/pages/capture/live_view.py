@@ -282,11 +282,9 @@ class LiveView(QObject):
         """Watch the session's limits: they may have been changed."""
         session, watch = self.workspace.session, self._watch()
         if session is not None and watch is not None:
-            limits = session.limits
-            if limits != watch.alarms.limits:
-                watch.alarms.set_limits(limits)
-                self._show_figures(watch)
-                self.canvas.tell(watch)
+            watch.set_limits(session.limits)
+            self._show_figures(watch)
+            self.canvas.tell(watch)
 
     def _replan(self) -> None:
         plan = self.plan_fields.plan()
