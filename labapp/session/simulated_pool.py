@@ -82,6 +82,8 @@ def simulated_pool(session: Session) -> str:
 def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDevice:
     """Make a camera that films the pool of a scenario without end.
 
+    The pool swings as fast at every rate: of a faster camera some frames are alike.
+
     Parameters
     ----------
     text
@@ -101,5 +103,11 @@ def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDev
     for number in range(len(recording.pools)):
         progress(number, len(recording.pools))
         images.append(recording.frame(number).image)
-    rate_hz = recording.frame_rate_hz or 60.0
-    return SimulatedDevice("pool", there_and_back(images), rate_hz=rate_hz)
+    rate_hz, film = recording.frame_rate_hz or 60.0, there_and_back(images)
+
+    def filmed(number: int) -> GreyImage:
+        return film(int(number * rate_hz / (device.settings.rate_hz or rate_hz)))
+
+    device = SimulatedDevice("pool", film, rate_hz=rate_hz)
+    device.picture = filmed
+    return device

@@ -444,13 +444,16 @@ class Run:
                 "was unplugged": truth.lost,
                 "it is back after": truth.lost,
                 "not whole, left out": truth.broken,
-                "MB wait in memory": self.stalls,
-                "writing has caught up": self.stalls,
             }
-            found = {words: how_many(told, words) for words in wanted}
-            wrong = {words for words in wanted if found[words] != wanted[words]}
-            words = ", ".join(f"“{each}” {found[each]} of {wanted[each]}" for each in wanted)
-            line(not wrong, f"{where}: {words}")
+            # The disk of a busy computer stalls of itself, too.
+            least = {"MB wait in memory": self.stalls, "writing has caught up": self.stalls}
+            found = {words: how_many(told, words) for words in (*wanted, *least)}
+            right = all(found[each] == count for each, count in wanted.items())
+            right &= all(found[each] >= count for each, count in least.items())
+            words = ", ".join(
+                f"“{each}” {found[each]} of {n}" for each, n in (wanted | least).items()
+            )
+            line(right, f"{where}: {words}")
 
 
 def run(folder: Path, seconds: float, rate_hz: float, part: str) -> bool:

@@ -6,6 +6,7 @@ import csv
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -236,6 +237,11 @@ def test_the_simulated_camera_films_a_pool_on_the_session_s_bench(tmp_path: Path
     assert np.array_equal(images[0], images[2 * len(told) - 2])
     steps = [np.abs(a.astype(float) - b).mean() for a, b in pairwise(images)]
     assert min(steps) > 0
+    # A camera that is three times as fast sees the pool swing no faster.
+    device.settings = replace(device.settings, rate_hz=3 * device.settings.rate_hz)
+    faster = [device.picture(k) for k in range(3 * len(images))]
+    for k in (0, 5, 2 * len(told) - 1):
+        assert all(np.array_equal(each, images[k]) for each in faster[3 * k : 3 * k + 3])
 
 
 # --- on the page ----------------------------------------------------------------------------------
