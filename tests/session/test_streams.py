@@ -209,6 +209,7 @@ def test_opc_ua_clients_read_the_newest_frame(measured: Measurement) -> None:
                     for name in wanted
                 }
                 if found["frame"] == 41:
+                    assert stream.listeners == 1
                     break
                 await asyncio.sleep(0.02)
             return found

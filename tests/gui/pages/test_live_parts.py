@@ -371,6 +371,11 @@ def test_a_port_that_is_taken_is_said_with_what_to_do(
     streams.boxes["lines"].click()
     qtbot.waitUntil(lambda: streams.words["lines"].text().startswith("● 127.0.0.1"))
     assert page.live_view.live.watch.stream("opcua") is None
+    port = free_port()
+    hand.enter(streams.ports["opcua"], str(port))
+    streams.boxes["opcua"].click()
+    told = f"● opc.tcp://127.0.0.1:{port}/labapp: 0 programs listen, 0 frames told"
+    qtbot.waitUntil(lambda: streams.words["opcua"].text() == told, timeout=30_000)
 
 
 @pytest.mark.parametrize("part", ["Picture", "Surface", "Trends and limits", "Control software"])
