@@ -9,7 +9,7 @@ from PySide6.QtWidgets import QCheckBox, QGridLayout, QVBoxLayout, QWidget
 
 from labapp.errors import InputError
 from labapp.gui.pages.capture.parts import wrapped
-from labapp.gui.tasks import Control
+from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import NumberField
 from labapp.gui.views.labels import headed
 from labapp.gui.workspace import Workspace
@@ -61,6 +61,7 @@ class LiveStreams(QWidget):
         self.ports: dict[str, NumberField] = {}
         self.words = {kind: wrapped() for kind in KINDS}
         self._problems: dict[str, str] = {}
+        self._tasks: dict[str, Task] = {}
         outer = QVBoxLayout(self)
         outer.setContentsMargins(8, 8, 8, 8)
         group, layout = headed("Tell control software every frame that is measured")
@@ -78,7 +79,7 @@ class LiveStreams(QWidget):
             field.editor.setAccessibleName(f"Port of {words}")
             field.set_value(port)
             field.setFixedWidth(PORT_PX)
-            field.edited.connect(partial(self._again, kind))
+            field.edited.connect(partial(self._bring_about, kind))
             for column, widget in enumerate((box, field.label, field)):
                 grid.addWidget(widget, 2 * row, column)
             grid.addWidget(self.words[kind], 2 * row + 1, 0, 1, 4)
@@ -97,69 +98,69 @@ class LiveStreams(QWidget):
         """Switch on what is ticked: a camera has been started."""
         for kind, box in self.boxes.items():
             if box.isChecked():
-                self._open(kind)
+                self._bring_about(kind)
 
-    def _switch(self, kind: str, on: bool) -> None:
-        self._problems.pop(kind, None)
-        watch = self._watch()
-        if on:
-            self._open(kind)
-        elif watch is not None and watch.stream(kind) is not None:
-            title = f"Ending {KINDS[kind][0]}"
-            self._workspace.tasks.start(
-                title, lambda _: watch.tell_by(kind, None), lambda _: self.show_state()
-            )
-        self.show_state()
-
-    def _again(self, kind: str, _: object = None) -> None:
-        if self.boxes[kind].isChecked():
-            self._open(kind)
-
-    def _open_to_all(self) -> None:
-        for kind in KINDS:
-            self._again(kind)
-        self.show_state()
-
-    def _open(self, kind: str) -> None:
-        """Open a stream in the background, in place of the one that there is."""
-        watch = self._watch()
-        if watch is None:
-            return
+    def _wanted(self, kind: str) -> tuple[LiveWatch | None, str, bool]:
+        """What is to be: who tells, where (empty: nowhere), and whether others may listen."""
         anywhere, port = self.anywhere.isChecked(), int(self.ports[kind].value() or 0)
         place = f"{ANY if anywhere else OWN}:{port}"
+        return self._watch(), place if self.boxes[kind].isChecked() else "", anywhere
+
+    def _bring_about(self, kind: str, _: object = None) -> None:
+        """Open a stream in the background, or end it, as is wanted; one thing after the other."""
+        watch, place, anywhere = wanted = self._wanted(kind)
+        if watch is None or self._is_at_work(kind):
+            return
+        words, is_open = KINDS[kind][0], watch.stream(kind) is not None
+        if not place and not is_open:
+            return
 
         def work(_: Control) -> str:
             watch.tell_by(kind, None)  # it may have this very port
-            try:
-                watch.tell_by(kind, open_stream(kind, place, anywhere))
-            except InputError as error:
-                return problem_in_words(error)
+            if place:
+                try:
+                    watch.tell_by(kind, open_stream(kind, place, anywhere))
+                except InputError as error:
+                    return problem_in_words(error)
             return ""
 
         def done(problem: str) -> None:
-            if problem:
+            if self._wanted(kind) != wanted:
+                self._bring_about(kind)  # something else is wanted by now
+            elif problem:
                 self._problems[kind] = problem
-                self.boxes[kind].blockSignals(True)
                 self.boxes[kind].setChecked(False)
-                self.boxes[kind].blockSignals(False)
-                self._workspace.said.emit(f"{KINDS[kind][0]}: {problem}", True)
-            elif not self.boxes[kind].isChecked():
-                self._switch(kind, False)  # it was switched off meanwhile
-            else:
-                self._workspace.said.emit(f"{KINDS[kind][0]}: measures are told at {place}", False)
+                self._workspace.said.emit(f"{words}: {problem}", True)
+            elif place:
+                self._workspace.said.emit(f"{words}: measures are told at {place}", False)
             self.show_state()
 
-        self._problems.pop(kind, None)
-        self._workspace.tasks.start(f"Opening {KINDS[kind][0]}", work, done)
+        title = f"Opening {words}" if place else f"Ending {words}"
+        self._tasks[kind] = self._workspace.tasks.start(title, work, done)
+
+    def _is_at_work(self, kind: str) -> bool:
+        return self._tasks.get(kind) in self._workspace.tasks.active
+
+    def _switch(self, kind: str, on: bool) -> None:
+        if on:
+            self._problems.pop(kind, None)
+        self._bring_about(kind)
+        self.show_state()
+
+    def _open_to_all(self) -> None:
+        for kind, box in self.boxes.items():
+            if box.isChecked():
+                self._bring_about(kind)
+        self.show_state()
 
     # --- what it shows ------------------------------------------------------------------------
 
     def show_state(self) -> None:
         """Show who listens and how much was told."""
         watch = self._watch()
-        for kind, box in self.boxes.items():
+        for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
-            told = stream_in_words(stream, box.isChecked(), self._problems.get(kind, ""))
+            told = stream_in_words(stream, self._is_at_work(kind), self._problems.get(kind, ""))
             if told != self.words[kind].text():
                 self.words[kind].setText(told)
         warning = WARNING if self.anywhere.isChecked() else ""
@@ -168,12 +169,12 @@ class LiveStreams(QWidget):
         self.warning.setVisible(bool(warning))
 
 
-def stream_in_words(stream: Stream | None, wanted: bool, problem: str) -> str:
+def stream_in_words(stream: Stream | None, at_work: bool, problem: str) -> str:
     """Where a stream is heard, by how many, and what was told."""
     if problem:
         return f"⚠ {problem}"
     if stream is None:
-        return "○ Opening …" if wanted else "○ Off"
+        return "○ One moment …" if at_work else "○ Off"
     listen = "program listens" if stream.listeners == 1 else "programs listen"
     told = several(stream.told, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
