@@ -7,18 +7,17 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from PySide6.QtCore import QObject, QTimer, Signal
 from PySide6.QtWidgets import QApplication
 
 from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task, Tasks
-
-if TYPE_CHECKING:
-    from labapp.media.events import Event
-    from labapp.media.foot_switch import Action, FootSwitch, Learned, PedalMap
-    from labapp.media.hid import HidInfo
+from labapp.media import hid
+from labapp.media.events import Event
+from labapp.media.foot_switch import Action, FootSwitch, Learned, PedalMap, learn
+from labapp.media.hid import AWAY, LONGEST, UNPLUGGED, HidError, HidInfo
 
 POLL_MS = 20
 """What is pressed is done within this."""
@@ -56,8 +55,6 @@ class InUse:
             return f"● {name}: connected"
         if self.told is None:
             return f"○ {name}: being looked for"
-        from labapp.media.hid import AWAY, UNPLUGGED
-
         if self.told.words in (AWAY, UNPLUGGED):
             return f"▲ {name}: not connected. It goes on when it is plugged in"
         return f"▲ {self.told.words}"
@@ -154,8 +151,6 @@ class FootSwitches(QObject):
     def use(self, kept: Iterable[Mapping[str, Any]]) -> None:
         """Take up the foot switches that were remembered; one that is damaged is said."""
         for values in kept:
-            from labapp.media.foot_switch import PedalMap
-
             try:
                 pedals = PedalMap.from_dict(values)
             except InputError as error:
@@ -183,14 +178,11 @@ class FootSwitches(QObject):
         self._keep()
 
     def _begin(self, pedals: PedalMap) -> None:
-        from labapp.media.foot_switch import FootSwitch
-        from labapp.media.hid import find_hid, open_hid
-
         if pedals.device in self.in_use or not pedals.actions:
             return
         # Calls come in the device's thread: it is given the queue, and nothing of Qt.
         hear = partial(_put, self._heard, pedals.device)
-        switch = FootSwitch(pedals, hear, hear, find_hid, open_hid)
+        switch = FootSwitch(pedals, hear, hear, hid.find_hid, hid.open_hid)
         self.in_use[pedals.device] = InUse(switch)
         if not self._timer.isActive():
             self._timer.start()
@@ -201,9 +193,6 @@ class FootSwitches(QObject):
 
     def _take(self) -> None:
         """Do what was pressed, and tell what happened."""
-        from labapp.media.events import Event
-        from labapp.media.hid import AWAY, UNPLUGGED
-
         deaf = self.learns or time.monotonic() < self._deaf_until_s
         for _ in range(self._heard.qsize()):
             key, heard = self._heard.get_nowait()
@@ -303,7 +292,7 @@ class FootSwitches(QObject):
 def pedal_name(number: int, keyboard: bool) -> str:
     """A pedal as it is called: of a device with buttons its number from 1, else its key."""
     if not keyboard:
-        return f"pedal {number % BITS + 1}"
+        return f"pedal {number % (8 * LONGEST) + 1}"
     letters = {4 + k: letter for k, letter in enumerate("ABCDEFGHIJKLMNOPQRSTUVWXYZ1234567890")}
     keys = {**letters, **{58 + k: f"F{k + 1}" for k in range(12)}}
     keys |= {104 + k: f"F{k + 13}" for k in range(12)}
@@ -311,37 +300,29 @@ def pedal_name(number: int, keyboard: bool) -> str:
     return f"key {keys.get(number, f'number {number}')}"
 
 
-BITS = 512
-"""Numbers of pedals that a kind of report has room for."""
-
-
 def _put(heard: queue.SimpleQueue[tuple[str, Any]], key: str, what: object) -> None:
     heard.put((key, what))
 
 
 def _found() -> Found:
-    from labapp.media.hid import HidError, find_hid, may_be_read
-
     try:
-        devices = {info.key: info for info in find_hid()}
+        devices = {info.key: info for info in hid.find_hid()}
     except HidError as error:
         return Found(problem=str(error))
     known_first = sorted(devices.values(), key=lambda info: not (info.is_pedal or info.is_3d))
-    usable = [info.name for info in known_first if info.is_pedal and may_be_read(info)]
-    closed = [info for info in known_first if not may_be_read(info)]
+    usable = [info.name for info in known_first if info.is_pedal and hid.may_be_read(info)]
+    closed = [info for info in known_first if not hid.may_be_read(info)]
     return Found(tuple(dict.fromkeys(usable)), tuple(closed))
 
 
 def _learned(control: Control) -> Learned | str | None:
     """Wait for a pedal; why none can be heard, as words."""
-    from labapp.media.foot_switch import learn
-    from labapp.media.hid import HidError, find_hid, open_hid
 
     def told(problems: list[str]) -> None:
         if not control.cancelled.is_set():
             control.part(problems)
 
     try:
-        return learn(control.cancelled, find_hid, open_hid, told)
+        return learn(control.cancelled, hid.find_hid, hid.open_hid, told)
     except HidError as error:
         return str(error)

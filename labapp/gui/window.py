@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QByteArray, QSize, Qt, QTimer, QUrl
@@ -118,8 +117,8 @@ class MainWindow(QMainWindow):
         self.setAcceptDrops(True)
         self._plain_layout = self.saveState(LAYOUT_VERSION)
         self._restore()
-        self.workspace.foot_switches.kept.connect(self._keep_foot_switches)
-        self.workspace.foot_switches.use(preferences.foot_switches)
+        if preferences.foot_switches:
+            self.workspace.foot_switches.use(preferences.foot_switches)
         self._session_opened()
 
     def _make_views(self) -> None:
@@ -165,6 +164,9 @@ class MainWindow(QMainWindow):
         space.said.connect(self.say)
         space.asked.connect(self.menus.do)
         space.next_wanted.connect(self.files.begin_next)
+        space.pedals_kept.connect(
+            lambda held: self.remember(replace(self.preferences, foot_switches=held))
+        )
         space.tasks.changed.connect(self.menus.refresh)
         self.step_list.chosen.connect(self.show_step)
         self.timeline.moved.connect(space.show_frame)
@@ -435,9 +437,6 @@ class MainWindow(QMainWindow):
         if problem:
             self.say(problem)
         self.menus.show_recent(preferences.recent)
-
-    def _keep_foot_switches(self, held: tuple[Mapping[str, Any], ...]) -> None:
-        self.remember(replace(self.preferences, foot_switches=held))
 
     # --- events -----------------------------------------------------------------------------
 

@@ -7,16 +7,17 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QObject, Signal
 
-from labapp.gui.foot_switches import FootSwitches
 from labapp.gui.tasks import Control, Task, Tasks, in_words
 from labapp.simulation import parallel
 
 if TYPE_CHECKING:
+    from labapp.gui.foot_switches import FootSwitches
     from labapp.session.measured import Overview
     from labapp.session.session import Session
 
@@ -50,11 +51,8 @@ class Workspace(QObject):
         An action of the window's menus is wanted, by its name.
     next_wanted
         A session like this one is wanted for a recording: its file.
-
-    Attributes
-    ----------
-    foot_switches
-        Those in use; they ask for actions of the menus.
+    pedals_kept
+        What the pedals of foot switches do is to be remembered, as plain values.
     """
 
     closing = Signal()
@@ -65,6 +63,7 @@ class Workspace(QObject):
     said = Signal(str, bool)
     asked = Signal(str)
     next_wanted = Signal(object)
+    pedals_kept = Signal(object)
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -79,9 +78,17 @@ class Workspace(QObject):
         self.tasks = Tasks(self)
         self.tasks.changed.connect(self._show_end)
         self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
-        self.foot_switches = FootSwitches(self.tasks, self)
-        self.foot_switches.pressed.connect(self.asked)
-        self.foot_switches.said.connect(self.said)
+
+    @cached_property
+    def foot_switches(self) -> FootSwitches:
+        """The foot switches in use; what they need is loaded when they are first asked for."""
+        from labapp.gui.foot_switches import FootSwitches
+
+        made = FootSwitches(self.tasks, self)
+        made.pressed.connect(self.asked)
+        made.said.connect(self.said)
+        made.kept.connect(self.pedals_kept)
+        return made
 
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""
@@ -119,7 +126,8 @@ class Workspace(QObject):
 
     def close(self) -> None:
         """Stop all work and close the session: the window goes."""
-        self.foot_switches.stop()
+        if "foot_switches" in vars(self):
+            self.foot_switches.stop()
         self._stop_measuring()
         self.show(None)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from PySide6.QtGui import QGuiApplication, QTextOption
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QPlainTextEdit, QVBoxLayout, QWidget
@@ -12,10 +12,8 @@ from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
 from labapp.gui.pages.capture.parts import button, wrapped
 from labapp.gui.views.fields import ChoiceField, FieldForm
 from labapp.gui.views.labels import headed
+from labapp.media.foot_switch import Action
 from labapp.media.hid import commands
-
-if TYPE_CHECKING:
-    from labapp.media.foot_switch import Action
 
 NOTHING = "nothing"
 
@@ -180,10 +178,10 @@ class FootSwitchPanel(QWidget):
         (self.switches.give_up if self.switches.learns else self.switches.learn)()
 
     def _use(self) -> None:
-        self.switches.use_learned(cast("Action", self.action.value()))
+        self.switches.use_learned(cast(Action, self.action.value()))
 
     def _assign(self, key: str, pedal: int, chosen: str) -> None:
-        action = None if chosen == NOTHING else cast("Action", chosen)
+        action = None if chosen == NOTHING else cast(Action, chosen)
         self.switches.assign(key, pedal, action)
 
     def _copy(self) -> None:
