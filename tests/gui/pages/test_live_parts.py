@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -149,11 +150,13 @@ class Prepared:
     """Measures what the test wants, in milliseconds."""
 
     found = OK
+    gate = threading.Event()
 
     def __init__(self, *_: object) -> None:
         pass
 
     def measure(self, _image: Any, drawn: bool) -> LiveMeasurement:
+        Prepared.gate.wait(60)
         drawn = drawn and Prepared.found.measures is not None
         return replace(Prepared.found, scene=surface() if drawn else None)
 
@@ -170,6 +173,7 @@ def page(
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
     monkeypatch.setattr(live_watch, "LiveMeasuring", Prepared)
     monkeypatch.setattr(Prepared, "found", OK)
+    Prepared.gate.set()
     assert window.workspace.create(tmp_path / "new.labsession")
     setup = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
     window.workspace.attempt(lambda session: session.set_setup(setup))
@@ -309,6 +313,26 @@ def test_a_frame_that_cannot_be_measured_says_why_where_the_figures_stand(
     choose(page, "Picture")
     qtbot.waitUntil(page.picture_view.isVisible)
     assert shown.view.scene is None
+
+
+def test_what_is_old_does_not_look_as_if_it_were_seen_now(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    view, shown = page.live_view, page.live_view.canvas.surface
+    window.workspace.attempt(lambda session: session.set_limits(Limits(width_mm=(None, 6.9))))
+    start(page, qtbot)
+    choose(page, "Surface")
+    qtbot.waitUntil(lambda: shown.view.scene is not None)
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ in order")
+    Prepared.gate.clear()  # a frame that takes long
+    try:
+        qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n? not known")
+        qtbot.waitUntil(lambda: "The figures are" in view.figures.words.text())
+        qtbot.waitUntil(lambda: shown.view.scene is None)
+    finally:
+        Prepared.gate.set()
+    qtbot.waitUntil(lambda: shown.view.scene is not None)
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ in order")
 
 
 def test_control_software_is_told_while_a_camera_is_watched(

@@ -82,6 +82,7 @@ class LiveCanvas(QWidget):
             self.streams.begin()
         else:
             self.tabs.setCurrentIndex(0)
+            self.surface.let_go()
             self.alarms.show_alarms(())
             self.streams.show_state()
 

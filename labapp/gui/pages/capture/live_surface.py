@@ -8,6 +8,7 @@ from functools import partial
 
 from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout, QWidget
 
+from labapp.gui.pages.capture.live_figures import OLD_S
 from labapp.gui.pages.capture.parts import button
 from labapp.gui.views.view3d import make_view3d
 from labapp.session.drawing import Direction
@@ -22,7 +23,8 @@ LOOKS: dict[Direction, tuple[str, str]] = {
 }
 
 LASTS_S = 1.0
-"""A surface is shown so long where the frames after it cannot be measured."""
+"""A surface is shown so long where the frames after it cannot be measured; `OLD_S`, where no more
+are measured: it is not of the pool that is seen."""
 
 ROOMY = 1.5
 """A colour scale stays while a surface fills this part of it: colours do not change at once."""
@@ -66,19 +68,25 @@ class LiveSurface(QWidget):
             self._show(replace(scene, limits=self._limits))
             self._shown_s = time.monotonic()
             return True
-        if followed is not None and time.monotonic() - self._shown_s > LASTS_S:
-            found = followed.found
-            if found.measures is None:
-                self.view.set_words(f"No surface ({found.status}): {found.reason}")
-                self._show(None)
+        age_s = time.monotonic() - self._shown_s
+        found = None if followed is None else followed.found
+        if found is not None and found.measures is None and age_s > LASTS_S:
+            self.view.set_words(f"No surface ({found.status}): {found.reason}")
+            self._show(None)
+        elif self.view.scene is not None and age_s > OLD_S:
+            self.clear()
         return False
 
     def clear(self) -> None:
-        """Show nothing, and let go of OpenGL."""
+        """Show nothing until a surface comes."""
         self.view.set_words(WAITING)
-        self.view.show_scene(None)
-        self.view.close_view()
+        self._show(None)
         self._limits = None
+
+    def let_go(self) -> None:
+        """Show nothing, and let go of OpenGL."""
+        self.clear()
+        self.view.close_view()
 
     def _show(self, scene: Scene | None) -> None:
         self.view.show_scene(scene)
