@@ -39,7 +39,7 @@ SILENT_S = 2.0
 HOPELESS_S = 6.0
 """… and after so long it is opened anew."""
 
-RETRY_S = (0.1, 0.2, 0.5, 1.0, 2.0)
+RETRY_S = (0.1, 0.2, 0.5, 1.0)
 """Pauses between attempts to open a camera that is gone; the last again and again."""
 
 State = Literal["opening", "running", "stalled", "lost", "ended"]
