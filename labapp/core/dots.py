@@ -326,11 +326,13 @@ def squares(
         Shape (n, 2·reach + 1, 2·reach + 1).
     """
     height, width = image.shape
-    if len(u) and min(u.min(), v.min(), width - 1 - u.max(), height - 1 - v.max()) < reach:
+    side = 2 * reach + 1
+    if len(u) == 0:
+        return np.zeros((0, side, side), np.float32)
+    if min(u.min(), v.min(), width - 1 - u.max(), height - 1 - v.max()) < reach:
         wide = cv2.copyMakeBorder(image, reach, reach, reach, reach, beyond)
         image = np.asarray(wide, np.float32)
         u, v = u + reach, v + reach
-    side = 2 * reach + 1
     return np.asarray(sliding_window_view(image, (side, side))[v - reach, u - reach])
 
 

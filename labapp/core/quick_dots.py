@@ -6,8 +6,9 @@ few pixels is worked out for these alone.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -29,7 +30,7 @@ from labapp.core.dots import (
     squares,
     typical,
 )
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, IntArray, freeze
 
 ROUND_PX2 = 0.25
 """Variance, px² of the smaller picture, that making a picture smaller and large again adds."""
@@ -99,11 +100,6 @@ class Exposure:
     def __post_init__(self) -> None:
         freeze(self)
 
-    @cached_property
-    def pad(self) -> Pad:
-        """What its frames are worked on with, one at a time."""
-        return Pad(self.noise.shape)
-
     @classmethod
     def of(cls, frame: Image, settings: BandPassSettings) -> Exposure:
         """Take it from a frame, as `band_pass_dots` does."""
@@ -131,7 +127,7 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     CannotMeasure
         ``no-dots`` if nothing stands out of the noise.
     """
-    pad, size = exposure.pad, exposure.size_px
+    pad, size = _pad(exposure.noise.shape), exposure.size_px
     image, fine, narrow, wide, band = pad.image, pad.fine, pad.narrow, pad.wide, pad.band
     np.copyto(image, frame, casting="unsafe")
     pad.blur(image, fine, 0.5 * size)
@@ -150,6 +146,17 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     pad.widen(narrow, wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
     cv2.subtract(fine, wide, dst=wide)
     return describe(wide, band, exposure.noise, u, v, size, settings.speckle_px, WHOLE)
+
+
+_own = threading.local()
+
+
+def _pad(shape: tuple[int, ...]) -> Pad:
+    """What this thread works on: kept, for frames of one size follow on each other."""
+    pad: Pad | None = getattr(_own, "pad", None)
+    if pad is None or pad.image.shape != shape:
+        pad = _own.pad = Pad(shape)
+    return pad
 
 
 def _peaks(band: Grey, floor: Grey, size: float, pad: Pad) -> tuple[IntArray, IntArray]:
@@ -181,8 +188,8 @@ def _taps(sigma: float) -> int:
     return round(8 * sigma + 1) | 1
 
 
-@cache
-def _nine(sigma: float, taps: int) -> FloatArray:
+@lru_cache(maxsize=8)
+def _nine(sigma: float, taps: int) -> Grey:
     """Gaussian weights of a pixel and its two neighbours on a line, shape (3, taps + 2).
 
     Kept, as a recording has one size of dot.
@@ -190,4 +197,6 @@ def _nine(sigma: float, taps: int) -> FloatArray:
     own = _taps(sigma)
     kernel = np.asarray(cv2.getGaussianKernel(own, sigma, cv2.CV_32F), np.float32).ravel()
     kernel = np.pad(kernel, (taps - own) // 2)
-    return np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
+    nine = np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
+    nine.flags.writeable = False
+    return np.asarray(nine)

@@ -7,7 +7,7 @@ curvature keeps it from running away where no ray came back (there it goes on as
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -62,13 +62,15 @@ class Cells:
         return product.reshape(3, count, side**2)
 
 
-@cache
+@lru_cache(maxsize=16)
 def _values_and_slopes(*step_mm: float) -> FloatArray:
     """Pieces of the splines and, beside them, of their derivatives, a cell's size each, (2, 4, 8).
 
     Kept, as a basis is asked thousands of times.
     """
-    return np.stack([np.hstack([_PIECES[0], _PIECES[1] / step]) for step in step_mm])
+    pieces = np.stack([np.hstack([_PIECES[0], _PIECES[1] / step]) for step in step_mm])
+    pieces.flags.writeable = False
+    return pieces
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
@@ -70,3 +72,23 @@ def test_a_frame_without_dots_has_none() -> None:
         with pytest.raises(CannotMeasure) as answer:
             quick_dots(dark, exposure, BandPassSettings())
         assert answer.value.status == "no-dots"
+
+
+def test_threads_that_share_an_exposure_do_not_share_their_dots() -> None:
+    rng = np.random.default_rng(11)
+    frames = [frame(places(rng), rng) for _ in range(6)]
+    exposure, settings = Exposure.of(frames[0], BandPassSettings()), BandPassSettings()
+    alone = [quick_dots(image, exposure, settings).image_px for image in frames]
+    with ThreadPoolExecutor(3) as pool:
+        told = list(
+            pool.map(lambda k: quick_dots(frames[k % 6], exposure, settings).image_px, range(120))
+        )
+    for k, found in enumerate(told):
+        np.testing.assert_array_equal(found, alone[k % 6])
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (24, 600)])
+def test_a_blank_picture_smaller_than_a_dot_is_wide_has_no_dots(shape: tuple[int, int]) -> None:
+    exposure = Exposure(4.0, np.ones(shape, np.float32), np.ones(shape, np.float32))
+    with pytest.raises(CannotMeasure, match="no-dots"):
+        quick_dots(np.full(shape, 7, np.uint8), exposure, BandPassSettings())
