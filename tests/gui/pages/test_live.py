@@ -19,7 +19,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.core.pipeline import Settings
 from labapp.gui.pages.capture import live_view
-from labapp.gui.pages.capture.live import SIMULATED, Live, choices
+from labapp.gui.pages.capture.live import SIMULATED, STATES, WAITS, Live, choices
 from labapp.gui.pages.capture.live_figures import Figure, figures
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.window import MainWindow
@@ -503,3 +503,8 @@ def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePag
         if button.isVisible() and button.text():
             assert button.width() >= button.sizeHint().width() - 1, button.text()
     assert window.page.live_view.record_button.isVisible()
+    # Whatever is to be said of the camera, the window does not grow beyond the screen.
+    for words in (*(words for _, words in STATES.values()), *WAITS.values()):
+        page.live_view.state.setText(f"▲ {words}, 1000.0 frames/s")
+        QTest.qWait(20)
+        assert (window.width(), window.height()) == (911, 512), words

@@ -450,7 +450,7 @@ class LiveView(QObject):
         self.bar = QWidget()
         layout = QVBoxLayout(self.bar)
         layout.setContentsMargins(8, 2, 8, 4)
-        self.state = QLabel()
+        self.state = wrapped()
         self.ring = QProgressBar()
         self.ring.setRange(0, 100)
         self.ring.setFixedWidth(RING_BAR_PX)
