@@ -229,7 +229,7 @@ def test_what_raw_and_ffv1_cost_is_told():
 def test_the_codec_that_is_chosen_is_recorded(page: CapturePage, qtbot: QtBot):
     view = page.live_view
     qtbot.waitUntil(lambda: "a second" in view.plan_fields.cost.text())
-    for words, codec in (("FFV1: small, much work", "ffv1"), ("Raw: large, little work", "raw")):
+    for words, codec in (("FFV1: small, slow", "ffv1"), ("Raw: large, quick", "raw")):
         Hand(page.window()).choose(view.plan_fields.codec, words)
         assert view.live.plan.codec == codec
         view.trigger()

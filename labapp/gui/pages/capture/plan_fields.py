@@ -12,7 +12,7 @@ from labapp.media.recorder import Plan
 
 BEFORE_S = 2.0
 
-CODECS: dict[Codec, str] = {"raw": "Raw: large, little work", "ffv1": "FFV1: small, much work"}
+CODECS: dict[Codec, str] = {"raw": "Raw: large, quick", "ffv1": "FFV1: small, slow"}
 
 COSTS: dict[Codec, tuple[float, float]] = {"raw": (1.0, 2.3e-9), "ffv1": (0.42, 15e-9)}
 """Part of a frame's bytes that is written, and seconds of a core a byte (docs/cameras.md)."""
