@@ -109,9 +109,9 @@ class FilmedDevice(SimulatedDevice):
         return numbered(self._noises[k % NOISES] if noisy else self._film(k), k)
 
     def open(self) -> SimulatedCamera:
-        camera = _FilmedCamera(self, self.truth) if self.plugged else super().open()
+        super().open()  # is it there?
         self.truth.opened += 1
-        return camera
+        return _FilmedCamera(self, self.truth)
 
 
 class _FilmedCamera(SimulatedCamera):
