@@ -194,6 +194,12 @@ class Recorder:
         """Memory that frames take now, MB."""
         return self._held_byte / 1e6
 
+    @property
+    def ring_s(self) -> float:
+        """How many seconds are kept for before a trigger."""
+        with self._turn:
+            return self._ring[-1].time_s - self._ring[0].time_s if self._ring else 0.0
+
     def take(self, frame: CameraFrame) -> None:
         """Take a frame of the camera; never waits."""
         told: list[tuple[Kind, str]] = []
@@ -401,7 +407,7 @@ class Recorder:
         """Say why no more of a recording can be written; what is there stays."""
         if not isinstance(error, OSError | InputError):
             logging.getLogger("labapp").exception("recording %s", take.path)
-        reason = error.strerror if isinstance(error, OSError) else error
+        reason = (isinstance(error, OSError) and error.strerror) or error
         take.trouble = f"cannot be written: {reason}"
         words = f"{take.trouble}; what was written is whole: {several(take.frames, 'frame')}"
         self._say(Event(take.path.name, "loss", words))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+from bisect import bisect_right
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +20,10 @@ if TYPE_CHECKING:
     from labapp.media.recorder import Take
 
 NOTES = ("time_s", "frame", "source", "kind", "what")
-"""Columns of the notes beside a recording."""
+"""Columns of the notes beside a recording; the frame is the one that was next at that time."""
+
+NOTED_LATE = 10_000
+"""A note may be of so many frames ago: what is measured by itself is told seconds later."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,7 @@ class TakeFiles:
         self._early: list[Note] = []
         """Notes from before the first frame, whose time they are told by."""
         self._first_s = self._last_s = take.triggered_s
+        self._times_s: deque[float] = deque(maxlen=NOTED_LATE)
 
     def do(self, item: CameraFrame | Note | None) -> None:
         """Write a frame or a note; None: end it."""
@@ -96,6 +102,7 @@ class TakeFiles:
         self.wrong.flush()
         self.take.frames += 1
         self._last_s = frame.time_s
+        self._times_s.append(frame.time_s)
 
     def _tell_wrong(self, count: int) -> None:
         frames = several(count, "frame")
@@ -113,7 +120,8 @@ class TakeFiles:
         """Add a row to the notes; the video goes on where that cannot be, which is said once."""
         time_s = note.time_s - self._first_s
         event = note.event
-        row = (f"{time_s:.6f}", self.take.frames, event.source, event.kind, event.words)
+        later = len(self._times_s) - bisect_right(self._times_s, note.time_s)
+        row = (f"{time_s:.6f}", self.take.frames - later, event.source, event.kind, event.words)
         text = io.StringIO(newline="")
         try:
             began = not self.take.notes.exists()

@@ -1,9 +1,9 @@
 """Alarms while a pool is filmed: raised, over, and acknowledged by the operator.
 
-One is raised when a size is beyond its limit by more than chance, or when so many frames in a row
-cannot be measured; it is over when the size has been within its limits, or frames have been
-measured, for a second: a pool that swings about a limit is one alarm. It is shown until it is both
-over and acknowledged: none goes by unseen.
+One is raised when a size is beyond its limit by more than chance, when so many frames in a row
+cannot be measured, or when none is for long; it is over when the size has been within its limits,
+or frames have been measured, for a second: a pool that swings about a limit is one alarm. It is
+shown until it is both over and acknowledged: none goes by unseen.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from labapp.words import several
 CALM_S = 1.0
 """An alarm is over when its cause has been away for so long, by the camera's clock."""
 
-NOT_MEASURED = "not-measured"
-"""Code of the alarm of frames that cannot be measured; others are as ``width-high``."""
+NOT_MEASURED, SILENT = "not-measured", "silent"
+"""Codes of the alarms of frames that cannot be measured, and of none that is; others are as
+``width-high``."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Alarm:
     Parameters
     ----------
     code
-        ``width-low``, ``width-high`` … ``height-high`` or ``not-measured``.
+        ``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``.
     words
         What is wrong, in a sentence without its end.
     frame, time_s
@@ -72,6 +73,8 @@ class Alarms:
         self._held_s: dict[str, float] = {}
         """When the cause of each alarm was last there, or may have been."""
         self._unmeasured = 0
+        self._newest = (0, 0.0)
+        """Number and time of the frame that was looked at last."""
         self._turn = threading.Lock()
 
     @property
@@ -79,17 +82,16 @@ class Alarms:
         """What is watched."""
         return self._limits
 
-    def set_limits(self, limits: Limits) -> None:
-        """Watch other limits from the next frame on; alarms of those that were changed are over."""
+    def set_limits(self, limits: Limits) -> list[Alarm]:
+        """Watch other limits from the next frame on; gives the alarms that are over with it."""
         with self._turn:
             former, self._limits = self._limits, limits
-            for name in NAMES:
-                if former.of(name) != limits.of(name):
-                    for end in ("low", "high"):
-                        self._end(f"{name}-{end}")
+            changed = [name for name in NAMES if former.of(name) != limits.of(name)]
+            codes = [f"{name}-{end}" for name in changed for end in ("low", "high")]
             if not limits.are_set:
                 self._unmeasured = 0
-                self._end(NOT_MEASURED)
+                codes += [NOT_MEASURED, SILENT]
+            return [alarm for code in codes for alarm in self._end(code)]
 
     @property
     def shown(self) -> tuple[Alarm, ...]:
@@ -118,6 +120,9 @@ class Alarms:
         with self._turn:
             if not self._limits.are_set:
                 return []
+            self._newest = (frame, time_s)
+            if measures is not None and self._misses(measures):
+                measures, reason = None, "a size that is watched is not known"
             self._unmeasured = self._unmeasured + 1 if measures is None else 0
             causes = self._causes(measures, reason)
             for code, words in causes.items():
@@ -134,6 +139,14 @@ class Alarms:
                     changed += self._end(code)
             return changed
 
+    def silence(self, words: str) -> list[Alarm]:
+        """Take it that no frame is measured, which words say; gives the alarm if it is new."""
+        with self._turn:
+            if not self._limits.are_set:
+                return []
+            self._held_s[SILENT] = self._newest[1]
+            return self._raise(SILENT, words, *self._newest)
+
     def acknowledge(self) -> list[Alarm]:
         """Take it that the operator has seen all that is shown; gives those not seen before."""
         with self._turn:
@@ -142,10 +155,17 @@ class Alarms:
             self._shown = {alarm.code: replace(alarm, acknowledged=True) for alarm in kept}
             return seen
 
+    def _misses(self, measures: Measures) -> bool:
+        """Whether a size that has limits is not known."""
+        return any(
+            standing(size, self._limits.of(size.name)) == "unknown" for size in sizes_of(measures)
+        )
+
     def _causes(self, measures: Measures | None, reason: str) -> dict[str, str | None]:
         """Codes of what is wrong in a frame, in words; None: it may be, but cannot be told."""
         if measures is None:
             unknown: dict[str, str | None] = dict.fromkeys(self._shown)
+            unknown.pop(SILENT, None)
             if self._unmeasured < self._limits.unmeasured:
                 return unknown
             words = f"{several(self._unmeasured, 'frame')} in a row could not be measured: {reason}"

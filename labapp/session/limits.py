@@ -6,7 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from labapp.core.measures import Measures
+from labapp.core.values import BoolArray, FloatArray
 from labapp.errors import InputError
 
 CHANCE = 2.0
@@ -134,3 +137,10 @@ def standing(size: Size, ends: Ends) -> Standing:
     if beyond <= chance:
         return "in doubt"
     return "low" if below > above else "high"
+
+
+def beyond(value_mm: FloatArray, sigma_mm: FloatArray, ends: Ends) -> BoolArray:
+    """Which of many sizes are ``low`` or ``high`` (`standing`), of their shape."""
+    chance = CHANCE * np.where(np.isfinite(sigma_mm), sigma_mm, 0.0)
+    low, high = (math.nan if end is None else end for end in ends)
+    return np.asarray((low - value_mm > chance) | (value_mm - high > chance))

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event, Kind
 from labapp.session.alarms import Alarm, Alarms
-from labapp.session.limits import NAMES, Limits, Size, sizes_of, standing
+from labapp.session.limits import NAMES, Limits, Size, beyond, sizes_of
 from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring
 from labapp.session.scene import Scene
 from labapp.session.setup import Setup
@@ -38,6 +38,9 @@ TREND_S = 120.0
 
 MOST_KEPT = 12_000
 """Frames of the trend at most: a hundred a second."""
+
+SILENT_S = 10.0
+"""No figure for so long is an alarm. A frame that is measured by itself takes seconds."""
 
 
 @dataclass(frozen=True)
@@ -112,13 +115,16 @@ class Pace:
 
 
 class _Past(NamedTuple):
-    """What the trend keeps of a frame: little, for there are thousands."""
+    """What the trend keeps of a frame: numbers alone, for there are thousands.
+
+    Sizes are their values and then their σ, shape (6,).
+    """
 
     done_s: float
     arrived_s: float
     number: int
     is_measured: bool
-    sizes: tuple[Size, Size, Size]
+    sizes_mm: tuple[float, ...]
 
 
 class LiveWatch:
@@ -165,6 +171,8 @@ class LiveWatch:
         self._turn = threading.Lock()
         self._streams: dict[str, Stream] = {}
         self._is_closed = False
+        self._heard_s, self._last = time.monotonic(), (0, 0.0)
+        self._names: tuple[str, ...] = NAMES
         self._is_drawn = threading.Event()
 
     def take(self, frame: CameraFrame) -> None:
@@ -193,7 +201,10 @@ class LiveWatch:
         if self._in_order and self._to_measure:
             self._in_order -= 1
             return self._to_measure.popleft()
-        return newest_of(self._to_measure)
+        frame = newest_of(self._to_measure)
+        if frame is None:
+            self._heed_silence()
+        return frame
 
     def measure(self, frame: CameraFrame) -> None:
         """Measure a frame, watch its sizes, and tell them.
@@ -204,7 +215,12 @@ class LiveWatch:
             If the process that measures has ended.
         """
         drawn = self._is_drawn.is_set()
-        found = self._measuring.measure(frame.image, drawn)
+        try:
+            found = self._measuring.measure(frame.image, drawn)
+        except Exception as error:
+            if not self._is_closed:
+                self._fall_silent(f"Nothing is measured any more: {error}")
+            raise
         if found.scene is not None:
             self._is_drawn.clear()
             self._scene.append(found.scene)
@@ -214,19 +230,35 @@ class LiveWatch:
         for alarm in self.alarms.judge(frame.number, frame.time_s, found.measures, found.reason):
             self._say(Event(self._name, *_told(alarm)), frame.time_s)
         done_s, sizes = time.monotonic(), followed.sizes
+        self._heard_s = done_s
+        numbers = (*(s.value_mm for s in sizes), *(s.sigma_mm for s in sizes))
         is_measured = found.measures is not None
+        if is_measured:
+            self._names = tuple(size.name for size in sizes)
         with self._turn:
-            past = _Past(done_s, frame.arrived_s, frame.number, is_measured, sizes)
+            past = _Past(done_s, frame.arrived_s, frame.number, is_measured, numbers)
             self._past.append(past)
             while self._past[0].done_s < done_s - TREND_S:
                 self._past.popleft()
         self._newest.append(followed)
-        self._tell(followed)
-
-    def _tell(self, followed: Followed) -> None:
-        found = followed.found
         measured = Measurement(found.status, found.reason, self._scheme, measures=found.measures)
-        values = live_values(followed.number, followed.time_s, measured, self.alarms.shown)
+        self._last = frame.number, frame.time_s
+        self._tell(measured)
+
+    def _heed_silence(self) -> None:
+        """Raise an alarm, and tell it, where no figure has come for long."""
+        silent_s = time.monotonic() - self._heard_s
+        if silent_s > SILENT_S:
+            self._heard_s = float("inf")
+            self._fall_silent(f"No frame has been measured for {silent_s:.0f} s")
+
+    def _fall_silent(self, words: str) -> None:
+        for alarm in self.alarms.silence(words):
+            self._say(Event(self._name, *_told(alarm)), None)
+        self._tell(Measurement("silent", words, self._scheme))
+
+    def _tell(self, measured: Measurement) -> None:
+        values = live_values(*self._last, measured, self.alarms.shown)
         with self._turn:  # one that is told must not be closed meanwhile
             for stream in self._streams.values():
                 stream.publish(values)
@@ -263,22 +295,15 @@ class LiveWatch:
         with self._turn:
             late = [each for each in self._past if each.arrived_s > now_s - last_s]
 
-        def of_each(told: Callable[[Size], float], kind: type) -> Any:
-            table = [[told(size) for size in each.sizes] for each in late]
-            return np.array(table, kind).reshape(len(late), len(NAMES)).T
-
-        def beyond(size: Size) -> bool:
-            return standing(size, limits.of(size.name)) in ("low", "high")
-
-        measured = (each for each in reversed(late) if each.is_measured)
-        last = next(measured, None)
+        sizes = np.array([each.sizes_mm for each in late], float).reshape(len(late), 6).T
+        value, sigma = sizes[:3], sizes[3:]
         return Trend(
-            NAMES if last is None else tuple(size.name for size in last.sizes),
+            self._names,
             np.array([each.number for each in late], np.int64),
-            np.array([each.arrived_s - now_s for each in late], float),
-            of_each(lambda size: size.value_mm, float),
-            of_each(lambda size: size.sigma_mm, float),
-            of_each(beyond, bool),
+            np.array([each.arrived_s for each in late], float) - now_s,
+            value,
+            sigma,
+            np.array([beyond(value[k], sigma[k], limits.of(n)) for k, n in enumerate(NAMES)]),
         )
 
     # --- to do --------------------------------------------------------------------------------
@@ -297,7 +322,8 @@ class LiveWatch:
     def set_limits(self, limits: Limits) -> None:
         """Watch other limits from the next frame on, which is said."""
         if limits != self.alarms.limits:
-            self.alarms.set_limits(limits)
+            for alarm in self.alarms.set_limits(limits):
+                self._say(Event(self._name, *_told(alarm)), None)
             self._say(Event(self._name, "note", f"limits now: {limits.words}"), None)
 
     def acknowledge(self) -> None:

@@ -152,6 +152,16 @@ def test_marks_and_what_happened_are_kept_beside_it(start: Start) -> None:
     assert int(found[1]["frame"]) == 5
 
 
+def test_a_note_of_a_frame_some_time_ago_tells_that_frame(start: Start) -> None:
+    with start() as recorder:
+        take = recorder.trigger()
+        for k in range(20):
+            recorder.take(frame(k))
+        recorder.note(Event("camera", "warning", "late"), frame(6).time_s)
+    late = next(row for row in notes(take) if row["what"] == "late")
+    assert (float(late["time_s"]), int(late["frame"])) == (pytest.approx(0.06), 7)
+
+
 def test_a_recorder_that_is_closed_holds_no_frames_and_begins_nothing(start: Start) -> None:
     with start(before_s=1) as recorder:
         for k in range(50):

@@ -139,6 +139,14 @@ def test_frames_in_a_row_that_cannot_be_measured_are_an_alarm():
     assert codes(over) == [("width-high", False), ("not-measured", False)]
 
 
+def test_a_frame_that_misses_a_watched_size_is_not_in_order():
+    alarms = Alarms(Limits(width_mm=(None, 6.9), unmeasured=2))
+    alarms.judge(1, 0.1, measured(7.2), "")
+    for k in range(2, 40):
+        alarms.judge(k, 0.1 * k, measured(math.nan), "")
+    assert codes(alarms.shown) == [("width-high", True), ("not-measured", True)]
+
+
 def test_without_limits_nothing_is_watched():
     alarms = Alarms(Limits())
     for frame in range(20):

@@ -20,7 +20,7 @@ from labapp.media import open_source
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.session import live_watch
-from labapp.session.limits import Limits
+from labapp.session.limits import Limits, Size, standing
 from labapp.session.live_measuring import LiveMeasurement
 from labapp.session.live_watch import LiveWatch
 from labapp.session.scene import Scene, empty_scene
@@ -134,6 +134,65 @@ def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: To
     for _ in range(2):
         watch.set_limits(Limits(width_mm=(6.0, None)))
     assert [event.words for event, _ in told[6:]] == ["limits now: width from 6 mm"]
+
+
+def test_no_figure_for_long_is_an_alarm_until_there_is_one(
+    watch: LiveWatch, told: Told, monkeypatch: pytest.MonkeyPatch
+):
+    watch.measure(frame(3))
+    assert watch.next_frame() is None
+    assert told == []
+    monkeypatch.setattr(live_watch, "SILENT_S", 0.0)
+    for _ in range(3):
+        watch.next_frame()
+    assert [event.words for event, _ in told] == [
+        "ALARM: No frame has been measured for 0 s (frame 3)"
+    ]
+    assert [(alarm.code, alarm.holds) for alarm in watch.alarms.shown] == [("silent", True)]
+    watch.measure(frame(5))
+    assert [(alarm.code, alarm.holds) for alarm in watch.alarms.shown] == [("silent", False)]
+    assert told[-1][0].words.startswith("alarm over: No frame has been measured")
+
+
+def test_measuring_that_ends_by_itself_is_an_alarm_and_is_told(watch: LiveWatch, told: Told):
+    stream = LineStream()
+    watch.tell_by("lines", stream)
+    with socket.create_connection(("127.0.0.1", stream.port), timeout=30) as heard:
+        lines = heard.makefile(encoding="utf-8")
+        lines.readline()
+
+        def broken(*_: object) -> LiveMeasurement:
+            raise OSError("the process was killed")
+
+        prepare(watch, {}).measure = broken  # type: ignore[method-assign]
+        with pytest.raises(OSError, match="killed"):
+            watch.measure(frame(7))
+        line = json.loads(lines.readline())
+    assert line["status"] == "silent"
+    assert line["alarm"] == "silent"
+    assert line.get("width_mm") is None
+    assert "Nothing is measured any more: the process was killed" in told[0][0].words
+
+
+def test_alarms_that_other_limits_end_are_said_to_be_over(watch: LiveWatch, told: Told):
+    prepare(watch, {1: 7.2})
+    watch.measure(frame(1))
+    watch.set_limits(Limits(width_mm=(6.0, 7.5)))
+    kinds = [event.words.partition(":")[0] for event, _ in told]
+    assert kinds == ["ALARM", "alarm over", "limits now"]
+
+
+def test_the_trend_judges_as_figures_are_judged(watch: LiveWatch):
+    rng = np.random.default_rng(3)
+    widths = {k: float(w) for k, w in enumerate(rng.uniform(5.8, 7.1, 60))}
+    prepare(watch, {**widths, 7: None})
+    for number in widths:
+        watch.measure(frame(number))
+    trend, limits = watch.trend(60), watch.alarms.limits
+    sizes = zip(trend.value_mm[0].tolist(), trend.sigma_mm[0].tolist(), strict=True)
+    stands = [standing(Size("width", *each), limits.width_mm) for each in sizes]
+    assert trend.beyond[0].tolist() == [each in ("low", "high") for each in stands]
+    assert {"low", "high", "in order", "unknown"} <= set(stands)
 
 
 def test_a_surface_is_drawn_when_it_is_asked_for_and_only_once(watch: LiveWatch):

@@ -184,6 +184,34 @@ def test_another_plan_holds_from_then_on(live: Live):
     assert 4 <= len(numbers) <= 8
 
 
+def test_a_plan_of_while_it_records_holds_for_the_next_recording(live: Live):
+    live.open(SimulatedDevice("test", numbered).open)
+    wait_until(lambda: live.ring()[0] > 0.9)
+    live.trigger()
+    live.set_plan(Plan(before_s=0, after_s=0.1, every=3))
+    assert live.ring() == (0.0, "0.0 of 0.2 s")
+    wait_until(lambda: live.takes[0].frames > 60)
+    live.trigger()
+    wait_until(lambda: live.ring() == (0.0, "nothing before the trigger"))
+    live.trigger()
+    wait_until(live.takes[1].finished.is_set)
+    steps = []
+    for take in live.takes:
+        with open_source(take.path) as video:
+            steps.append(set(np.diff([number_in(frame.image) for frame in video]).tolist()))
+    assert steps == [{1}, {3}]
+
+
+def test_what_is_kept_for_before_a_trigger_is_what_is_there(live: Live):
+    device = SimulatedDevice("test", numbered)
+    live.set_plan(Plan(before_s=0.5, after_s=0.1))
+    live.open(device.open)
+    wait_until(lambda: live.ring()[0] > 0.9)
+    device.unplug()
+    live.trigger()
+    assert live.ring() == (0.0, "0.0 of 0.5 s")
+
+
 def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
     assert live.watch is None
     assert figures(None)[0] == Figure("Width", "–", "", "mm")

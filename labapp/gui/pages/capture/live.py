@@ -39,8 +39,8 @@ from labapp.words import several
 SIMULATED = "simulated"
 """Id of the simulated camera."""
 
-SHOW_S, LOOK_S, MEASURE_S = 0.025, 0.25, 0.0125
-"""Dots are looked for in a frame, a frame is judged, and one is measured no more often."""
+SHOW_S, LOOK_S = 0.025, 0.25
+"""Dots are looked for in a frame, and a frame is judged no more often."""
 
 LIGHT_S = 1.0
 """Noise and size of the dots are told anew so often: it takes a seventh of a second."""
@@ -164,7 +164,7 @@ class Live:
         self._told: set[Path] = set()
         self._counted: deque[tuple[float, int]] = deque()
         self._frame_byte = 0
-        self._ring_since_s = time.monotonic()
+        self._is_stale = False
         self._closing = threading.Event()
         self._turn = threading.Lock()
         self._light: Exposure | None = None
@@ -212,7 +212,7 @@ class Live:
         return self.feed is not None and not self._closing.is_set()
 
     def _recorder(self, feed: Feed) -> Recorder:
-        self._ring_since_s = time.monotonic()
+        self._is_stale = False
         return Recorder(
             self._place, self.plan, feed.bit_depth, feed.settings.rate_hz, self._events.put
         )
@@ -220,6 +220,7 @@ class Live:
     # --- in the camera's thread ---------------------------------------------------------------
 
     def _take(self, frame: CameraFrame) -> None:
+        self._renew()
         for recorder in self._recorders[-1:]:
             recorder.take(frame)
         self._to_show.append(frame)
@@ -363,11 +364,11 @@ class Live:
 
     def ring(self) -> tuple[float, str]:
         """How full the memory of what comes before a trigger is, 0 … 1, and that in words."""
-        wanted_s = self.plan.before_s
+        recorder = self._recorders[-1] if self._recorders else None
+        wanted_s = (recorder or self).plan.before_s
         if not wanted_s:
             return 0.0, "nothing before the trigger"
-        kept_s = min(wanted_s, time.monotonic() - self._ring_since_s)
-        kept_s *= self.running is None
+        kept_s = 0.0 if recorder is None else min(wanted_s, recorder.ring_s)
         return kept_s / wanted_s, f"{kept_s:.1f} of {wanted_s:g} s"
 
     def recording_in_words(self, room_byte: int | None) -> str:
@@ -404,28 +405,37 @@ class Live:
         """
         if not self.is_open:
             return
-        recorder = self._recorders[-1]
-        if recorder.running is None:
+        with self._turn:
+            recorder = self._recorders[-1]
+            if recorder.running is not None:
+                recorder.stop()
+                return
             self.takes.append(recorder.trigger())
-            if self.watch is not None:
-                for event, time_s in self.watch.standing():
-                    recorder.note(event, time_s)
-        else:
-            recorder.stop()
-            self._ring_since_s = time.monotonic()
+        if self.watch is not None:
+            for event, time_s in self.watch.standing():
+                recorder.note(event, time_s)
 
     def mark(self) -> None:
         """Note the present frame beside the recording that runs."""
         self._say(Event(self.name, "note", "marked by hand"))
 
     def set_plan(self, plan: Plan) -> None:
-        """Record otherwise from now on; not while a recording runs."""
+        """Record otherwise, and forget frames of before: from now on, or from a recording's end."""
         self.plan = plan
-        if self.feed is not None and self.running is None:
+        self._is_stale = True
+        self._renew()
+
+    def _renew(self) -> None:
+        """Give what follows to another recorder where one is wanted and nothing is recorded."""
+        if not self._is_stale:
+            return
+        with self._turn:
+            if self.feed is None or self.running is not None or self._closing.is_set():
+                return
             former = self._recorders[-1]
             self._recorders.append(self._recorder(self.feed))
-            # What it has still to write is waited for elsewhere; `close` waits for it, too.
-            threading.Thread(target=former.close, name="recorder ends", daemon=True).start()
+        # What it has still to write is waited for elsewhere; `close` waits for it, too.
+        threading.Thread(target=former.close, name="recorder ends", daemon=True).start()
 
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
         """Set the camera between two frames; what it is set to is answered when it is."""

@@ -144,7 +144,9 @@ class LiveFigures(QWidget):
         self._looks: dict[QLabel, tuple[Look, bool]] = {}
 
     def show_figures(self, shown: Sequence[Figure]) -> None:
-        """Show figures, each in a row."""
+        """Show figures, each in a row, and no others."""
+        for (row, _), label in self._labels.items():
+            label.setVisible(row < len(shown))
         for row, figure in enumerate(shown):
             name = f"{figure.name}\n{figure.told}" if figure.told else figure.name
             texts = (name, figure.value, figure.sigma, figure.unit)
