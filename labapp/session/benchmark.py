@@ -185,6 +185,7 @@ class Latency:
 
 def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
     """Measure so many frames of the video one after the other, and some by the cold chain."""
+    cv2.setNumThreads(1)
     steps: dict[str, list[float]] = {name: [] for name in STEPS}
     last = [0.0]
 
