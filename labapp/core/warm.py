@@ -153,7 +153,7 @@ def follow(
     passed("fit")
     heard = testimony(bed, scene, pool, labels)
     level, open_mm = _level(track, pool, heard.witness)
-    outside = beyond(bed, _shifted(pool, level), level, labels)
+    outside = beyond(bed, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
         pool, labels, lower = _fitted(bed, scene, _shifted(pool, level), labels, widen=False)
