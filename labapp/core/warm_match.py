@@ -220,9 +220,7 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
     return Testimony(witness, len(stray), missed)
 
 
-def beyond(
-    bed: Bed, pool: WarmPool, level: Level, labels: IntArray, before: BoolArray
-) -> IntArray:
+def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray, before: BoolArray) -> IntArray:
     """Lit rays whose dots may be false ones, by where they landed.
 
     Well beyond the boundary one or two (`hypothesis`); of those not lit ``before``, shape (R,), all
