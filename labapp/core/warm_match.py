@@ -37,10 +37,6 @@ RIVALS = 3
 """So many of the nearest rays contend for a dot, and so many other dots for a ray: the next ones
 are farther off by a row or a column."""
 
-WITHIN = 0.05
-"""A ray that lights up has landed at least so far within the boundary, in spacings of the rays: a
-false dot bends the surface until it lies at its rim."""
-
 ASTRAY = 0.25
 """A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
 
@@ -224,7 +220,7 @@ def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray, before: Boo
     """Lit rays whose dots may be false ones, by where they landed.
 
     Well beyond the boundary one or two (`hypothesis`); of those not lit ``before``, shape (R,), all
-    that are not clearly within it.
+    that are not within it.
     """
     lit = np.flatnonzero(labels != UNLABELLED)
     height, slope = lay(bed, pool.coefficients)
@@ -232,5 +228,4 @@ def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray, before: Boo
     rise = np.linalg.norm(slope[lit] * bed.spacing_mm, axis=-1)
     is_new, inward = ~before[lit], level.sign * over
     far = ~is_new & (inward < -BEYOND * rise)
-    unsure = is_new & (inward < WITHIN * rise)
-    return np.asarray(lit[unsure | (far & (far.sum() <= FEW))])
+    return np.asarray(lit[(is_new & (inward < 0)) | (far & (far.sum() <= FEW))])

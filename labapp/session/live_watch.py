@@ -184,10 +184,10 @@ class LiveWatch:
 
     def close(self) -> None:
         """End the measuring, whatever it is at, and who is told is told so. Twice does no harm."""
-        self._measuring.close()
         with self._turn:
-            self._is_closed = True
+            self._is_closed = True  # that measuring ends now is no alarm
             streams, self._streams = self._streams, {}
+        self._measuring.close()
         for stream in streams.values():
             stream.close()
 
