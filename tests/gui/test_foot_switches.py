@@ -20,7 +20,7 @@ from labapp.gui.pages.capture import live_view
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.window import MainWindow
-from labapp.media import hid, open_source
+from labapp.media import foot_switch, hid, open_source
 from labapp.media.cameras import SimulatedDevice
 from labapp.media.foot_switch import PedalMap
 from labapp.media.hid import HidInfo
@@ -227,7 +227,10 @@ def test_pedals_act_on_the_live_recording_whatever_page_is_in_view(
     qtbot.waitUntil(lambda: "No camera is watched: start one in the step" in said_in(window))
 
 
-def test_a_question_is_answered_before_the_next_step(start, bench: Bench, copy_sample, qtbot):
+def test_a_question_is_answered_before_the_next_step(
+    start, bench: Bench, copy_sample, qtbot, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(foot_switch, "BOUNCE_S", 0.0)  # it is pressed twice, and at once
     window = start(LEARNED)
     window.files.open(copy_sample("thumb_tack"))
     panel_of(window)
