@@ -148,7 +148,7 @@ class Painted(QObject):
         self._longest_s, self._last_s = 0.0, time.monotonic()
         viewport.installEventFilter(self)
 
-    def eventFilter(self, _: QObject, event: QEvent) -> bool:  # noqa: N802
+    def eventFilter(self, _: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt calls it so
         if event.type() == QEvent.Type.Paint and self._view.updates != self._shown:
             self._shown, now_s = self._view.updates, time.monotonic()
             self._longest_s = max(self._longest_s, now_s - self._last_s)

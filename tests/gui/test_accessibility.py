@@ -365,6 +365,9 @@ def test_the_question_whether_to_open_read_only(window: MainWindow, copy_sample:
 
     def look() -> None:
         box = QApplication.activeModalWidget()
+        if box is None or not box.isActiveWindow():  # a busy machine takes its time
+            QTimer.singleShot(20, look)
+            return
         assert isinstance(box, QMessageBox)
         try:
             asked.extend(check_round(box))

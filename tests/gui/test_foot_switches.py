@@ -251,10 +251,10 @@ def test_unplugged_is_said_and_it_comes_back_by_itself(start, bench: Bench, copy
     window.files.open(copy_sample("thumb_tack"))
     panel = panel_of(window)
     qtbot.waitUntil(connected(window))
+    unplugged = "▲ VEC Infinity foot pedal: not connected. It goes on when it is plugged in"
     for count in (1, 2):
         bench.devices[INFINITY].plugged = False
-        unplugged = "▲ VEC Infinity foot pedal: not connected. It goes on when it is plugged in"
-        qtbot.waitUntil(lambda: panel.words.text() == unplugged)  # noqa: B023
+        qtbot.waitUntil(lambda: panel.words.text() == unplugged)
         assert window.status_line.unread == ["VEC Infinity foot pedal: it was unplugged"]
         bench.devices[INFINITY].plugged = True
         qtbot.waitUntil(lambda: panel.words.text().startswith("● VEC"))
