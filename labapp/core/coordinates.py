@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -76,7 +77,11 @@ class ImageCalibration:
 
     def to_image(self, plane_mm: FloatArray) -> FloatArray:
         """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
-        return _apply(_inverse(self.matrix), plane_mm)
+        return _apply(self._to_image, plane_mm)
+
+    @cached_property
+    def _to_image(self) -> FloatArray:
+        return _inverse(self.matrix)
 
     def jacobian(self, image_px: FloatArray) -> FloatArray:
         """∂(X′, Z′)/∂(u, v) at (u, v), shape (…, 2, 2), mm/px."""

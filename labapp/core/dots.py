@@ -209,12 +209,13 @@ def estimate_size(image: Grey) -> float:
     A blob is a maximum over place and scale of the scale-normalised band-pass. Hot pixels peak
     at the smallest scale and gradients at the largest, so those two do not vote.
     """
-    stack = np.stack([band_pass(image, s) for s in _SCALES_PX])
+    # The scales grow by 2^¼: what is taken off one (`band_pass`) is what another begins with.
+    blurred = [gauss(image, 0.8 * _SCALES_PX[0] * 2 ** (k / 4)) for k in range(len(_SCALES_PX) + 4)]
+    stack = np.stack([fine - wide for fine, wide in zip(blurred, blurred[4:], strict=False)])
     best = stack.max(axis=0)
     votes = np.zeros(len(_SCALES_PX))
-    noise = 1.4826 * np.median(
-        np.abs(stack - np.median(stack, axis=(1, 2), keepdims=True)), axis=(1, 2)
-    )
+    some = stack[:, ::2, ::2].reshape(len(stack), -1)
+    noise = 1.4826 * np.median(np.abs(some - np.median(some, axis=1, keepdims=True)), axis=1)
     for k in range(1, len(_SCALES_PX) - 1):
         v, u = local_maxima(stack[k], 8.0 * noise[k] + 1e-6, _SCALES_PX[k])
         here = stack[k - 1 : k + 2, v, u]
@@ -336,29 +337,30 @@ def squares(
     return np.asarray(sliding_window_view(image, (side, side))[v - reach, u - reach])
 
 
-def describe(
-    light: Grey,
-    band: Grey,
-    noise: Grey,
-    u: IntArray,
-    v: IntArray,
-    size: float,
-    speckle_px: float,
-    whole: float = 1.0,
-) -> Dots:
-    """Centroid, its uncertainty, size, peak and signal-to-noise of each peak.
+def centroids(
+    light: Grey, u: IntArray, v: IntArray, margin: int, width: FloatArray, reach: float
+) -> tuple[FloatArray, FloatArray]:
+    """Centroids of light under Gaussian windows that are moved onto them until they stay.
 
-    The centroid is weighted by the light above its surroundings (`light_of`) under a Gaussian
-    window, ``whole`` times as wide as the size asks for, which is moved onto the centroid it gives
-    until it stays.
+    Parameters
+    ----------
+    light
+        Picture; dark where below 0.
+    u, v
+        Column and row of n pixels.
+    margin
+        Light within so many pixels is weighed.
+    width
+        Standard deviation of each one's window, shape (n,), px.
+    reach
+        A centroid is no farther from its pixel along either axis, px.
+
+    Returns
+    -------
+    offset, moment
+        The centroids from the pixels, shape (2, n), px; the second moments of the light under the
+        windows, the sum of both axes', shape (n,), px².
     """
-    reach = whole * size
-    width = 1.1 * np.full(len(u), reach)
-    if len(u) > 1:  # a window that ends half-way to the next dot keeps its light out
-        place = np.stack([u, v], axis=1)
-        nearest = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
-        width = np.minimum(width, np.maximum(0.275 * nearest, 0.75))
-    margin = int(np.ceil(2.2 * reach)) + 1
     across = np.arange(-margin, margin + 1.0)
     patches = np.maximum(squares(light, u, v, margin), 0.0).astype(float)
     offset = np.zeros((2, len(u)))
@@ -372,6 +374,49 @@ def describe(
         # The window holds the mean back; half as much again brings it home in a few steps.
         offset = np.clip(offset + 1.5 * (mean - offset), -reach, reach)
     moment = sum(part @ across**2 for part in sums) / total - np.sum(mean**2, axis=0)
+    return offset, moment
+
+
+def describe(
+    light: Grey, band: Grey, noise: Grey, u: IntArray, v: IntArray, size: float, speckle_px: float
+) -> Dots:
+    """Centroid, its uncertainty, size, peak and signal-to-noise of each peak.
+
+    The centroid is weighted by the light above its surroundings (`light_of`).
+    """
+    next_px = np.full(len(u), np.inf)
+    if len(u) > 1:
+        place = np.stack([u, v], axis=1)
+        next_px = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
+    width = windows(next_px, size)
+    found = centroids(light, u, v, margin_of(size), width, size)
+    return described(band, noise, (u, v), size, speckle_px, width, found)
+
+
+def windows(next_px: FloatArray, reach: float) -> FloatArray:
+    """Width of the windows of dots so far from the next one, shape (n,), px.
+
+    A window that ends half-way to the next dot keeps its light out.
+    """
+    return np.minimum(1.1 * reach, np.maximum(0.275 * next_px, 0.75))
+
+
+def margin_of(reach: float) -> int:
+    """So far from a peak, px, light is weighed."""
+    return int(np.ceil(2.2 * reach)) + 1
+
+
+def described(
+    band: Grey,
+    noise: Grey,
+    peaks: tuple[IntArray, IntArray],
+    size: float,
+    speckle_px: float,
+    width: FloatArray,
+    light: tuple[FloatArray, FloatArray],
+) -> Dots:
+    """Dots of peaks, their columns and rows, from what `centroids` says of their light."""
+    (u, v), (offset, moment) = peaks, light
     moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
     spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / _WIDTH_KEPT**2
     peak = band[v, u].astype(float) / _PEAK_GAIN

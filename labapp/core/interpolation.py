@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.spatial import QhullError
 
 from labapp.core.boundary import Boundary
@@ -46,6 +45,8 @@ class CloughTocherSurface:
     """
 
     def __init__(self, points_mm: FloatArray) -> None:
+        from scipy.interpolate import CloughTocher2DInterpolator
+
         self.points_mm = points_mm = np.asarray(points_mm, float)
         try:
             self._cubic = CloughTocher2DInterpolator(points_mm[:, :2], points_mm[:, 2])

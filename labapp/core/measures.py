@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -192,8 +193,8 @@ def size_of(surface: Surface, boundary: Boundary) -> tuple[FloatArray, FloatArra
     # ∫∫ z dA in triangles about the centre: each spoke stands for half of the two beside it.
     volume = wedge @ (samples[..., 2] @ (weight * fraction))
     points = np.vstack([samples.reshape(-1, 3), outline])
-    high = refined(surface, boundary, points[np.nanargmax(points[:, 2])], sign=1.0)
-    low = refined(surface, boundary, points[np.nanargmin(points[:, 2])], sign=-1.0)
+    high = refined(surface.height, boundary, points[np.nanargmax(points[:, 2])], sign=1.0)
+    low = refined(surface.height, boundary, points[np.nanargmin(points[:, 2])], sign=-1.0)
     peak = high if abs(high[2]) >= abs(low[2]) else low
     return np.array([width, length, high[2], low[2], wedge.sum(), volume]), peak[:2]
 
@@ -219,24 +220,29 @@ _PARABOLOID = np.linalg.pinv(
 """Offsets of a patch's nine points; slopes and curvatures of the paraboloid through them."""
 
 
-def refined(surface: Surface, boundary: Boundary, start_mm: FloatArray, sign: float) -> FloatArray:
+def refined(
+    height: Callable[[FloatArray, FloatArray], FloatArray],
+    boundary: Boundary,
+    start_mm: FloatArray,
+    sign: float,
+) -> FloatArray:
     """Extreme near a sample, shape (3,): the vertex of the paraboloid through a patch round it.
 
     An extreme at the boundary, or where the patch has no vertex, stays where it is.
     """
-    z = surface.height(start_mm[0] + _PATCH[0], start_mm[1] + _PATCH[1])
+    z = height(start_mm[0] + _PATCH[0], start_mm[1] + _PATCH[1])
     if not np.isfinite(z).all():
         return start_mm
-    b_x, b_y, c_xx, c_xy, c_yy = _PARABOLOID @ z
-    bend = np.array([[2 * c_xx, c_xy], [c_xy, 2 * c_yy]])
-    if not (np.linalg.eigvalsh(-sign * bend) > 1e-9).all():
+    b_x, b_y, c_xx, c_xy, c_yy = (_PARABOLOID @ z).tolist()
+    spread = math.hypot(c_xx - c_yy, c_xy)
+    if not -sign * (c_xx + c_yy) - spread > 1e-9:  # the smaller of twice its curvatures
         return start_mm
-    at = start_mm[:2] + np.clip(
-        np.linalg.solve(bend, [-b_x, -b_y]), -2 * STENCIL_MM, 2 * STENCIL_MM
-    )
+    area = 4 * c_xx * c_yy - c_xy * c_xy
+    vertex = np.array([c_xy * b_y - 2 * c_yy * b_x, c_xy * b_x - 2 * c_xx * b_y]) / area
+    at = start_mm[:2] + np.clip(vertex, -2 * STENCIL_MM, 2 * STENCIL_MM)
     if not boundary.contains(at[0], at[1]):
         return start_mm
-    refined = np.append(at, surface.height(at[0], at[1]))
+    refined = np.append(at, height(at[0], at[1]))
     return refined if sign * refined[2] >= sign * start_mm[2] else start_mm
 
 

@@ -180,7 +180,8 @@ def fit_pool(
         points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
     )
     told = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
-    weights = slope_weights(points, plane_mm, plane_covariance_mm2, rig, settings.floor_mm)
+    jacobian = slope_of_dot(points, plane_mm, rig)
+    weights = slope_weights(jacobian, plane_covariance_mm2, settings.floor_mm)
     out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
     rim = out > np.median(out)
     stiffness = CORRELATED_MM2 / settings.jerk**2
@@ -219,11 +220,16 @@ def landing_spacing(landing_mm: FloatArray) -> FloatArray:
     return np.asarray(np.abs([across, along]), float)
 
 
-def slope_weights(
-    points: FloatArray, plane_mm: FloatArray, covariance: FloatArray, rig: Rig, floor: float
-) -> FloatArray:
-    """Inverse covariance of the slopes that dots of the given covariance give, shape (n, 2, 2)."""
-    jacobian = slope_of_dot(points, plane_mm, rig)
+def slope_weights(jacobian: FloatArray, covariance: FloatArray, floor: float) -> FloatArray:
+    """Inverse covariance of slopes that follow dots (`slope_of_dot`) of some covariance, (n, 2, 2).
+
+    Parameters
+    ----------
+    jacobian, covariance
+        Of the slopes by the dots, mm⁻¹, and of the dots, mm², shapes (n, 2, 2).
+    floor
+        Least uncertainty of a dot, mm.
+    """
     floored = covariance + floor**2 * np.eye(2)
     return np.asarray(np.linalg.inv(jacobian @ floored @ np.swapaxes(jacobian, -1, -2)))
 
@@ -244,16 +250,11 @@ def slope_of_dot(points_mm: FloatArray, plane_mm: FloatArray, rig: Rig) -> Float
 def meet_surface(surface: SplineSurface, rays: FloatArray, points: FloatArray) -> FloatArray:
     """Where rays meet the surface, by bounded Newton steps from points on them; shapes (n, 3).
 
-    Rays that leave the surface's rectangle stay at its edge.
+    Beyond the surface's rectangle it goes on as it is at its edge.
     """
-    low, high = surface.basis.low_mm + 1e-9, surface.basis.high_mm - 1e-9
-    for _ in range(4):
-        height, gradient = surface.height_and_gradient(*np.clip(points[:, :2], low, high).T)
-        gap = points[:, 2] - height
-        descent = rays[:, 2] - np.vecdot(gradient, rays[:, :2])
-        step = np.clip(gap / np.maximum(-descent, 0.05), -0.5, 0.5)
-        points = points + step[:, None] * rays
-    return points
+    from labapp.core import kernels
+
+    return kernels.advance(surface.basis.grid, surface.coefficients, rays, points, 4)[0]
 
 
 def predict_dots(
@@ -352,11 +353,12 @@ def place_level(
     """
     # Height by which the surface changes from one ray to the next, straight across the contour.
     rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
-    rise = np.maximum(rise, np.median(rise) / 4)
+    usual = np.median(rise)
+    rise = np.maximum(rise, usual / 4)
     shift, sign = about or _rough_level(height, rise, witness)
     near = np.abs(height + shift) < 3.0 * rise
     reach = 1.0 if about is None else WINDOW
-    shifts = shift + np.linspace(-reach, reach, round(120 * reach) + 1) * np.median(rise)
+    shifts = shift + np.linspace(-reach, reach, round(120 * reach) + 1) * usual
     lit = y[witness > 0]
     start, end = (lit.max() + lit.min()) / 2, lit.min()
     # Only a pool that stands above the work piece is seen to sink at its rear.

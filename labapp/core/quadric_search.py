@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from labapp.core.optics import bisecting_gradient, meet_plane, reflect, surface_normal
+from labapp.core.optics import bisecting_gradient
 from labapp.core.ray_growth import UNLABELLED, Scene
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -46,21 +46,12 @@ class Quadric:
     slope
         g, shape (2,).
     curvature
-        (κ_x, κ_xy, κ_y), shape (3,) or, for several, (m, 1, 3), mm⁻¹.
+        (κ_x, κ_xy, κ_y), shape (3,), mm⁻¹.
     """
 
     center: FloatArray
     slope: FloatArray
     curvature: FloatArray
-
-    def height_and_gradient(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Height, shape (…), mm, and slopes at (x, y), shape (…, 2), mm."""
-        offset = xy - self.center
-        x, y = offset[..., 0], offset[..., 1]
-        k_x, k_xy, k_y = (self.curvature[..., k] for k in range(3))
-        along_x, along_y = self.slope[0] + k_x * x + k_xy * y, self.slope[1] + k_xy * x + k_y * y
-        gradient = np.concatenate([along_x[..., None], along_y[..., None]], axis=-1)
-        return np.vecdot(self.slope + gradient, offset) / 2, gradient
 
 
 @dataclass(frozen=True)
@@ -138,19 +129,19 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> list[Quad
     middle = window.middle
     beside = window.rays[middle[0], middle[1] + 1][None]
     # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.
-    trial = np.array([[[-0.02, 0.0, -0.02]], [[0.02, 0.0, 0.02]]])
-    moved = window.dots(Quadric(center, slope, trial), beside)[:, 0, 0] - hole[0]
+    trial = np.array([[*slope, -0.02, 0.0, -0.02], [*slope, 0.02, 0.0, 0.02]])
+    moved = window.met(center, trial, beside)[1][:, 0, 0] - hole[0]
     across = (np.array([1, -1]) * half_width - moved.mean()) / ((moved[1] - moved[0]) / 0.04)
     across = across[(np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST)]
-    curvatures = np.zeros((len(across), len(_RATIOS), 3))
-    curvatures[..., 0] = across[:, None]
-    curvatures[..., 2] = across[:, None] * _RATIOS
-    curvatures = curvatures.reshape(-1, 1, 3)
-    patterns = window.dots(Quadric(center, slope, curvatures), window.rays.reshape(-1, 3))
+    quadrics = np.zeros((len(across) * len(_RATIOS), 5))
+    quadrics[:, :2] = slope
+    quadrics[:, 2] = np.repeat(across, len(_RATIOS))
+    quadrics[:, 4] = np.outer(across, _RATIOS).ravel()
+    patterns = window.met(center, quadrics, window.rays.reshape(-1, 3))[1]
     patterns = patterns.reshape(-1, *window.rays.shape[:2], 2)
     hit = window.hits(patterns, LOOSE)[0][(slice(None), *window.core)]
-    likely = curvatures[hit.sum(axis=(1, 2)) >= 5]
-    return [Quadric(center, slope, curvature[0]) for curvature in likely]
+    likely = quadrics[hit.sum(axis=(1, 2)) >= 5]
+    return [Quadric(center, each[:2], each[2:]) for each in likely]
 
 
 class _Window:
@@ -161,7 +152,7 @@ class _Window:
         rows, columns = scene.rays.shape[:2]
         reach = min(REACH, i, j, rows - 1 - i, columns - 1 - j)
         self.scene = scene
-        self.tree = cKDTree(scene.plane_mm)
+        self.tree, self.plane = cKDTree(scene.plane_mm), scene.rig.imaging_plane.pose_mm
         self.part = slice(i - reach, i + reach + 1), slice(j - reach, j + reach + 1)
         self.rays = scene.rays[self.part]
         self.landing_mm = scene.landing_mm[i, j]
@@ -169,53 +160,37 @@ class _Window:
         self.middle = (reach, reach)
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
 
-    def dots(self, quadric: Quadric, rays: FloatArray) -> FloatArray:
-        """Dots that quadrics make of rays, shape (n, 3): IPCS, shape (…, n, 2), mm."""
-        points = self._points(quadric, rays)
-        normal = surface_normal(quadric.height_and_gradient(points[..., :2])[1])
-        return meet_plane(points, reflect(rays, normal), self.scene.rig.imaging_plane)
+    def met(
+        self, center: FloatArray, quadrics: FloatArray, rays: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Where rays, shape (n, 3), meet quadrics of (g, κ), shape (m, 5), and their dots.
 
-    def _points(self, quadric: Quadric, rays: FloatArray) -> FloatArray:
+        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm.
+        """
+        from labapp.core import quadric_kernels
+
         laser = self.scene.rig.laser.position_mm
-        points = laser - laser[2] / rays[..., 2:] * rays
-        for _ in range(3):
-            height, gradient = quadric.height_and_gradient(points[..., :2])
-            gap = points[..., 2] - height
-            descent = rays[..., 2] - np.vecdot(gradient, rays[..., :2])
-            step = np.minimum(np.maximum(gap / np.maximum(-descent, 0.05), -1.0), 1.0)
-            points = points + step[..., None] * rays
-        return np.asarray(points)
+        return quadric_kernels.meet(center, quadrics, rays, laser, self.plane)
 
     def hits(self, pattern: FloatArray, gate: float) -> tuple[BoolArray, IntArray, FloatArray]:
-        """Which predicted dots, shape (…, rows, columns, 2), fall on a dot, on which, how far off.
+        """Which predicted dots, shape (m, rows, columns, 2), fall on a dot, on which, how far off.
 
-        The last is in units of the gate.
+        The last is in units of the gate: a share of the way to the next predicted dot in the row
+        or the column.
         """
-        sane = np.asarray(np.isfinite(pattern).all(axis=-1))
-        flat = np.where(sane[..., None], pattern, 1e6)
-        spacing = np.full(sane.shape, np.inf)
-        across = np.linalg.norm(np.diff(flat, axis=-2), axis=-1)
-        along = np.linalg.norm(np.diff(flat, axis=-3), axis=-1)
-        for part, step in (
-            (spacing[..., :, 1:], across),
-            (spacing[..., :, :-1], across),
-            (spacing[..., 1:, :], along),
-            (spacing[..., :-1, :], along),
-        ):
-            np.minimum(part, step, out=part)
-        distance, dot = self.tree.query(flat)
-        off = distance / np.maximum(gate * spacing, 1e-9)
-        return (off < 1) & ~self.absent & sane, np.asarray(dot), off
+        from labapp.core import quadric_kernels
+
+        return quadric_kernels.hits(pattern, self.scene.plane_mm, self.absent, gate)
 
     def fitted(self, quadric: Quadric) -> Quadric:
         """Fit the quadric to the dots that its rays next to the reference fall near."""
         for _ in range(2):
-            rays = self.rays[self.core]
-            hit, dot, _ = self.hits(self._pattern(quadric), LOOSE)
-            hit, dot = hit[self.core], dot[self.core]
+            points, pattern = self._pattern(quadric)
+            hit, dot, _ = self.hits(pattern[None], LOOSE)
+            hit, dot = hit[0][self.core], dot[0][self.core]
             if hit.sum() < 4:
                 return quadric
-            points = self._points(quadric, rays[hit])
+            points = points[self.core][hit]
             laser, plane = self.scene.rig.laser.position_mm, self.scene.rig.imaging_plane
             dots = plane.to_universal(self.scene.plane_mm[dot[hit]])
             slopes = bisecting_gradient(points - laser, dots - points)
@@ -226,14 +201,17 @@ class _Window:
             quadric = Quadric(quadric.center, values[:2], values[2:])
         return quadric
 
-    def _pattern(self, quadric: Quadric) -> FloatArray:
-        dots = self.dots(quadric, self.rays.reshape(-1, 3))
-        return dots.reshape(*self.rays.shape[:2], 2)
+    def _pattern(self, quadric: Quadric) -> tuple[FloatArray, FloatArray]:
+        """Where all rays of the window meet a quadric, and their dots, (rows, columns, 3 and 2)."""
+        own = np.concatenate([quadric.slope, quadric.curvature])[None]
+        points, dots = self.met(quadric.center, own, self.rays.reshape(-1, 3))
+        shape = self.rays.shape[:2]
+        return points.reshape(*shape, 3), dots.reshape(*shape, 2)
 
     def judge(self, quadric: Quadric) -> QuadricGuess | None:
         """Hold a quadric against the dots; None if it does not explain those round the hole."""
-        pattern = self._pattern(quadric)
-        hit, dot, off = self.hits(pattern, TIGHT)
+        pattern = self._pattern(quadric)[1]
+        hit, dot, off = (part[0] for part in self.hits(pattern[None], TIGHT))
         if hit[self.core].sum() < 6:
             return None
         own = np.where(hit, dot, UNLABELLED)

@@ -13,6 +13,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from labapp.core import kernels
 from labapp.core.dots import (
     HOT,
     BandPassSettings,
@@ -21,14 +22,14 @@ from labapp.core.dots import (
     Image,
     band_noise,
     band_pass,
-    describe,
+    described,
     estimate_size,
-    first_of_each,
     hot_scale,
     local_noise,
+    margin_of,
     peak_disc,
-    squares,
     typical,
+    windows,
 )
 from labapp.core.values import BoolArray, CannotMeasure, IntArray, freeze
 
@@ -46,7 +47,6 @@ class Pad:
         self.image, self.fine, self.narrow, self.wide, self.band = (
             np.empty(shape, np.float32) for _ in range(5)
         )
-        self.peak = np.empty(shape, np.uint8)
         self._small: dict[int, tuple[Grey, Grey]] = {}
 
     def blur(self, image: Grey, into: Grey, sigma: float) -> None:
@@ -134,18 +134,23 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     pad.blur(fine, narrow, float(np.sqrt(0.8**2 - 0.5**2)) * size)
     pad.widen(narrow, wide, (1.6**2 - 0.8**2) * size**2)
     cv2.subtract(narrow, wide, dst=band)
-    u, v = _peaks(band, exposure.floor, size, pad)
+    over = np.flatnonzero(band > exposure.floor)
+    u, v = kernels.peaks(band, peak_disc(size).astype(bool), over)
     keep = _not_hot(image, band, u, v, size)
     u, v = u[keep], v[keep]
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
     bright = band[v, u].astype(float)
     keep = bright >= settings.contrast * typical(bright)
-    keep[keep] = first_of_each(u[keep], v[keep], size)
     u, v = u[keep], v[keep]
+    first = kernels.first_of_each(u, v, max(1.5, size))
+    u, v = u[first], v[first]
     pad.widen(narrow, wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
     cv2.subtract(fine, wide, dst=wide)
-    return describe(wide, band, exposure.noise, u, v, size, settings.speckle_px, WHOLE)
+    place, reach = np.stack([u, v], axis=1).astype(float), WHOLE * size
+    width = windows(kernels.two_nearest(place, place)[0][:, 1], reach)
+    found = kernels.centroids(wide, u, v, margin_of(reach), width, reach)
+    return described(band, exposure.noise, (u, v), size, settings.speckle_px, width, found)
 
 
 _own = threading.local()
@@ -159,28 +164,12 @@ def _pad(shape: tuple[int, ...]) -> Pad:
     return pad
 
 
-def _peaks(band: Grey, floor: Grey, size: float, pad: Pad) -> tuple[IntArray, IntArray]:
-    """Columns and rows of the local maxima (`dots.local_maxima`): first among 3 × 3 pixels."""
-    cv2.dilate(band, np.ones((3, 3), np.uint8), dst=pad.wide)
-    cv2.max(pad.wide, floor, dst=pad.wide)
-    cv2.compare(band, pad.wide, cv2.CMP_GE, dst=pad.peak)
-    if not cv2.countNonZero(pad.peak):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    u, v = np.asarray(cv2.findNonZero(pad.peak)).reshape(-1, 2).T.astype(np.int64)
-    disc = peak_disc(size).astype(bool)
-    around = squares(band, u, v, disc.shape[0] // 2, cv2.BORDER_REFLECT)[:, disc]
-    keep = (band[v, u] >= around.max(axis=1)) & (band[v, u] > floor[v, u])
-    return u[keep], v[keep]
-
-
 def _not_hot(image: Grey, band: Grey, u: IntArray, v: IntArray, size: float) -> BoolArray:
     """Not a hot pixel (`dots._dot_like`): the finer band is worked out round the peaks alone."""
     scale = hot_scale(size)
     taps = _taps(1.6 * scale)
     narrow, wide = (_nine(sigma, taps) for sigma in (0.8 * scale, 1.6 * scale))
-    patch = squares(image, u, v, taps // 2 + 1, cv2.BORDER_REFLECT)
-    fine = narrow @ patch @ narrow.T - wide @ patch @ wide.T
-    return np.asarray(fine.max(axis=(1, 2)) < HOT * band[v, u])
+    return np.asarray(kernels.finest(image, u, v, narrow, wide) < HOT * band[v, u])
 
 
 def _taps(sigma: float) -> int:

@@ -97,18 +97,12 @@ class Scene:
         cls, dots: Dots, rig: Rig, calibration: ImageCalibration, frame_shape: tuple[int, int]
     ) -> Scene:
         """Put the dots of a frame on the imaging plane."""
-        jacobian = calibration.jacobian(dots.image_px)
+        from labapp.core import kernels
+
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
-        spread = jacobian * sigma[:, None, :]
-        area = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
-        return cls(
-            calibration.to_plane(dots.image_px),
-            spread @ np.swapaxes(spread, -1, -2),
-            RESOLVED * float(np.median(dots.size_px * np.sqrt(np.abs(area)))),
-            rig,
-            calibration,
-            frame_shape,
-        )
+        plane, covariance, scale = kernels.on_plane(calibration.matrix, dots.image_px, sigma)
+        resolution = RESOLVED * float(np.median(dots.size_px * scale))
+        return cls(plane, covariance, resolution, rig, calibration, frame_shape)
 
     @cached_property
     def rays(self) -> FloatArray:

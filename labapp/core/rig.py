@@ -128,6 +128,11 @@ class ImagingPlane:
         """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
         return np.cross(self.x_axis, self.z_axis)
 
+    @cached_property
+    def pose_mm(self) -> FloatArray:
+        """O′, the directions of O′X′ and O′Z′, and the normal, shape (4, 3)."""
+        return np.array([self.origin_mm, self.x_axis, self.z_axis, self.normal])
+
     def to_universal(self, plane_mm: FloatArray) -> FloatArray:
         """IPCS (X′, Z′), shape (…, 2), to UCS points, shape (…, 3), mm (Eq. 4-5)."""
         plane_mm = np.asarray(plane_mm, float)

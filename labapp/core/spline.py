@@ -125,6 +125,12 @@ class SplineBasis:
             [np.ptp(knots) / (len(knots) - 1) for knots in (self.x_knots, self.y_knots)]
         )
 
+    @cached_property
+    def grid(self) -> FloatArray:
+        """Low and high end, step, mm, and number of cells along x and along y, shape (2, 4)."""
+        cells = np.array(self.shape) - DEGREE
+        return np.column_stack([self.low_mm, self.high_mm, self.step_mm, cells])
+
     def cells(self, x_mm: FloatArray, y_mm: FloatArray) -> Cells:
         """Find the cells of points, each shape (n,); the outermost go on beyond the rectangle."""
         nx, ny = self.shape
@@ -279,19 +285,16 @@ def fit_slopes(
         Weight of the roughness, mm⁶: the area over which the third derivatives go together, over
         their expected variance.
     """
+    from labapp.core import kernels
+
     count = basis.shape[0] * basis.shape[1]
-    cells = basis.cells(*points_mm.T)
-    value, *slope = cells.value_and_slopes()
-    by = np.stack(slope, axis=1)
-    weighted = weights @ by
-    at = (cells.splines[:, :, None] * count + cells.splines[:, None, :]).ravel()
-    square = np.swapaxes(by, 1, 2) @ weighted
-    gram = np.bincount(at, square.ravel(), count * count).reshape(count, count)
-    normal = np.asarray(gram + stiffness * basis.roughness, float)
-    pull = np.einsum("nas,na->ns", weighted, slopes)
-    target = np.bincount(cells.splines.ravel(), pull.ravel(), count)
+    splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
+    pull = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
+    target = np.bincount(splines.ravel(), pull.ravel(), count)
+    normal = stiffness * basis.roughness
+    kernels.add_gram(basis.grid, points_mm, weights, normal.reshape(-1), count)
     # Slopes say nothing of the level: hold the mean height at 0, as firmly as the slopes hold.
-    level = np.bincount(cells.splines.ravel(), value.ravel(), count) / len(points_mm)
+    level = np.bincount(splines.ravel(), value.ravel(), count) / len(points_mm)
     scale = np.trace(normal) / count
     normal += scale * np.outer(level, level)
     normal[np.diag_indices(count)] += 1e-11 * scale

@@ -193,8 +193,8 @@ def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
     for coefficients in predictions(track):
         pool = met(bed, coefficients, track.pool.points_mm, 1)
         labels, off = tracked(scene, pool, own, looked_for)
-        if len(off) >= FOUND * count and np.median(off) < STEADY:
-            return pool, labels, float(np.median(off))
+        if len(off) >= FOUND * count and (half := float(np.median(off))) < STEADY:
+            return pool, labels, half
     found = 0
     for coefficients in track.past[: -GROWN_FROM - 1 : -1]:
         pool, labels = _grown(track, scene, coefficients)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -33,9 +32,9 @@ class CannotMeasure(Exception):
 
 def freeze(value: Any) -> None:
     """Make every array field of a dataclass instance read-only (call from ``__post_init__``)."""
-    for field in dataclasses.fields(value):
-        item = getattr(value, field.name)
+    for name in type(value).__dataclass_fields__:
+        item = getattr(value, name)
         if isinstance(item, np.ndarray) and item.flags.writeable:
             item = item.view()
             item.flags.writeable = False
-            object.__setattr__(value, field.name, item)
+            object.__setattr__(value, name, item)

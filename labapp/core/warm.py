@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from labapp.core import measures
+from labapp.core import kernels, measures
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.correspondence import Match, Trial
 from labapp.core.dots import Image
@@ -34,7 +34,16 @@ from labapp.core.rig import Rig
 from labapp.core.spline import SplineSurface
 from labapp.core.track import MEMORY, Broken, Track, begin, found_again, rms
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
-from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, lay, met, spline_values
+from labapp.core.warm_fit import (
+    SERVES_MM,
+    Bed,
+    Slopes,
+    WarmPool,
+    fit_slopes_to,
+    lay,
+    met,
+    spline_values,
+)
 from labapp.core.warm_match import beyond, testimony, widened
 from labapp.core.warm_measures import follow_rim, sigma_of, sizes_of
 
@@ -203,16 +212,17 @@ def _fitted(
     bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, *, widen: bool = True
 ) -> tuple[WarmPool, IntArray, FloatArray]:
     """Fit the surface, roughly first, and then with the labels that it bears out."""
-    slopes = _slopes(bed, scene, labels)
+    slopes, serves = _slopes(bed, scene, labels), None
     for _ in range(WIDENINGS if widen else 0):
-        pool, lower, _ = fit_slopes_to(bed, pool, slopes, until_mm=ROUGHLY_MM)
+        pool, lower, moved = fit_slopes_to(bed, pool, slopes, until_mm=ROUGHLY_MM)
+        serves = lower if moved < SERVES_MM else None
         before, labels = labels, widened(bed, scene, pool, lower, labels)
         if np.array_equal(labels, before):
             break
-        slopes = _slopes(bed, scene, labels)
+        slopes, serves = _slopes(bed, scene, labels), None
         if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
             break
-    pool, lower, moved = fit_slopes_to(bed, pool, slopes)
+    pool, lower, moved = fit_slopes_to(bed, pool, slopes, lower=serves)
     if not moved < UNSETTLED_MM:
         raise Broken("the surface does not settle")
     return pool, labels, lower
@@ -253,18 +263,13 @@ def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, off: f
         If the absent ray's place is lit; or a neighbour is dark and the dots are not where they
         were foreseen, or three are: no hole tells the rows then (`lattice.find_holes`).
     """
-    marker = np.array(bed.rig.pattern.marker) - 1
-    place = [
-        np.flatnonzero((bed.at == marker + step).all(axis=1))
-        for step in ((0, 0), (0, -1), (0, 1), (-1, 0), (1, 0))
-    ]
-    if any(len(one) == 0 for one in place):
+    if bed.hole is None:
         raise Broken("the absent ray is at the pool's edge")
-    hole, *beside = (int(one[0]) for one in place)
+    hole, beside = bed.hole[0], bed.hole[1:]
     lit = labels[beside] != UNLABELLED
     reach = min(
         float(np.linalg.norm(pool.plane_mm[a] - pool.plane_mm[b])) / 2
-        for a, b in (beside[:2], beside[2:])
+        for a, b in beside.reshape(2, 2)
     )
     if not np.linalg.norm(scene.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
         raise Broken("a dot is where the absent one should be dark")
@@ -340,16 +345,16 @@ def _sized(
     bed, coefficients = track.bed, pool.coefficients
     points = pool.points_mm[ray]
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-    rim = follow_rim(bed, coefficients, level, center, track.boundary)
-    sizes = sizes_of(bed, coefficients, level, rim)
+    boundary, climb = follow_rim(bed, coefficients, level, center, track.boundary)
+    sizes = sizes_of(bed, coefficients, level, boundary, climb)
     if not sizes.holds:
         raise Broken("the surface comes down to the work piece within its boundary")
-    splines, values = spline_values(bed.basis, points[:, :2])
-    level_at = np.bincount(splines.ravel(), values[0].ravel(), len(coefficients)) / len(ray)
+    share = np.full(len(ray), 1 / len(ray))
+    level_at = kernels.gradient_of_sum(bed.basis.grid, len(coefficients), points[:, :2], share)
     made = Reconstruction(
         scheme="fit",
         surface=SplineSurface(bed.basis, coefficients),
-        boundary=rim.boundary,
+        boundary=boundary,
         ray=match.ray,
         points_mm=points,
         residual_mm=residual,

@@ -14,28 +14,12 @@ import numpy as np
 from scipy.linalg.blas import dsbmv
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 
-from labapp.core.optics import (
-    bisecting_gradient,
-    meet_level,
-    meet_plane,
-    ray_directions,
-    reflect,
-    surface_normal,
-)
-from labapp.core.pool_fit import (
-    CORRELATED_MM2,
-    FitSettings,
-    landing_spacing,
-    slope_weights,
-)
+from labapp.core import kernels
+from labapp.core.optics import meet_level, ray_directions
+from labapp.core.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing, slope_weights
 from labapp.core.rig import Rig
 from labapp.core.spline import DEGREE, SplineBasis
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
-
-SIDE = DEGREE + 1
-COLUMN, ROW = np.tril_indices(SIDE**2)[::-1]
-LOWER = ROW * SIDE**2 + COLUMN
-"""Products of two of a cell's splines: the lower triangle, and its flat places in the square."""
 
 ROUNDS = 8
 SETTLED_MM, SERVES_MM = 3e-4, 5e-3
@@ -59,15 +43,16 @@ class Bed:
         Unit directions, and where they would land on z = 0, shape (R, 3).
     absent
         Rays that the lens does not make, shape (R,).
+    hole
+        Numbers of the absent ray that tells the rows and of those on its left and right, below and
+        above it, shape (5,); None if one of them lands elsewhere.
     spacing_mm
         Between neighbouring landing points along X and along Y, shape (2,), mm.
-    splines, values
-        The splines that are not zero where rays land, and their value and derivatives by x and y
-        there, shapes (R, 16) and (3, R, 16).
+    laser_mm, plane
+        Where the laser is, shape (3,); origin, axes along X′ and Z′ and normal of the imaging
+        plane, shape (4, 3).
     stiffness
         Weight of the roughness times its matrix, lower band, shape (width + 1, p).
-    pairs
-        Flat place in the band of each product of two of a cell's splines, less its first spline.
     settings
         Of the fit.
     """
@@ -78,11 +63,11 @@ class Bed:
     rays: FloatArray
     landing_mm: FloatArray
     absent: BoolArray
+    hole: IntArray | None
     spacing_mm: FloatArray
-    splines: IntArray
-    values: FloatArray
+    laser_mm: FloatArray
+    plane: FloatArray
     stiffness: FloatArray
-    pairs: IntArray
     settings: FitSettings
 
     def __post_init__(self) -> None:
@@ -96,14 +81,18 @@ class Bed:
         spacing = landing_spacing(landing)
         at = np.argwhere(basis.contains(landing[..., 0], landing[..., 1]))
         rays, landing = rays[at[:, 0], at[:, 1]], landing[at[:, 0], at[:, 1]]
-        corner = basis.cells(np.zeros(1), np.zeros(1)).splines[0]
-        corner = corner - corner[0]
-        count, width = basis.shape[0] * basis.shape[1], int(corner[-1])
-        stiffness = np.zeros((width + 1, count))
+        count, width = basis.shape[0] * basis.shape[1], DEGREE * (basis.shape[1] + 1)
+        stiffness = np.zeros((width + 1, count), order="F")  # columns together, as LAPACK has it
         matrix = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
         for k in range(width + 1):
             stiffness[k, : count - k] = np.diagonal(matrix, -k)
-        splines, values = spline_values(basis, landing[:, :2])
+        number = {(i, j): k for k, (i, j) in enumerate((at + 1).tolist())}
+        hole = None
+        if rig.pattern.marker is not None:
+            i, j = rig.pattern.marker
+            five = (i, j), (i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)
+            if all(ray in number for ray in five):
+                hole = np.array([number[ray] for ray in five])
         return cls(
             rig=rig,
             basis=basis,
@@ -111,11 +100,11 @@ class Bed:
             rays=rays,
             landing_mm=landing,
             absent=np.array([(i, j) in rig.pattern.absent_rays for i, j in (at + 1).tolist()]),
+            hole=hole,
             spacing_mm=spacing,
-            splines=splines,
-            values=values,
+            laser_mm=rig.laser.position_mm,
+            plane=rig.imaging_plane.pose_mm,
             stiffness=stiffness,
-            pairs=(corner[ROW] - corner[COLUMN]) * count + corner[COLUMN],
             settings=settings,
         )
 
@@ -128,9 +117,7 @@ def spline_values(basis: SplineBasis, place_mm: FloatArray) -> tuple[IntArray, F
     splines, values
         Their numbers, shape (n, 16); value and derivatives by x and by y, shape (3, n, 16).
     """
-    x, y = np.minimum(np.maximum(place_mm, basis.low_mm), basis.high_mm).T
-    cells = basis.cells(x, y)
-    return cells.splines, cells.value_and_slopes()
+    return kernels.splines_at(basis.grid, place_mm)
 
 
 @dataclass(frozen=True)
@@ -161,23 +148,10 @@ class WarmPool:
 
 def met(bed: Bed, coefficients: FloatArray, points_mm: FloatArray, steps: int = 2) -> WarmPool:
     """Meet every ray with a surface, from points nearby, shape (R, 3)."""
-    points, slope = points_mm, [np.empty(0)] * 2
-    for _ in range(steps):
-        splines, values = spline_values(bed.basis, points[:, :2])
-        z, *slope = np.vecdot(values, coefficients[splines])
-        points = points + _step(bed.rays, points[:, 2] - z, *slope)[:, None] * bed.rays
-    slopes = np.array(slope).T
-    plane = meet_plane(points, reflect(bed.rays, surface_normal(slopes)), bed.rig.imaging_plane)
-    plane[~bed.basis.contains(*points[:, :2].T)] = np.nan
-    return WarmPool(coefficients, points, slopes, plane)
-
-
-def _step(
-    rays: FloatArray, gap: FloatArray, slope_x: FloatArray, slope_y: FloatArray
-) -> FloatArray:
-    """Bounded Newton step along rays that are ``gap`` above the surface (`meet_surface`)."""
-    descent = slope_x * rays[:, 0] + slope_y * rays[:, 1] - rays[:, 2]
-    return np.minimum(np.maximum(gap / np.maximum(descent, 0.05), -0.5), 0.5)
+    grid, rays = bed.basis.grid, bed.rays
+    return WarmPool(
+        coefficients, *kernels.meet(grid, coefficients, rays, points_mm, steps, bed.plane)
+    )
 
 
 @dataclass(frozen=True)
@@ -201,9 +175,9 @@ class Slopes:
     @classmethod
     def of(cls, bed: Bed, ray: IntArray, plane_mm: FloatArray, covariance: FloatArray) -> Slopes:
         """Weigh dots on the plane, shape (n, 2), of the covariance given, shape (n, 2, 2)."""
-        landing, floor = bed.landing_mm[ray], bed.settings.floor_mm
-        weights = slope_weights(landing, plane_mm, covariance, bed.rig, floor)
-        return cls(ray, bed.rig.imaging_plane.to_universal(plane_mm), weights)
+        dots = bed.rig.imaging_plane.to_universal(plane_mm)
+        jacobian = kernels.slopes_of_dots(bed.laser_mm, bed.plane[1:3], bed.landing_mm[ray], dots)
+        return cls(ray, dots, slope_weights(jacobian, covariance, bed.settings.floor_mm))
 
 
 def fit_slopes_to(
@@ -213,13 +187,14 @@ def fit_slopes_to(
     rounds: int = ROUNDS,
     rest: FloatArray | float = 0.0,
     until_mm: float = SETTLED_MM,
+    lower: FloatArray | None = None,
 ) -> tuple[WarmPool, FloatArray, float]:
     """Fit the surface to slopes, round by round from a pool that is near.
 
     Each round takes the slopes where the rays now meet the surface, fits, and meets them anew,
     until no reflection point moves by ``until_mm``. A factor serves the next round, too, where
-    points hardly move. What is held down is the roughness; of the difference to a surface where
-    coefficients ``rest`` are given.
+    points hardly move; one that serves for the first may be given as ``lower``. What is held down
+    is the roughness; of the difference to a surface where coefficients ``rest`` are given.
 
     Returns
     -------
@@ -232,26 +207,17 @@ def fit_slopes_to(
     CannotMeasure
         ``no-surface`` if the slopes do not settle the surface.
     """
-    laser, rays = bed.rig.laser.position_mm, bed.rays[slopes.ray]
+    grid, rays, weights = bed.basis.grid, bed.rays[slopes.ray], slopes.weights
     coefficients, points = pool.coefficients, pool.points_mm[slopes.ray]
-    count, width = len(coefficients), len(bed.stiffness) - 1
-    lower, moved = np.empty(0), np.inf
+    width, moved = len(bed.stiffness) - 1, 0.0
+    lower = factor(bed, points, weights) if lower is None else lower
     for _ in range(rounds):
-        splines, values = spline_values(bed.basis, points[:, :2])
         if moved > SERVES_MM:
-            lower = factor(bed, splines, values, slopes.weights)
-        slope = np.vecdot(values[1:], coefficients[splines]).T
-        asked = bisecting_gradient(points - laser, slopes.dots_mm - points)
-        pull = (slopes.weights @ (asked - slope)[:, :, None])[:, :, 0]
-        right = pull[:, 0, None] * values[1] + pull[:, 1, None] * values[2]
-        target = np.bincount(splines.ravel(), right.ravel(), count).astype(float)
+            lower = factor(bed, points, weights)
+        target = kernels.pull(grid, coefficients, points, weights, bed.laser_mm, slopes.dots_mm)
         target -= dsbmv(width, 1.0, bed.stiffness, coefficients - rest, lower=1)
-        change = solve(lower, target)
-        coefficients = coefficients + change
-        z, *slope = np.vecdot(values, coefficients[splines])
-        step = _step(rays, points[:, 2] - z, *slope)
-        points = points + step[:, None] * rays
-        moved = float(np.abs(step).max())
+        coefficients = coefficients + solve(lower, target)
+        points, moved = kernels.advance(grid, coefficients, rays, points, 1)
         if moved < until_mm:
             break
     every = pool.points_mm.copy()
@@ -259,8 +225,8 @@ def fit_slopes_to(
     return met(bed, coefficients, every, 1), lower, moved
 
 
-def factor(bed: Bed, splines: IntArray, values: FloatArray, weights: FloatArray) -> FloatArray:
-    """Cholesky factor of the normal matrix, lower band, shape (width + 1, p).
+def factor(bed: Bed, points_mm: FloatArray, weights: FloatArray) -> FloatArray:
+    """Cholesky factor of the normal matrix of slopes at points, lower band, shape (width + 1, p).
 
     Slopes leave the level open; it is held by one spline in the middle, which moves nothing else.
 
@@ -269,12 +235,11 @@ def factor(bed: Bed, splines: IntArray, values: FloatArray, weights: FloatArray)
     CannotMeasure
         ``no-surface`` if there is none.
     """
-    by = np.moveaxis(values[1:], 0, 1)
-    square = np.swapaxes(by, 1, 2) @ (weights @ by)
-    at = (splines[:, :1] + bed.pairs).ravel()
-    gram = np.bincount(at, square.reshape(len(by), -1)[:, LOWER].ravel(), bed.stiffness.size)
-    band = gram.reshape(bed.stiffness.shape) + bed.stiffness
-    band[0, splines[len(splines) // 2, 5]] += band[0].mean()
+    columns, (height, count) = bed.stiffness.flatten(order="F"), bed.stiffness.shape
+    kernels.add_gram(bed.basis.grid, points_mm, weights, columns, height - 1)
+    band = columns.reshape(count, height).T
+    middle = kernels.splines_at(bed.basis.grid, points_mm[len(points_mm) // 2, None])[0]
+    band[0, middle[0, 5]] += band[0].mean()
     lower, info = dpbtrf(band, lower=1, overwrite_ab=1)
     if info:
         raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
@@ -288,5 +253,5 @@ def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
 
 def lay(bed: Bed, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Height and slopes of a surface where the rays would land, shapes (R,) and (R, 2)."""
-    z, *slope = np.vecdot(bed.values, coefficients[bed.splines])
+    z, *slope = kernels.surface_at(bed.basis.grid, coefficients, bed.landing_mm)
     return z, np.array(slope).T

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
+from labapp.core import kernels
 from labapp.core.hypothesis import BEYOND, FEW
 from labapp.core.optics import reflect, surface_normal
-from labapp.core.pool_fit import Level, slope_of_dot
+from labapp.core.pool_fit import Level
 from labapp.core.ray_growth import (
     CAUTION,
     CLEAR,
@@ -51,7 +51,8 @@ def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
     """Distance of some rays' dots from the next of them; infinite for other rays, shape (R,)."""
     distance = np.full(len(plane_mm), np.inf)
     if len(ray) > 1:
-        distance[ray] = cKDTree(plane_mm[ray]).query(plane_mm[ray], k=2)[0][:, 1]
+        places = plane_mm[ray]
+        distance[ray] = kernels.two_nearest(places, places)[0][:, 1]
     return distance
 
 
@@ -105,10 +106,9 @@ def tracked(
     if len(near) < 2 or len(scene.plane_mm) < 2:
         return labels, np.empty(0)
     plane = pool.plane_mm[near]
-    rays, dots = cKDTree(plane), cKDTree(scene.plane_mm)
-    step = rays.query(plane, k=2)[0][:, 1]
-    off, ray = rays.query(scene.plane_mm, k=2)
-    other, dot = dots.query(plane, k=2)
+    step = kernels.two_nearest(plane, plane)[0][:, 1]
+    off, ray = kernels.two_nearest(scene.plane_mm, plane)
+    other, dot = kernels.two_nearest(plane, scene.plane_mm)
     own, off_own = ray[:, 0], off[:, 0]
     gate = GATE * step[own]
     sure = (off_own < gate) & (step[own] > scene.resolution_mm) & lit[near[own]]
@@ -164,7 +164,10 @@ def _surprise(
     by = np.zeros((2, len(ray), len(pool.coefficients)))
     for axis in range(2):
         np.put_along_axis(by[axis], splines, values[1 + axis], axis=1)
-    moved = np.linalg.inv(slope_of_dot(pool.points_mm[ray], pool.plane_mm[ray], bed.rig))
+    dots_mm = bed.rig.imaging_plane.to_universal(pool.plane_mm[ray])
+    axes = bed.plane[1:3]
+    slopes = kernels.slopes_of_dots(bed.laser_mm, axes, pool.points_mm[ray], dots_mm)
+    moved = np.linalg.inv(slopes)
     rows = moved @ np.moveaxis(by, 0, 1)
     across = solve(lower, np.asfortranarray(rows.reshape(2 * len(ray), -1).T))
     spread = rows @ across.T.reshape(len(ray), 2, -1).swapaxes(1, 2)

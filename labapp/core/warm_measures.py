@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
-from labapp.core import measures
+from labapp.core import kernels, measures
 from labapp.core.boundary import Boundary
 from labapp.core.fit import boundary_of, contour
 from labapp.core.pool_fit import Level
 from labapp.core.spline import SplineSurface
-from labapp.core.values import FloatArray, IntArray
-from labapp.core.warm_fit import Bed, spline_values
+from labapp.core.values import FloatArray
+from labapp.core.warm_fit import Bed
 
 STEPS = 4
 """Newton steps from the boundary of the frame before, at most."""
@@ -35,30 +35,16 @@ STRIDE = 4
 """Every so many boundary points there is a spoke of samples: the surface is smooth."""
 
 
-@dataclass(frozen=True)
-class Rim:
-    """A boundary, and the surface there; m points.
-
-    Parameters
-    ----------
-    boundary
-        The boundary.
-    splines, value
-        The splines that are not zero at its points, and their values, shape (m, 16).
-    climb
-        Gradient of the surface's height over the rim's, shape (m, 2).
-    """
-
-    boundary: Boundary
-    splines: IntArray
-    value: FloatArray
-    climb: FloatArray
-
-
 def follow_rim(
     bed: Bed, coefficients: FloatArray, level: Level, center_mm: FloatArray, before: Boundary
-) -> Rim:
+) -> tuple[Boundary, FloatArray]:
     """Move a boundary onto a surface that is near its own.
+
+    Returns
+    -------
+    boundary, climb
+        The boundary of m points, and the gradient there of the surface's height over the rim's,
+        shape (m, 2).
 
     Raises
     ------
@@ -68,19 +54,12 @@ def follow_rim(
     radius = np.linalg.norm(before.points_mm[:, :2] - before.center_mm, axis=-1)
     theta = np.radians(before.theta_deg)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    rear = np.array([level.rear.drop_mm, level.rear.start_mm, level.rear.end_mm])
     for attempt in range(2):
-        for _ in range(STEPS):
-            place = center_mm + radius[:, None] * way
-            splines, values = spline_values(bed.basis, place)
-            z, slope_x, slope_y = np.vecdot(values, coefficients[splines])
-            y = place[:, 1]
-            climb = np.stack([slope_x, slope_y - level.rear.slope(y)], axis=-1)
-            outward = np.vecdot(climb, way)
-            over = z - level.rear.height(y)
-            change = -over / np.where(np.abs(outward) > 1e-6, outward, np.inf)
-            radius = radius + np.minimum(np.maximum(change, -0.3), 0.3)
-            if np.abs(change).max() < LAST_MM:
-                break
+        radius, climb, over = kernels.follow_rim(
+            bed.basis.grid, coefficients, rear, center_mm, way, radius, STEPS, LAST_MM
+        )
+        place = center_mm + radius[:, None] * way
         inside = bool(bed.basis.contains(*place.T).all() and (radius > 0).all())
         if inside and np.abs(over).max() < ON_RIM_MM:
             break
@@ -88,7 +67,7 @@ def follow_rim(
         if attempt:
             break
         radius = np.linalg.norm(found.points_mm[:, :2] - center_mm, axis=-1)
-    return Rim(boundary_of(level.rear, center_mm, way, radius), splines, values[0], climb)
+    return boundary_of(level.rear, center_mm, way, radius), climb
 
 
 @dataclass(frozen=True)
@@ -113,46 +92,46 @@ class Sizes:
     holds: bool
 
 
-def sizes_of(bed: Bed, coefficients: FloatArray, level: Level, rim: Rim) -> Sizes:
+def sizes_of(
+    bed: Bed, coefficients: FloatArray, level: Level, boundary: Boundary, climb: FloatArray
+) -> Sizes:
     """Measure a surface within its boundary as `measures.size_of` does, with fewer samples."""
-    boundary, count = rim.boundary, len(coefficients)
-    surface = SplineSurface(bed.basis, coefficients)
+
+    def height(x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        place_mm = np.stack([x_mm, y_mm], axis=-1).reshape(-1, 2)
+        z = kernels.surface_at(bed.basis.grid, coefficients, place_mm)[0]
+        return np.asarray(z.reshape(np.shape(x_mm)))
+
+    def gradient_of(place_mm: FloatArray, share: FloatArray) -> FloatArray:
+        return kernels.gradient_of_sum(bed.basis.grid, len(coefficients), place_mm, share)
+
     outline, center = boundary.points_mm, boundary.center_mm
     fraction = (NODE + 1) / 2
     spoke = outline[::STRIDE, :2] - center
     place = (center + fraction[:, None] * spoke[:, None]).reshape(-1, 2)
-    cells = bed.basis.cells(*place.T)
-    value = cells.values()
-    z = (value * coefficients[cells.splines]).sum(axis=-1)
+    z = kernels.surface_at(bed.basis.grid, coefficients, place)[0]
     wedge = _gathered(measures.wedges(boundary))
     share = (wedge[:, None] * (WEIGHT * fraction)).ravel()
     samples = np.vstack([np.column_stack([place, z]), outline])
     extremes = [int(np.argmax(samples[:, 2])), int(np.argmin(samples[:, 2]))]
     # An extreme on the rim is where it is; one within may lie between the samples.
     high, low = (
-        measures.refined(surface, boundary, samples[at], sign) if at < len(place) else samples[at]
+        measures.refined(height, boundary, samples[at], sign) if at < len(place) else samples[at]
         for at, sign in zip(extremes, (1.0, -1.0), strict=True)
     )
-    gradient = np.zeros((6, count))
-    right, left = int(np.argmax(outline[:, 0])), int(np.argmin(outline[:, 0]))
-    head, tail = int(np.argmax(outline[:, 1])), int(np.argmin(outline[:, 1]))
-    for row, ahead, behind in ((0, right, left), (1, head, tail)):
-        for at, side in ((ahead, -1.0), (behind, 1.0)):
-            np.add.at(gradient[row], rim.splines[at], side * rim.value[at] / rim.climb[at, row])
+    gradient = np.zeros((6, len(coefficients)))
+    ends = outline[:, :2].argmax(axis=0), outline[:, :2].argmin(axis=0)
+    for axis, end in enumerate(np.transpose(ends)):
+        gradient[axis] = gradient_of(outline[end, :2], np.array([-1.0, 1.0]) / climb[end, axis])
     for row, at, extreme in ((2, extremes[0], high), (3, extremes[1], low)):
         if at < len(place):  # on the rim, whose height is given, nothing changes
-            splines, values = spline_values(bed.basis, extreme[None, :2])
-            gradient[row, splines[0]] = values[0, 0]
+            gradient[row] = gradient_of(extreme[None, :2], np.ones(1))
     way = outline[:, :2] - center
     radius = np.linalg.norm(way, axis=-1)
-    outward = np.sum(rim.climb * way, axis=-1) / radius
+    outward = np.sum(climb * way, axis=-1) / radius
     moved = -radius * (2 * np.pi / len(outline)) / outward
-    at_rim = rim.splines.ravel()
-    gradient[4] = np.bincount(at_rim, (moved[:, None] * rim.value).ravel(), count)
-    gradient[5] = np.bincount(cells.splines.ravel(), (share[:, None] * value).ravel(), count)
-    gradient[5] += np.bincount(
-        at_rim, ((moved * outline[:, 2])[:, None] * rim.value).ravel(), count
-    )
+    gradient[4] = gradient_of(outline[:, :2], moved)
+    gradient[5] = gradient_of(place, share) + gradient_of(outline[:, :2], moved * outline[:, 2])
     width, length = np.ptp(outline[:, :2], axis=0)
     peak = high if abs(high[2]) >= abs(low[2]) else low
     size = np.array([width, length, high[2], low[2], wedge.sum(), share @ z])

@@ -13,7 +13,6 @@ from typing import NamedTuple
 from labapp.core.measures import Measures
 from labapp.core.pipeline import Settings
 from labapp.core.quality import Quality, judge_quality
-from labapp.core.warm import WarmChain
 from labapp.media import GreyImage
 from labapp.session.scene import Scene, scene_of
 from labapp.session.setup import Setup
@@ -112,6 +111,8 @@ _measure: list[Callable[[GreyImage, bool], LiveMeasurement]] = []
 
 def _begin(given: _Chain) -> None:
     setup, settings, depth = given
+    from labapp.core.warm import WarmChain
+
     chain = WarmChain(setup.rig, setup.calibration, settings)
     rays = setup.rig.pattern.rows * setup.rig.pattern.columns
     verdict: list[tuple[float, Quality]] = []

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -21,13 +21,11 @@ from threadpoolctl import ThreadpoolController
 
 from labapp.core.correction import Correction
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.warm import WarmChain
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource, open_source
 from labapp.session.results import ResultsWriter
 from labapp.session.run import measuring_pool
 from labapp.session.setup import Setup
-from labapp.session.tables import table_rows
 
 STRETCH = 1000
 """Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
@@ -66,7 +64,7 @@ class Job:
     Parameters
     ----------
     path, index
-        The recording, and what opening it found out (`FrameSource.index`).
+        The recording, and what opening it found out (`FrameSource.index`), where it was.
     setup, settings
         What it is measured with.
     """
@@ -107,6 +105,10 @@ def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None
         pools = [measuring_pool(1) for _ in range(workers)]
         for pool in pools:
             at_end.callback(pool.shutdown, cancel_futures=True)
+            pool.submit(_ready)
+        if job.index is None:  # found out once, while the processes start
+            with open_source(job.path) as source:
+                job = replace(job, index=source.index)
         begun: deque[deque[Future[list[Told]]]] = deque()
         waiting = iter(enumerate(stretches))
         begun += (_begun(pools[k % workers], job, s) for k, s in islice(waiting, workers))
@@ -148,6 +150,8 @@ def follow_each(
 
     A frame that was corrected by hand is measured as it was corrected.
     """
+    from labapp.core.warm import WarmChain
+
     threads, chain = ThreadpoolController(), WarmChain(setup.rig, setup.calibration, settings)
     for place, number in enumerate(frames):
         if place % STRETCH == 0:
@@ -175,12 +179,22 @@ def _begun(pool: Executor, job: Job, stretch: Sequence[int]) -> deque[Future[lis
     )
 
 
+def _ready() -> None:
+    """Have a process start, and load what it measures with."""
+    import labapp.core.warm
+    import labapp.session.quick_rows  # noqa: F401
+
+
 class Following:
     """Measures one stretch of a recording."""
 
     def __init__(self, job: Job) -> None:
-        self._job = job
+        from labapp.core.warm import WarmChain
+        from labapp.session.quick_rows import quick_rows
+
+        self._job, self._rows = job, quick_rows
         self._source: FrameSource = open_source(job.path, job.index)
+        self._threads = ThreadpoolController()
         self._chain = WarmChain(job.setup.rig, job.setup.calibration, job.settings)
 
     def measure(self, number: int) -> Told:
@@ -194,13 +208,13 @@ class Following:
             time_s = frame.time_s
             measurement = self._chain.measure(frame.image)
             broke = self._chain.broke
-        rows = table_rows(number, time_s, measurement, self._job.setup.calibration)
+        rows = self._rows(number, time_s, measurement, self._job.setup.calibration)
         return Told(number, time_s, measurement, broke, rows)
 
     def measure_all(self, numbers: Sequence[int]) -> list[Told]:
         """Measure the next frames."""
         # Matrices are small: more threads than one get in each other's way.
-        with ThreadpoolController().limit(limits=1, user_api="blas"):
+        with self._threads.limit(limits=1, user_api="blas"):
             return [self.measure(number) for number in numbers]
 
     def close(self) -> None:

@@ -1,0 +1,489 @@
+"""Inner loops of the warm chain, compiled for the processor (docs/adr/0018).
+
+A followed frame has a hundred dots: NumPy's overhead per call would take longer than the sums. Here
+are only loops over dots, rays and splines; what they mean is told where they are called. All of
+them are in one file because a compiled function is kept on disk as long as its own file does not
+change, whatever became of those it calls.
+
+Arrays may be read-only, and of any layout but for pictures. Places of splines are a grid's: for
+each of its two axes low, high, step and number of cells, shape (2, 4) (`SplineBasis.grid`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled as _compiled
+from labapp.core.compiled import part as _inner
+from labapp.core.dots import Grey
+from labapp.core.values import BoolArray, FloatArray, IntArray
+
+_f, _i = types.float64, types.int64
+_f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
+_grey, _greys = (types.Array(types.float32, n, "C", readonly=True) for n in (2, 3))
+_ints = types.Array(_i, 1, "A", readonly=True)
+_mask = types.Array(types.boolean, 2, "C", readonly=True)
+
+
+# --- splines ------------------------------------------------------------------------------------
+
+
+@_inner
+def _along(axis: FloatArray, place: float, value: FloatArray, slope: FloatArray) -> int:
+    """Values and slopes of the four cubic splines at a place held to an axis; the first one."""
+    low, high, step = axis[0], axis[1], axis[2]
+    at = (min(max(place, low), high) - low) / step
+    first = min(int(at), int(axis[3]) - 1) if at > 0.0 else 0
+    t = at - first
+    s = 1.0 - t
+    value[0] = s * s * s / 6.0
+    value[1] = ((3.0 * t - 6.0) * t * t + 4.0) / 6.0
+    value[2] = ((3.0 * s - 6.0) * s * s + 4.0) / 6.0
+    value[3] = t * t * t / 6.0
+    slope[0] = -s * s / 2.0 / step
+    slope[1] = (1.5 * t - 2.0) * t / step
+    slope[2] = (2.0 - 1.5 * s) * s / step
+    slope[3] = t * t / 2.0 / step
+    return first
+
+
+@_inner
+def _at(
+    grid: FloatArray, coefficients: FloatArray, x: float, y: float, work: FloatArray
+) -> tuple[float, float, float]:
+    """Height and slopes of a surface; what the splines are there stays in ``work``, (4, 4)."""
+    first_x = _along(grid[0], x, work[0], work[1])
+    first_y = _along(grid[1], y, work[2], work[3])
+    many = int(grid[1, 3]) + 3
+    z, slope_x, slope_y = 0.0, 0.0, 0.0
+    for a in range(4):
+        at = (first_x + a) * many + first_y
+        value, slope = 0.0, 0.0
+        for b in range(4):
+            value += work[2, b] * coefficients[at + b]
+            slope += work[3, b] * coefficients[at + b]
+        z += work[0, a] * value
+        slope_x += work[1, a] * value
+        slope_y += work[0, a] * slope
+    return z, slope_x, slope_y
+
+
+@_compiled(_f2, _f2)
+def splines_at(grid: FloatArray, place: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Splines that are not zero at places, shape (n, 2): see `warm_fit.spline_values`."""
+    count, many = len(place), int(grid[1, 3]) + 3
+    splines, values = np.empty((count, 16), np.int64), np.empty((3, count, 16))
+    work = np.empty((4, 4))
+    for k in range(count):
+        first_x = _along(grid[0], place[k, 0], work[0], work[1])
+        first_y = _along(grid[1], place[k, 1], work[2], work[3])
+        for a in range(4):
+            for b in range(4):
+                splines[k, 4 * a + b] = (first_x + a) * many + first_y + b
+                values[0, k, 4 * a + b] = work[0, a] * work[2, b]
+                values[1, k, 4 * a + b] = work[1, a] * work[2, b]
+                values[2, k, 4 * a + b] = work[0, a] * work[3, b]
+    return splines, values
+
+
+@_compiled(_f2, _f1, _f2)
+def surface_at(grid: FloatArray, coefficients: FloatArray, place: FloatArray) -> FloatArray:
+    """Height and slopes of a surface at places, shapes (n, 2) and (3, n)."""
+    made, work = np.empty((3, len(place))), np.empty((4, 4))
+    for k in range(len(place)):
+        z, slope_x, slope_y = _at(grid, coefficients, place[k, 0], place[k, 1], work)
+        made[0, k], made[1, k], made[2, k] = z, slope_x, slope_y
+    return made
+
+
+@_compiled(_f2, _i, _f2, _f1)
+def gradient_of_sum(
+    grid: FloatArray, count: int, place: FloatArray, share: FloatArray
+) -> FloatArray:
+    """Derivative of Σ share · height at places by so many coefficients, shape (p,)."""
+    made, work, many = np.zeros(count), np.empty((4, 4)), int(grid[1, 3]) + 3
+    for k in range(len(place)):
+        first_x = _along(grid[0], place[k, 0], work[0], work[1])
+        first_y = _along(grid[1], place[k, 1], work[2], work[3])
+        for a in range(4):
+            for b in range(4):
+                made[(first_x + a) * many + first_y + b] += share[k] * work[0, a] * work[2, b]
+    return made
+
+
+# --- rays ---------------------------------------------------------------------------------------
+
+
+@_inner
+def _meet(
+    grid: FloatArray, coefficients: FloatArray, ray: FloatArray, point: FloatArray, work: FloatArray
+) -> tuple[float, float, float]:
+    """Move a point along its ray by a bounded Newton step (`meet_surface`); step and slopes."""
+    z, slope_x, slope_y = _at(grid, coefficients, point[0], point[1], work)
+    descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
+    step = min(max((point[2] - z) / max(descent, 0.05), -0.5), 0.5)
+    for axis in range(3):
+        point[axis] += step * ray[axis]
+    return step, slope_x, slope_y
+
+
+@_compiled(_f2, _f1, _f2, _f2, _i, _f2)
+def meet(
+    grid: FloatArray,
+    coefficients: FloatArray,
+    rays: FloatArray,
+    points: FloatArray,
+    steps: int,
+    plane: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Meet rays with a surface and reflect them to a plane: see `warm_fit.met`.
+
+    The plane is its origin, its axes along X′ and Z′ and its normal, shape (4, 3).
+    """
+    count = len(rays)
+    met, slopes, dots = points.copy(), np.empty((count, 2)), np.empty((count, 2))
+    work = np.empty((4, 4))
+    for k in range(count):
+        ray, point = rays[k], met[k]
+        slope_x, slope_y = 0.0, 0.0
+        for _ in range(steps):
+            _, slope_x, slope_y = _meet(grid, coefficients, ray, point, work)
+        slopes[k, 0], slopes[k, 1] = slope_x, slope_y
+        # Twice the ray's part along the normal (−f_x, −f_y, 1) is taken off (Eq. 4-4).
+        twice = 2.0 * (ray[2] - slope_x * ray[0] - slope_y * ray[1])
+        twice /= slope_x * slope_x + slope_y * slope_y + 1.0
+        away = ray[0] + twice * slope_x, ray[1] + twice * slope_y, ray[2] - twice
+        gap, along = 0.0, 0.0
+        for axis in range(3):
+            gap += (plane[0, axis] - point[axis]) * plane[3, axis]
+            along += away[axis] * plane[3, axis]
+        distance = gap / along if along != 0.0 else np.nan
+        on_grid = grid[0, 0] <= point[0] <= grid[0, 1] and grid[1, 0] <= point[1] <= grid[1, 1]
+        dots[k, 0] = dots[k, 1] = np.nan
+        if on_grid and 0.0 < distance < np.inf:
+            dots[k, 0] = dots[k, 1] = 0.0
+            for axis in range(3):
+                at = point[axis] + distance * away[axis] - plane[0, axis]
+                dots[k, 0] += at * plane[1, axis]
+                dots[k, 1] += at * plane[2, axis]
+    return met, slopes, dots
+
+
+@_inner
+def _bisecting(
+    laser: FloatArray, point: FloatArray, dot_x: float, dot_y: float, dot_z: float
+) -> tuple[float, float]:
+    """Slopes that turn the ray from the laser at a point to a dot (`optics.bisecting_gradient`)."""
+    to_x, to_y, to_z = point[0] - laser[0], point[1] - laser[1], point[2] - laser[2]
+    on_x, on_y, on_z = dot_x - point[0], dot_y - point[1], dot_z - point[2]
+    to = np.sqrt(to_x * to_x + to_y * to_y + to_z * to_z)
+    on = np.sqrt(on_x * on_x + on_y * on_y + on_z * on_z)
+    normal_z = on_z / on - to_z / to
+    return -(on_x / on - to_x / to) / normal_z, -(on_y / on - to_y / to) / normal_z
+
+
+@_compiled(_f1, _f2, _f2, _f2)
+def slopes_of_dots(
+    laser: FloatArray, axes: FloatArray, points: FloatArray, dots: FloatArray
+) -> FloatArray:
+    """What `pool_fit.slope_of_dot` gives for dots in the UCS, shape (n, 3), and a plane's axes."""
+    made, step = np.empty((len(points), 2, 2)), 1e-3
+    for k in range(len(points)):
+        dot, point = dots[k], points[k]
+        base_x, base_y = _bisecting(laser, point, dot[0], dot[1], dot[2])
+        for axis in range(2):
+            by = step * axes[axis, 0], step * axes[axis, 1], step * axes[axis, 2]
+            x, y = _bisecting(laser, point, dot[0] + by[0], dot[1] + by[1], dot[2] + by[2])
+            made[k, 0, axis], made[k, 1, axis] = (x - base_x) / step, (y - base_y) / step
+    return made
+
+
+# --- the fit ------------------------------------------------------------------------------------
+
+
+@_compiled(_f2, _f2, _f3, types.Array(_f, 1, "C"), _i)
+def add_gram(
+    grid: FloatArray, points: FloatArray, weights: FloatArray, normal: FloatArray, stride: int
+) -> None:
+    """Add what slopes at points weigh to a normal matrix, its coefficients i ≤ j at i·stride + j.
+
+    With a stride of p that is the upper triangle of a full matrix; with the width of a band, its
+    columns one after the other, as LAPACK has them.
+    """
+    work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
+    by_x, by_y = np.empty(16), np.empty(16)
+    for k in range(len(points)):
+        first_x = _along(grid[0], points[k, 0], work[0], work[1])
+        first_y = _along(grid[1], points[k, 1], work[2], work[3])
+        for a in range(4):
+            for b in range(4):
+                by_x[4 * a + b] = work[1, a] * work[2, b]
+                by_y[4 * a + b] = work[0, a] * work[3, b]
+        xx, xy, yy = weights[k, 0, 0], weights[k, 0, 1], weights[k, 1, 1]
+        for own in range(16):
+            along_x = xx * by_x[own] + xy * by_y[own]
+            along_y = xy * by_x[own] + yy * by_y[own]
+            row = ((first_x + own // 4) * many + first_y + own % 4) * stride
+            for other in range(own, 16):
+                column = (first_x + other // 4) * many + first_y + other % 4
+                normal[row + column] += along_x * by_x[other] + along_y * by_y[other]
+
+
+@_compiled(_f2, _f1, _f2, _f3, _f1, _f2)
+def pull(
+    grid: FloatArray,
+    coefficients: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    laser: FloatArray,
+    dots: FloatArray,
+) -> FloatArray:
+    """What the slopes that dots ask for at points pull at the coefficients, shape (p,)."""
+    made, work = np.zeros(len(coefficients)), np.empty((4, 4))
+    many = int(grid[1, 3]) + 3
+    for k in range(len(points)):
+        x, y = points[k, 0], points[k, 1]
+        _, slope_x, slope_y = _at(grid, coefficients, x, y, work)
+        first_x = _along(grid[0], x, work[0], work[1])
+        first_y = _along(grid[1], y, work[2], work[3])
+        asked_x, asked_y = _bisecting(laser, points[k], dots[k, 0], dots[k, 1], dots[k, 2])
+        off_x, off_y = asked_x - slope_x, asked_y - slope_y
+        pull_x = weights[k, 0, 0] * off_x + weights[k, 0, 1] * off_y
+        pull_y = weights[k, 1, 0] * off_x + weights[k, 1, 1] * off_y
+        for a in range(4):
+            for b in range(4):
+                by_x, by_y = work[1, a] * work[2, b], work[0, a] * work[3, b]
+                made[(first_x + a) * many + first_y + b] += pull_x * by_x + pull_y * by_y
+    return made
+
+
+@_compiled(_f2, _f1, _f2, _f2, _i)
+def advance(
+    grid: FloatArray, coefficients: FloatArray, rays: FloatArray, points: FloatArray, steps: int
+) -> tuple[FloatArray, float]:
+    """Move points along their rays towards the surface; and the longest of the last steps."""
+    moved, most, work = points.copy(), 0.0, np.empty((4, 4))
+    for k in range(len(points)):
+        step = 0.0
+        for _ in range(steps):
+            step, _, _ = _meet(grid, coefficients, rays[k], moved[k], work)
+        most = max(most, abs(step))
+    return moved, most
+
+
+# --- dots ---------------------------------------------------------------------------------------
+
+
+@_compiled(_f2, _f2, _f2)
+def on_plane(
+    matrix: FloatArray, image: FloatArray, sigma: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Put dots of some standard deviations on the imaging plane (`ImageCalibration`).
+
+    Gives the places, shape (n, 2), their covariance and how many mm a pixel is there, shape (n,).
+    """
+    count = len(image)
+    plane, covariance, scale = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
+    by = np.empty((2, 2))
+    for k in range(count):
+        u, v = image[k, 0], image[k, 1]
+        w = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
+        for i in range(2):
+            plane[k, i] = (matrix[i, 0] * u + matrix[i, 1] * v + matrix[i, 2]) / w
+            for j in range(2):
+                by[i, j] = (matrix[i, j] - plane[k, i] * matrix[2, j]) / w
+        for i in range(2):
+            for j in range(2):
+                covariance[k, i, j] = (
+                    by[i, 0] * by[j, 0] * sigma[k, 0] ** 2 + by[i, 1] * by[j, 1] * sigma[k, 1] ** 2
+                )
+        scale[k] = np.sqrt(abs(by[0, 0] * by[1, 1] - by[0, 1] * by[1, 0]))
+    return plane, covariance, scale
+
+
+@_compiled(_f2, _f2)
+def two_nearest(places: FloatArray, among: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Distance and number of the two nearest of some places, shape (m, 2), from each of others.
+
+    Shapes (n, 2); where there is no second one it is infinitely far off and has the number m.
+    """
+    count = len(places)
+    distance, number = np.empty((count, 2)), np.empty((count, 2), np.int64)
+    among_x, among_y, square = among[:, 0].copy(), among[:, 1].copy(), np.empty(len(among))
+    for k in range(count):
+        for m in range(len(among)):
+            x, y = places[k, 0] - among_x[m], places[k, 1] - among_y[m]
+            square[m] = x * x + y * y
+        first, second, one, other = np.inf, np.inf, len(among), len(among)
+        for m in range(len(among)):
+            if square[m] < second:
+                if square[m] < first:
+                    second, other = first, one
+                    first, one = square[m], m
+                else:
+                    second, other = square[m], m
+        distance[k, 0], distance[k, 1] = np.sqrt(first), np.sqrt(second)
+        number[k, 0], number[k, 1] = one, other
+    return distance, number
+
+
+@_inner
+def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
+    """Whether no pixel of a disc round one is over it."""
+    (height, width), reach, own = band.shape, len(disc) // 2, band[v, u]
+    if (u > 0 and band[v, u - 1] > own) or (u < width - 1 and band[v, u + 1] > own):
+        return False  # most are told by their neighbours
+    for y in range(max(v - reach, 0), min(v + reach + 1, height)):
+        for x in range(max(u - reach, 0), min(u + reach + 1, width)):
+            if disc[y - v + reach, x - u + reach] and band[y, x] > own:
+                return False
+    return True
+
+
+@_compiled(_grey, _mask, _ints)
+def peaks(band: Grey, disc: BoolArray, pixels: IntArray) -> IntArray:
+    """Columns and rows, shape (2, n), of those of some pixels that none of a disc is over."""
+    found, count = np.empty((2, len(pixels)), np.int64), 0
+    for at in pixels:
+        v, u = at // band.shape[1], at % band.shape[1]
+        if _tops(band, disc, v, u):
+            found[0, count], found[1, count] = u, v
+            count += 1
+    return found[:, :count].copy()
+
+
+@_compiled(_grey, _ints, _ints, _i, _f1, _f)
+def centroids(
+    light: Grey, u: IntArray, v: IntArray, margin: int, width: FloatArray, reach: float
+) -> tuple[FloatArray, FloatArray]:
+    """Centroids and second moments of light round pixels: see `dots.centroids`."""
+    count, side = len(u), 2 * margin + 1
+    offset, moment, patch = np.zeros((2, count)), np.empty(count), np.zeros((side, side))
+    along_u, along_v, pull_u = np.empty(side), np.empty(side), np.empty(side)
+    for k in range(count):
+        for y in range(side):
+            for x in range(side):
+                at_y, at_x = v[k] + y - margin, u[k] + x - margin
+                seen = 0 <= at_y < light.shape[0] and 0 <= at_x < light.shape[1]
+                patch[y, x] = max(light[at_y, at_x], 0.0) if seen else 0.0
+        for _ in range(4):
+            for x in range(side):
+                away = (x - margin - offset[0, k]) / width[k]
+                pull_u[x] = np.exp(-0.5 * away * away)
+                along_u[x] = 0.0
+            for y in range(side):
+                away = (y - margin - offset[1, k]) / width[k]
+                pull_v, row = np.exp(-0.5 * away * away), 0.0
+                for x in range(side):
+                    weighed = patch[y, x] * pull_u[x]
+                    row += weighed
+                    along_u[x] += pull_v * weighed
+                along_v[y] = pull_v * row
+            total, mean_u, mean_v, square = 1e-12, 0.0, 0.0, 0.0
+            for at in range(side):
+                away = at - margin
+                total += along_u[at]
+                mean_u += along_u[at] * away
+                mean_v += along_v[at] * away
+                square += (along_u[at] + along_v[at]) * away * away
+            mean_u, mean_v = mean_u / total, mean_v / total
+            moment[k] = square / total - mean_u * mean_u - mean_v * mean_v
+            # The window holds the mean back; half as much again brings it home in a few steps.
+            offset[0, k] += 1.5 * (mean_u - offset[0, k])
+            offset[1, k] += 1.5 * (mean_v - offset[1, k])
+            offset[0, k] = min(max(offset[0, k], -reach), reach)
+            offset[1, k] = min(max(offset[1, k], -reach), reach)
+    return offset, moment
+
+
+@_inner
+def _mirrored(at: int, count: int) -> int:
+    """A pixel's number where a picture goes on beyond its edge as in a mirror."""
+    if at < 0:
+        at = -1 - at
+    return 2 * count - 1 - at if at >= count else at
+
+
+@_compiled(_grey, _ints, _ints, _grey, _grey)
+def finest(image: Grey, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
+    """Largest difference of two filters among nine pixels round each (`quick_dots._nine`)."""
+    side, made = narrow.shape[1], np.empty(len(u))
+    patch, across = np.empty((side, side)), np.empty((2, side, 3))
+    for k in range(len(u)):
+        for y in range(side):
+            at_y = _mirrored(v[k] + y - side // 2, image.shape[0])
+            for x in range(side):
+                patch[y, x] = image[at_y, _mirrored(u[k] + x - side // 2, image.shape[1])]
+        for y in range(side):
+            for j in range(3):
+                across[0, y, j] = across[1, y, j] = 0.0
+                for x in range(side):
+                    across[0, y, j] += narrow[j, x] * patch[y, x]
+                    across[1, y, j] += wide[j, x] * patch[y, x]
+        most = -np.inf
+        for i in range(3):
+            for j in range(3):
+                value = 0.0
+                for y in range(side):
+                    value += narrow[i, y] * across[0, y, j] - wide[i, y] * across[1, y, j]
+                most = max(most, value)
+        made[k] = most
+    return made
+
+
+@_compiled(_ints, _ints, _f)
+def first_of_each(u: IntArray, v: IntArray, within: float) -> IntArray:
+    """Numbers of the pixels that none before them is near that stays: `dots.first_of_each`."""
+    kept = np.empty(len(u), np.int64)
+    count = 0
+    for k in range(len(u)):
+        alone = True
+        for m in range(count):
+            x, y = u[k] - u[kept[m]], v[k] - v[kept[m]]
+            if x * x + y * y <= within * within:
+                alone = False
+                break
+        if alone:
+            kept[count] = k
+            count += 1
+    return kept[:count].copy()
+
+
+# --- the boundary -------------------------------------------------------------------------------
+
+
+@_compiled(_f2, _f1, _f1, _f1, _f2, _f1, _i, _f)
+def follow_rim(
+    grid: FloatArray,
+    coefficients: FloatArray,
+    rear: FloatArray,
+    center: FloatArray,
+    way: FloatArray,
+    radius: FloatArray,
+    steps: int,
+    last: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Newton steps along directions to where a surface meets its rim: `warm_measures.follow_rim`.
+
+    The rear is its depth and where it starts and ends. Gives radii, gradients of the height over
+    the rim and that height, where each was before its last step.
+    """
+    count, work = len(radius), np.empty((4, 4))
+    made, climb, over = radius.copy(), np.empty((count, 2)), np.empty(count)
+    for _ in range(steps):
+        most = 0.0
+        for k in range(count):
+            x, y = center[0] + made[k] * way[k, 0], center[1] + made[k] * way[k, 1]
+            z, slope_x, slope_y = _at(grid, coefficients, x, y, work)
+            part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
+            over[k] = z + rear[0] * part * part
+            climb[k, 0] = slope_x
+            climb[k, 1] = slope_y - 2.0 * rear[0] * part / (rear[1] - rear[2])
+            outward = climb[k, 0] * way[k, 0] + climb[k, 1] * way[k, 1]
+            change = -over[k] / outward if abs(outward) > 1e-6 else 0.0
+            made[k] += min(max(change, -0.3), 0.3)
+            most = max(most, abs(change))
+        if most < last:
+            break
+    return made, climb, over

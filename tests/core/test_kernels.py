@@ -1,0 +1,272 @@
+"""The compiled loops give what NumPy, SciPy and OpenCV give, written down in another way."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from labapp.core import dots, kernels, quadric_kernels
+from labapp.core.coordinates import ImageCalibration
+from labapp.core.optics import (
+    bisecting_gradient,
+    meet_level,
+    meet_plane,
+    ray_directions,
+    reflect,
+    surface_normal,
+)
+from labapp.core.pool_fit import Rear, slope_of_dot
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.values import FloatArray
+
+RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
+PLANE, LASER = RIG.imaging_plane, RIG.laser.position_mm
+BASIS = SplineBasis.over(np.array([-4.0, -5.0]), np.array([4.0, 4.0]), 0.9)
+COUNT = BASIS.shape[0] * BASIS.shape[1]
+
+
+def random() -> np.random.Generator:
+    return np.random.default_rng(18)
+
+
+def surface() -> SplineSurface:
+    """A dome with bumps, 0.3 mm high."""
+    x, y = np.random.default_rng(3).uniform(BASIS.low_mm, BASIS.high_mm, (4 * COUNT, 2)).T
+    z = 0.3 - 0.02 * (x**2 + 0.8 * y**2) + 0.01 * np.sin(2 * x) * np.cos(y)
+    return SplineSurface(BASIS, np.linalg.lstsq(BASIS.matrix(x, y), z, rcond=None)[0])
+
+
+def landings() -> tuple[FloatArray, FloatArray]:
+    """Rays, and where they land on z = 0, shapes (n, 3)."""
+    rays = ray_directions(RIG.laser, RIG.pattern).reshape(-1, 3)
+    return rays, meet_level(LASER, rays)
+
+
+def test_splines_and_surfaces_are_those_of_the_basis() -> None:
+    # Some places lie beyond the rectangle, whose edge they are held to.
+    place = random().uniform(BASIS.low_mm - 0.5, BASIS.high_mm + 0.5, (200, 2))
+    held = np.clip(place, BASIS.low_mm, BASIS.high_mm)
+    splines, values = kernels.splines_at(BASIS.grid, place)
+    for of, (dx, dy) in zip(values, ((0, 0), (1, 0), (0, 1)), strict=True):
+        matrix = np.zeros((len(place), COUNT))
+        np.put_along_axis(matrix, splines, of, axis=1)
+        np.testing.assert_allclose(matrix, BASIS.matrix(*held.T, dx, dy), atol=1e-12)
+    made = kernels.surface_at(BASIS.grid, surface().coefficients, place)
+    height, gradient = surface().height_and_gradient(*held.T)
+    np.testing.assert_allclose(made, [height, *gradient.T], atol=1e-12)
+    share = random().normal(size=len(place))
+    summed = kernels.gradient_of_sum(BASIS.grid, COUNT, place, share)
+    np.testing.assert_allclose(summed, share @ BASIS.matrix(*held.T), atol=1e-12)
+
+
+def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() -> None:
+    rays, landing = landings()
+    points, slopes, plane = kernels.meet(
+        BASIS.grid, surface().coefficients, rays, landing, 6, PLANE.pose_mm
+    )
+    known = np.isfinite(plane[:, 0])
+    assert 20 < known.sum() < len(rays)  # some rays land beyond the rectangle
+    np.testing.assert_allclose(np.cross(points - LASER, rays), 0.0, atol=1e-9)
+    height, gradient = surface().height_and_gradient(*points[known, :2].T)
+    np.testing.assert_allclose(points[known, 2], height, atol=1e-9)
+    np.testing.assert_allclose(slopes[known], gradient, atol=1e-6)  # before the last step
+    way = reflect(rays[known], surface_normal(slopes[known]))
+    np.testing.assert_allclose(plane[known], meet_plane(points[known], way, PLANE), atol=1e-9)
+    own = rays[known], landing[known]
+    moved, last = kernels.advance(BASIS.grid, surface().coefficients, *own, 6)
+    np.testing.assert_allclose(moved, points[known], atol=1e-12)
+    assert 0.0 <= last < 1e-9
+    once, step = kernels.advance(BASIS.grid, surface().coefficients, *own, 1)
+    np.testing.assert_allclose(step, np.linalg.norm(once - landing[known], axis=-1).max())
+
+
+def test_a_ray_that_runs_away_from_the_plane_has_no_dot() -> None:
+    rays, landing = landings()
+    steep = SplineSurface(BASIS, surface().coefficients + 8.0 * BASIS_Y)
+    plane = kernels.meet(BASIS.grid, steep.coefficients, rays, landing, 1, PLANE.pose_mm)[2]
+    assert np.isnan(plane).all()
+
+
+BASIS_Y = np.tile((BASIS.y_knots[:-4] + BASIS.y_knots[4:]) / 2, BASIS.shape[0]) - 0.3
+
+
+def test_slopes_of_dots_are_those_of_the_bisector() -> None:
+    rng, (_, landing) = random(), landings()
+    seen = rng.uniform([10.0, 10.0], [80.0, 60.0], (len(landing), 2))
+    made = kernels.slopes_of_dots(LASER, PLANE.pose_mm[1:3], landing, PLANE.to_universal(seen))
+    np.testing.assert_allclose(made, slope_of_dot(landing, seen, RIG), atol=1e-9)
+
+
+@pytest.mark.parametrize("banded", [True, False])
+def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
+    rng = random()
+    points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
+    root = rng.normal(size=(60, 2, 2))
+    weights = root @ np.swapaxes(root, 1, 2)
+    by = np.stack([BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1)
+    normal = np.einsum("nap,nab,nbq->pq", by, weights, by)
+    if banded:
+        width = 3 * BASIS.shape[1] + 3
+        flat = np.zeros(COUNT * (width + 1))
+        kernels.add_gram(BASIS.grid, points, weights, flat, width)
+        band = flat.reshape(COUNT, width + 1).T
+        for k in range(width + 1):
+            np.testing.assert_allclose(band[k, : COUNT - k], np.diagonal(normal, -k), atol=1e-9)
+        assert not np.diagonal(normal, -width - 1).any()
+    else:
+        flat = np.zeros(COUNT**2)
+        kernels.add_gram(BASIS.grid, points, weights, flat, COUNT)
+        np.testing.assert_allclose(flat.reshape(COUNT, COUNT), np.triu(normal), atol=1e-9)
+    dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
+    asked = bisecting_gradient(points - LASER, dots_mm - points)
+    off = asked - surface().gradient(*points[:, :2].T)
+    np.testing.assert_allclose(
+        kernels.pull(BASIS.grid, surface().coefficients, points, weights, LASER, dots_mm),
+        np.einsum("nap,nab,nb->p", by, weights, off),
+        atol=1e-9,
+    )
+
+
+def test_dots_are_put_on_the_plane_as_the_calibration_has_it() -> None:
+    calibration = ImageCalibration(
+        np.array([[0.17, 0.01, -8.0], [0.004, -0.18, 95.0], [1e-4, -2e-4, 1.0]])
+    )
+    image, sigma = random().uniform(0, 480, (30, 2)), random().uniform(0.05, 0.4, (30, 2))
+    plane, covariance, scale = kernels.on_plane(calibration.matrix, image, sigma)
+    np.testing.assert_allclose(plane, calibration.to_plane(image))
+    by = calibration.jacobian(image)
+    np.testing.assert_allclose(
+        covariance, np.einsum("nij,nj,nkj->nik", by, sigma**2, by), atol=1e-15
+    )
+    np.testing.assert_allclose(scale, np.sqrt(np.abs(np.linalg.det(by))))
+
+
+def test_the_two_nearest_are_those_of_a_tree() -> None:
+    places, among = random().uniform(0, 10, (2, 40, 2))
+    distance, number = kernels.two_nearest(places, among)
+    wanted = cKDTree(among).query(places, k=2)
+    np.testing.assert_allclose(distance, wanted[0])
+    np.testing.assert_array_equal(number, wanted[1])
+    distance, number = kernels.two_nearest(places, among[:1])
+    assert np.isinf(distance[:, 1]).all()
+    assert (number == [0, 1]).all()
+
+
+def picture() -> tuple[FloatArray, dots.Grey]:
+    """Dots, some at the very edge, in noise; their places (u, v)."""
+    rng = random()
+    place = np.stack(np.meshgrid(np.arange(1.0, 150, 18), np.arange(1.0, 110, 16)), -1)
+    place = place.reshape(-1, 2) + rng.uniform(-1, 1, (place.size // 2, 2))
+    v, u = np.mgrid[:110, :150]
+    image = rng.normal(0, 1.0, u.shape)
+    for at in place:
+        image += 50 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * 1.9**2))
+    return place, image.astype(np.float32)
+
+
+def test_peaks_are_the_local_maxima() -> None:
+    band = dots.band_pass(picture()[1], 1.9)
+    v, u = dots.local_maxima(band, 3.0, 1.9)
+    found = kernels.peaks(band, dots.peak_disc(1.9).astype(bool), np.flatnonzero(band > 3.0))
+    np.testing.assert_array_equal(found, [u, v])
+    doubled = np.concatenate([found, found + np.array([[1], [0]])], axis=1)
+    first = kernels.first_of_each(*doubled, 2.0)
+    np.testing.assert_array_equal(first, np.flatnonzero(dots.first_of_each(*doubled, 2.0)))
+
+
+def test_centroids_are_those_of_the_whole_search() -> None:
+    place, image = picture()
+    u, v = np.rint(place).astype(np.int64).T
+    width = random().uniform(1.0, 2.2, len(u))
+    made = kernels.centroids(image, u, v, 6, width, 2.0)
+    wanted = dots.centroids(image, u, v, 6, width, 2.0)
+    for one, other in zip(made, wanted, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_the_finer_band_is_that_of_the_whole_picture() -> None:
+    place, image = picture()
+    u, v = np.rint(place).astype(np.int64).T
+    narrow, wide = np.zeros((2, 3, 13), np.float32)
+    for filters, sigma, taps in ((narrow, 0.8, 7), (wide, 1.3, 11)):
+        own = cv2.getGaussianKernel(taps, sigma, cv2.CV_32F).ravel()
+        for k in range(3):
+            start = (11 - taps) // 2 + k
+            filters[k, start : start + taps] = own
+    fine = cv2.GaussianBlur(image, (7, 7), 0.8, borderType=cv2.BORDER_REFLECT)
+    fine -= cv2.GaussianBlur(image, (11, 11), 1.3, borderType=cv2.BORDER_REFLECT)
+    most = np.pad(fine, 1, "symmetric")  # beyond the edge the filters see the mirrored picture
+    most = np.array([most[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)])
+    np.testing.assert_allclose(kernels.finest(image, u, v, narrow, wide), most, atol=1e-4)
+
+
+@pytest.mark.parametrize("drop_mm", [0.0, 0.06])
+def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
+    theta = np.linspace(-np.pi, np.pi, 48, endpoint=False)
+    way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    center, rear = np.array([0.1, -0.4]), Rear(drop_mm, -1.0, -4.5)
+    radius, climb, over = kernels.follow_rim(
+        BASIS.grid, surface().coefficients, np.array([drop_mm, -1.0, -4.5]), center, way,
+        np.full(48, 3.0), 20, 1e-10,
+    )  # fmt: skip
+    place = center + radius[:, None] * way
+    height, gradient = surface().height_and_gradient(*place.T)
+    inside = BASIS.contains(*place.T)
+    assert inside.sum() > 40
+    np.testing.assert_allclose((height - rear.height(place[:, 1]))[inside], 0.0, atol=1e-9)
+    np.testing.assert_allclose(over[inside], 0.0, atol=1e-9)
+    gradient[:, 1] -= rear.slope(place[:, 1])
+    np.testing.assert_allclose(climb[inside], gradient[inside], atol=1e-6)
+
+
+def test_rays_meet_quadrics() -> None:
+    rays = ray_directions(RIG.laser, RIG.pattern)[7:12, 7:12].reshape(-1, 3)
+    center = np.array([0.2, -0.3])
+    quadrics = np.array([[0.02, -0.03, -0.05, 0.01, -0.04], [0.0, 0.01, 0.03, 0.0, 0.02]])
+    points, plane = quadric_kernels.meet(center, quadrics, rays, LASER, PLANE.pose_mm)
+    for (g_x, g_y, k_x, k_xy, k_y), met, seen in zip(quadrics, points, plane, strict=True):
+        x, y = (met[:, :2] - center).T
+        z = g_x * x + g_y * y + (k_x * x**2 + 2 * k_xy * x * y + k_y * y**2) / 2
+        np.testing.assert_allclose(met[:, 2], z, atol=1e-5)
+        np.testing.assert_allclose(np.cross(met - LASER, rays), 0.0, atol=1e-9)
+        slope = np.stack([g_x + k_x * x + k_xy * y, g_y + k_xy * x + k_y * y], axis=-1)
+        way = reflect(rays, surface_normal(slope))
+        np.testing.assert_allclose(seen, meet_plane(met, way, PLANE), atol=1e-9)
+
+
+def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
+    j, i = np.meshgrid(np.arange(4.0), np.arange(3.0))
+    pattern = np.stack([2.0 * j, 3.0 * i], axis=-1)
+    pattern[2, 3] = np.nan
+    absent = np.zeros((3, 4), bool)
+    absent[1, 1] = True
+    places = np.array([[0.9, 0.0], [2.0, 3.0], [6.0, 1.1], [4.0, 5.0]])
+    hit, dot, off = (part[0] for part in quadric_kernels.hits(pattern[None], places, absent, 0.5))
+    np.testing.assert_allclose(off[0, 0], 0.9)  # of half the 2 mm to the next in its row
+    assert hit[0, 0]
+    assert not hit[1, 1]  # nobody makes that dot
+    assert off[1, 1] == 0.0
+    assert not hit[0, 3]  # 1.1 of 1 mm
+    assert dot[0, 3] == 2
+    assert not hit[2, 3]
+    assert np.isinf(off[2, 3])
+    assert np.argwhere(hit).tolist() == [[0, 0]]
+
+
+def test_what_cannot_be_kept_on_disk_is_compiled_all_the_same(tmp_path: Path) -> None:
+    script = "from labapp.core.compiled import compiled\nfrom numba import types\n" + (
+        "made = compiled(types.int64)(eval('lambda x: x + 1'))\nprint(made(1))\n"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False,
+        cwd=Path(__file__).parents[2], env={**os.environ, "HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert (told.returncode, told.stdout) == (0, "2\n"), told.stderr
