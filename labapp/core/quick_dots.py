@@ -13,7 +13,6 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from labapp.core import kernels
 from labapp.core.dots import (
     HOT,
     BandPassSettings,
@@ -127,6 +126,8 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     CannotMeasure
         ``no-dots`` if nothing stands out of the noise.
     """
+    from labapp.core import kernels
+
     pad, size = _pad(exposure.noise.shape), exposure.size_px
     image, fine, narrow, wide, band = pad.image, pad.fine, pad.narrow, pad.wide, pad.band
     np.copyto(image, frame, casting="unsafe")
@@ -166,6 +167,8 @@ def _pad(shape: tuple[int, ...]) -> Pad:
 
 def _not_hot(image: Grey, band: Grey, u: IntArray, v: IntArray, size: float) -> BoolArray:
     """Not a hot pixel (`dots._dot_like`): the finer band is worked out round the peaks alone."""
+    from labapp.core import kernels
+
     scale = hot_scale(size)
     taps = _taps(1.6 * scale)
     narrow, wide = (_nine(sigma, taps) for sigma in (0.8 * scale, 1.6 * scale))

@@ -19,16 +19,10 @@ from labapp.media.events import Event, Kind
 from labapp.session.alarms import Alarm, Alarms
 from labapp.session.limits import NAMES, Limits, Size, beyond, sizes_of
 from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring
+from labapp.session.live_queue import FrameQueue
 from labapp.session.scene import Scene
 from labapp.session.setup import Setup
 from labapp.session.streams import Stream, live_values
-
-BURST = 32
-"""So many frames right after one that was measured by itself are measured one after the other."""
-
-STEP_S = 0.0125
-"""Of frames that wait, those that came sooner after another are left out: what a burst of them
-tells is then a whole swing, among which what comes next is found again."""
 
 RATE_S = 2.0
 """Rates are those of so long."""
@@ -163,8 +157,7 @@ class LiveWatch:
         self.alarms = Alarms(limits)
         self._name, self._scheme, self._say = name, settings.scheme, say
         self._measuring = LiveMeasuring(setup, settings, bit_depth)
-        self._to_measure: deque[CameraFrame] = deque()
-        self._in_order, self._taken_s = BURST, 0.0
+        self._queue = FrameQueue()
         self._newest: deque[Followed] = deque(maxlen=1)
         self._scene: deque[Scene] = deque(maxlen=1)
         self._past: deque[_Past] = deque(maxlen=MOST_KEPT)
@@ -177,10 +170,7 @@ class LiveWatch:
 
     def take(self, frame: CameraFrame) -> None:
         """Take a frame of the camera; never waits."""
-        waiting = self._to_measure
-        if not waiting or (len(waiting) < BURST and frame.time_s > self._taken_s + STEP_S):
-            self._taken_s = frame.time_s
-            waiting.append(frame)
+        self._queue.put(frame)
 
     def close(self) -> None:
         """End the measuring, whatever it is at, and who is told is told so. Twice does no harm."""
@@ -194,14 +184,8 @@ class LiveWatch:
     # --- in a thread of its own ---------------------------------------------------------------
 
     def next_frame(self) -> CameraFrame | None:
-        """The newest frame; after one that was measured by itself those that came right after it.
-
-        That took seconds: the present frame would be too far from it to be measured from it.
-        """
-        if self._in_order and self._to_measure:
-            self._in_order -= 1
-            return self._to_measure.popleft()
-        frame = newest_of(self._to_measure)
+        """The next frame to be measured; None while there is none (`FrameQueue`)."""
+        frame = self._queue.next()
         if frame is None:
             self._heed_silence()
         return frame
@@ -214,7 +198,7 @@ class LiveWatch:
         LiveMeasuringEnded
             If the process that measures has ended.
         """
-        drawn = self._is_drawn.is_set()
+        drawn, began_s = self._is_drawn.is_set(), time.monotonic()
         try:
             found = self._measuring.measure(frame.image, drawn)
         except Exception as error:
@@ -224,8 +208,7 @@ class LiveWatch:
         if found.scene is not None:
             self._is_drawn.clear()
             self._scene.append(found.scene)
-        if not found.followed:
-            self._in_order = BURST
+        self._queue.done(found.followed, time.monotonic() - began_s)
         followed = Followed(frame.number, frame.time_s, frame.arrived_s, found)
         for alarm in self.alarms.judge(frame.number, frame.time_s, found.measures, found.reason):
             self._say(Event(self._name, *_told(alarm)), frame.time_s)
@@ -343,13 +326,6 @@ class LiveWatch:
         for each in (former, stream):
             if each is not None:
                 each.close()
-
-
-def newest_of(frames: deque[CameraFrame]) -> CameraFrame | None:
-    """Take the newest frame; those before it are let go."""
-    while len(frames) > 1:
-        frames.popleft()
-    return frames.popleft() if frames else None
 
 
 def _told(alarm: Alarm) -> tuple[Kind, str]:

@@ -166,7 +166,7 @@ class Feed:
         return answer
 
     def trigger(self) -> None:
-        """Have a frame taken now; without effect where the trigger is not "software"."""
+        """Have a frame taken now; without effect while it is away, or takes frames otherwise."""
         self._pulls.release()
 
     def stop(self) -> None:
@@ -348,6 +348,8 @@ class Feed:
                     told.add(str(error))
                     self._tell("warning", str(error))
                 continue
+            while self._pulls.acquire(blocking=False):
+                pass  # of a moment that has gone
             away_s = time.monotonic() - gone_s
             self._tell("note", f"it is back after {away_s:.1f} s, set as before")
             return

@@ -271,6 +271,21 @@ def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
     ]
 
 
+def test_an_alarm_that_nobody_saw_stays_in_view_when_the_camera_is_stopped(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    hand, view = Hand(window), page.live_view
+    start(page, qtbot)
+    choose(page, "Trends and limits")
+    hand.enter(view.canvas.trends.fields["width", 1], "6.6")
+    qtbot.waitUntil(view.canvas.alarms.isVisible)
+    hand.button("Stop the camera")
+    qtbot.waitUntil(lambda: view.live is None)
+    assert view.canvas.alarms.words.text().startswith("△ over: Width")
+    hand.button("Acknowledge")
+    assert not view.canvas.alarms.isVisible()
+
+
 def test_limits_that_cannot_be_are_refused_and_others_undone(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):

@@ -144,6 +144,25 @@ def test_a_camera_that_waits_for_a_trigger_does_not_stall() -> None:
 
 
 @pytest.mark.usefixtures("hasty")
+def test_frames_that_were_asked_for_while_a_camera_was_away_are_not_taken_later() -> None:
+    device = SimulatedDevice("test", numbered)
+    frames: list[CameraFrame] = []
+    wanted = CameraSettings(trigger="software")
+    with Feed("test", device.open, frames.append, settings=wanted) as running:
+        wait_until(lambda: running.state == "running")
+        device.unplug()
+        wait_until(lambda: running.state == "lost")
+        for _ in range(5):
+            running.trigger()
+        device.plug()
+        wait_until(lambda: running.state == "running")
+        time.sleep(LONG_AGO_S)
+        assert frames == []
+        running.trigger()
+        wait_until(lambda: len(frames) == 1)
+
+
+@pytest.mark.usefixtures("hasty")
 def test_a_camera_that_was_left_waiting_for_a_trigger_gives_frames() -> None:
     device = SimulatedDevice("test", numbered, rate_hz=1000)
     device.settings = replace(device.settings, trigger="software")

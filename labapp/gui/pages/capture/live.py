@@ -30,7 +30,8 @@ from labapp.media.events import Event
 from labapp.media.recorder import Plan, Recorder, Take
 from labapp.session.limits import Limits
 from labapp.session.live_measuring import LiveMeasuringEnded
-from labapp.session.live_watch import RATE_S, LiveWatch, newest_of
+from labapp.session.live_queue import newest_of
+from labapp.session.live_watch import RATE_S, LiveWatch
 from labapp.session.log import NAME
 from labapp.session.session import Session
 from labapp.session.setup import Setup
@@ -241,7 +242,7 @@ class Live:
             ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
         ]
         if self.watch is not None:
-            # That is done elsewhere, and every frame that is left out is a longer step: no rest.
+            # That is done elsewhere, and the frames that are left out make the steps longer: no rest.
             works.append(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
         for work in works:
             name = f"live {work[0]}"

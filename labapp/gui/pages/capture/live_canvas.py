@@ -83,7 +83,7 @@ class LiveCanvas(QWidget):
         else:
             self.tabs.setCurrentIndex(0)
             self.surface.let_go()
-            self.alarms.show_alarms(())
+            self.alarms.keep_unseen()
             self.streams.show_state()
 
     def follow(self, followed: Followed | None, watch: LiveWatch) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -215,6 +215,7 @@ class AlarmStrip(QFrame):
         row.setContentsMargins(6, 2, 6, 2)
         row.addWidget(self.words, 1)
         row.addWidget(self.button)
+        self._alarms: tuple[Alarm, ...] = ()
         self.hide()
 
     def show_alarms(self, alarms: Sequence[Alarm]) -> None:
@@ -231,6 +232,12 @@ class AlarmStrip(QFrame):
                 widget.setPalette(colours)
         self.button.setEnabled(not all(alarm.acknowledged for alarm in alarms))
         self.setVisible(bool(alarms))
+        self._alarms = tuple(alarms)
+
+    def keep_unseen(self) -> None:
+        """Show what was not acknowledged until it is: no camera is watched any more."""
+        unseen = (alarm for alarm in self._alarms if not alarm.acknowledged)
+        self.show_alarms([replace(alarm, holds=False) for alarm in unseen])
 
 
 def alarms_in_words(alarms: Sequence[Alarm]) -> str:

@@ -242,6 +242,7 @@ class LiveView(QObject):
         self._ending.clear()
         self.live = None
         self.canvas.set_live(False)
+        self.canvas.alarms.show_alarms(())
         self._timer.stop()
         self._rings.hide()
         self._show_state()
@@ -274,6 +275,8 @@ class LiveView(QObject):
         if watch is not None:
             watch.acknowledge()
             self.canvas.tell(watch)
+        else:
+            self.canvas.alarms.show_alarms(())
 
     def _watch(self) -> LiveWatch | None:
         return None if self.live is None else self.live.watch

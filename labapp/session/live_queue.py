@@ -1,0 +1,101 @@
+"""Which frames of a live camera are measured: as many as can be, at even steps.
+
+Each frame is measured from those before. What comes next is foreseen where steps are even, and has
+to be searched for after a jump, which takes ten times as long: a frame in three, say, is measured
+rather than whichever is the newest.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+
+from labapp.media.cameras import CameraFrame
+
+MOST = 32
+"""So many frames wait at most; and so many right after one that was measured by itself are measured
+in their order, however old: the present one would be too far from it."""
+
+SWING_S = 0.0125
+"""Until twice as many have followed each other steps are no smaller: what they tell is then a whole
+swing, among which what comes next is found again after a jump."""
+
+SHARE, EASE, WEIGHT = 0.8, 0.85, 0.05
+"""Measuring takes this share of a step at most, by its running mean, in which the newest weighs so
+much; steps are made smaller only where this part of the smaller one would do."""
+
+
+class FrameQueue:
+    """The frames that wait to be measured. `put` never waits; the rest belongs into one thread."""
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._waiting: deque[CameraFrame] = deque()
+        self._every, self._due = 1, 0
+        self._last: CameraFrame | None = None
+        self._interval_s = self._took_s = 0.0
+        self._in_order, self._followed = MOST, 0
+        self._is_behind = False
+
+    @property
+    def every(self) -> int:
+        """Every so many-th frame is measured."""
+        return self._every
+
+    def put(self, frame: CameraFrame) -> None:
+        """Take a frame of the camera, if it is its turn."""
+        with self._turn:
+            last, self._last = self._last, frame
+            if last is not None and frame.number > last.number:
+                step_s = (frame.time_s - last.time_s) / (frame.number - last.number)
+                self._interval_s = _mean(self._interval_s, step_s)
+            if self._due - self._every < frame.number < self._due:
+                return
+            if len(self._waiting) < MOST:
+                self._waiting.append(frame)
+                self._due = frame.number + self._every
+            else:
+                self._is_behind = True
+
+    def next(self) -> CameraFrame | None:
+        """The next frame to be measured; None while there is none."""
+        with self._turn:
+            if self._in_order and self._waiting:
+                self._in_order -= 1
+                return self._waiting.popleft()
+            self._in_order = 0
+            if self._is_behind:
+                self._is_behind = False
+                return newest_of(self._waiting)
+            return self._waiting.popleft() if self._waiting else None
+
+    def done(self, followed: bool, took_s: float) -> None:
+        """Hear whether the frame was measured from those before, and how long it took, s."""
+        with self._turn:
+            if not followed:
+                self._in_order, self._followed = MOST, 0
+                return
+            self._followed += 1
+            self._took_s = _mean(self._took_s, took_s)
+            if not self._interval_s > 0:
+                return
+            least_s = self._took_s / SHARE
+            if self._followed < 2 * MOST:
+                least_s = max(least_s, SWING_S)
+            wanted = max(1, math.ceil(least_s / self._interval_s - 1e-6))
+            grown_s = EASE * self._interval_s * (self._every - 1)
+            if wanted > self._every or (wanted < self._every and least_s < grown_s):
+                self._every = wanted
+
+
+def _mean(former: float, newest: float) -> float:
+    """A running mean; of nothing before, the newest."""
+    return former + WEIGHT * (newest - former) if former else newest
+
+
+def newest_of(frames: deque[CameraFrame]) -> CameraFrame | None:
+    """Take the newest frame; those before it are let go."""
+    while len(frames) > 1:
+        frames.popleft()
+    return frames.popleft() if frames else None
