@@ -242,7 +242,7 @@ class Live:
             ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
         ]
         if self.watch is not None:
-            # That is done elsewhere, and the frames that are left out make the steps longer: no rest.
+            # That is done elsewhere, and what is left out makes the steps longer: no rest.
             works.append(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
         for work in works:
             name = f"live {work[0]}"
