@@ -20,7 +20,7 @@ import numpy as np
 from labapp.core import kernels, measures
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.correspondence import Match, Trial
-from labapp.core.dots import Image
+from labapp.core.dots import Image, estimate_size
 from labapp.core.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.lattice import Lattice
 from labapp.core.measures import reflection_errors
@@ -120,15 +120,26 @@ class WarmChain:
             return measurement
         except (Broken, CannotMeasure, np.linalg.LinAlgError) as reason:
             self.broke = str(reason)
-        measurement = measure(image, self.rig, self.calibration, self.settings)
+        settings = _with_size(self.settings, image)
+        measurement = measure(image, self.rig, self.calibration, settings)
         if measurement.status == "ok":
-            self._track = begin(image, measurement, self.rig, self.settings, self._track)
+            self._track = begin(image, measurement, self.rig, settings, self._track)
         elif self._track is not None:
             track, unseen = self._track, self._track.unseen + 1
             past, slopes = track.past[-1:], track.slopes[-1:]
             kept = replace(track, unseen=unseen, past=past, slopes=slopes)
             self._track = kept if unseen <= HELD else None
         return measurement
+
+
+def _with_size(settings: Settings, image: Image) -> Settings:
+    """The settings with the size of the frame's dots, which a search and a track ask for alike."""
+    dots = settings.dots
+    if dots.method != "band-pass" or dots.band_pass.size_px:
+        return settings
+    size = estimate_size(np.asarray(image, np.float32))
+    band_pass = replace(dots.band_pass, size_px=size)
+    return replace(settings, dots=replace(dots, band_pass=band_pass))
 
 
 # --- one frame ----------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
 import multiprocessing
 import os
@@ -148,6 +149,7 @@ def begin_worker(nice: int = 0, become: Callable[..., None] | None = None, *give
             os._exit(1)
 
     threading.Thread(target=follow, name="parent", daemon=True).start()
+    atexit.register(os._exit, 0)  # taking down all that is loaded would take half a second
     if become is not None:
         become(*given)
 
