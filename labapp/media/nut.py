@@ -100,7 +100,8 @@ class NutWriter:
         self._file = _Whole(_made(path) if file is None else file)
         self._shape, self._top = shape, 2**bit_depth - 1
         self._dtype = np.uint8 if bit_depth <= 8 else np.uint16
-        options = {"flush_packets": "1"}
+        # An index at the end would have to be kept in memory: 240 bytes a frame, for hours.
+        options = {"flush_packets": "1", "write_index": "0"}
         self._container = av.open(
             self._file, "w", format="nut", options=options, buffer_size=BUFFER_BYTE
         )
@@ -148,17 +149,17 @@ class NutWriter:
         self.frames += 1
 
     def close(self) -> None:
-        """End the video with an index, where that can be written.
+        """End the video.
 
         Raises
         ------
         OSError
-            If it cannot: the video is whole without.
+            If what is left of it cannot be written: it is whole without.
         """
         try:
             self._container.close()
         except FFmpegError as error:
-            raise OSError(errno.EIO, "the index at its end cannot be written") from error
+            raise OSError(errno.EIO, "the end of the video cannot be written") from error
         finally:
             self._file.close()
 

@@ -179,7 +179,7 @@ def test_a_full_disk_is_told_as_such_and_what_was_written_is_whole(tmp_path: Pat
     with pytest.raises(OSError, match="No space left") as full:
         writer.write(frames[5], 0.05)
     assert full.value.errno == errno.ENOSPC
-    with pytest.raises(OSError, match="index at its end"):
+    with pytest.raises(OSError, match="end of the video"):
         writer.close()
     with open_source(path) as video:
         assert len(video) == writer.frames == 5
