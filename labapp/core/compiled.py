@@ -13,8 +13,12 @@ from numba import njit, types
 
 F = TypeVar("F", bound=Callable[..., object])
 
-HOW: dict[str, Any] = {"nogil": True, "fastmath": {"reassoc", "contract", "nsz"}}
-"""Sums may be taken in any order, as NumPy takes them; NaN and infinity are what they are."""
+HOW: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz"},
+}
+"""Sums may be taken in any order and division by zero gives infinity or NaN, as in NumPy."""
 
 
 def compiled(*signature: types.Type) -> Callable[[F], F]:

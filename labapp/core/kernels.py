@@ -268,7 +268,10 @@ def advance(
         step = 0.0
         for _ in range(steps):
             step, _, _ = _meet(grid, coefficients, rays[k], moved[k], work)
-        most = max(most, abs(step))
+        if not abs(step) <= most:  # NaN, too
+            most = abs(step)
+        if np.isnan(most):
+            break
     return moved, most
 
 
@@ -400,8 +403,7 @@ def centroids(
 @_inner
 def _mirrored(at: int, count: int) -> int:
     """A pixel's number where a picture goes on beyond its edge as in a mirror."""
-    if at < 0:
-        at = -1 - at
+    at %= 2 * count
     return 2 * count - 1 - at if at >= count else at
 
 

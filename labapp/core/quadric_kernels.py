@@ -1,4 +1,4 @@
-"""Inner loops of `quadric_search`, compiled for the processor (docs/adr/0018)."""
+"""Inner loops of `quadric_search`, compiled (docs/adr/0018)."""
 
 from __future__ import annotations
 

@@ -276,7 +276,7 @@ def fit_slopes(
     basis
         Splines to build it of.
     points_mm
-        Where the slopes are known, (x, y), shape (n, 2), mm.
+        Where the slopes are known, (x, y), shape (n, 2), mm; held to the basis's rectangle.
     slopes
         (∂z/∂x, ∂z/∂y) there, shape (n, 2).
     weights

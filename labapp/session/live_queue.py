@@ -21,6 +21,9 @@ SWING_S = 0.0125
 """Until twice as many have followed each other steps are no smaller: what they tell is then a whole
 swing, among which what comes next is found again after a jump."""
 
+FAR_S = 0.1
+"""Steps are no larger: frames farther from each other are hardly measured from each other."""
+
 SHARE, EASE, WEIGHT = 0.8, 0.85, 0.05
 """Measuring takes this share of a step at most, by its running mean, in which the newest weighs so
 much; steps are made smaller only where this part of the smaller one would do."""
@@ -34,8 +37,9 @@ class FrameQueue:
         self._waiting: deque[CameraFrame] = deque()
         self._every, self._due = 1, 0
         self._last: CameraFrame | None = None
+        self._given_s = 0.0
         self._interval_s = self._took_s = 0.0
-        self._in_order, self._followed = MOST, 0
+        self._in_order = self._followed = 0
         self._is_behind = False
 
     @property
@@ -48,8 +52,9 @@ class FrameQueue:
         with self._turn:
             last, self._last = self._last, frame
             if last is not None and frame.number > last.number:
-                step_s = (frame.time_s - last.time_s) / (frame.number - last.number)
-                self._interval_s = _mean(self._interval_s, step_s)
+                # By our own clock: a camera's may be set back.
+                since_s = frame.arrived_s - last.arrived_s
+                self._interval_s = _mean(self._interval_s, since_s / (frame.number - last.number))
             if self._due - self._every < frame.number < self._due:
                 return
             if len(self._waiting) < MOST:
@@ -61,32 +66,45 @@ class FrameQueue:
     def next(self) -> CameraFrame | None:
         """The next frame to be measured; None while there is none."""
         with self._turn:
-            if self._in_order and self._waiting:
-                self._in_order -= 1
-                return self._waiting.popleft()
-            self._in_order = 0
-            if self._is_behind:
+            if not self._waiting:
+                self._in_order, self._is_behind = 0, False
+                return None
+            if self._in_order or not self._is_behind:
+                self._in_order = max(self._in_order - 1, 0)
+                frame = self._waiting.popleft()
+            else:
                 self._is_behind = False
-                return newest_of(self._waiting)
-            return self._waiting.popleft() if self._waiting else None
+                frame = self._waiting.pop()
+                self._waiting.clear()
+            self._given_s = frame.arrived_s
+            return frame
 
     def done(self, followed: bool, took_s: float) -> None:
         """Hear whether the frame was measured from those before, and how long it took, s."""
         with self._turn:
             if not followed:
-                self._in_order, self._followed = MOST, 0
+                self._followed = 0
+                if self._waiting and self._waiting[0].arrived_s - self._given_s > FAR_S:
+                    # None that waits can be measured from this one; those after the next can be.
+                    self._waiting.clear()
+                    self._every, self._due, self._took_s = self._steps(SWING_S), 0, 0.0
+                self._in_order = len(self._waiting)
                 return
             self._followed += 1
-            self._took_s = _mean(self._took_s, took_s)
-            if not self._interval_s > 0:
-                return
+            self._took_s = _mean(self._took_s, min(took_s, FAR_S))
             least_s = self._took_s / SHARE
             if self._followed < 2 * MOST:
                 least_s = max(least_s, SWING_S)
-            wanted = max(1, math.ceil(least_s / self._interval_s - 1e-6))
+            wanted = self._steps(least_s)
             grown_s = EASE * self._interval_s * (self._every - 1)
             if wanted > self._every or (wanted < self._every and least_s < grown_s):
                 self._every = wanted
+
+    def _steps(self, least_s: float) -> int:
+        """How many frames a step takes that is no shorter, s; or one of `FAR_S`."""
+        if not self._interval_s > 0:
+            return 1
+        return max(1, math.ceil(min(least_s, FAR_S) / self._interval_s - 1e-6))
 
 
 def _mean(former: float, newest: float) -> float:

@@ -1,4 +1,4 @@
-"""A followed frame's rows of every table: the text of `tables.table_rows`, in less time."""
+"""A followed frame's rows of every table: the text of `tables.table_rows`, in less time than it."""
 
 from __future__ import annotations
 

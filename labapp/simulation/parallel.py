@@ -135,7 +135,8 @@ def begin_worker(nice: int = 0, become: Callable[..., None] | None = None, *give
     """Begin a process that works for another one; see `processes`.
 
     It gives way by ``nice``, where the system knows of it, computes in one thread, and ends when
-    the one that it works for is gone, killed even.
+    the one that it works for is gone, killed even. At its own end nothing is taken down: what was
+    registered with `atexit` before is not called.
     """
     if hasattr(os, "nice"):
         os.nice(nice)

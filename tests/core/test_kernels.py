@@ -208,6 +208,31 @@ def test_the_finer_band_is_that_of_the_whole_picture() -> None:
     np.testing.assert_allclose(kernels.finest(image, u, v, narrow, wide), most, atol=1e-4)
 
 
+@pytest.mark.parametrize("rows", [1, 3])
+def test_pictures_lower_than_the_filters_are_mirrored_again_and_again(rows: int) -> None:
+    image = random().uniform(0, 90, (rows, 40)).astype(np.float32)
+    own = np.float32(cv2.getGaussianKernel(31, 4.0).ravel())
+    filters = np.stack([np.pad(own, (k, 2 - k)) for k in range(3)])
+    blurred = np.pad(image, 16, "symmetric")
+    blurred = cv2.sepFilter2D(blurred, -1, own, own)[15 : 17 + rows, 15:57]
+    u, v = np.array([0, 20, 39]), np.array([0, rows - 1, 0])
+    most = [blurred[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)]
+    made = kernels.finest(image, u, v, filters, np.zeros_like(filters))
+    np.testing.assert_allclose(made, most, rtol=1e-5)
+
+
+def test_what_is_not_a_number_is_not_settled() -> None:
+    rays, landing = landings()
+    nothing = np.full(COUNT, np.nan)
+    assert np.isnan(kernels.advance(BASIS.grid, nothing, rays, landing, 1)[1])
+    assert np.isnan(kernels.meet(BASIS.grid, nothing, rays, landing, 1, PLANE.pose_mm)[2]).all()
+
+
+def test_division_by_zero_is_as_in_numpy() -> None:
+    matrix, place = np.zeros((3, 3)), np.ones((1, 2))
+    assert not np.isfinite(kernels.on_plane(matrix, place, place)[0]).any()
+
+
 @pytest.mark.parametrize("drop_mm", [0.0, 0.06])
 def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
     theta = np.linspace(-np.pi, np.pi, 48, endpoint=False)

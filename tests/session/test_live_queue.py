@@ -26,20 +26,38 @@ class Measured:
         return self.began_s - self.number / RATE_HZ
 
 
+COLD_S, REACH_S = 1.5, 0.12
+
+
 def measure(
-    queue: FrameQueue, frames: range, took_s: float, cold: frozenset[int] = frozenset()
+    queue: FrameQueue,
+    frames: range,
+    took_s: float,
+    cold: frozenset[int] = frozenset(),
+    slow: frozenset[int] = frozenset(),
 ) -> list[Measured]:
-    """Have a camera give frames while they are measured, each in a time; by itself in 1.5 s."""
-    done, free_s = [], 0.0
+    """Have a camera give frames while they are measured, each in a time.
+
+    Measured by itself, in 1.5 s, is the how-many-th one as told, and any that is far from the one
+    before where no 16 were followed until then. Slow ones take 10 s.
+    """
+    done: list[Measured] = []
+    free_s, learnt = frames[0] / RATE_HZ, MOST
+    busy: tuple[bool, float] | None = None
     for number in frames:
         now_s = number / RATE_HZ
-        free_s = max(free_s, frames[0] / RATE_HZ)
-        while free_s <= now_s and (frame := queue.next()) is not None:
+        while free_s <= now_s:
+            if busy is not None:
+                queue.done(*busy)
+            busy, frame = None, queue.next()
+            if frame is None:
+                break
             done.append(Measured(frame.number, max(free_s, frame.number / RATE_HZ)))
-            followed = len(done) not in cold
-            own_s = took_s if followed else 1.5
-            free_s = done[-1].began_s + own_s
-            queue.done(followed, own_s)
+            far = len(done) > 1 and done[-1].number - done[-2].number > REACH_S * RATE_HZ
+            followed = len(done) not in cold and (not far or learnt >= MOST // 2)
+            learnt = learnt + 1 if followed else 0
+            own_s = COLD_S if not followed else 10.0 if len(done) in slow else took_s
+            busy, free_s = (followed, own_s), done[-1].began_s + own_s
         queue.put(CameraFrame(number, now_s, now_s, IMAGE))
     return done
 
@@ -79,6 +97,24 @@ def test_where_measuring_becomes_slow_it_is_never_behind_for_long() -> None:
     assert max(one.age_s for one in done if one.number > 3000) < 0.1
     done = measure(queue, range(5000, 9000), 0.005)
     assert set(np.diff([one.number for one in done if one.number > 8000])) == {2}
+
+
+def test_after_a_long_wait_frames_are_followed_again() -> None:
+    queue = FrameQueue()
+    done = measure(queue, range(16000), 0.006, cold=frozenset({200, 201}), slow=frozenset({199}))
+    assert max(one.age_s for one in done if one.number > 9000) < 0.1
+    assert set(np.diff([one.number for one in done if one.number > 12000])) == {2}
+
+
+def test_a_camera_whose_clock_is_set_back_is_measured_as_before() -> None:
+    queue, numbers = FrameQueue(), []
+    for number in range(2000):
+        time_s = number / RATE_HZ if number < 500 else 2.5 + 1e-6 * number
+        queue.put(CameraFrame(number, time_s, number / RATE_HZ, IMAGE))
+        while (frame := queue.next()) is not None:
+            numbers.append(frame.number)
+            queue.done(True, 0.006)
+    assert np.diff(numbers).max() <= 3
 
 
 def test_a_camera_that_counts_from_the_start_again_goes_on() -> None:

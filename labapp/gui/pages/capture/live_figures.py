@@ -216,10 +216,12 @@ class AlarmStrip(QFrame):
         row.addWidget(self.words, 1)
         row.addWidget(self.button)
         self._alarms: tuple[Alarm, ...] = ()
+        self._kept: tuple[Alarm, ...] = ()
         self.hide()
 
     def show_alarms(self, alarms: Sequence[Alarm]) -> None:
-        """Show alarms; none hides it."""
+        """Show alarms, after those that are kept; none hides it."""
+        alarms = (*self._kept, *alarms)
         told = alarms_in_words(alarms)
         if told != self.words.text():
             self.words.setText(told)
@@ -232,12 +234,18 @@ class AlarmStrip(QFrame):
                 widget.setPalette(colours)
         self.button.setEnabled(not all(alarm.acknowledged for alarm in alarms))
         self.setVisible(bool(alarms))
-        self._alarms = tuple(alarms)
+        self._alarms = alarms
 
     def keep_unseen(self) -> None:
-        """Show what was not acknowledged until it is: no camera is watched any more."""
+        """Keep what was not acknowledged until it is: the camera is watched no more."""
         unseen = (alarm for alarm in self._alarms if not alarm.acknowledged)
-        self.show_alarms([replace(alarm, holds=False) for alarm in unseen])
+        self._kept = tuple(replace(alarm, holds=False) for alarm in unseen)
+        self.show_alarms(())
+
+    def let_go(self) -> None:
+        """Keep none any longer, and show none."""
+        self._kept = ()
+        self.show_alarms(())
 
 
 def alarms_in_words(alarms: Sequence[Alarm]) -> str:

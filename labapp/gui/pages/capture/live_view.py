@@ -219,6 +219,8 @@ class LiveView(QObject):
             return
         self._timer.stop()
         self._rings.hide()
+        if live.watch is not None:
+            self.canvas.tell(live.watch)  # alarms, to the last
         self.canvas.set_live(False)
         self._ending.append(live)
         title = "Stopping the camera" if live.running is None else "Finishing the recording"
@@ -242,7 +244,7 @@ class LiveView(QObject):
         self._ending.clear()
         self.live = None
         self.canvas.set_live(False)
-        self.canvas.alarms.show_alarms(())
+        self.canvas.alarms.let_go()
         self._timer.stop()
         self._rings.hide()
         self._show_state()
@@ -272,11 +274,10 @@ class LiveView(QObject):
     def acknowledge(self) -> None:
         """Take it that the operator has seen the alarms."""
         watch = self._watch()
+        self.canvas.alarms.let_go()
         if watch is not None:
             watch.acknowledge()
             self.canvas.tell(watch)
-        else:
-            self.canvas.alarms.show_alarms(())
 
     def _watch(self) -> LiveWatch | None:
         return None if self.live is None else self.live.watch
