@@ -63,7 +63,9 @@ def benchmark(
 
 
 def _tell_run(run: Run) -> None:
+    whole = run.frames / (run.seconds + run.start_s)
     typer.echo(f"\nfrom file to CSV        {run.frames / run.seconds:.1f} frames/s")
+    typer.echo(f"start of processes      {run.start_s:.1f} s more; with it {whole:.1f} frames/s")
     ms = 1e3 * run.processor_s / run.frames
     typer.echo(f"processor time          {ms:.1f} ms a frame, the start of all processes included")
     typer.echo(

@@ -16,14 +16,10 @@ from numba import types
 
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import part as _inner
-from labapp.core.dots import Grey
-from labapp.core.values import BoolArray, FloatArray, IntArray
+from labapp.core.values import FloatArray, IntArray
 
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
-_grey, _greys = (types.Array(types.float32, n, "C", readonly=True) for n in (2, 3))
-_ints = types.Array(_i, 1, "A", readonly=True)
-_mask = types.Array(types.boolean, 2, "C", readonly=True)
 
 
 # --- splines ------------------------------------------------------------------------------------
@@ -71,7 +67,10 @@ def _at(
 
 @_compiled(_f2, _f2)
 def splines_at(grid: FloatArray, place: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Splines that are not zero at places, shape (n, 2): see `warm_fit.spline_values`."""
+    """Splines that are not zero at places, shape (n, 2), held to the rectangle.
+
+    Gives their numbers, shape (n, 16); value and derivatives by x and by y, shape (3, n, 16).
+    """
     count, many = len(place), int(grid[1, 3]) + 3
     splines, values = np.empty((count, 16), np.int64), np.empty((3, count, 16))
     work = np.empty((4, 4))
@@ -275,181 +274,74 @@ def advance(
     return moved, most
 
 
-# --- dots ---------------------------------------------------------------------------------------
+# --- the level ------------------------------------------------------------------------------------
+
+NOTHING = 1e-17
+"""One and so much is one."""
+
+FACTORS = 1000
+"""So many factors of at most 2 have a product that is a number still."""
 
 
-@_compiled(_f2, _f2, _f2)
-def on_plane(
-    matrix: FloatArray, image: FloatArray, sigma: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Put dots of some standard deviations on the imaging plane (`ImageCalibration`).
+@_compiled(_f2, _f1, _f, _f, _i, _f1)
+def doubts(
+    over: FloatArray, side: FloatArray, first: float, step: float, count: int, blurs: FloatArray
+) -> FloatArray:
+    """What witnesses have against levels: Σ log(1 + exp(−side · (over + level) / blur)).
 
-    Gives the places, shape (n, 2), their covariance and how many mm a pixel is there, shape (n,).
+    Along the levels the exponential is a geometric progression, away from where it is 1.
+
+    Parameters
+    ----------
+    over
+        Height over the boundary for each of d depths of the rear, shape (d, n), mm.
+    side
+        Of each witness, lit above 0, over its rise, shape (n,), mm⁻¹.
+    first, step, count
+        The levels: the first, mm, the way to the next, above 0, and how many.
+    blurs
+        Shape (b,).
+
+    Returns
+    -------
+    FloatArray
+        Nats, shape (d, b, count).
     """
-    count = len(image)
-    plane, covariance, scale = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
-    by = np.empty((2, 2))
-    for k in range(count):
-        u, v = image[k, 0], image[k, 1]
-        w = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
-        for i in range(2):
-            plane[k, i] = (matrix[i, 0] * u + matrix[i, 1] * v + matrix[i, 2]) / w
-            for j in range(2):
-                by[i, j] = (matrix[i, j] - plane[k, i] * matrix[2, j]) / w
-        for i in range(2):
-            for j in range(2):
-                covariance[k, i, j] = (
-                    by[i, 0] * by[j, 0] * sigma[k, 0] ** 2 + by[i, 1] * by[j, 1] * sigma[k, 1] ** 2
-                )
-        scale[k] = np.sqrt(abs(by[0, 0] * by[1, 1] - by[0, 1] * by[1, 0]))
-    return plane, covariance, scale
-
-
-@_compiled(_f2, _f2)
-def two_nearest(places: FloatArray, among: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Distance and number of the two nearest of some places, shape (m, 2), from each of others.
-
-    Shapes (n, 2); where there is no second one it is infinitely far off and has the number m.
-    """
-    count = len(places)
-    distance, number = np.empty((count, 2)), np.empty((count, 2), np.int64)
-    among_x, among_y, square = among[:, 0].copy(), among[:, 1].copy(), np.empty(len(among))
-    for k in range(count):
-        for m in range(len(among)):
-            x, y = places[k, 0] - among_x[m], places[k, 1] - among_y[m]
-            square[m] = x * x + y * y
-        first, second, one, other = np.inf, np.inf, len(among), len(among)
-        for m in range(len(among)):
-            if square[m] < second:
-                if square[m] < first:
-                    second, other = first, one
-                    first, one = square[m], m
-                else:
-                    second, other = square[m], m
-        distance[k, 0], distance[k, 1] = np.sqrt(first), np.sqrt(second)
-        number[k, 0], number[k, 1] = one, other
-    return distance, number
-
-
-@_inner
-def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
-    """Whether no pixel of a disc round one is over it."""
-    (height, width), reach, own = band.shape, len(disc) // 2, band[v, u]
-    if (u > 0 and band[v, u - 1] > own) or (u < width - 1 and band[v, u + 1] > own):
-        return False  # most are told by their neighbours
-    for y in range(max(v - reach, 0), min(v + reach + 1, height)):
-        for x in range(max(u - reach, 0), min(u + reach + 1, width)):
-            if disc[y - v + reach, x - u + reach] and band[y, x] > own:
-                return False
-    return True
-
-
-@_compiled(_grey, _mask, _ints)
-def peaks(band: Grey, disc: BoolArray, pixels: IntArray) -> IntArray:
-    """Columns and rows, shape (2, n), of those of some pixels that none of a disc is over."""
-    found, count = np.empty((2, len(pixels)), np.int64), 0
-    for at in pixels:
-        v, u = at // band.shape[1], at % band.shape[1]
-        if _tops(band, disc, v, u):
-            found[0, count], found[1, count] = u, v
-            count += 1
-    return found[:, :count].copy()
-
-
-@_compiled(_grey, _ints, _ints, _i, _f1, _f)
-def centroids(
-    light: Grey, u: IntArray, v: IntArray, margin: int, width: FloatArray, reach: float
-) -> tuple[FloatArray, FloatArray]:
-    """Centroids and second moments of light round pixels: see `dots.centroids`."""
-    count, side = len(u), 2 * margin + 1
-    offset, moment, patch = np.zeros((2, count)), np.empty(count), np.zeros((side, side))
-    along_u, along_v, pull_u = np.empty(side), np.empty(side), np.empty(side)
-    for k in range(count):
-        for y in range(side):
-            for x in range(side):
-                at_y, at_x = v[k] + y - margin, u[k] + x - margin
-                seen = 0 <= at_y < light.shape[0] and 0 <= at_x < light.shape[1]
-                patch[y, x] = max(light[at_y, at_x], 0.0) if seen else 0.0
-        for _ in range(4):
-            for x in range(side):
-                away = (x - margin - offset[0, k]) / width[k]
-                pull_u[x] = np.exp(-0.5 * away * away)
-                along_u[x] = 0.0
-            for y in range(side):
-                away = (y - margin - offset[1, k]) / width[k]
-                pull_v, row = np.exp(-0.5 * away * away), 0.0
-                for x in range(side):
-                    weighed = patch[y, x] * pull_u[x]
-                    row += weighed
-                    along_u[x] += pull_v * weighed
-                along_v[y] = pull_v * row
-            total, mean_u, mean_v, square = 1e-12, 0.0, 0.0, 0.0
-            for at in range(side):
-                away = at - margin
-                total += along_u[at]
-                mean_u += along_u[at] * away
-                mean_v += along_v[at] * away
-                square += (along_u[at] + along_v[at]) * away * away
-            mean_u, mean_v = mean_u / total, mean_v / total
-            moment[k] = square / total - mean_u * mean_u - mean_v * mean_v
-            # The window holds the mean back; half as much again brings it home in a few steps.
-            offset[0, k] += 1.5 * (mean_u - offset[0, k])
-            offset[1, k] += 1.5 * (mean_v - offset[1, k])
-            offset[0, k] = min(max(offset[0, k], -reach), reach)
-            offset[1, k] = min(max(offset[1, k], -reach), reach)
-    return offset, moment
-
-
-@_inner
-def _mirrored(at: int, count: int) -> int:
-    """A pixel's number where a picture goes on beyond its edge as in a mirror."""
-    at %= 2 * count
-    return 2 * count - 1 - at if at >= count else at
-
-
-@_compiled(_grey, _ints, _ints, _grey, _grey)
-def finest(image: Grey, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
-    """Largest difference of two filters among nine pixels round each (`quick_dots._nine`)."""
-    side, made = narrow.shape[1], np.empty(len(u))
-    patch, across = np.empty((side, side)), np.empty((2, side, 3))
-    for k in range(len(u)):
-        for y in range(side):
-            at_y = _mirrored(v[k] + y - side // 2, image.shape[0])
-            for x in range(side):
-                patch[y, x] = image[at_y, _mirrored(u[k] + x - side // 2, image.shape[1])]
-        for y in range(side):
-            for j in range(3):
-                across[0, y, j] = across[1, y, j] = 0.0
-                for x in range(side):
-                    across[0, y, j] += narrow[j, x] * patch[y, x]
-                    across[1, y, j] += wide[j, x] * patch[y, x]
-        most = -np.inf
-        for i in range(3):
-            for j in range(3):
-                value = 0.0
-                for y in range(side):
-                    value += narrow[i, y] * across[0, y, j] - wide[i, y] * across[1, y, j]
-                most = max(most, value)
-        made[k] = most
+    made = np.empty((len(over), len(blurs), count))
+    factors, starts, slopes = np.empty(count), np.empty(count + 1), np.empty(count + 1)
+    for d in range(len(over)):
+        for b in range(len(blurs)):
+            factors[:], starts[:], slopes[:], total = 1.0, 0.0, 0.0, made[d, b]
+            total[:] = 0.0
+            for n in range(len(side)):
+                # The exponent is −(start + level · slope) and changes its sign at ``turn``.
+                start = side[n] * (over[d, n] + first) / blurs[b]
+                slope = side[n] * step / blurs[b]
+                turn = -start / slope if slope != 0.0 else np.inf * start
+                turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
+                # Where it is above 0 it is taken out of the logarithm.
+                begins, ends = (0, turn) if slope > 0.0 else (turn, count)
+                starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
+                starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
+                shrinks = np.exp(-abs(slope))
+                factor, k = np.exp(-abs(start + turn * slope)), turn
+                while k < count and factor > NOTHING:
+                    factors[k] *= 1.0 + factor
+                    factor *= shrinks
+                    k += 1
+                factor, k = np.exp(-abs(start + (turn - 1) * slope)), turn - 1
+                while k >= 0 and factor > NOTHING:
+                    factors[k] *= 1.0 + factor
+                    factor *= shrinks
+                    k -= 1
+                if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
+                    total += np.log(factors)
+                    factors[:] = 1.0
+            start, slope = 0.0, 0.0
+            for k in range(count):
+                start, slope = start + starts[k], slope + slopes[k]
+                total[k] += start + k * slope
     return made
-
-
-@_compiled(_ints, _ints, _f)
-def first_of_each(u: IntArray, v: IntArray, within: float) -> IntArray:
-    """Numbers of the pixels that none before them is near that stays: `dots.first_of_each`."""
-    kept = np.empty(len(u), np.int64)
-    count = 0
-    for k in range(len(u)):
-        alone = True
-        for m in range(count):
-            x, y = u[k] - u[kept[m]], v[k] - v[kept[m]]
-            if x * x + y * y <= within * within:
-                alone = False
-                break
-        if alone:
-            kept[count] = k
-            count += 1
-    return kept[:count].copy()
 
 
 # --- the boundary -------------------------------------------------------------------------------

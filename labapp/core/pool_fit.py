@@ -282,23 +282,11 @@ so much of its probability is at the ends of that, everywhere."""
 # sharply as the surface is to one that half the neighbouring rays contradict.
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
 _BLUR_PRIOR = 1.2
-
-# So many factors of at most 2 have a product that is a number still.
-_FACTORS = 1000
+_ROUGH = _BLURS[-1:]
 
 # How deep a rear may lie, mm, and how often one lies below the work piece at all.
 _DROPS = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
 _SINKS = 0.2
-
-
-def _doubt(inside: FloatArray) -> FloatArray:
-    """Σ log(1 + exp(−x)) along the first axis."""
-    apart = np.abs(inside)
-    total = 0.5 * (apart - inside).sum(axis=0)
-    apart = 1.0 + np.exp(-apart)
-    for start in range(0, len(apart), _FACTORS):
-        total += np.log(apart[start : start + _FACTORS].prod(axis=0))
-    return np.asarray(total)
 
 
 def find_level(
@@ -364,11 +352,8 @@ def place_level(
     # Only a pool that stands above the work piece is seen to sink at its rear.
     seen = sign > 0 and bool(np.any(near & (witness < 0) & (y < end)))
     drops = (_DROPS if seen else _DROPS[:1]) if drop_mm is None else np.array([drop_mm])
-    log_likelihood = np.empty((len(drops), len(_BLURS), len(shifts)))
-    for k, depth in enumerate(drops):
-        over = height[near] - Rear(depth, start, end).height(y[near])
-        inside = sign * witness[near, None] * (over[:, None] + shifts) / rise[near, None]
-        log_likelihood[k] = -_doubt(inside[:, None] / _BLURS[:, None])
+    over = np.array([height[near] - Rear(drop, start, end).height(y[near]) for drop in drops])
+    log_likelihood = -_doubts(over, sign * witness[near] / rise[near], shifts, _BLURS)
     log_posterior = log_likelihood - _BLUR_PRIOR * np.log(_BLURS)[:, None]
     log_posterior[1:] += np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1))
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
@@ -386,10 +371,18 @@ def place_level(
 
 def _rough_level(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:
     """Shift, mm, and sign that the witnesses contradict least."""
-    scan = np.linspace((-height).min(), (-height).max(), 300)
-    inside = witness[:, None] * (height[:, None] + scan) / rise[:, None]
-    above = _doubt(4.0 * inside)
-    below = above + 4.0 * inside.sum(axis=0)
+    scan, side = np.linspace((-height).min(), (-height).max(), 300), witness / rise
+    above = _doubts(height[None], side, scan, _ROUGH)[0, 0]
+    below = _doubts(height[None], -side, scan, _ROUGH)[0, 0]
     if above.min() <= below.min():
         return float(scan[np.argmin(above)]), 1
     return float(scan[np.argmin(below)]), -1
+
+
+def _doubts(
+    over: FloatArray, side: FloatArray, shifts: FloatArray, blurs: FloatArray
+) -> FloatArray:
+    """What witnesses have against evenly spaced shifts: see `kernels.doubts`."""
+    from labapp.core import kernels
+
+    return kernels.doubts(over, side, shifts[0], shifts[1] - shifts[0], len(shifts), blurs)

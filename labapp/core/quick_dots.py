@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from labapp.core.dots import (
     HOT,
@@ -43,18 +44,24 @@ class Pad:
     """Pictures to work on. Made anew for every frame they would cost as much as the work."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.image, self.fine, self.narrow, self.wide, self.band = (
-            np.empty(shape, np.float32) for _ in range(5)
+        self.image, self.narrow, self.wide, self.band = (
+            np.empty(shape, np.float32) for _ in range(4)
         )
+        self.over = np.empty(shape, bool)
         self._small: dict[int, tuple[Grey, Grey]] = {}
 
-    def blur(self, image: Grey, into: Grey, sigma: float) -> None:
-        """Blur by a Gaussian (`dots.gauss`)."""
-        cv2.GaussianBlur(image, (0, 0), sigma, dst=into, borderType=cv2.BORDER_REFLECT)
+    def blur(self, image: Grey | npt.NDArray[np.uint8], into: Grey, sigma: float) -> None:
+        """Blur by a Gaussian (`dots.gauss`); of 8-bit pictures none is made in between."""
+        kernel = _kernel(sigma)
+        cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, into, borderType=cv2.BORDER_REFLECT)
 
-    def widen(self, image: Grey, into: Grey, variance_px2: float) -> None:
-        """Blur by a Gaussian of some variance, by way of a smaller picture where it is wide."""
-        height, width = image.shape
+    def widen(self, image: Grey, into: Grey, variance_px2: float) -> Grey:
+        """Blur by a Gaussian of some variance, px² of ``into``, by way of a smaller picture.
+
+        Returns the smaller picture of the image; it can be given to be widened further. Where the
+        blur is narrow, or the picture's sides cannot be divided, that is the image itself.
+        """
+        height, width = into.shape
         scale = 1
         while (
             variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
@@ -63,7 +70,7 @@ class Pad:
             scale *= 2
         if scale == 1:
             self.blur(image, into, float(np.sqrt(variance_px2)))
-            return
+            return image
         shape = height // scale, width // scale
         if scale not in self._small:
             self._small[scale] = np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -71,6 +78,7 @@ class Pad:
         cv2.resize(image, shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
         self.blur(small, blurred, float(np.sqrt(variance_px2 / scale**2 - ROUND_PX2)))
         cv2.resize(blurred, (width, height), dst=into)
+        return small
 
 
 WHOLE = 1.8
@@ -126,17 +134,17 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     CannotMeasure
         ``no-dots`` if nothing stands out of the noise.
     """
-    from labapp.core import kernels
+    from labapp.core import dot_kernels
 
     pad, size = _pad(exposure.noise.shape), exposure.size_px
-    image, fine, narrow, wide, band = pad.image, pad.fine, pad.narrow, pad.wide, pad.band
+    image, narrow, wide, band = pad.image, pad.narrow, pad.wide, pad.band
     np.copyto(image, frame, casting="unsafe")
-    pad.blur(image, fine, 0.5 * size)
-    pad.blur(fine, narrow, float(np.sqrt(0.8**2 - 0.5**2)) * size)
-    pad.widen(narrow, wide, (1.6**2 - 0.8**2) * size**2)
+    eight_bit = frame.dtype == np.uint8
+    pad.blur(frame.astype(np.uint8, copy=False) if eight_bit else image, narrow, 0.8 * size)
+    small = pad.widen(narrow, wide, (1.6**2 - 0.8**2) * size**2)
     cv2.subtract(narrow, wide, dst=band)
-    over = np.flatnonzero(band > exposure.floor)
-    u, v = kernels.peaks(band, peak_disc(size).astype(bool), over)
+    over = np.flatnonzero(np.greater(band, exposure.floor, out=pad.over))
+    u, v = dot_kernels.peaks(band, peak_disc(size).astype(bool), over)
     keep = _not_hot(image, band, u, v, size)
     u, v = u[keep], v[keep]
     if len(u) == 0:
@@ -144,13 +152,13 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     bright = band[v, u].astype(float)
     keep = bright >= settings.contrast * typical(bright)
     u, v = u[keep], v[keep]
-    first = kernels.first_of_each(u, v, max(1.5, size))
+    first = dot_kernels.first_of_each(u, v, max(1.5, size))
     u, v = u[first], v[first]
-    pad.widen(narrow, wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
-    cv2.subtract(fine, wide, dst=wide)
+    pad.widen(small, wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
     place, reach = np.stack([u, v], axis=1).astype(float), WHOLE * size
-    width = windows(kernels.two_nearest(place, place)[0][:, 1], reach)
-    found = kernels.centroids(wide, u, v, margin_of(reach), width, reach)
+    width = windows(dot_kernels.two_nearest(place, place)[0][:, 1], reach)
+    light = image, wide, _kernel(0.5 * size)
+    found = dot_kernels.centroids(*light, u, v, margin_of(reach), width, reach)
     return described(band, exposure.noise, (u, v), size, settings.speckle_px, width, found)
 
 
@@ -167,12 +175,12 @@ def _pad(shape: tuple[int, ...]) -> Pad:
 
 def _not_hot(image: Grey, band: Grey, u: IntArray, v: IntArray, size: float) -> BoolArray:
     """Not a hot pixel (`dots._dot_like`): the finer band is worked out round the peaks alone."""
-    from labapp.core import kernels
+    from labapp.core import dot_kernels
 
     scale = hot_scale(size)
     taps = _taps(1.6 * scale)
     narrow, wide = (_nine(sigma, taps) for sigma in (0.8 * scale, 1.6 * scale))
-    return np.asarray(kernels.finest(image, u, v, narrow, wide) < HOT * band[v, u])
+    return np.asarray(dot_kernels.finest(image, u, v, narrow, wide) < HOT * band[v, u])
 
 
 def _taps(sigma: float) -> int:
@@ -181,14 +189,17 @@ def _taps(sigma: float) -> int:
 
 
 @lru_cache(maxsize=8)
-def _nine(sigma: float, taps: int) -> Grey:
-    """Gaussian weights of a pixel and its two neighbours on a line, shape (3, taps + 2).
+def _kernel(sigma: float) -> Grey:
+    """Gaussian weights of pixels on a line; kept, as a recording has one size of dot."""
+    kernel = np.asarray(cv2.getGaussianKernel(_taps(sigma), sigma, cv2.CV_32F), np.float32).ravel()
+    kernel.flags.writeable = False
+    return kernel
 
-    Kept, as a recording has one size of dot.
-    """
-    own = _taps(sigma)
-    kernel = np.asarray(cv2.getGaussianKernel(own, sigma, cv2.CV_32F), np.float32).ravel()
-    kernel = np.pad(kernel, (taps - own) // 2)
+
+@lru_cache(maxsize=8)
+def _nine(sigma: float, taps: int) -> Grey:
+    """Gaussian weights of a pixel and its two neighbours on a line, shape (3, taps + 2)."""
+    kernel = np.pad(_kernel(sigma), (taps - _taps(sigma)) // 2)
     nine = np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
     nine.flags.writeable = False
     return np.asarray(nine)

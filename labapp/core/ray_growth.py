@@ -97,10 +97,10 @@ class Scene:
         cls, dots: Dots, rig: Rig, calibration: ImageCalibration, frame_shape: tuple[int, int]
     ) -> Scene:
         """Put the dots of a frame on the imaging plane."""
-        from labapp.core import kernels
+        from labapp.core import dot_kernels
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
-        plane, covariance, scale = kernels.on_plane(calibration.matrix, dots.image_px, sigma)
+        plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, dots.image_px, sigma)
         resolution = RESOLVED * float(np.median(dots.size_px * scale))
         return cls(plane, covariance, resolution, rig, calibration, frame_shape)
 

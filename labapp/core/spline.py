@@ -73,6 +73,32 @@ def _values_and_slopes(*step_mm: float) -> FloatArray:
     return pieces
 
 
+@lru_cache(maxsize=32)
+def _roughness(nx: int, ny: int, *step_mm: float) -> FloatArray:
+    """`SplineBasis.roughness`; kept, as a search lays the same splines again and again."""
+    grams = []
+    node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
+    power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
+    for count, step in zip((nx, ny), step_mm, strict=True):
+        gram = np.zeros((DEGREE + 1, count, count))
+        for order, pieces in enumerate(_PIECES):
+            part = power @ (pieces / step**order)
+            within = (part * (weight * step / 2)[:, None]).T @ part
+            for cell in range(count - DEGREE):
+                own = slice(cell, cell + DEGREE + 1)
+                gram[order, own, own] += within
+        grams.append(gram)
+    x, y = grams
+    roughness = (
+        np.kron(x[3], y[0])
+        + 3 * np.kron(x[2], y[1])
+        + 3 * np.kron(x[1], y[2])
+        + np.kron(x[0], y[3])
+    )
+    roughness.flags.writeable = False
+    return np.asarray(roughness)
+
+
 @dataclass(frozen=True)
 class SplineBasis:
     """Tensor product of uniform cubic B-splines over a rectangle.
@@ -163,28 +189,10 @@ class SplineBasis:
         x, y = np.asarray(x_mm), np.asarray(y_mm)
         return np.asarray((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high))
 
-    @cached_property
+    @property
     def roughness(self) -> FloatArray:
         """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc, shape (splines, splines)."""
-        grams = []
-        node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
-        power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
-        for count, step in zip(self.shape, self.step_mm, strict=True):
-            gram = np.zeros((DEGREE + 1, count, count))
-            for order, pieces in enumerate(_PIECES):
-                part = power @ (pieces / step**order)
-                within = (part * (weight * step / 2)[:, None]).T @ part
-                for cell in range(count - DEGREE):
-                    own = slice(cell, cell + DEGREE + 1)
-                    gram[order, own, own] += within
-            grams.append(gram)
-        x, y = grams
-        return np.asarray(
-            np.kron(x[3], y[0])
-            + 3 * np.kron(x[2], y[1])
-            + 3 * np.kron(x[1], y[2])
-            + np.kron(x[0], y[3])
-        )
+        return _roughness(*self.shape, *self.step_mm)
 
 
 @dataclass(frozen=True)

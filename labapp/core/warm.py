@@ -42,7 +42,6 @@ from labapp.core.warm_fit import (
     fit_slopes_to,
     lay,
     met,
-    spline_values,
 )
 from labapp.core.warm_match import beyond, testimony, widened
 from labapp.core.warm_measures import follow_rim, sigma_of, sizes_of
@@ -335,7 +334,7 @@ def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatA
     """Work out how uncertain reflection points are, every now and then or where it is not known."""
     if track.count % POINTS_EVERY and np.isfinite(track.free_mm[ray]).all():
         return track
-    splines, values = spline_values(track.bed.basis, pool.points_mm[ray, :2])
+    splines, values = kernels.splines_at(track.bed.basis.grid, pool.points_mm[ray, :2])
     at_points = np.zeros((len(ray), len(pool.coefficients)))
     np.put_along_axis(at_points, splines, values[0], axis=1)
     free = track.free_mm.copy()

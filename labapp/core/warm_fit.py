@@ -109,17 +109,6 @@ class Bed:
         )
 
 
-def spline_values(basis: SplineBasis, place_mm: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Splines that are not zero at places, shape (n, 2), held to the rectangle.
-
-    Returns
-    -------
-    splines, values
-        Their numbers, shape (n, 16); value and derivatives by x and by y, shape (3, n, 16).
-    """
-    return kernels.splines_at(basis.grid, place_mm)
-
-
 @dataclass(frozen=True)
 class WarmPool:
     """A surface, and what it makes of all rays.

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core import kernels
+from labapp.core import dot_kernels, kernels
 from labapp.core.hypothesis import BEYOND, FEW
 from labapp.core.optics import reflect, surface_normal
 from labapp.core.pool_fit import Level
@@ -27,7 +27,7 @@ from labapp.core.ray_growth import (
     surprise_of,
 )
 from labapp.core.values import BoolArray, FloatArray, IntArray
-from labapp.core.warm_fit import Bed, WarmPool, lay, solve, spline_values
+from labapp.core.warm_fit import Bed, WarmPool, lay, solve
 
 GATE, CLEARLY = 0.35, 2.0
 """A dot is a tracked ray's within this share of the way to the next predicted dot, if no other dot
@@ -52,7 +52,7 @@ def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
     distance = np.full(len(plane_mm), np.inf)
     if len(ray) > 1:
         places = plane_mm[ray]
-        distance[ray] = kernels.two_nearest(places, places)[0][:, 1]
+        distance[ray] = dot_kernels.two_nearest(places, places)[0][:, 1]
     return distance
 
 
@@ -106,9 +106,9 @@ def tracked(
     if len(near) < 2 or len(scene.plane_mm) < 2:
         return labels, np.empty(0)
     plane = pool.plane_mm[near]
-    step = kernels.two_nearest(plane, plane)[0][:, 1]
-    off, ray = kernels.two_nearest(scene.plane_mm, plane)
-    other, dot = kernels.two_nearest(plane, scene.plane_mm)
+    step = dot_kernels.two_nearest(plane, plane)[0][:, 1]
+    off, ray = dot_kernels.two_nearest(scene.plane_mm, plane)
+    other, dot = dot_kernels.two_nearest(plane, scene.plane_mm)
     own, off_own = ray[:, 0], off[:, 0]
     gate = GATE * step[own]
     sure = (off_own < gate) & (step[own] > scene.resolution_mm) & lit[near[own]]
@@ -160,7 +160,7 @@ def _surprise(
     bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, ray: IntArray, dot: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """What `ray_growth.surprise_of` says of rays making dots, shapes (rays, dots)."""
-    splines, values = spline_values(bed.basis, pool.points_mm[ray, :2])
+    splines, values = kernels.splines_at(bed.basis.grid, pool.points_mm[ray, :2])
     by = np.zeros((2, len(ray), len(pool.coefficients)))
     for axis in range(2):
         np.put_along_axis(by[axis], splines, values[1 + axis], axis=1)

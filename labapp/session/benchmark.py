@@ -26,7 +26,7 @@ from labapp.core.warm import WarmChain
 from labapp.media import open_source
 from labapp.session.results import ResultsWriter
 from labapp.session.scenario import read_scenario
-from labapp.session.sequence import Job, measure_sequence
+from labapp.session.sequence import Job, await_ready, followers, measure_sequence
 from labapp.session.setup import Setup, read_setup
 from labapp.session.simulate import simulate
 from labapp.session.simulated_pool import BENCH
@@ -226,6 +226,8 @@ class Run:
     ----------
     frames, seconds, processor_s
         How many frames, in how long, and what time of processors that took.
+    start_s
+        How long before the processes that measure had started and loaded what they need.
     measured, cold
         How many have a surface; how many were measured by the cold chain.
     wrong, labelled
@@ -239,6 +241,7 @@ class Run:
     frames: int
     seconds: float
     processor_s: float
+    start_s: float
     measured: int
     cold: int
     wrong: int
@@ -264,12 +267,16 @@ def run_video(
     begun, used = time.perf_counter(), sum(os.times()[:4])
     kept = []
     job = Job(video.path, None, video.setup, Settings())
-    with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
-        for told in measure_sequence(job, range(frames), workers):
-            results.write(told.frame, told.time_s, told.measurement, told.rows)
-            kept.append(told)
-            progress()
-    seconds, used = time.perf_counter() - begun, sum(os.times()[:4]) - used
+    with followers(frames, workers) as pools:
+        await_ready(pools)
+        start_s = time.perf_counter() - begun
+        with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
+            for told in measure_sequence(job, range(frames), pools):
+                results.write(told.frame, told.time_s, told.measurement, told.rows)
+                kept.append(told)
+                progress()
+        seconds = time.perf_counter() - begun - start_s
+    used = sum(os.times()[:4]) - used
     for told in kept:
         broke += told.broke is not None
         found, match, size = (
@@ -293,6 +300,7 @@ def run_video(
         frames,
         seconds,
         used,
+        start_s,
         measured,
         broke,
         wrong,

@@ -11,7 +11,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -75,7 +75,34 @@ class Job:
     settings: Settings
 
 
-def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None) -> Iterator[Told]:
+@contextmanager
+def followers(frames: int, workers: int | None = None) -> Iterator[list[Executor]]:
+    """Begin processes that measure stretches, one each; they load meanwhile what they need.
+
+    Parameters
+    ----------
+    frames
+        How many are to be measured: there are no more processes than stretches.
+    workers
+        How many processes; None: one a core; 0: none.
+    """
+    stretches = -(-frames // STRETCH)
+    with ExitStack() as at_end:
+        pools: list[Executor] = []
+        for _ in range(min(os.cpu_count() or 1 if workers is None else workers, stretches)):
+            pools.append(pool := measuring_pool(1))
+            at_end.callback(pool.shutdown, cancel_futures=True)
+            pool.submit(_ready)
+        yield pools
+
+
+def await_ready(pools: Sequence[Executor]) -> None:
+    """Wait until `followers` have loaded what they need."""
+    for told in [pool.submit(_ready) for pool in pools]:
+        told.result()
+
+
+def measure_sequence(job: Job, frames: Sequence[int], pools: Sequence[Executor]) -> Iterator[Told]:
     """Measure frames in their order, each from the one before.
 
     Parameters
@@ -84,8 +111,8 @@ def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None
         What to measure.
     frames
         Numbers of the frames, as they follow on each other.
-    workers
-        How many processes measure; None: one a core, at most one a stretch; 0: here.
+    pools
+        Where to measure (`followers`); none: here.
 
     Raises
     ------
@@ -93,30 +120,23 @@ def measure_sequence(job: Job, frames: Sequence[int], workers: int | None = None
         If the recording cannot be opened.
     """
     stretches = [frames[at : at + STRETCH] for at in range(0, len(frames), STRETCH)]
-    if workers is None:
-        workers = min(os.cpu_count() or 1, len(stretches))
-    if workers == 0:
+    if not pools:
         for stretch in stretches:
             with closing(Following(job)) as following:
                 for at in range(0, len(stretch), BATCH):
                     yield from following.measure_all(stretch[at : at + BATCH])
         return
-    with ExitStack() as at_end:
-        pools = [measuring_pool(1) for _ in range(workers)]
-        for pool in pools:
-            at_end.callback(pool.shutdown, cancel_futures=True)
-            pool.submit(_ready)
-        if job.index is None:  # found out once, while the processes start
-            with open_source(job.path) as source:
-                job = replace(job, index=source.index)
-        begun: deque[deque[Future[list[Told]]]] = deque()
-        waiting = iter(enumerate(stretches))
-        begun += (_begun(pools[k % workers], job, s) for k, s in islice(waiting, workers))
-        while begun:
-            batches = begun.popleft()
-            while batches:
-                yield from batches.popleft().result()
-            begun += (_begun(pools[k % workers], job, s) for k, s in islice(waiting, 1))
+    if job.index is None:  # found out once, for all of them
+        with open_source(job.path) as source:
+            job = replace(job, index=source.index)
+    begun: deque[deque[Future[list[Told]]]] = deque()
+    waiting = iter(enumerate(stretches))
+    begun += (_begun(pools[k % len(pools)], job, s) for k, s in islice(waiting, len(pools)))
+    while begun:
+        batches = begun.popleft()
+        while batches:
+            yield from batches.popleft().result()
+        begun += (_begun(pools[k % len(pools)], job, s) for k, s in islice(waiting, 1))
 
 
 def follow_frames(
@@ -134,9 +154,10 @@ def follow_frames(
     InputError
         If the recording cannot be opened, or a frame's results cannot be written.
     """
-    for told in measure_sequence(Job(path, index, setup, settings), frames):
-        results.write(told.frame, told.time_s, told.measurement, told.rows)
-        yield told.frame, told.time_s, told.measurement
+    with followers(len(frames)) as pools:
+        for told in measure_sequence(Job(path, index, setup, settings), frames, pools):
+            results.write(told.frame, told.time_s, told.measurement, told.rows)
+            yield told.frame, told.time_s, told.measurement
 
 
 def follow_each(

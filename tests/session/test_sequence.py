@@ -19,7 +19,7 @@ from labapp.session.benchmark import SCENARIO
 from labapp.session.record import Record
 from labapp.session.results import ResultsWriter
 from labapp.session.scenario import read_scenario
-from labapp.session.sequence import Job, Told, measure_sequence
+from labapp.session.sequence import Job, Told, followers, measure_sequence
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from labapp.session.simulate import simulate
@@ -47,8 +47,8 @@ def test_two_sequences_in_turn_keep_apart(
         for k, number in enumerate(order):
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), images[number])
     jobs = [Job(tmp_path / name, None, job.setup, job.settings) for name in "ab"]
-    alone = [[one.rows for one in measure_sequence(each, range(3), 0)] for each in jobs]
-    in_turn = zip(*(measure_sequence(each, range(3), 0) for each in jobs), strict=True)
+    alone = [[one.rows for one in measure_sequence(each, range(3), [])] for each in jobs]
+    in_turn = zip(*(measure_sequence(each, range(3), []) for each in jobs), strict=True)
     assert [[one.rows for one in pair] for pair in in_turn] == [
         list(pair) for pair in zip(*alone, strict=True)
     ]
@@ -59,9 +59,11 @@ def test_stretches_are_measured_alike_here_and_by_processes(
 ) -> None:
     monkeypatch.setattr(sequence, "STRETCH", 5)
     monkeypatch.setattr(sequence, "BATCH", 2)
-    told: dict[int, list[Told]] = {
-        workers: list(measure_sequence(job, range(FRAMES), workers)) for workers in (0, 2)
-    }
+    told: dict[int, list[Told]] = {}
+    for workers in (0, 2):
+        with followers(FRAMES, workers) as pools:
+            assert len(pools) == workers
+            told[workers] = list(measure_sequence(job, range(FRAMES), pools))
     assert [one.frame for one in told[2]] == list(range(FRAMES))
     for here, there in zip(told[0], told[2], strict=True):
         assert here.rows == there.rows
@@ -88,7 +90,7 @@ def test_a_frame_that_cannot_be_read_is_told_and_the_others_measured(
         for n in range(3):
             cv2.imwrite(str(folder / f"frame_{n}.png"), np.asarray(source.frame(n).image))
     (folder / "frame_1.png").write_bytes(b"not a picture")
-    told = list(measure_sequence(Job(folder, None, job.setup, job.settings), range(3), 0))
+    told = list(measure_sequence(Job(folder, None, job.setup, job.settings), range(3), []))
     assert [one.measurement.status for one in told] == ["ok", "unreadable", "ok"]
 
 
@@ -130,4 +132,4 @@ def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
 
 
 def told_here(job: Job) -> list[Told]:
-    return list(measure_sequence(job, range(3), 0))
+    return list(measure_sequence(job, range(3), []))
