@@ -341,6 +341,7 @@ def doubts(
             for k in range(count):
                 start, slope = start + starts[k], slope + slopes[k]
                 total[k] += start + k * slope
+                total[k] = max(total[k], 0.0)  # rounded
     return made
 
 

@@ -86,6 +86,10 @@ WHOLE = 1.8
 speckle, which move it the less."""
 
 
+MUCH = 0.3
+"""Where the dots' surroundings are a larger share of the picture, the whole of it is blurred."""
+
+
 @dataclass(frozen=True)
 class Exposure:
     """What frames of one recording share as long as light and camera stay as they are.
@@ -157,8 +161,11 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     pad.widen(small, wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * size**2)
     place, reach = np.stack([u, v], axis=1).astype(float), WHOLE * size
     width = windows(dot_kernels.two_nearest(place, place)[0][:, 1], reach)
-    light = image, wide, _kernel(0.5 * size)
-    found = dot_kernels.centroids(*light, u, v, margin_of(reach), width, reach)
+    margin, taps = margin_of(reach), _kernel(0.5 * size)
+    if len(u) * (2 * margin + 1) ** 2 > MUCH * image.size:
+        pad.blur(image, narrow, 0.5 * size)
+        image, taps = narrow, _kernel(0.0)
+    found = dot_kernels.centroids(image, wide, taps, u, v, margin, width, reach)
     return described(band, exposure.noise, (u, v), size, settings.speckle_px, width, found)
 
 
@@ -191,7 +198,8 @@ def _taps(sigma: float) -> int:
 @lru_cache(maxsize=8)
 def _kernel(sigma: float) -> Grey:
     """Gaussian weights of pixels on a line; kept, as a recording has one size of dot."""
-    kernel = np.asarray(cv2.getGaussianKernel(_taps(sigma), sigma, cv2.CV_32F), np.float32).ravel()
+    taps = cv2.getGaussianKernel(_taps(sigma), sigma, cv2.CV_32F)
+    kernel = np.asarray(taps, np.float32).ravel()
     kernel.flags.writeable = False
     return kernel
 

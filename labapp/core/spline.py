@@ -73,7 +73,7 @@ def _values_and_slopes(*step_mm: float) -> FloatArray:
     return pieces
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def _roughness(nx: int, ny: int, *step_mm: float) -> FloatArray:
     """`SplineBasis.roughness`; kept, as a search lays the same splines again and again."""
     grams = []

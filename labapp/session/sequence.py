@@ -132,11 +132,16 @@ def measure_sequence(job: Job, frames: Sequence[int], pools: Sequence[Executor])
     begun: deque[deque[Future[list[Told]]]] = deque()
     waiting = iter(enumerate(stretches))
     begun += (_begun(pools[k % len(pools)], job, s) for k, s in islice(waiting, len(pools)))
-    while begun:
-        batches = begun.popleft()
-        while batches:
-            yield from batches.popleft().result()
-        begun += (_begun(pools[k % len(pools)], job, s) for k, s in islice(waiting, 1))
+    try:
+        while begun:
+            while begun[0]:
+                yield from begun[0].popleft().result()
+            begun.popleft()
+            begun += (_begun(pools[k % len(pools)], job, s) for k, s in islice(waiting, 1))
+    finally:
+        for batches in begun:
+            for future in batches:
+                future.cancel()
 
 
 def follow_frames(
@@ -202,6 +207,7 @@ def _begun(pool: Executor, job: Job, stretch: Sequence[int]) -> deque[Future[lis
 
 def _ready() -> None:
     """Have a process start, and load what it measures with."""
+    import labapp.core.quadric_kernels
     import labapp.core.warm
     import labapp.session.quick_rows  # noqa: F401
 

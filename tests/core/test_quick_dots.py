@@ -49,6 +49,20 @@ def test_the_dots_of_the_next_frame_are_those_of_the_default_detector(seed: int)
     assert np.sqrt(np.mean(off**2)) < np.sqrt(2) * 0.08
 
 
+def test_light_is_the_same_round_the_dots_alone_and_over_the_whole_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(5)
+    image = frame(places(rng), rng)
+    exposure = Exposure.of(image, BandPassSettings())
+    made = []
+    for much in (np.inf, 0.0):
+        monkeypatch.setattr("labapp.core.quick_dots.MUCH", much)
+        made.append(quick_dots(image, exposure, BandPassSettings()))
+    np.testing.assert_allclose(made[0].image_px, made[1].image_px, atol=1e-4)
+    np.testing.assert_allclose(made[0].size_px, made[1].size_px, atol=1e-3)
+
+
 def test_speckle_moves_them_less() -> None:
     rng = np.random.default_rng(9)
     exposure, off = None, []
