@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Generator
+from concurrent.futures import Executor, Future
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -79,6 +82,26 @@ def test_stretches_are_measured_alike_here_and_by_processes(
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["ok"] * FRAMES
     assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
+
+
+def test_a_sequence_given_up_takes_back_what_it_had_given_out(
+    job: Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sequence, "BATCH", 2)
+    given: list[Future[Any]] = []
+
+    class Slow(Executor):
+        def submit(self, *_: Any, **__: Any) -> Future[Any]:
+            given.append(Future())
+            if len(given) == 1:
+                given[0].set_result(["the first"])
+            return given[-1]
+
+    told = measure_sequence(job, range(FRAMES), [Slow()])
+    assert next(told) == "the first"
+    assert isinstance(told, Generator)
+    told.close()
+    assert [one.cancelled() for one in given] == [False, True, True, True, True]
 
 
 def test_a_frame_that_cannot_be_read_is_told_and_the_others_measured(
