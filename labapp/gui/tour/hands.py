@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import TypeVar
 
@@ -47,6 +48,9 @@ LONGEST_MS = 60_000
 """What takes longer than this has gone wrong."""
 
 LOOK_MS = 5
+
+NESTED = 32
+"""Layouts are nested less deep: words that grow have theirs grow by one event, that the next."""
 
 TITLE_PX = 24
 """Height of the title that is drawn over a dialog: its frame is the desktop's, not the app's."""
@@ -90,6 +94,7 @@ class Hands:
     size_px: tuple[int, int]
     tell: Callable[[str], None]
     count: int = field(default=0, init=False)
+    pictures: dict[bytes, str] = field(default_factory=dict, init=False)
 
     # --- waiting -----------------------------------------------------------------------------
 
@@ -125,7 +130,8 @@ class Hands:
         self.wait(self._rests, "work to end")
 
     def _rests(self) -> bool:
-        QApplication.sendPostedEvents()
+        for _ in range(NESTED):
+            QApplication.sendPostedEvents()
         timers = self.window.findChildren(QTimer)
         due = any(timer.isActive() and timer.isSingleShot() for timer in timers)
         return not due and not self.window.workspace.tasks.active
@@ -293,6 +299,9 @@ class Hands:
         self.count += 1
         part = name if name.startswith("dialog-") else "-".join(filter(None, (self.page, name)))
         file = self.out / f"{self.count:02d}-{part}.png"
+        same = self.pictures.setdefault(sha256(image.constBits()).digest(), file.name)
+        if same != file.name:
+            raise self.fail(f"{file.name} would show the same as {same}")
         if not image.save(str(file)):
             raise self.fail(f"{file} cannot be written")
         titles = [widget.windowTitle() for widget in _over(self.window)]
