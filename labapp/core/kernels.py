@@ -96,18 +96,27 @@ def surface_at(grid: FloatArray, coefficients: FloatArray, place: FloatArray) ->
     return made
 
 
+@_inner
+def _add(
+    grid: FloatArray, x: float, y: float, share: float, work: FloatArray, made: FloatArray
+) -> None:
+    """Add a share of what every spline is at a place."""
+    many = int(grid[1, 3]) + 3
+    first_x = _along(grid[0], x, work[0], work[1])
+    first_y = _along(grid[1], y, work[2], work[3])
+    for a in range(4):
+        for b in range(4):
+            made[(first_x + a) * many + first_y + b] += share * work[0, a] * work[2, b]
+
+
 @_compiled(_f2, _i, _f2, _f1)
 def gradient_of_sum(
     grid: FloatArray, count: int, place: FloatArray, share: FloatArray
 ) -> FloatArray:
     """Derivative of Σ share · height at places by so many coefficients, shape (p,)."""
-    made, work, many = np.zeros(count), np.empty((4, 4)), int(grid[1, 3]) + 3
+    made, work = np.zeros(count), np.empty((4, 4))
     for k in range(len(place)):
-        first_x = _along(grid[0], place[k, 0], work[0], work[1])
-        first_y = _along(grid[1], place[k, 1], work[2], work[3])
-        for a in range(4):
-            for b in range(4):
-                made[(first_x + a) * many + first_y + b] += share[k] * work[0, a] * work[2, b]
+        _add(grid, place[k, 0], place[k, 1], share[k], work, made)
     return made
 
 
@@ -274,7 +283,7 @@ def advance(
     return moved, most
 
 
-# --- the level ------------------------------------------------------------------------------------
+# --- the level ----------------------------------------------------------------------------------
 
 NOTHING = 1e-17
 """One and so much is one."""
@@ -382,3 +391,90 @@ def follow_rim(
         if most < last:
             break
     return made, climb, over
+
+
+# --- sizes --------------------------------------------------------------------------------------
+
+
+@_compiled(_f2, _f1, _f2, _f1, _f1, _f1, _f1, _i)
+def spokes(
+    grid: FloatArray,
+    coefficients: FloatArray,
+    outline: FloatArray,
+    center: FloatArray,
+    fraction: FloatArray,
+    weight: FloatArray,
+    rear: FloatArray,
+    stride: int,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sample a surface at fractions of the way from a centre to each ``stride``-th boundary point.
+
+    The rear is its depth and where it starts and ends (`follow_rim`).
+
+    Returns
+    -------
+    samples, over, share
+        Places with their height, shape (n, 3); height over the rim, shape (n,), and what a sample
+        counts in the volume, shape (n,): its weight times its share of the wedges of all boundary
+        points (`measures.wedges`), those between two spokes shared by how near they are.
+    """
+    count, rings, work = len(outline), len(fraction), np.empty((4, 4))
+    wedge = np.empty(count)
+    for k in range(count):
+        before, after = outline[k - 1], outline[(k + 1) % count]
+        x, y = outline[k, 0] - center[0], outline[k, 1] - center[1]
+        twice = (before[0] - center[0]) * y - x * (before[1] - center[1])
+        twice += x * (after[1] - center[1]) - (after[0] - center[0]) * y
+        wedge[k] = twice / 4.0
+    samples = np.empty((count // stride * rings, 3))
+    over, share = np.empty(len(samples)), np.empty(len(samples))
+    for spoke in range(count // stride):
+        own = 0.0
+        for off in range(1 - stride, stride):
+            own += wedge[(spoke * stride + off) % count] * (1.0 - abs(off) / stride)
+        end = outline[spoke * stride]
+        for ring in range(rings):
+            at = spoke * rings + ring
+            x = center[0] + fraction[ring] * (end[0] - center[0])
+            y = center[1] + fraction[ring] * (end[1] - center[1])
+            z, _, _ = _at(grid, coefficients, x, y, work)
+            part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
+            samples[at, 0], samples[at, 1], samples[at, 2] = x, y, z
+            over[at] = z + rear[0] * part * part
+            share[at] = own * weight[ring] * fraction[ring]
+    return samples, over, share
+
+
+@_compiled(_f2, _i, _f2, _f1, _f2, _f2, _f1)
+def size_gradients(
+    grid: FloatArray,
+    count: int,
+    samples: FloatArray,
+    share: FloatArray,
+    outline: FloatArray,
+    climb: FloatArray,
+    center: FloatArray,
+) -> FloatArray:
+    """Derivatives of width, length, area and volume by so many coefficients, shape (4, p).
+
+    Samples and what they count in the volume are those of `spokes`; climb is the gradient of the
+    height over the rim at each boundary point, shape (m, 2).
+    """
+    made, work = np.zeros((4, count)), np.empty((4, 4))
+    for axis in range(2):
+        low, high = 0, 0
+        for k in range(len(outline)):
+            low = k if outline[k, axis] < outline[low, axis] else low
+            high = k if outline[k, axis] > outline[high, axis] else high
+        for end, sign in ((high, -1.0), (low, 1.0)):
+            moved = sign / climb[end, axis]
+            _add(grid, outline[end, 0], outline[end, 1], moved, work, made[axis])
+    for k in range(len(outline)):
+        x, y = outline[k, 0] - center[0], outline[k, 1] - center[1]
+        # Where the surface rises by dz the boundary moves by −dz over its slope outwards.
+        moved = -2.0 * np.pi / len(outline) * (x * x + y * y) / (climb[k, 0] * x + climb[k, 1] * y)
+        _add(grid, outline[k, 0], outline[k, 1], moved, work, made[2])
+        _add(grid, outline[k, 0], outline[k, 1], moved * outline[k, 2], work, made[3])
+    for k in range(len(samples)):
+        _add(grid, samples[k, 0], samples[k, 1], share[k], work, made[3])
+    return made

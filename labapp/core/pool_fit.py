@@ -25,7 +25,7 @@ from labapp.core.optics import (
 )
 from labapp.core.rig import Rig
 from labapp.core.spline import SlopeFit, SplineBasis, SplineSurface, fit_slopes
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze, median
 
 REACH = 2.5
 """How far beyond the outermost dots the surface goes on, in rows of rays: the torch may hide some
@@ -281,7 +281,7 @@ so much of its probability is at the ends of that, everywhere."""
 # Width of the step from inside to outside, in dot spacings: from a boundary that is known as
 # sharply as the surface is to one that half the neighbouring rays contradict.
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
-_BLUR_PRIOR = 1.2
+_BLUR_COST = 1.2 * np.log(_BLURS)[:, None]
 _ROUGH = _BLURS[-1:]
 
 # How deep a rear may lie, mm, and how often one lies below the work piece at all.
@@ -341,7 +341,7 @@ def place_level(
     """
     # Height by which the surface changes from one ray to the next, straight across the contour.
     rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
-    usual = np.median(rise)
+    usual = median(rise)
     rise = np.maximum(rise, usual / 4)
     shift, sign = about or _rough_level(height, rise, witness)
     near = np.abs(height + shift) < 3.0 * rise
@@ -354,7 +354,7 @@ def place_level(
     drops = (_DROPS if seen else _DROPS[:1]) if drop_mm is None else np.array([drop_mm])
     over = np.array([height[near] - Rear(drop, start, end).height(y[near]) for drop in drops])
     log_likelihood = -_doubts(over, sign * witness[near] / rise[near], shifts, _BLURS)
-    log_posterior = log_likelihood - _BLUR_PRIOR * np.log(_BLURS)[:, None]
+    log_posterior = log_likelihood - _BLUR_COST
     log_posterior[1:] += np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1))
     posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
     posterior /= posterior.sum()

@@ -26,7 +26,7 @@ from labapp.core.pool_fit import (
     slope_of_dot,
 )
 from labapp.core.rig import Rig
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze, median
 
 UNLABELLED = -1
 
@@ -101,7 +101,7 @@ class Scene:
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
         plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, dots.image_px, sigma)
-        resolution = RESOLVED * float(np.median(dots.size_px * scale))
+        resolution = RESOLVED * median(dots.size_px * scale)
         return cls(plane, covariance, resolution, rig, calibration, frame_shape)
 
     @cached_property
@@ -370,7 +370,7 @@ def _without_outliers(scene: Scene, labels: IntArray, settings: FitSettings) -> 
         at = np.argwhere(labels != UNLABELLED)
         off = np.linalg.norm(pool.residual_mm, axis=-1)
         allowed = 0.25 * spacing[labels[at[:, 0], at[:, 1]]]
-        bad = off > np.maximum(6.0 * float(np.median(off)), allowed)
+        bad = off > np.maximum(6.0 * median(off), allowed)
         if not bad.any():
             return labels
         labels = labels.copy()

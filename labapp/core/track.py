@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import types
 
 from labapp.core.boundary import Boundary
+from labapp.core.compiled import compiled
 from labapp.core.correspondence import Match
 from labapp.core.dots import Image
 from labapp.core.fit import LEAST_DOTS, UNSETTLED_MM
@@ -22,7 +24,7 @@ from labapp.core.ray_growth import UNLABELLED, Scene
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
 from labapp.core.spline import SplineSurface
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
 from labapp.core.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, met
 from labapp.core.warm_match import around, filled, tracked
 
@@ -167,18 +169,50 @@ def predictions(track: Track) -> Iterator[FloatArray]:
     """
     past, order = track.past, min(ORDER, len(track.past) // 2)
     if order > 2:
-        slopes = track.slopes[:, np.flatnonzero(track.lit)[::TEACHERS]]
-        slopes = slopes - slopes.mean(axis=0)
-        count = len(past) - order
-        steps = np.stack([slopes[order - k - 1 :][:count].ravel() for k in range(order)])
-        gram = steps @ steps.T
+        teachers = np.flatnonzero(track.lit)[::TEACHERS]
+        gram, right = recurrence(track.slopes, teachers, order)
         gram[np.diag_indices(order)] += 1e-4 * np.trace(gram)
-        ratio = np.linalg.solve(gram, steps @ slopes[order:].ravel())
+        ratio = np.linalg.solve(gram, right)
         mean = past.mean(axis=0)
         yield mean + ratio @ (past[: -order - 1 : -1] - mean)
     if len(past) > 1:
         yield 2 * past[-1] - past[-2]
     yield past[-1]
+
+
+@compiled(
+    types.Array(types.float64, 3, "A", readonly=True),
+    types.Array(types.int64, 1, "A", readonly=True),
+    types.int64,
+)
+def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of the linear recurrence by which frames follow on each other.
+
+    Of the slopes of some rays in M frames, shape (M, R, 2), each over its mean: shapes
+    (order, order) and (order,), the newest of the frames that are followed first.
+    """
+    gram, right = np.zeros((order, order)), np.zeros(order)
+    own = np.empty(len(slopes))
+    for ray in rays:
+        for axis in range(2):
+            mean = 0.0
+            for m in range(len(slopes)):
+                own[m] = slopes[m, ray, axis]
+                mean += own[m] / len(slopes)
+            for m in range(len(slopes)):
+                own[m] -= mean
+            for k in range(order):
+                for m in range(order, len(slopes)):
+                    right[k] += own[m - 1 - k] * own[m]
+                for other in range(k + 1):
+                    product = 0.0
+                    for m in range(order, len(slopes)):
+                        product += own[m - 1 - k] * own[m - 1 - other]
+                    gram[k, other] += product
+    for k in range(order):
+        for other in range(k):
+            gram[other, k] = gram[k, other]
+    return gram, right
 
 
 def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
@@ -193,7 +227,7 @@ def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
     for coefficients in predictions(track):
         pool = met(bed, coefficients, track.pool.points_mm, 1)
         labels, off = tracked(scene, pool, own, looked_for)
-        if len(off) >= FOUND * count and (half := float(np.median(off))) < STEADY:
+        if len(off) >= FOUND * count and (half := median(off)) < STEADY:
             return pool, labels, half
     found = 0
     for coefficients in track.past[: -GROWN_FROM - 1 : -1]:

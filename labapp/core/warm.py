@@ -175,7 +175,7 @@ def follow(
     outside = beyond(bed, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
-        pool, labels, lower = _fitted(bed, scene, _shifted(pool, level), labels, widen=False)
+        pool, lower = _settled(bed, _shifted(pool, level), _slopes(bed, scene, labels))
         heard = testimony(bed, scene, pool, labels)
         level, open_mm = _level(track, pool, heard.witness)
     pool = met(bed, pool.coefficients + level.shift_mm, pool.points_mm, 1)
@@ -219,11 +219,11 @@ def _shifted(pool: WarmPool, level: Level) -> WarmPool:
 
 
 def _fitted(
-    bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, *, widen: bool = True
+    bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray
 ) -> tuple[WarmPool, IntArray, FloatArray]:
     """Fit the surface, roughly first, and then with the labels that it bears out."""
     slopes, serves = _slopes(bed, scene, labels), None
-    for _ in range(WIDENINGS if widen else 0):
+    for _ in range(WIDENINGS):
         pool, lower, moved = fit_slopes_to(bed, pool, slopes, until_mm=ROUGHLY_MM)
         serves = lower if moved < SERVES_MM else None
         before, labels = labels, widened(bed, scene, pool, lower, labels)
@@ -232,10 +232,17 @@ def _fitted(
         slopes, serves = _slopes(bed, scene, labels), None
         if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
             break
-    pool, lower, moved = fit_slopes_to(bed, pool, slopes, lower=serves)
+    pool, lower = _settled(bed, pool, slopes, serves)
+    return pool, labels, lower
+
+
+def _settled(
+    bed: Bed, pool: WarmPool, slopes: Slopes, lower: FloatArray | None = None
+) -> tuple[WarmPool, FloatArray]:
+    pool, lower, moved = fit_slopes_to(bed, pool, slopes, lower=lower)
     if not moved < UNSETTLED_MM:
         raise Broken("the surface does not settle")
-    return pool, labels, lower
+    return pool, lower
 
 
 def _slopes(bed: Bed, scene: Scene, labels: IntArray) -> Slopes:

@@ -11,12 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import types
 from scipy.linalg.blas import dsbmv
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from labapp.core import kernels
+from labapp.core.compiled import compiled
 from labapp.core.optics import meet_level, ray_directions
-from labapp.core.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing, slope_weights
+from labapp.core.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
 from labapp.core.rig import Rig
 from labapp.core.spline import DEGREE, SplineBasis
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
@@ -166,7 +168,27 @@ class Slopes:
         """Weigh dots on the plane, shape (n, 2), of the covariance given, shape (n, 2, 2)."""
         dots = bed.rig.imaging_plane.to_universal(plane_mm)
         jacobian = kernels.slopes_of_dots(bed.laser_mm, bed.plane[1:3], bed.landing_mm[ray], dots)
-        return cls(ray, dots, slope_weights(jacobian, covariance, bed.settings.floor_mm))
+        return cls(ray, dots, weights_of(jacobian, covariance, bed.settings.floor_mm))
+
+
+_matrices = types.Array(types.float64, 3, "A", readonly=True)
+
+
+@compiled(_matrices, _matrices, types.float64)
+def weights_of(jacobian: FloatArray, covariance: FloatArray, floor: float) -> FloatArray:
+    """What `pool_fit.slope_weights` gives."""
+    made = np.empty(jacobian.shape)
+    for k in range(len(jacobian)):
+        xx, xy, yy = covariance[k, 0, 0] + floor**2, covariance[k, 0, 1], covariance[k, 1, 1]
+        yy += floor**2
+        (a, b), (c, d) = jacobian[k, 0], jacobian[k, 1]
+        one = a * a * xx + 2.0 * a * b * xy + b * b * yy
+        other = c * c * xx + 2.0 * c * d * xy + d * d * yy
+        both = a * c * xx + (a * d + b * c) * xy + b * d * yy
+        area = one * other - both * both
+        made[k, 0, 0], made[k, 1, 1] = other / area, one / area
+        made[k, 0, 1] = made[k, 1, 0] = -both / area
+    return made
 
 
 def fit_slopes_to(

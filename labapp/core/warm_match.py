@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numba import types
 
 from labapp.core import dot_kernels, kernels
+from labapp.core.compiled import compiled
 from labapp.core.hypothesis import BEYOND, FEW
-from labapp.core.optics import reflect, surface_normal
 from labapp.core.pool_fit import Level
 from labapp.core.ray_growth import (
     CAUTION,
@@ -23,10 +24,9 @@ from labapp.core.ray_growth import (
     UNLABELLED,
     Scene,
     amid,
-    behind_torch,
     surprise_of,
 )
-from labapp.core.values import BoolArray, FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray, median
 from labapp.core.warm_fit import Bed, WarmPool, lay, solve
 
 GATE, CLEARLY = 0.35, 2.0
@@ -131,7 +131,7 @@ def widened(
     next_mm = next_of(pool.plane_mm, looked_for)
     rays = np.flatnonzero(lit)
     off = np.linalg.norm(pool.plane_mm[rays] - scene.plane_mm[labels[rays]], axis=-1)
-    astray = off > np.maximum(6.0 * np.median(off), ASTRAY * next_mm[rays])
+    astray = off > np.maximum(6.0 * median(off), ASTRAY * next_mm[rays])
     labels = labels.copy()
     labels[rays[astray]] = UNLABELLED
     free = unlabelled(len(scene.plane_mm), labels)
@@ -199,8 +199,7 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
     known = np.isfinite(pool.plane_mm[:, 0])
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
     merged = next_mm < scene.resolution_mm
-    way = reflect(bed.rays, surface_normal(pool.slopes))
-    hidden = behind_torch(pool.points_mm, bed.rays, way, bed.rig.electrode.height_mm)
+    hidden = behind_torch(pool.points_mm, bed.rays, pool.slopes, bed.rig.electrode.height_mm)
     seen = known & ~hidden & ~merged
     seen[seen] = scene.in_view(pool.plane_mm[seen])
     among = amid(on_pattern(bed, lit).view(bool))[tuple(bed.at.T)]
@@ -217,6 +216,21 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
         if run_together.any():
             stray = stray[apart[run_together].min(axis=0) > scene.resolution_mm]
     return Testimony(witness, len(stray), missed)
+
+
+@compiled(*3 * [types.Array(types.float64, 2, "A", readonly=True)], types.float64)
+def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: float) -> BoolArray:
+    """What `ray_growth.behind_torch` says of rays that a surface of some slopes reflects."""
+    hidden = np.empty(len(rays), np.bool_)
+    for k in range(len(rays)):
+        x, y, z = -rays[k, 0], -rays[k, 1], -rays[k, 2]
+        if points[k, 1] >= 0.0:  # Eq. 4-4
+            a, b = slopes[k, 0], slopes[k, 1]
+            twice = 2.0 * (a * x + b * y - z) / (a * a + b * b + 1.0)
+            y, z = twice * b - y, -twice - z
+        y = y if y != 0.0 else 1e-12
+        hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - 0.3
+    return hidden
 
 
 def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray, before: BoolArray) -> IntArray:

@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dtbtrs
 from labapp.core import kernels, measures
 from labapp.core.boundary import Boundary
 from labapp.core.fit import boundary_of, contour
-from labapp.core.pool_fit import Level
+from labapp.core.pool_fit import Level, Rear
 from labapp.core.spline import SplineSurface
 from labapp.core.values import FloatArray
 from labapp.core.warm_fit import Bed
@@ -29,7 +29,9 @@ ON_RIM_MM = 1e-3
 """Before the last step boundary points are on the rim's height to within this, or the boundary is
 looked for anew."""
 
-NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
+_NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
+FRACTION = (_NODE + 1) / 2
+"""Samples between the centre and the boundary, as fractions of the way, and what they weigh."""
 
 STRIDE = 4
 """Every so many boundary points there is a spoke of samples: the surface is smooth."""
@@ -54,10 +56,16 @@ def follow_rim(
     radius = np.linalg.norm(before.points_mm[:, :2] - before.center_mm, axis=-1)
     theta = np.radians(before.theta_deg)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    rear = np.array([level.rear.drop_mm, level.rear.start_mm, level.rear.end_mm])
     for attempt in range(2):
         radius, climb, over = kernels.follow_rim(
-            bed.basis.grid, coefficients, rear, center_mm, way, radius, STEPS, LAST_MM
+            bed.basis.grid,
+            coefficients,
+            _numbers(level.rear),
+            center_mm,
+            way,
+            radius,
+            STEPS,
+            LAST_MM,
         )
         place = center_mm + radius[:, None] * way
         inside = bool(bed.basis.contains(*place.T).all() and (radius > 0).all())
@@ -96,57 +104,43 @@ def sizes_of(
     bed: Bed, coefficients: FloatArray, level: Level, boundary: Boundary, climb: FloatArray
 ) -> Sizes:
     """Measure a surface within its boundary as `measures.size_of` does, with fewer samples."""
+    grid, outline, center = bed.basis.grid, boundary.points_mm, boundary.center_mm
 
     def height(x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         place_mm = np.stack([x_mm, y_mm], axis=-1).reshape(-1, 2)
-        z = kernels.surface_at(bed.basis.grid, coefficients, place_mm)[0]
+        z = kernels.surface_at(grid, coefficients, place_mm)[0]
         return np.asarray(z.reshape(np.shape(x_mm)))
 
-    def gradient_of(place_mm: FloatArray, share: FloatArray) -> FloatArray:
-        return kernels.gradient_of_sum(bed.basis.grid, len(coefficients), place_mm, share)
-
-    outline, center = boundary.points_mm, boundary.center_mm
-    fraction = (NODE + 1) / 2
-    spoke = outline[::STRIDE, :2] - center
-    place = (center + fraction[:, None] * spoke[:, None]).reshape(-1, 2)
-    z = kernels.surface_at(bed.basis.grid, coefficients, place)[0]
-    wedge = _gathered(measures.wedges(boundary))
-    share = (wedge[:, None] * (WEIGHT * fraction)).ravel()
-    samples = np.vstack([np.column_stack([place, z]), outline])
-    extremes = [int(np.argmax(samples[:, 2])), int(np.argmin(samples[:, 2]))]
-    # An extreme on the rim is where it is; one within may lie between the samples.
-    high, low = (
-        measures.refined(height, boundary, samples[at], sign) if at < len(place) else samples[at]
-        for at, sign in zip(extremes, (1.0, -1.0), strict=True)
+    samples, over, share = kernels.spokes(
+        grid, coefficients, outline, center, FRACTION, WEIGHT, _numbers(level.rear), STRIDE
     )
-    gradient = np.zeros((6, len(coefficients)))
-    ends = outline[:, :2].argmax(axis=0), outline[:, :2].argmin(axis=0)
-    for axis, end in enumerate(np.transpose(ends)):
-        gradient[axis] = gradient_of(outline[end, :2], np.array([-1.0, 1.0]) / climb[end, axis])
-    for row, at, extreme in ((2, extremes[0], high), (3, extremes[1], low)):
-        if at < len(place):  # on the rim, whose height is given, nothing changes
-            gradient[row] = gradient_of(extreme[None, :2], np.ones(1))
-    way = outline[:, :2] - center
-    radius = np.linalg.norm(way, axis=-1)
-    outward = np.sum(climb * way, axis=-1) / radius
-    moved = -radius * (2 * np.pi / len(outline)) / outward
-    gradient[4] = gradient_of(outline[:, :2], moved)
-    gradient[5] = gradient_of(place, share) + gradient_of(outline[:, :2], moved * outline[:, 2])
+    extremes, changes = [], np.zeros((2, len(coefficients)))
+    for sign, change in zip((1.0, -1.0), changes, strict=True):
+        within, rim = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
+        # An extreme on the rim is where it is, and its height is given; one within may lie between
+        # the samples.
+        if sign * within[2] >= sign * rim[2]:
+            rim = measures.refined(height, boundary, within, sign)
+            change[:] = kernels.gradient_of_sum(grid, len(change), rim[None, :2], np.ones(1))
+        extremes.append(rim)
+    high, low = extremes
+    by_rim = kernels.size_gradients(grid, len(coefficients), samples, share, outline, climb, center)
     width, length = np.ptp(outline[:, :2], axis=0)
-    peak = high if abs(high[2]) >= abs(low[2]) else low
-    size = np.array([width, length, high[2], low[2], wedge.sum(), share @ z])
-    over = level.sign * (z - level.rear.height(place[:, 1])).reshape(len(spoke), -1)
+    area, volume = share.sum(), share @ samples[:, 2]
+    above = (level.sign * over > 0).reshape(-1, len(FRACTION))
     # The middle of a dented pool may lie lower; nothing lies lower farther out than it.
-    entered = np.maximum.accumulate(over > 0, axis=1)
-    holds = bool((over > 0)[entered].all() and entered[:, -1].all())
-    return Sizes(size, peak[:2], gradient, holds)
+    entered = np.maximum.accumulate(above, axis=1)
+    return Sizes(
+        np.array([width, length, high[2], low[2], area, volume]),
+        (high if abs(high[2]) >= abs(low[2]) else low)[:2],
+        np.concatenate([by_rim[:2], changes, by_rim[2:]]),
+        bool(above[entered].all() and entered[:, -1].all()),
+    )
 
 
-def _gathered(wedge: FloatArray) -> FloatArray:
-    """What each `STRIDE`-th boundary point stands for: its wedge and its share of those between."""
-    parts = wedge.reshape(-1, STRIDE)
-    share = np.arange(STRIDE) / STRIDE
-    return np.asarray(parts @ (1 - share) + np.roll(parts @ share, 1))
+def _numbers(rear: Rear) -> FloatArray:
+    """A rear as compiled functions have it."""
+    return np.array([rear.drop_mm, rear.start_mm, rear.end_mm])
 
 
 def sigma_of(

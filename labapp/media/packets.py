@@ -6,8 +6,9 @@ import dataclasses
 import io
 import json
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -89,6 +90,43 @@ class Packets:
         between = np.sort(pos)[1:] - np.sort(pos + ends)[:-1]
         holed = placed_by != "pos" or bool((between > MOST_HEADERS_BYTE).any())
         return cls(placed_by, place, pts, dts, key > 0, shown > 0, holed)
+
+    @classmethod
+    def listed(
+        cls, entries: Sequence[IndexEntry], stream: int, claimed: int, path: Path
+    ) -> Self | None:
+        """List packets as the index at the end of an AVI has them, without reading them.
+
+        Every chunk that it names must be in the file, in their order and hardly anything else
+        between them or after the last, and there must be as many as its header claims.
+
+        Returns
+        -------
+        Packets or None
+            None if the index does not fit the file: it is to be read through.
+        """
+        if not entries or len(entries) != claimed:
+            return None
+        names = [b"%02d" % stream + kind for kind in (b"db", b"dc")]
+        end = entries[0].pos
+        with path.open("rb", buffering=0) as file:
+            for entry in entries:
+                if not 0 <= entry.pos - end <= MOST_HEADERS_BYTE:
+                    return None
+                file.seek(entry.pos)
+                name, size = file.read(4), int.from_bytes(file.read(4), "little")
+                end = entry.pos + 8 + entry.size
+                if name not in names or size != entry.size:
+                    return None
+            file.seek(end + end % 2)
+            if file.read(4)[:2] == names[0][:2]:
+                return None
+        shown = [entry for entry in entries if entry.size]
+        place, stamp, key = (
+            np.array([getattr(entry, name) for entry in shown])
+            for name in ("pos", "timestamp", "is_keyframe")
+        )
+        return cls("pos", place + 8, stamp, stamp, key, np.ones(len(shown), bool))
 
     def completed(self, entries: Iterable[IndexEntry], file_byte: int) -> Self:
         """These as the index at the end of an AVI has them; itself where it has others.

@@ -84,8 +84,9 @@ SEEK_WARNING = (
 class VideoSource(FrameSource):
     """A video of which every packet is known, so that any frame is found exactly.
 
-    The file is read through once without decoding: where each packet is, which are key frames,
-    and which frame, in the order they are shown, comes of each. A packet is given its place in
+    The file is read through once without decoding, unless it is an AVI whose index fits it: where
+    each packet is, which are key frames, and which frame, in the order they are shown, comes of
+    each. A packet is given its place in
     that table as its time stamp before it is decoded; the frame that comes out carries it, so a
     frame is known for certain wherever reading began. Only where the container keeps neither the
     order frames are shown in nor which are key frames (H.264 in AVI; an AVI cut before its index)
@@ -286,8 +287,7 @@ class VideoSource(FrameSource):
                 yield number, frame
 
     def _read_through(self) -> PacketTable:
-        """Everything there is to know about the file, by reading all of it once."""
-        entries = list(self._stream.index_entries)
+        """Everything there is to know about the file, by its index or reading all of it once."""
         is_avi = self._container.format.name == "avi"
         codec = self._stream.codec_context.codec
         timing = Timing(
@@ -297,15 +297,7 @@ class VideoSource(FrameSource):
             stamped=not (is_avi and codec.reorder),
             from_0=is_avi,
         )
-        size = self._fingerprint[0]
-        last: deque[Packet[VideoStream]] = deque(maxlen=2)
-        packets = Packets.read(_kept(_packets(self._container, self._stream), last), size)
-        is_cut = self._container.format.name == "nut" and not self._is_whole(tuple(last))
-        if is_cut and len(packets) > 1:
-            packets = packets.without_last()
-        indexed = is_avi and len(entries) >= len(packets)
-        if indexed:
-            packets = packets.completed(entries, size)
+        packets, indexed, is_cut = self._all_packets(is_avi, timing.claimed)
         if not len(packets):
             raise InputError(self._path, "frames", "not one that is whole", A_VIDEO)
         number = number_by_order(packets)
@@ -336,6 +328,23 @@ class VideoSource(FrameSource):
             # MPEG program streams have stamps for some packets only; the others' are guessed.
             seekable=self._container.format.name != "mpeg",
         )
+
+    def _all_packets(self, is_avi: bool, claimed: int) -> tuple[Packets, bool, bool]:
+        """All packets, whether an index has them so, and whether a last one was cut off."""
+        entries = list(self._stream.index_entries)
+        if is_avi:
+            listed = Packets.listed(entries, self._stream.index, claimed, self._path)
+            if listed is not None:
+                return listed, True, False
+        last: deque[Packet[VideoStream]] = deque(maxlen=2)
+        size = self._fingerprint[0]
+        packets = Packets.read(_kept(_packets(self._container, self._stream), last), size)
+        if is_avi and len(entries) >= len(packets):
+            return packets.completed(entries, size), True, False
+        is_cut = self._container.format.name == "nut" and not self._is_whole(tuple(last))
+        if is_cut and len(packets) > 1:
+            packets = packets.without_last()
+        return packets, False, is_cut
 
     def _is_whole(self, last: Sequence[Packet[VideoStream]]) -> bool:
         """Whether the last of packets is, if it can be decoded by itself; if not, it is taken for.

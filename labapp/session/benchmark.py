@@ -261,53 +261,48 @@ def run_video(
     InputError
         If the folder cannot be written.
     """
-    frames = len(video.height_mm)
-    broke = measured = wrong = labelled = 0
-    heights, surprises = np.full(frames, np.nan), []
+    frames, broke = len(video.height_mm), 0
     begun, used = time.perf_counter(), sum(os.times()[:4])
-    kept = []
     job = Job(video.path, None, video.setup, Settings())
     with followers(frames, workers) as pools:
         await_ready(pools)
         start_s = time.perf_counter() - begun
         with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
             for told in measure_sequence(job, range(frames), pools):
-                results.write(told.frame, told.time_s, told.measurement, told.rows)
-                kept.append(told)
+                results.add(told.surfaces, told.rows)
+                broke += told.broke is not None
                 progress()
         seconds = time.perf_counter() - begun - start_s
     used = sum(os.times()[:4]) - used
-    for told in kept:
-        broke += told.broke is not None
-        found, match, size = (
-            told.measurement.dots,
-            told.measurement.match,
-            told.measurement.measures,
-        )
-        if found is None or match is None or size is None:
-            continue
-        measured += 1
-        heights[told.frame] = size.height_mm
-        surprises.append((size.height_mm - video.height_mm[told.frame]) / size.height_sigma_mm)
-        place, ray = video.dots[told.frame]
-        own = {(i, j): at for (i, j), at in zip(ray.tolist(), place, strict=True)}
-        for (i, j), at in zip(match.ray.tolist(), found.image_px[match.dot], strict=True):
-            true = own.get((i, j))
-            right = true is not None and np.hypot(*(at - true)) <= TRUE_PX
-            labelled, wrong = labelled + right, wrong + (not right)
+    heights, sigma = np.full((2, frames), np.nan)
+    for row in _rows(out / "measures.csv"):
+        if row["status"] == "ok":
+            frame = int(row["frame"])
+            heights[frame], sigma[frame] = float(row["height_mm"]), float(row["height_sigma_mm"])
+    surprise = (heights - video.height_mm) / sigma
+    labels = [row for row in _rows(out / "dots.csv") if row["ray_row"]]
+    right = sum(_is_right(video, row) for row in labels)
     shown = sum(len(place) for place, _ in video.dots)
     return Run(
         frames,
         seconds,
         used,
         start_s,
-        measured,
+        int(np.isfinite(heights).sum()),
         broke,
-        wrong,
-        labelled / shown,
-        float(np.sqrt(np.mean(np.square(surprises)))),
+        len(labels) - right,
+        right / shown,
+        float(np.sqrt(np.nanmean(np.square(surprise)))),
         _frequency(heights),
     )
+
+
+def _is_right(video: Video, row: dict[str, str]) -> bool:
+    """Whether a dot's ray, in its row of ``dots.csv``, made a dot there."""
+    place, ray = video.dots[int(row["frame"])]
+    own = place[(ray == [int(row["ray_row"]), int(row["ray_column"])]).all(axis=1)]
+    off = own - [float(row["u_px"]), float(row["v_px"])]
+    return bool((np.hypot(*off.T) <= TRUE_PX).any())
 
 
 def _frequency(heights: FloatArray) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core import dot_kernels, dots, kernels, quadric_kernels
+from labapp.core import dot_kernels, dots, kernels, quadric_kernels, ray_growth
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.optics import (
     bisecting_gradient,
@@ -22,10 +22,13 @@ from labapp.core.optics import (
     reflect,
     surface_normal,
 )
-from labapp.core.pool_fit import Rear, slope_of_dot
+from labapp.core.pool_fit import Rear, slope_of_dot, slope_weights
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.track import recurrence
 from labapp.core.values import FloatArray
+from labapp.core.warm_fit import weights_of
+from labapp.core.warm_match import behind_torch
 
 RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
 PLANE, LASER = RIG.imaging_plane, RIG.laser.position_mm
@@ -132,6 +135,36 @@ def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
         kernels.pull(BASIS.grid, surface().coefficients, points, weights, LASER, dots_mm),
         np.einsum("nap,nab,nb->p", by, weights, off),
         atol=1e-9,
+    )
+
+
+def test_slopes_weigh_as_the_covariance_of_their_dots_has_it() -> None:
+    rng = random()
+    jacobian, half = rng.normal(0.0, 1e-2, (30, 2, 2)), rng.normal(0.0, 0.05, (30, 2, 2))
+    covariance = half @ half.swapaxes(1, 2)
+    np.testing.assert_allclose(
+        weights_of(jacobian, covariance, 0.02), slope_weights(jacobian, covariance, 0.02)
+    )
+
+
+def test_rays_are_hidden_by_the_torch_as_when_they_are_reflected_one_by_one() -> None:
+    rays, landing = landings()
+    points = landing + random().normal(0.0, 0.2, landing.shape)
+    slopes = random().normal(0.0, 0.1, (len(rays), 2))
+    way = reflect(rays, surface_normal(slopes))
+    hidden = ray_growth.behind_torch(points, rays, way, 2.4)
+    assert 10 < hidden.sum() < len(rays) - 10
+    np.testing.assert_array_equal(behind_torch(points, rays, slopes, 2.4), hidden)
+
+
+def test_frames_follow_on_each_other_by_the_least_squares_recurrence() -> None:
+    slopes, rays, order = random().normal(0.0, 1.0, (30, 40, 2)), np.arange(0, 40, 3), 4
+    own = slopes[:, rays].reshape(30, -1)
+    own = own - own.mean(axis=0)
+    before = np.stack([own[order - 1 - k : 29 - k].ravel() for k in range(order)], axis=-1)
+    gram, right = recurrence(slopes, rays, order)
+    np.testing.assert_allclose(
+        np.linalg.solve(gram, right), np.linalg.lstsq(before, own[order:].ravel(), rcond=None)[0]
     )
 
 

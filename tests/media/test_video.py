@@ -309,6 +309,48 @@ def test_with_its_index_a_recording_is_not_read_through_again(
     read.assert_not_called()
 
 
+@pytest.mark.parametrize("options", [X264, FFV1, MJPG])
+def test_an_avi_whose_index_fits_is_not_read_through(
+    tmp_path: Path, encode: Encode, options: str
+) -> None:
+    path = encode(tmp_path / "v.avi", numbered(), *options.split())
+    with mock.patch.object(Packets, "listed", return_value=None), VideoSource(path) as source:
+        index = source.index
+    with mock.patch.object(Packets, "read") as read, VideoSource(path) as source:
+        assert source.index == index
+    read.assert_not_called()
+
+
+def test_an_avi_whose_index_does_not_fit_is_read_through(tmp_path: Path, encode: Encode) -> None:
+    path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
+    content = path.read_bytes()
+    index = content.rindex(b"idx1")
+    chunk = content.index(b"00dc", content.index(b"movi"))
+    second = content.index(b"00dc", chunk + 8)
+    entry = index + 8 + 16 * 3  # of the fourth frame
+    frames, again = content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32
+    one_less, size = ((k * (COUNT - 1)).to_bytes(4, "little") for k in (1, 16))
+    fewer = {frames: one_less, again: one_less}
+    for changes in (
+        fewer,  # the header speaks of fewer
+        {second: b"01dc"},  # another stream's
+        {second + 4: b"\x07"},  # shorter than the index has it
+        {entry + 8: b"\xff\xff\xff\x7f"},  # beyond the file
+        {**fewer, index + 4: size},  # neither it nor the index knows the last
+        {**fewer, index + 4: size + content[index + 8 : entry] + content[entry + 16 :]},  # a fourth
+    ):
+        changed = bytearray(content)
+        for at, put in changes.items():
+            changed[at : at + len(put)] = put
+        path.write_bytes(changed)
+        with (
+            mock.patch.object(Packets, "read", side_effect=Packets.read) as read,
+            contextlib.suppress(InputError),
+        ):
+            VideoSource(path).close()
+        read.assert_called_once()
+
+
 def test_an_index_that_does_not_fit_is_ignored(tmp_path: Path, encode: Encode) -> None:
     path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
     with VideoSource(path) as source:

@@ -1,0 +1,70 @@
+"""Sizes of a followed surface, and how they change with it, against `measures.size_of`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core import measures
+from labapp.core.boundary import Boundary
+from labapp.core.pool_fit import FitSettings, Level, Rear
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.values import FloatArray
+from labapp.core.warm_fit import Bed
+from labapp.core.warm_measures import Sizes, follow_rim, sizes_of
+
+BASIS = SplineBasis.over(np.array([-4.0, -5.0]), np.array([4.0, 4.0]), 0.9)
+RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
+BED = Bed.of(RIG, BASIS, FitSettings())
+CENTER = np.array([0.1, -0.4])
+
+
+def coefficients(dent_mm: float) -> FloatArray:
+    """Splines of a dome, 0.3 mm high, lower in the middle by a dent."""
+    x, y = np.random.default_rng(3).uniform(BASIS.low_mm, BASIS.high_mm, (2000, 2)).T
+    z = 0.3 - 0.03 * ((x - 0.2) ** 2 + 0.8 * y**2) + 0.01 * np.sin(2 * x) * np.cos(y)
+    z -= dent_mm * np.exp(-2.0 * ((x - 0.2) ** 2 + y**2))
+    return np.asarray(np.linalg.lstsq(BASIS.matrix(x, y), z, rcond=None)[0])
+
+
+def measured(made: FloatArray, level: Level) -> tuple[Sizes, Boundary]:
+    circle = Boundary.polar(CENTER, np.full(360, 3.0))
+    for _ in range(4):
+        circle, climb = follow_rim(BED, made, level, CENTER, circle)
+    return sizes_of(BED, made, level, circle, climb), circle
+
+
+@pytest.mark.parametrize(("sign", "drop_mm"), [(1, 0.0), (1, 0.05), (-1, 0.0)])
+@pytest.mark.parametrize("dent_mm", [0.0, 0.2])
+def test_sizes_are_those_of_many_samples(sign: int, drop_mm: float, dent_mm: float) -> None:
+    made = sign * coefficients(dent_mm)
+    level = Level(0.0, 0.001, sign, Rear(drop_mm, -1.0, -3.2), 0.0)
+    sizes, boundary = measured(made, level)
+    wanted, peak = measures.size_of(SplineSurface(BASIS, made), boundary)
+    assert (np.abs(sizes.size - wanted) < [1e-9, 1e-9, 1e-5, 1e-5, 1e-9, 2e-4]).all()
+    np.testing.assert_allclose(sizes.peak_mm, peak, atol=1e-3)
+    assert sizes.holds
+
+
+def test_a_surface_that_comes_down_on_the_way_to_its_boundary_does_not_hold() -> None:
+    x, y = np.random.default_rng(3).uniform(BASIS.low_mm, BASIS.high_mm, (2000, 2)).T
+    away = np.hypot(x - CENTER[0], y - CENTER[1])
+    ridge = np.exp(-(((away - 2.4) / 0.5) ** 2)) + 0.3 * np.exp(-((away / 0.8) ** 2)) - 0.05
+    made = np.linalg.lstsq(BASIS.matrix(x, y), 0.2 * ridge, rcond=None)[0]
+    assert not measured(made, Level(0.0, 0.001, 1, Rear(), 0.0))[0].holds
+
+
+@pytest.mark.parametrize("drop_mm", [0.0, 0.05])
+def test_derivatives_are_those_of_small_changes(drop_mm: float) -> None:
+    made, step = coefficients(0.0), 1e-5
+    level = Level(0.0, 0.001, 1, Rear(drop_mm, -1.0, -3.2), 0.0)
+    sizes, _ = measured(made, level)
+    for spline in np.random.default_rng(5).choice(len(made), 25, replace=False):
+        change = np.zeros_like(made)
+        change[spline] = step
+        more, less = (measured(made + way * change, level)[0].size for way in (1, -1))
+        off = sizes.gradient[:, spline] - (more - less) / (2 * step)
+        if drop_mm:
+            off[3] = 0.0  # the deepest is the rear of the rim, which is given
+        assert np.abs(off).max() < 2e-3
