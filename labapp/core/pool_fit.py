@@ -281,12 +281,13 @@ so much of its probability is at the ends of that, everywhere."""
 # Width of the step from inside to outside, in dot spacings: from a boundary that is known as
 # sharply as the surface is to one that half the neighbouring rays contradict.
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
-_BLUR_COST = 1.2 * np.log(_BLURS)[:, None]
+_BLUR_COST = 1.2 * np.log(_BLURS)
 _ROUGH = _BLURS[-1:]
 
 # How deep a rear may lie, mm, and how often one lies below the work piece at all.
 _DROPS = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
 _SINKS = 0.2
+_SUNK = -float(np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1)))
 
 
 def find_level(
@@ -339,6 +340,8 @@ def place_level(
     about
         A level that is near, as its shift, mm, and its sign; None: it is looked for.
     """
+    from labapp.core import level_kernels
+
     # Height by which the surface changes from one ray to the next, straight across the contour.
     rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
     usual = median(rise)
@@ -346,43 +349,31 @@ def place_level(
     shift, sign = about or _rough_level(height, rise, witness)
     near = np.abs(height + shift) < 3.0 * rise
     reach = 1.0 if about is None else WINDOW
-    shifts = shift + np.linspace(-reach, reach, round(120 * reach) + 1) * usual
+    count = round(120 * reach) + 1
+    first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
     lit = y[witness > 0]
     start, end = (lit.max() + lit.min()) / 2, lit.min()
     # Only a pool that stands above the work piece is seen to sink at its rear.
     seen = sign > 0 and bool(np.any(near & (witness < 0) & (y < end)))
     drops = (_DROPS if seen else _DROPS[:1]) if drop_mm is None else np.array([drop_mm])
     over = np.array([height[near] - Rear(drop, start, end).height(y[near]) for drop in drops])
-    log_likelihood = -_doubts(over, sign * witness[near] / rise[near], shifts, _BLURS)
-    log_posterior = log_likelihood - _BLUR_COST
-    log_posterior[1:] += np.log(_SINKS / (1 - _SINKS) / (len(_DROPS) - 1))
-    posterior = np.exp(log_posterior - log_posterior.max()).sum(axis=1)
-    posterior /= posterior.sum()
-    part = slice(1, None) if posterior[0].sum() < 0.5 else slice(0, 1)
-    if about is not None and posterior[:, [0, -1]].sum() > OFF_WINDOW:
+    side = sign * witness[near] / rise[near]
+    nats = level_kernels.doubts(over, side, first, step, count, _BLURS)
+    weighed = level_kernels.weigh(nats, _BLUR_COST, _SUNK, drops, first, step)
+    drop, mean, sigma, off_window = weighed
+    if about is not None and off_window > OFF_WINDOW:
         return place_level(height, slope, y, witness, spacing_mm, drop_mm)
-    chosen = posterior[part] / posterior[part].sum()
-    drop = float(chosen.sum(axis=1) @ drops[part])
-    mean = float(chosen.sum(axis=0) @ shifts)
-    sigma = float(np.sqrt(posterior.sum(axis=0) @ (shifts - mean) ** 2))
-    surprise = -log_likelihood.max() / np.log(2) / max(int(near.sum()), 1)
+    surprise = nats.min() / np.log(2) / max(int(near.sum()), 1)
     return Level(mean, sigma, sign, Rear(drop, start, end), float(surprise))
 
 
 def _rough_level(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:
     """Shift, mm, and sign that the witnesses contradict least."""
+    from labapp.core import level_kernels
+
     scan, side = np.linspace((-height).min(), (-height).max(), 300), witness / rise
-    above = _doubts(height[None], side, scan, _ROUGH)[0, 0]
-    below = _doubts(height[None], -side, scan, _ROUGH)[0, 0]
+    asked = scan[0], scan[1] - scan[0], len(scan), _ROUGH
+    above, below = (level_kernels.doubts(height[None], k * side, *asked)[0, 0] for k in (1, -1))
     if above.min() <= below.min():
         return float(scan[np.argmin(above)]), 1
     return float(scan[np.argmin(below)]), -1
-
-
-def _doubts(
-    over: FloatArray, side: FloatArray, shifts: FloatArray, blurs: FloatArray
-) -> FloatArray:
-    """What witnesses have against evenly spaced shifts: see `kernels.doubts`."""
-    from labapp.core import kernels
-
-    return kernels.doubts(over, side, shifts[0], shifts[1] - shifts[0], len(shifts), blurs)

@@ -32,12 +32,11 @@ class CannotMeasure(Exception):
 
 def freeze(value: Any) -> None:
     """Make every array field of a dataclass instance read-only (call from ``__post_init__``)."""
-    for name in type(value).__dataclass_fields__:
-        item = getattr(value, name)
+    fields = vars(value)
+    for name, item in fields.items():
         if isinstance(item, np.ndarray) and item.flags.writeable:
-            item = item.view()
-            item.flags.writeable = False
-            object.__setattr__(value, name, item)
+            view = fields[name] = item.view()
+            view.flags.writeable = False
 
 
 def median(values: FloatArray) -> float:

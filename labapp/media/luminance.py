@@ -53,7 +53,8 @@ def _has_luminance(frame: VideoFrame) -> bool:
 
 
 def _turned(image: GreyImage, rotation_deg: int) -> GreyImage:
-    return np.ascontiguousarray(np.rot90(image, round(rotation_deg / 90)))
+    turned = np.rot90(image, round(rotation_deg / 90)) if rotation_deg else image
+    return np.ascontiguousarray(turned)
 
 
 @functools.cache

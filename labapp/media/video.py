@@ -331,15 +331,14 @@ class VideoSource(FrameSource):
 
     def _all_packets(self, is_avi: bool, claimed: int) -> tuple[Packets, bool, bool]:
         """All packets, whether an index has them so, and whether a last one was cut off."""
-        entries = list(self._stream.index_entries)
-        if is_avi:
-            listed = Packets.listed(entries, self._stream.index, claimed, self._path)
-            if listed is not None:
-                return listed, True, False
+        entries = list(self._stream.index_entries) if is_avi else []
+        listed = Packets.listed(entries, self._stream.index, claimed, self._path)
+        if listed is not None:
+            return listed, True, False
         last: deque[Packet[VideoStream]] = deque(maxlen=2)
         size = self._fingerprint[0]
         packets = Packets.read(_kept(_packets(self._container, self._stream), last), size)
-        if is_avi and len(entries) >= len(packets):
+        if len(entries) >= len(packets):
             return packets.completed(entries, size), True, False
         is_cut = self._container.format.name == "nut" and not self._is_whole(tuple(last))
         if is_cut and len(packets) > 1:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core import dot_kernels, dots, kernels, quadric_kernels, ray_growth
+from labapp.core import dot_kernels, dots, kernels, level_kernels, quadric_kernels, ray_growth
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.optics import (
     bisecting_gradient,
@@ -333,22 +333,44 @@ def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
     assert np.argwhere(hit).tolist() == [[0, 0]]
 
 
-@pytest.mark.parametrize("witnesses", [1, 90, 2 * kernels.FACTORS + 7])
+@pytest.mark.parametrize("witnesses", [1, 90, 2 * level_kernels.FACTORS + 7])
 def test_doubts_are_logarithms_of_what_was_seen(witnesses: int) -> None:
     # Some lie so far off that an exponential alone would be infinite, one never changes its mind.
     over = random().normal(0.0, 0.1, (3, witnesses))
     side = random().choice([-1.0, 1.0], witnesses) / random().uniform(0.01, 0.04, witnesses)
     side[0] = 0.0
     levels, blurs = np.linspace(-0.05, 0.07, 31), np.array([0.005, 0.04, 0.25])
-    made = kernels.doubts(over, side, levels[0], levels[1] - levels[0], 31, blurs)
+    made = level_kernels.doubts(over, side, levels[0], levels[1] - levels[0], 31, blurs)
     inside = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
     expected = np.logaddexp(0.0, -inside).sum(axis=-1)
     np.testing.assert_allclose(made, expected, rtol=1e-11)
 
 
+@pytest.mark.parametrize("depth", [0, 1])
+def test_levels_are_weighed_by_what_speaks_against_them(depth: int) -> None:
+    nats = random().uniform(0.0, 4.0, (3, 4, 21))
+    nats[depth] -= 3.0  # there the rear is as deep as that, or it does not sink
+    blur_cost, drops, levels = np.linspace(0, 1, 4), np.array([0.0, 0.05, 0.1]), 0.3 + np.arange(21)
+    against = nats + blur_cost[:, None]
+    against[1:] += 1.5
+    share = np.exp(-against).sum(axis=1)
+    share /= share.sum()
+    part = slice(1, None) if depth else slice(0, 1)
+    chosen = share[part] / share[part].sum()
+    mean = chosen.sum(axis=0) @ levels
+    wanted = (
+        chosen.sum(axis=1) @ drops[part],
+        mean,
+        np.sqrt(share.sum(axis=0) @ (levels - mean) ** 2),
+        share[:, [0, -1]].sum(),
+    )
+    made = level_kernels.weigh(nats, blur_cost, 1.5, drops, 0.3, 1.0)
+    np.testing.assert_allclose(made, wanted)
+
+
 def test_doubts_of_what_is_unknown_are_unknown() -> None:
     over = np.array([[0.1, np.nan], [0.1, 0.2]])
-    made = kernels.doubts(over, np.ones(2), 0.0, 0.1, 3, np.ones(2))
+    made = level_kernels.doubts(over, np.ones(2), 0.0, 0.1, 3, np.ones(2))
     assert np.isnan(made[0]).all()
     assert np.isfinite(made[1]).all()
 

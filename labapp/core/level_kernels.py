@@ -1,0 +1,133 @@
+"""Inner loops of where z = 0 lies, compiled for the processor (docs/adr/0018)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled as _compiled
+from labapp.core.values import FloatArray
+
+_f, _i = types.float64, types.int64
+_f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
+
+NOTHING = 1e-17
+"""One and so much is one."""
+
+FACTORS = 1000
+"""So many factors of at most 2 have a product that is a number still."""
+
+
+@_compiled(_f2, _f1, _f, _f, _i, _f1)
+def doubts(
+    over: FloatArray, side: FloatArray, first: float, step: float, count: int, blurs: FloatArray
+) -> FloatArray:
+    """What witnesses have against levels: Σ log(1 + exp(−side · (over + level) / blur)).
+
+    Along the levels the exponential is a geometric progression, away from where it is 1.
+
+    Parameters
+    ----------
+    over
+        Height over the boundary for each of d depths of the rear, shape (d, n), mm.
+    side
+        Of each witness, lit above 0, over its rise, shape (n,), mm⁻¹.
+    first, step, count
+        The levels: the first, mm, the way to the next, above 0, and how many.
+    blurs
+        Shape (b,).
+
+    Returns
+    -------
+    FloatArray
+        Nats, shape (d, b, count).
+    """
+    made = np.empty((len(over), len(blurs), count))
+    factors, starts, slopes = np.empty(count), np.empty(count + 1), np.empty(count + 1)
+    for d in range(len(over)):
+        for b in range(len(blurs)):
+            factors[:], starts[:], slopes[:], total = 1.0, 0.0, 0.0, made[d, b]
+            total[:] = 0.0
+            for n in range(len(side)):
+                # The exponent is −(start + level · slope) and changes its sign at ``turn``.
+                start = side[n] * (over[d, n] + first) / blurs[b]
+                slope = side[n] * step / blurs[b]
+                turn = -start / slope if slope != 0.0 else np.inf * start
+                turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
+                # Where it is above 0 it is taken out of the logarithm.
+                begins, ends = (0, turn) if slope > 0.0 else (turn, count)
+                starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
+                starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
+                shrinks = np.exp(-abs(slope))
+                factor, k = np.exp(-abs(start + turn * slope)), turn
+                while k < count and factor > NOTHING:
+                    factors[k] *= 1.0 + factor
+                    factor *= shrinks
+                    k += 1
+                factor, k = np.exp(-abs(start + (turn - 1) * slope)), turn - 1
+                while k >= 0 and factor > NOTHING:
+                    factors[k] *= 1.0 + factor
+                    factor *= shrinks
+                    k -= 1
+                if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
+                    total += np.log(factors)
+                    factors[:] = 1.0
+            start, slope = 0.0, 0.0
+            for k in range(count):
+                start, slope = start + starts[k], slope + slopes[k]
+                total[k] += start + k * slope
+                total[k] = max(total[k], 0.0)  # rounded
+    return made
+
+
+@_compiled(_f3, _f1, _f, _f1, _f, _f)
+def weigh(
+    nats: FloatArray,
+    blur_cost: FloatArray,
+    sunk: float,
+    drops: FloatArray,
+    first: float,
+    step: float,
+) -> tuple[float, float, float, float]:
+    """Weigh levels and depths of the rear by what witnesses have against them (`doubts`).
+
+    Parameters
+    ----------
+    nats
+        Shape (d, b, count).
+    blur_cost, sunk
+        What blurs, shape (b,), and every depth but the first have against them before, nats.
+    drops
+        The depths, shape (d,), mm.
+    first, step
+        The levels: the first, mm, and the way to the next.
+
+    Returns
+    -------
+    drop, mean, sigma, off
+        Expected depth and level, given that there is a depth or none, whichever is likelier; the
+        standard deviation of the level over both, mm; and the share of the first and last levels.
+    """
+    depths, blurs, count = nats.shape
+    least = np.inf
+    for d in range(depths):
+        for b in range(blurs):
+            for k in range(count):
+                least = min(least, nats[d, b, k] + blur_cost[b] + (sunk if d else 0.0))
+    share = np.zeros((depths, count))
+    for d in range(depths):
+        for b in range(blurs):
+            for k in range(count):
+                against = nats[d, b, k] + blur_cost[b] + (sunk if d else 0.0)
+                share[d, k] += np.exp(least - against)
+    share /= share.sum()
+    start, end = (1, depths) if share[0].sum() < 0.5 else (0, 1)
+    chosen, drop, mean, spread = share[start:end].sum(), 0.0, 0.0, 0.0
+    for d in range(start, end):
+        for k in range(count):
+            drop += share[d, k] / chosen * drops[d]
+            mean += share[d, k] / chosen * (first + k * step)
+    for d in range(depths):
+        for k in range(count):
+            spread += share[d, k] * (first + k * step - mean) ** 2
+    return drop, mean, np.sqrt(spread), share[:, 0].sum() + share[:, -1].sum()
