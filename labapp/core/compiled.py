@@ -30,6 +30,11 @@ def compiled(*signature: types.Type) -> Callable[[F], F]:
     return lambda function: _kept(function, signature)
 
 
+def compiled_for(*signatures: tuple[types.Type, ...]) -> Callable[[F], F]:
+    """Do the same for arguments of several kinds."""
+    return lambda function: _kept(function, list(signatures))
+
+
 def part(function: F) -> F:
     """Compile as a part of the functions of its file that call it."""
     return _kept(function)

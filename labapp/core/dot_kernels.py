@@ -9,13 +9,15 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled as _compiled
+from labapp.core.compiled import compiled_for as _compiled_for
 from labapp.core.compiled import part as _inner
-from labapp.core.dots import Grey
+from labapp.core.dots import Grey, Picture
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _f, _i = types.float64, types.int64
 _f1, _f2 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2))
 _taps, _grey = (types.Array(types.float32, n, "C", readonly=True) for n in (1, 2))
+_byte = types.Array(types.uint8, 2, "C", readonly=True)
 _ints = types.Array(_i, 1, "A", readonly=True)
 _mask = types.Array(types.boolean, 2, "C", readonly=True)
 
@@ -107,7 +109,7 @@ def _mirrored(at: int, count: int) -> int:
 
 @_inner
 def _blurred(
-    image: Grey, taps: Grey, u: int, v: int, raw: Grey, rows: Grey, patch: Grey, reach: int
+    image: Picture, taps: Grey, u: int, v: int, raw: Grey, rows: Grey, patch: Grey, reach: int
 ) -> None:
     """Blur a square round a pixel by a filter along rows and columns; rows may be longer."""
     side = 2 * reach + 1
@@ -142,9 +144,9 @@ def _bell(center: float, width: float, values: FloatArray) -> None:
         ratio *= shrinks
 
 
-@_compiled(_grey, _grey, _taps, _ints, _ints, _i, _f1, _f)
+@_compiled_for(*((own, _grey, _taps, _ints, _ints, _i, _f1, _f) for own in (_grey, _byte)))
 def centroids(
-    image: Grey,
+    image: Picture,
     around: Grey,
     taps: Grey,
     u: IntArray,
@@ -202,8 +204,8 @@ def centroids(
     return offset, moment
 
 
-@_compiled(_grey, _ints, _ints, _grey, _grey)
-def finest(image: Grey, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
+@_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))
+def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
     """Largest difference of two filters among nine pixels round each (`quick_dots._nine`)."""
     side, made = narrow.shape[1], np.empty(len(u))
     patch, across = np.empty((side, side)), np.empty((2, side, 3))

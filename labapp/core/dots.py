@@ -18,6 +18,7 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, f
 
 Image = npt.NDArray[np.generic]
 Grey = npt.NDArray[np.float32]
+Picture = Grey | npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,12 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
     Only actual reflected dots count: the centre reference that IRS and ERS add is "not an actual
     visible point" (§6.2), and its stand-in's error would say nothing.
     """
-    error = np.hypot(*(reconstruction.residual_mm * reflection_scale(match, rig)).T)
+    return scaled_errors(reconstruction, reflection_scale(match, rig))
+
+
+def scaled_errors(reconstruction: Reconstruction, scale: FloatArray) -> ReflectionErrors:
+    """Reflection errors where the scale is known (`reflection_scale`)."""
+    error = np.hypot(*(reconstruction.residual_mm * scale).T)
     inner = error[_inner(reconstruction.ray)]
     return ReflectionErrors(
         are_mm=float(error.mean()),

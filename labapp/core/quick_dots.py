@@ -12,7 +12,6 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from labapp.core.dots import (
     HOT,
@@ -20,6 +19,7 @@ from labapp.core.dots import (
     Dots,
     Grey,
     Image,
+    Picture,
     band_noise,
     band_pass,
     described,
@@ -44,13 +44,11 @@ class Pad:
     """Pictures to work on. Made anew for every frame they would cost as much as the work."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.image, self.narrow, self.wide, self.band = (
-            np.empty(shape, np.float32) for _ in range(4)
-        )
+        self.narrow, self.wide, self.band = (np.empty(shape, np.float32) for _ in range(3))
         self.over = np.empty(shape, bool)
         self._small: dict[int, tuple[Grey, Grey]] = {}
 
-    def blur(self, image: Grey | npt.NDArray[np.uint8], into: Grey, sigma: float) -> None:
+    def blur(self, image: Picture, into: Grey, sigma: float) -> None:
         """Blur by a Gaussian (`dots.gauss`); of 8-bit pictures none is made in between."""
         kernel = _kernel(sigma)
         cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, into, borderType=cv2.BORDER_REFLECT)
@@ -141,10 +139,13 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     from labapp.core import dot_kernels
 
     pad, size = _pad(exposure.noise.shape), exposure.size_px
-    image, narrow, wide, band = pad.image, pad.narrow, pad.wide, pad.band
-    np.copyto(image, frame, casting="unsafe")
-    eight_bit = frame.dtype == np.uint8
-    pad.blur(frame.astype(np.uint8, copy=False) if eight_bit else image, narrow, 0.8 * size)
+    narrow, wide, band = pad.narrow, pad.wide, pad.band
+    image: Picture
+    if frame.dtype == np.uint8:
+        image = np.ascontiguousarray(frame, np.uint8)
+    else:
+        image = np.ascontiguousarray(frame, np.float32)
+    pad.blur(image, narrow, 0.8 * size)
     small = pad.widen(narrow, wide, (1.6**2 - 0.8**2) * size**2)
     cv2.subtract(narrow, wide, dst=band)
     over = np.flatnonzero(np.greater(band, exposure.floor, out=pad.over))
@@ -175,12 +176,12 @@ _own = threading.local()
 def _pad(shape: tuple[int, ...]) -> Pad:
     """What this thread works on: kept, for frames of one size follow on each other."""
     pad: Pad | None = getattr(_own, "pad", None)
-    if pad is None or pad.image.shape != shape:
+    if pad is None or pad.band.shape != shape:
         pad = _own.pad = Pad(shape)
     return pad
 
 
-def _not_hot(image: Grey, band: Grey, u: IntArray, v: IntArray, size: float) -> BoolArray:
+def _not_hot(image: Picture, band: Grey, u: IntArray, v: IntArray, size: float) -> BoolArray:
     """Not a hot pixel (`dots._dot_like`): the finer band is worked out round the peaks alone."""
     from labapp.core import dot_kernels
 

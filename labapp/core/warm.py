@@ -23,7 +23,7 @@ from labapp.core.correspondence import Match, Trial
 from labapp.core.dots import Image, estimate_size
 from labapp.core.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.lattice import Lattice
-from labapp.core.measures import reflection_errors
+from labapp.core.measures import scaled_errors
 from labapp.core.orientation import ways
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.pool_fit import Level, place_level
@@ -378,5 +378,7 @@ def _sized(
         sigma_mm=np.hypot(track.free_mm[ray], level.sigma_mm),
     )
     sigma = sigma_of(lower, sizes.gradient, level_at, level.sigma_mm)
-    errors = reflection_errors(made, match, bed.rig)
+    # As `measures.reflection_scale` has it; where the rays land is known.
+    scale = np.ptp(bed.landing_mm[ray, :2], axis=0) / np.ptp(match.plane_mm, axis=0)
+    errors = scaled_errors(made, scale)
     return made, measures.measures_of(errors, sizes.size, sizes.peak_mm, center, sigma)

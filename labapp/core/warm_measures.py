@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dtbtrs
 
 from labapp.core import kernels, measures
 from labapp.core.boundary import Boundary
-from labapp.core.fit import boundary_of, contour
+from labapp.core.fit import contour
 from labapp.core.pool_fit import Level, Rear
 from labapp.core.spline import SplineSurface
 from labapp.core.values import FloatArray
@@ -75,7 +75,8 @@ def follow_rim(
         if attempt:
             break
         radius = np.linalg.norm(found.points_mm[:, :2] - center_mm, axis=-1)
-    return boundary_of(level.rear, center_mm, way, radius), climb
+    height = level.rear.height(place[:, 1])
+    return Boundary(center_mm, before.theta_deg, np.column_stack([place, height])), climb
 
 
 @dataclass(frozen=True)

@@ -255,6 +255,20 @@ def test_the_finer_band_is_that_of_the_whole_picture() -> None:
     np.testing.assert_allclose(dot_kernels.finest(image, u, v, narrow, wide), most, atol=1e-4)
 
 
+def test_bytes_are_read_as_they_are() -> None:
+    place, image = picture()
+    u, v = np.rint(place).astype(np.int64).T
+    coarse, around = np.clip(image + 20, 0, 255).astype(np.uint8), np.full(image.shape, 20.0, "f4")
+    taps, width = cv2.getGaussianKernel(9, 1.1, cv2.CV_32F).ravel(), np.full(len(u), 2.0)
+    narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
+    for made in (
+        lambda own: dot_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
+        lambda own: dot_kernels.finest(own, u, v, narrow, wide),
+    ):
+        for one, other in zip(made(coarse), made(coarse.astype(np.float32)), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("rows", [1, 3])
 def test_pictures_lower_than_the_filters_are_mirrored_again_and_again(rows: int) -> None:
     image = random().uniform(0, 90, (rows, 40)).astype(np.float32)
