@@ -218,6 +218,24 @@ def test_without_a_set_up_the_picture_alone_and_why(
     assert page.live_view.figures.words.text() == NO_SETUP
 
 
+@pytest.mark.parametrize("old_s", [-1.0, 60.0])
+def test_the_verdict_is_that_of_a_measured_frame_unless_it_is_old(
+    page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch, old_s: float
+):
+    monkeypatch.setattr(live_view, "OLD_S", old_s)
+    hidden = Remark("rows", "doubtful", "The torch hides dots in a row.")
+    monkeypatch.setattr(Prepared, "found", replace(OK, quality=replace(QUALITY, remarks=(hidden,))))
+    start(page, qtbot)
+    said: set[str] = set()
+
+    def told_often() -> bool:
+        said.add(page.exposure.verdict.text())
+        return page.live_view.updates > 40 and page.exposure.isVisible()
+
+    qtbot.waitUntil(told_often)
+    assert any("torch" in words for words in said) == (old_s > 0)
+
+
 def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):

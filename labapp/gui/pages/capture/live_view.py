@@ -52,9 +52,6 @@ TICK_MS = 33
 SLOW_MS = 300
 """It is renewed so often in any case."""
 
-FRESH_S = 2.0
-"""The verdict on a measured frame stands so long before that on one that was only looked at."""
-
 TELL_S = 0.2
 """Figures are renewed no more often."""
 
@@ -315,7 +312,7 @@ class LiveView(QObject):
         if looked is not None:
             self._room_byte = looked.room_byte
             self._ring_dots(looked.dots_px)
-            if time.monotonic() - self.measured_s > FRESH_S:
+            if self._followed is None or self._age_s > OLD_S:
                 self._show_quality(looked.quality)
         if live.watch is not None:
             self._follow(live.watch)
@@ -337,7 +334,8 @@ class LiveView(QObject):
             self._show_figures(watch)
             if was_old or former is None or former.found.status != followed.found.status:
                 self._told_s = 0.0  # what is said of the figures goes with them
-            self._show_quality(followed.found.quality)
+            if self._age_s <= OLD_S:  # else it is not of what is in view
+                self._show_quality(followed.found.quality)
         self.updates += self.canvas.follow(followed, watch)
 
     def _show_figures(self, watch: LiveWatch) -> None:
