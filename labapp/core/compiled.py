@@ -31,7 +31,7 @@ def compiled(*signature: types.Type) -> Callable[[F], F]:
 
 
 def compiled_for(*signatures: tuple[types.Type, ...]) -> Callable[[F], F]:
-    """Do the same for arguments of several kinds."""
+    """Do what `compiled` does for each of several kinds of arguments."""
     return lambda function: _kept(function, list(signatures))
 
 

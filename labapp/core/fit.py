@@ -93,10 +93,12 @@ def contour(
     first = np.argmax(crossing, axis=1)
     radius = reach[np.arange(count), first] + 0.5 * limit * fraction[1]
     radius = _refine_radius(surface, level.rear, center_mm, way, radius, limit * fraction[1])
-    return boundary_of(level.rear, center_mm, way, radius)
+    return _boundary_of(level.rear, center_mm, way, radius)
 
 
-def boundary_of(rear: Rear, center_mm: FloatArray, way: FloatArray, radius: FloatArray) -> Boundary:
+def _boundary_of(
+    rear: Rear, center_mm: FloatArray, way: FloatArray, radius: FloatArray
+) -> Boundary:
     """Build a boundary of radii, shape (m,), along directions, shape (m, 2), from −180° on."""
     place = center_mm + radius[:, None] * way
     points = np.column_stack([place, rear.height(place[:, 1])])
@@ -145,5 +147,5 @@ def _variants(
         for step in (mode, -mode):
             moved = SplineSurface(surface.basis, surface.coefficients + step)
             out = _refine_radius(moved, rear, center, way, radius, 0.3)
-            variants.append((moved, boundary_of(rear, center, way, out)))
+            variants.append((moved, _boundary_of(rear, center, way, out)))
     return tuple(variants)

@@ -338,7 +338,8 @@ def spokes(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sample a surface at fractions of the way from a centre to each ``stride``-th boundary point.
 
-    The rear is its depth and where it starts and ends (`follow_rim`).
+    There are m boundary points, a multiple of ``stride``. The rear is its depth and where it starts
+    and ends (`follow_rim`).
 
     Returns
     -------

@@ -359,8 +359,8 @@ def place_level(
     over = np.array([height[near] - Rear(drop, start, end).height(y[near]) for drop in drops])
     side = sign * witness[near] / rise[near]
     nats = level_kernels.doubts(over, side, first, step, count, _BLURS)
-    weighed = level_kernels.weigh(nats, _BLUR_COST, _SUNK, drops, first, step)
-    drop, mean, sigma, off_window = weighed
+    asked = _BLUR_COST, _SUNK, drops, first, step
+    drop, mean, sigma, off_window = level_kernels.weigh(nats, *asked)
     if about is not None and off_window > OFF_WINDOW:
         return place_level(height, slope, y, witness, spacing_mm, drop_mm)
     surprise = nats.min() / np.log(2) / max(int(near.sum()), 1)

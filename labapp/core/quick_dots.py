@@ -44,7 +44,9 @@ class Pad:
     """Pictures to work on. Made anew for every frame they would cost as much as the work."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.narrow, self.wide, self.band = (np.empty(shape, np.float32) for _ in range(3))
+        self.image, self.narrow, self.wide, self.band = (
+            np.empty(shape, np.float32) for _ in range(4)
+        )
         self.over = np.empty(shape, bool)
         self._small: dict[int, tuple[Grey, Grey]] = {}
 
@@ -135,16 +137,21 @@ def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> 
     ------
     CannotMeasure
         ``no-dots`` if nothing stands out of the noise.
+    ValueError
+        If the frame has another size than that of the exposure.
     """
     from labapp.core import dot_kernels
 
+    if frame.shape != exposure.noise.shape:
+        raise ValueError(f"a frame of {frame.shape}, an exposure of {exposure.noise.shape}")
     pad, size = _pad(exposure.noise.shape), exposure.size_px
     narrow, wide, band = pad.narrow, pad.wide, pad.band
     image: Picture
     if frame.dtype == np.uint8:
         image = np.ascontiguousarray(frame, np.uint8)
     else:
-        image = np.ascontiguousarray(frame, np.float32)
+        image = pad.image
+        np.copyto(image, frame, casting="unsafe")
     pad.blur(image, narrow, 0.8 * size)
     small = pad.widen(narrow, wide, (1.6**2 - 0.8**2) * size**2)
     cv2.subtract(narrow, wide, dst=band)

@@ -40,14 +40,10 @@ def freeze(value: Any) -> None:
 
 
 def median(values: FloatArray) -> float:
-    """Median of finite numbers, shape (n,), NaN of none: `np.median` without its checks.
-
-    They take longer than a hundred numbers do.
-    """
-    if not len(values):
+    """Median of numbers, shape (n,); NaN of none, or where one is: `np.median` in less time."""
+    count = len(values)
+    if not count:
         return float("nan")
-    half = len(values) // 2
-    if len(values) % 2:
-        return float(np.partition(values, half)[half])
-    low, high = np.partition(values, (half - 1, half))[half - 1 : half + 1].tolist()
-    return float((low + high) / 2)
+    low, high, last = (count - 1) // 2, count // 2, count - 1
+    ordered = np.partition(values, (low, high, last))  # NaN comes last
+    return float("nan" if np.isnan(ordered[last]) else (ordered[low] + ordered[high]) / 2)

@@ -31,7 +31,7 @@ looked for anew."""
 
 _NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
 FRACTION = (_NODE + 1) / 2
-"""Samples between the centre and the boundary, as fractions of the way, and what they weigh."""
+"""What samples between the centre and the boundary weigh, and where they are, of the way."""
 
 STRIDE = 4
 """Every so many boundary points there is a spoke of samples: the surface is smooth."""
@@ -117,13 +117,12 @@ def sizes_of(
     )
     extremes, changes = [], np.zeros((2, len(coefficients)))
     for sign, change in zip((1.0, -1.0), changes, strict=True):
-        within, rim = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
-        # An extreme on the rim is where it is, and its height is given; one within may lie between
-        # the samples.
-        if sign * within[2] >= sign * rim[2]:
-            rim = measures.refined(height, boundary, within, sign)
-            change[:] = kernels.gradient_of_sum(grid, len(change), rim[None, :2], np.ones(1))
-        extremes.append(rim)
+        within, extreme = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
+        # On the rim it is where it is, and its height is given; within it may lie between samples.
+        if sign * within[2] >= sign * extreme[2]:
+            extreme = measures.refined(height, boundary, within, sign)
+            change[:] = kernels.gradient_of_sum(grid, len(change), extreme[None, :2], np.ones(1))
+        extremes.append(extreme)
     high, low = extremes
     by_rim = kernels.size_gradients(grid, len(coefficients), samples, share, outline, climb, center)
     width, length = np.ptp(outline[:, :2], axis=0)

@@ -58,7 +58,7 @@ class FrameSource(Protocol):
     bit_depth
         Significant bits of a grey level: 8, 10, 12, 16; 32 for float.
     index
-        What opening had to find out by reading through the file (time stamps, key frames …):
+        What opening had to find out in the file (time stamps, key frames …):
         ``open_source(path, index)`` opens it again at once. None where opening is cheap. An index
         that does not fit the file is ignored.
     """

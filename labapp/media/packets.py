@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -98,7 +98,8 @@ class Packets:
         """List packets as the index at the end of an AVI has them, without reading them.
 
         Every chunk that it names must be in the file, in their order and hardly anything else
-        between them or after the last, and there must be as many as its header claims.
+        between them; after the last nothing but the index; and there must be as many as the header
+        claims.
 
         Returns
         -------
@@ -109,18 +110,19 @@ class Packets:
             return None
         names = [b"%02d" % stream + kind for kind in (b"db", b"dc")]
         end = entries[0].pos
-        with path.open("rb", buffering=0) as file:
-            for entry in entries:
-                if not 0 <= entry.pos - end <= MOST_HEADERS_BYTE:
+        try:
+            with path.open("rb", buffering=0) as file:
+                for entry in entries:
+                    if not 0 <= entry.pos - end <= MOST_HEADERS_BYTE:
+                        return None
+                    name, size, end = _chunk(file, entry.pos)
+                    if name not in names or size != entry.size:
+                        return None
+                name, _, end = _chunk(file, end + end % 2)
+                if name != b"idx1" or not 0 <= file.seek(0, 2) - end <= MOST_HEADERS_BYTE:
                     return None
-                file.seek(entry.pos)
-                name, size = file.read(4), int.from_bytes(file.read(4), "little")
-                end = entry.pos + 8 + entry.size
-                if name not in names or size != entry.size:
-                    return None
-            file.seek(end + end % 2)
-            if file.read(4)[:2] == names[0][:2]:
-                return None
+        except OSError:
+            return None
         shown = [entry for entry in entries if entry.size]
         place, stamp, key = (
             np.array([getattr(entry, name) for entry in shown])
@@ -156,6 +158,14 @@ class Packets:
     def stamps_differ(self) -> bool:
         """Whether every packet has a stamp that is its own."""
         return _differ(self.pts)
+
+
+def _chunk(file: BinaryIO, at: int) -> tuple[bytes, int, int]:
+    """Name and size of the chunk that is at a byte of an AVI, and where it ends."""
+    file.seek(at)
+    head = file.read(8)
+    size = int.from_bytes(head[4:], "little")
+    return head[:4], size, at + 8 + size
 
 
 def _differ(values: IntArray) -> bool:

@@ -86,11 +86,10 @@ class VideoSource(FrameSource):
 
     The file is read through once without decoding, unless it is an AVI whose index fits it: where
     each packet is, which are key frames, and which frame, in the order they are shown, comes of
-    each. A packet is given its place in
-    that table as its time stamp before it is decoded; the frame that comes out carries it, so a
-    frame is known for certain wherever reading began. Only where the container keeps neither the
-    order frames are shown in nor which are key frames (H.264 in AVI; an AVI cut before its index)
-    is everything decoded once to learn them.
+    each. A packet is given its place in that table as its time stamp before it is decoded; the
+    frame that comes out carries it, so a frame is known for certain wherever reading began. Only
+    where the container keeps neither the order frames are shown in nor which are key frames (H.264
+    in AVI; an AVI cut before its index) is everything decoded once to learn them.
 
     A frame that cannot be decoded whole is refused, and so are those that build on it.
 
@@ -124,7 +123,7 @@ class VideoSource(FrameSource):
         try:
             table = None if index is None else PacketTable.from_bytes(index, self._fingerprint)
             if table is None:
-                table, index = self._read_through(), None
+                table, index = self._table_of_file(), None
             self._use(table, index or table.to_bytes(self._fingerprint))
         except BaseException:
             self.close()
@@ -286,7 +285,7 @@ class VideoSource(FrameSource):
             if number >= self._next and not stray and not frame.is_corrupt:
                 yield number, frame
 
-    def _read_through(self) -> PacketTable:
+    def _table_of_file(self) -> PacketTable:
         """Everything there is to know about the file, by its index or reading all of it once."""
         is_avi = self._container.format.name == "avi"
         codec = self._stream.codec_context.codec

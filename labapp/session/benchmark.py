@@ -129,9 +129,9 @@ def make_video(
     )
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
+def _rows(path: Path) -> Iterator[dict[str, str]]:
     with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+        yield from csv.DictReader(file)
 
 
 def _write_raw(source_path: Path, path: Path) -> None:
@@ -269,7 +269,7 @@ def run_video(
         start_s = time.perf_counter() - begun
         with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
             for told in measure_sequence(job, range(frames), pools):
-                results.add(told.surfaces, told.rows)
+                results.write(told.frame, told.time_s, told.measurement, told.rows)
                 broke += told.broke is not None
                 progress()
         seconds = time.perf_counter() - begun - start_s
@@ -280,8 +280,11 @@ def run_video(
             frame = int(row["frame"])
             heights[frame], sigma[frame] = float(row["height_mm"]), float(row["height_sigma_mm"])
     surprise = (heights - video.height_mm) / sigma
-    labels = [row for row in _rows(out / "dots.csv") if row["ray_row"]]
-    right = sum(_is_right(video, row) for row in labels)
+    right = wrong = 0
+    for row in _rows(out / "dots.csv"):
+        if row["ray_row"]:
+            is_right = _is_right(video, row)
+            right, wrong = right + is_right, wrong + (not is_right)
     shown = sum(len(place) for place, _ in video.dots)
     return Run(
         frames,
@@ -290,7 +293,7 @@ def run_video(
         start_s,
         int(np.isfinite(heights).sum()),
         broke,
-        len(labels) - right,
+        wrong,
         right / shown,
         float(np.sqrt(np.nanmean(np.square(surprise)))),
         _frequency(heights),

@@ -27,11 +27,6 @@ SURFACES = ("csv", "stl")
 """What a run writes of each surface."""
 
 
-def frame_surfaces(frame: int, measurement: Measurement) -> dict[str, bytes]:
-    """The surface files that a run writes of a frame, by name."""
-    return surface_files(frame, measurement.reconstruction, SURFACES, SPACING_MM)
-
-
 def surface_files(
     frame: int,
     reconstruction: Reconstruction | None,
@@ -127,30 +122,39 @@ class ResultsWriter:
             self._close_files()
             raise self._unwritable(error) from error
 
-    def write(self, frame: int, time_s: float | None, measurement: Measurement) -> None:
-        """Write everything about one frame.
+    def write(
+        self,
+        frame: int,
+        time_s: float | None,
+        measurement: Measurement,
+        rows: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write everything about one frame; its ``rows`` of each table where they are made already.
 
         Raises
         ------
         InputError
             If it cannot be written (disk full, folder gone); the frames before are whole.
         """
-        rows = table_rows(frame, time_s, measurement, self._calibration)
-        self.add(frame_surfaces(frame, measurement) if self.surfaces else {}, rows)
-
-    def add(self, surfaces: Mapping[str, bytes], rows: Mapping[str, str]) -> None:
-        """Write a frame's surface files, by name, and its rows of each table: see `write`."""
         before = {file: os.fstat(file.fileno()).st_size for file in self._files.values()}
+        formats = SURFACES if self.surfaces else ()
+        surfaces = {
+            self.folder / name: content
+            for name, content in surface_files(
+                frame, measurement.reconstruction, formats, SPACING_MM
+            ).items()
+        }
+        rows = rows or table_rows(frame, time_s, measurement, self._calibration)
         try:
-            for name, content in surfaces.items():
-                write_whole(self.folder / name, content)
+            for path, content in surfaces.items():
+                write_whole(path, content)
             for name, text in rows.items():
                 _append(self._files[name], text)
         except BaseException as error:
             for file, size in before.items():
                 file.truncate(size)
-            for name in surfaces:
-                (self.folder / name).unlink(missing_ok=True)
+            for path in surfaces:
+                path.unlink(missing_ok=True)
             if isinstance(error, OSError):
                 raise self._unwritable(error) from error
             raise

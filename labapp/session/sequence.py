@@ -1,8 +1,8 @@
 """A recording measured frame from frame (`core.warm`), long stretches of it at once.
 
 Stretches are of one length, however many processes there are, and begin with a cold frame each:
-results do not depend on the machine. A process opens the recording itself, and gives back what is
-to be written.
+results do not depend on the machine. A process opens the recording itself, and gives back what it
+measured together with the rows of its tables.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from labapp.core.correction import Correction
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource, open_source
-from labapp.session.results import ResultsWriter, frame_surfaces
+from labapp.session.results import ResultsWriter
 from labapp.session.run import measuring_pool
 from labapp.session.setup import Setup
 
@@ -43,12 +43,11 @@ class Told:
     frame, time_s
         Its number, and its time where it has one.
     measurement
-        Its status, the reason and the measures. Dots, rays and surface stay where they were found:
-        to hand them over would take a tenth of the time that they took.
+        What was measured: all of it, or the status, the reason and the measures (`Job.whole`).
     broke
         Why it was not measured from the frame before; None if it was.
-    rows, surfaces
-        Its rows of each table, as CSV text, and its surface files, as `ResultsWriter.add` has them.
+    rows
+        Its rows of each table, as CSV text.
     """
 
     frame: int
@@ -56,7 +55,6 @@ class Told:
     measurement: Measurement
     broke: str | None
     rows: dict[str, str]
-    surfaces: dict[str, bytes]
 
 
 @dataclass(frozen=True)
@@ -69,15 +67,16 @@ class Job:
         The recording, and what opening it found out (`FrameSource.index`), where it was.
     setup, settings
         What it is measured with.
-    surfaces
-        Whether surface files are made.
+    whole
+        Whether dots, rays and surface are handed over besides the rows: that takes a twentieth of
+        the time that it took to measure them.
     """
 
     path: Path
     index: bytes | None
     setup: Setup
     settings: Settings
-    surfaces: bool = False
+    whole: bool = False
 
 
 @contextmanager
@@ -159,7 +158,7 @@ def follow_frames(
 ) -> Iterator[tuple[int, float | None, Measurement]]:
     """Measure frames of a recording by `measure_sequence` and write each, as `run.measure_frames`.
 
-    Of the measurements there are only the parts that `Told` has.
+    Without surface files the measurements are not whole (`Job`).
 
     Raises
     ------
@@ -167,9 +166,9 @@ def follow_frames(
         If the recording cannot be opened, or a frame's results cannot be written.
     """
     with followers(len(frames)) as pools:
-        job = Job(path, index, setup, settings, results.surfaces)
+        job = Job(path, index, setup, settings, whole=results.surfaces)
         for told in measure_sequence(job, frames, pools):
-            results.add(told.surfaces, told.rows)
+            results.write(told.frame, told.time_s, told.measurement, told.rows)
             yield told.frame, told.time_s, told.measurement
 
 
@@ -244,9 +243,11 @@ class Following:
             measurement = self._chain.measure(frame.image)
             broke = self._chain.broke
         rows = self._rows(number, time_s, measurement, self._job.setup.calibration)
-        surfaces = frame_surfaces(number, measurement) if self._job.surfaces else {}
-        told = replace(measurement, dots=None, lattice=None, match=None, reconstruction=None)
-        return Told(number, time_s, told, broke, rows, surfaces)
+        if not self._job.whole:
+            measurement = replace(
+                measurement, dots=None, lattice=None, match=None, reconstruction=None
+            )
+        return Told(number, time_s, measurement, broke, rows)
 
     def measure_all(self, numbers: Sequence[int]) -> list[Told]:
         """Measure the next frames."""

@@ -88,6 +88,13 @@ def test_a_frame_without_dots_has_none() -> None:
         assert answer.value.status == "no-dots"
 
 
+def test_a_frame_of_another_size_is_refused() -> None:
+    exposure = Exposure.of(np.zeros((40, 60), np.uint8), BandPassSettings(size_px=1.8))
+    for kind in (np.uint8, np.uint16):
+        with pytest.raises(ValueError, match="exposure of"):
+            quick_dots(np.zeros((60, 40), kind), exposure, BandPassSettings(size_px=1.8))
+
+
 def test_threads_that_share_an_exposure_do_not_share_their_dots() -> None:
     rng = np.random.default_rng(11)
     frames = [frame(places(rng), rng) for _ in range(6)]

@@ -6,6 +6,7 @@ import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -331,7 +332,11 @@ def test_an_avi_whose_index_does_not_fit_is_read_through(tmp_path: Path, encode:
     frames, again = content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32
     one_less, size = ((k * (COUNT - 1)).to_bytes(4, "little") for k in (1, 16))
     fewer = {frames: one_less, again: one_less}
+    more = content[chunk:second] * 3
+    beyond = b"RIFF" + (len(more) + 16).to_bytes(4, "little") + b"AVIXLIST"
+    beyond += (len(more) + 4).to_bytes(4, "little") + b"movi" + more
     for changes in (
+        {len(content): beyond},  # others after the index
         fewer,  # the header speaks of fewer
         {second: b"01dc"},  # another stream's
         {second + 4: b"\x07"},  # shorter than the index has it
@@ -343,12 +348,23 @@ def test_an_avi_whose_index_does_not_fit_is_read_through(tmp_path: Path, encode:
         for at, put in changes.items():
             changed[at : at + len(put)] = put
         path.write_bytes(changed)
-        with (
-            mock.patch.object(Packets, "read", side_effect=Packets.read) as read,
-            contextlib.suppress(InputError),
-        ):
-            VideoSource(path).close()
+        with mock.patch.object(Packets, "listed", return_value=None):
+            wanted = index_of(path)
+        with mock.patch.object(Packets, "read", side_effect=Packets.read) as read:
+            assert index_of(path) == wanted
         read.assert_called_once()
+
+
+def index_of(path: Path) -> bytes | None:
+    """What opening a recording found out; None where it is refused."""
+    with contextlib.suppress(InputError), VideoSource(path) as source:
+        return source.index
+    return None
+
+
+def test_an_index_of_a_file_that_cannot_be_read_is_none(tmp_path: Path) -> None:
+    entry = SimpleNamespace(pos=0, size=1, timestamp=0, is_keyframe=True)
+    assert Packets.listed([entry], 0, 1, tmp_path / "gone.avi") is None
 
 
 def test_an_index_that_does_not_fit_is_ignored(tmp_path: Path, encode: Encode) -> None:

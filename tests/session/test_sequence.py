@@ -67,21 +67,20 @@ def test_stretches_are_measured_alike_here_and_by_processes(
     for workers in (0, 2):
         with followers(FRAMES, workers) as pools:
             assert len(pools) == workers
-            told[workers] = list(
-                measure_sequence(replace(job, surfaces=True), range(FRAMES), pools)
-            )
+            told[workers] = list(measure_sequence(replace(job, whole=True), range(FRAMES), pools))
     assert [one.frame for one in told[2]] == list(range(FRAMES))
     for here, there in zip(told[0], told[2], strict=True):
         assert here.rows == there.rows
-        assert here.surfaces == there.surfaces
+        assert here.measurement.measures == there.measurement.measures
+        assert here.measurement.reconstruction is not None
         assert here.broke == there.broke
         assert here.measurement.measures == there.measurement.measures
     cold = [one.frame for one in told[0] if one.broke is not None]
     assert {0, 5} <= set(cold)
     assert len(cold) <= 4
-    with ResultsWriter(tmp_path / "out", job.setup.calibration, {}, False) as results:
+    with ResultsWriter(tmp_path / "out", job.setup.calibration, {}) as results:
         for one in told[2]:
-            results.add(one.surfaces, one.rows)
+            results.write(one.frame, one.time_s, one.measurement, one.rows)
     made = sorted(path.name for path in (tmp_path / "out").glob("surface_*"))
     assert made == [f"surface_{k:06d}.{end}" for k in range(FRAMES) for end in ("csv", "stl")]
     with (tmp_path / "out" / "measures.csv").open(encoding="utf-8", newline="") as file:
