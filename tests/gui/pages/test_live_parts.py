@@ -190,6 +190,7 @@ def page(
 def start(page: CapturePage, qtbot: QtBot) -> None:
     view = page.live_view
     view.measured_s = 0.0
+    qtbot.waitUntil(view.start_button.isEnabled)  # the one before is let go of first
     view.start_button.click()
     qtbot.waitUntil(lambda: view.measured_s > 0)
 
