@@ -299,6 +299,7 @@ def page(
 
 
 def start(page: CapturePage, qtbot: QtBot) -> None:
+    qtbot.waitUntil(page.live_view.start_button.isEnabled)
     page.live_view.start_button.click()
     qtbot.waitUntil(lambda: page.live_view.updates > 2)
 
