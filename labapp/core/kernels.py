@@ -1,9 +1,9 @@
 """Inner loops of the warm chain, compiled for the processor (docs/adr/0018).
 
 A followed frame has a hundred dots: NumPy's overhead per call would take longer than the sums. Here
-are only loops over dots, rays and splines; what they mean is told where they are called. All of
-them are in one file because a compiled function is kept on disk as long as its own file does not
-change, whatever became of those it calls.
+are only loops over rays and splines; what they mean is told where they are called. Those that call
+each other are in one file because a compiled function is kept on disk as long as its own file does
+not change, whatever became of those it calls.
 
 Arrays may be read-only, and of any layout but for pictures. Places of splines are a grid's: for
 each of its two axes low, high, step and number of cells, shape (2, 4) (`SplineBasis.grid`).

@@ -164,7 +164,7 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
 
 
 def scaled_errors(reconstruction: Reconstruction, scale: FloatArray) -> ReflectionErrors:
-    """Reflection errors where the scale is known (`reflection_scale`)."""
+    """Reflection errors where the scale, shape (2,), is known (`reflection_scale`)."""
     error = np.hypot(*(reconstruction.residual_mm * scale).T)
     inner = error[_inner(reconstruction.ray)]
     return ReflectionErrors(
