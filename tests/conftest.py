@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -37,8 +38,8 @@ def lacks(words: str) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    if item.get_closest_marker("xvfb") and shutil.which("xvfb-run") is None:
-        lacks("xvfb-run is not installed")
+    if item.get_closest_marker("xvfb") and shutil.which("Xvfb") is None:
+        lacks("Xvfb is not installed")
 
 
 @pytest.fixture(scope="session")
@@ -48,6 +49,15 @@ def opengl() -> None:
 
     if not can_draw():
         lacks("nothing can be drawn in 3-D here")
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A free port that nobody takes meanwhile: it is bound, though not listened at."""
+    with socket.socket() as held:
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        held.bind(("127.0.0.1", 0))
+        yield held.getsockname()[1]
 
 
 @pytest.fixture

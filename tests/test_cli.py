@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
@@ -24,6 +23,7 @@ from labapp.errors import InputError
 from labapp.session import log, results, run
 from labapp.session.run import select_frames
 from tests.conftest import Run
+from tests.waiting import PATIENCE_S, connect, wait_until
 
 SAMPLE = Path(__file__).parents[1] / "sample_sessions" / "gtaw"
 SETUP = SAMPLE / "setup.toml"
@@ -276,9 +276,9 @@ def test_measures_are_told_while_they_are_made(tmp_path: Path) -> None:
     )
     assert started.stderr is not None
     port = int(started.stderr.readline().rpartition(":")[2])
-    with socket.create_connection(("127.0.0.1", port), timeout=60) as connected:
+    with connect(port) as connected:
         told = [json.loads(line) for line in connected.makefile("rb")][1:]
-    _, complained = started.communicate(timeout=60)
+    _, complained = started.communicate(timeout=PATIENCE_S)
     assert started.returncode == 0, complained
     assert [line["frame"] for line in told] == [0, 1]
     for line, row in zip(told, table(out / "measures.csv"), strict=True):
@@ -314,12 +314,10 @@ def test_ctrl_c_leaves_whole_frames(tmp_path: Path) -> None:
         text=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
-    until = time.monotonic() + 60
     measures = out / "measures.csv"
-    while not (measures.exists() and len(table(measures)) >= 3) and time.monotonic() < until:
-        time.sleep(0.01)
+    wait_until(lambda: measures.exists() and len(table(measures)) >= 3)
     started.send_signal(signal.SIGINT)
-    _, complained = started.communicate(timeout=60)
+    _, complained = started.communicate(timeout=PATIENCE_S)
     rows = table(measures)
     assert started.returncode == 130
     assert 3 <= len(rows) < 30

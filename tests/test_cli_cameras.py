@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from labapp.media.cameras import CameraInfo, CameraLost
 from labapp.session.cameras import simulated_device
 from labapp.session.session import Session
 from tests.conftest import HEEDING, Run
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
 SAMPLE = ROOT / "sample_sessions/gtaw/recording.avi"
@@ -61,10 +61,7 @@ def test_ctrl_c_ends_a_recording_and_keeps_it(tmp_path: Path) -> None:
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
     command = [sys.executable, "-c", HEEDING, "record", CAMERA, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        until_s = time.monotonic() + 60
-        while not out.exists() or out.stat().st_size < 1_000_000:
-            assert time.monotonic() < until_s
-            time.sleep(0.02)
+        wait_until(lambda: out.exists() and out.stat().st_size >= 1_000_000)
         process.send_signal(signal.SIGINT)
         assert process.stdout is not None
         told = process.stdout.read()

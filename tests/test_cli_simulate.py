@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +21,7 @@ from labapp.session.simulate import simulate
 from labapp.simulation.pools import Wave
 from labapp.simulation.torch import ConeTorch
 from tests.conftest import HEEDING, Run
+from tests.waiting import PATIENCE_S, wait_until
 
 EXAMPLES = Path(__file__).parents[1] / "resources" / "simulations"
 SCENARIO = (EXAMPLES / "mode_11.toml").read_text("utf-8")
@@ -388,13 +388,11 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
         env={**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")},
         text=True,
     )
-    until = time.monotonic() + 300
-    while not list(tmp_path.glob("results/.out.*/out/recording.avi")):
-        assert running.poll() is None
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    parts = "results/.out.*/out/recording.avi"
+    wait_until(lambda: running.poll() is not None or any(tmp_path.glob(parts)))
+    assert running.poll() is None
     running.send_signal(signal.SIGINT)
-    _, err = running.communicate(timeout=300)
+    _, err = running.communicate(timeout=PATIENCE_S)
     assert running.returncode == 130
     assert "nothing is written" in err
     assert "Traceback" not in err

@@ -9,20 +9,50 @@ os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QWidget
+from pytestqt.qtbot import QtBot
 
 from labapp.gui.preferences import Preferences
 from labapp.gui.window import MainWindow
 from tests.gui.leaks import Left
+from tests.waiting import PATIENCE_S
 
 SAMPLES = Path(__file__).parents[2] / "sample_sessions"
+
+PATIENCE_MS = round(1000 * PATIENCE_S)
 
 KEPT: list[QWidget] = []
 """Windows with pictures and 3-D views can crash when they are destroyed: these live to the end."""
 
 CopySample = Callable[[str], Path]
+
+
+class PatientBot(QtBot):
+    """Waits as long as tests do; pytest-qt's five seconds are short on a busy machine."""
+
+    def waitUntil(self, callback: Callable[[], bool | None], **given: Any) -> None:  # noqa: N802
+        super().waitUntil(callback, timeout=given.get("timeout", PATIENCE_MS))
+
+    def waitSignal(self, signal: Any, **given: Any) -> Any:  # noqa: N802
+        return super().waitSignal(signal, **{"timeout": PATIENCE_MS, **given})
+
+    def waitExposed(self, widget: QWidget, **given: Any) -> Any:  # noqa: N802
+        return super().waitExposed(widget, **{"timeout": PATIENCE_MS, **given})
+
+
+def let_draw() -> None:
+    """Let what is shown be laid out and painted: each level of nesting is an event of its own."""
+    for _ in range(20):
+        QTest.qWait(1)
+
+
+@pytest.fixture
+def qtbot(qapp: QApplication, request: pytest.FixtureRequest) -> QtBot:
+    return PatientBot(request)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import shiboken6
 from PySide6.QtCore import QThreadPool, QTimer
 from PySide6.QtWidgets import QApplication
 
-GRACE_S = 2.0
+GRACE_S = 60.0
 """What ends by itself, such as a process that was told to, may take so long."""
 
 FILES = Path("/proc/self/fd")

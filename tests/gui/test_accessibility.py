@@ -43,7 +43,7 @@ from labapp.gui.views.canvas import Drawn, Plotted
 from labapp.gui.window import MainWindow
 from labapp.session.analysis import Made
 from labapp.simulation.tables import Table
-from tests.gui.conftest import CopySample
+from tests.gui.conftest import CopySample, let_draw
 
 Role = QAccessible.Role
 
@@ -162,7 +162,7 @@ def test_a_page_by_keyboard(opened: MainWindow, step: str, qtbot: QtBot):
     assert page is not None
     assert page.key == step
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
-    QTest.qWait(50)
+    let_draw()
     reached = check_round(opened)
     names = {each.accessibleName() for each in reached if page.isAncestorOf(each)}
     assert CANVASES.get(step, set()) <= names
@@ -190,7 +190,7 @@ def test_two_schemes_compared(opened: MainWindow, qtbot: QtBot):
     opened.show_step("surface")
     opened.page.comparing.click()  # type: ignore[union-attr]
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
-    QTest.qWait(50)
+    let_draw()
     check_round(opened)
 
 
@@ -206,7 +206,7 @@ def test_a_small_screen_at_150_percent_holds_every_page(opened: MainWindow, qtbo
             opened.page.comparing.click()  # type: ignore[union-attr]
         qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
         opened.resize(911, 512)
-        QTest.qWait(20)
+        let_draw()
         assert (opened.width(), opened.height()) == (911, 512), step.key
         for area in opened.findChildren(QScrollArea):
             cut = area.isVisible() and area.horizontalScrollBar().maximum() > 0
@@ -324,7 +324,7 @@ def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
     assert tool.form.isAncestorOf(reached[(reached.index(tool.close_button) + 1) % len(reached)])
     assert all(each.window() is tool for each in reached)
     tool.resize(819, 460)  # 1366 × 768 at 150 %
-    QTest.qWait(20)
+    let_draw()
     assert (tool.width(), tool.height()) == (819, 460)
     for button in tool.findChildren(QAbstractButton):
         if button.isVisible() and button.text():
@@ -335,7 +335,7 @@ def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
 
 def fill_simulator(tool: Any, qtbot: QtBot) -> None:
     """Its first frame is drawn; something was written."""
-    qtbot.waitUntil(lambda: tool.preview is not None, timeout=60_000)
+    qtbot.waitUntil(lambda: tool.preview is not None)
     tool.made = tool.preview.scenario, Path("here")
     tool.show_state()
 
@@ -346,7 +346,7 @@ def fill_adviser(tool: Any, qtbot: QtBot) -> None:
         tool.ranges[key].set_value(ends)
     tool.effort.set_value("quick")
     tool.start()
-    qtbot.waitUntil(lambda: tool.advice is not None, timeout=300_000)
+    qtbot.waitUntil(lambda: tool.advice is not None)
     tool.costs.show_table(Table("costs", "Costs", ("quantity", "cost_um"), (("s", 1.0),)))
     tool.groups[-1].show()
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtGui import QImage
-from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 
 from labapp.core.correction import Correction
@@ -16,7 +15,7 @@ from labapp.core.lattice import Lattice
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.theme import palette
 from labapp.gui.views.picture import PictureView
-from tests.gui.conftest import KEPT
+from tests.gui.conftest import KEPT, let_draw
 from tests.pictures import RENEW, Away, away, check_picture
 
 KEPT_PICTURE = Path(__file__).parent / "pictures" / "dots.png"
@@ -62,7 +61,7 @@ def view(qapp: QApplication) -> PictureView:
     made.resize(400, 340)
     made.show()
     made.show_picture(frame(places()))
-    QTest.qWait(20)
+    let_draw()
     return made
 
 

@@ -113,7 +113,7 @@ def test_steps_that_follow_each_other_are_one_edit(qtbot, number):
     assert number.editor.text() == "30.00"
     assert number.told == []
     number.set_value(27.0)  # a refresh meanwhile
-    qtbot.waitUntil(lambda: number.told == [30.0], timeout=2000)
+    qtbot.waitUntil(lambda: number.told == [30.0])
     for _ in range(8):
         qtbot.keyClick(number.editor, Qt.Key.Key_PageUp)
     number.flush()

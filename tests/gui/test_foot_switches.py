@@ -24,10 +24,11 @@ from labapp.media import foot_switch, hid, open_source
 from labapp.media.cameras import SimulatedDevice
 from labapp.media.foot_switch import PedalMap
 from labapp.media.hid import HidInfo
-from tests.gui.conftest import KEPT, CopySample
+from tests.gui.conftest import KEPT, CopySample, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
 from tests.media.pedals import INFINITY, KEYBOARD, MOUSE_3D, PCSENSOR, Bench, Device
+from tests.waiting import PATIENCE_S
 
 LEFT, MIDDLE, RIGHT = ("0100", "0000"), ("0200", "0000"), ("0400", "0000")
 """Reports of the Infinity's pedals, down and up."""
@@ -365,7 +366,7 @@ def test_a_system_that_is_slow_to_answer_holds_nothing_up(
     answer = threading.Event()
 
     def slow() -> list[HidInfo]:
-        answer.wait(30)
+        answer.wait(PATIENCE_S)
         return list(bench.find())
 
     monkeypatch.setattr(hid, "find_hid", slow)
@@ -406,7 +407,7 @@ def test_the_panel_by_keyboard_and_screen_reader(
     wanted += [panel.action.editor, panel.use_button, panel.copy_button, panel.commands]
     assert set(wanted) <= set(reached)
     window.resize(911, 512)  # 1366 × 768 at 150 %
-    qtbot.wait(20)
+    let_draw()
     area = window.side_panel.stack.currentWidget()
     assert area.horizontalScrollBar().maximum() == 0
 

@@ -20,6 +20,7 @@ from labapp.media.survey import Survey, survey
 from labapp.session import frames as frames_module
 from labapp.session.session import Session
 from tests.gui.conftest import SAMPLES
+from tests.waiting import PATIENCE_S
 
 FRAMES = 120
 STOPS_AT = 40
@@ -46,7 +47,7 @@ def session(window: MainWindow, tmp_path: Path) -> Session:
 
 
 def idle(window: MainWindow, qtbot: QtBot) -> None:
-    qtbot.waitUntil(lambda: not window.workspace.tasks.active, timeout=60_000)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
 def test_an_import_is_watched_cancelled_and_done_again(
@@ -62,7 +63,7 @@ def test_an_import_is_watched_cancelled_and_done_again(
         def step(done: int, total: int) -> None:
             progress(done, total)
             if done == STOPS_AT:
-                gate.wait(60)
+                gate.wait(PATIENCE_S)
 
         return survey(source, step)
 
@@ -106,15 +107,15 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
         if threading.current_thread().name == "Measuring":
             read.append(number)
             if number == STOPS_AT:
-                gate.wait(60)
+                gate.wait(PATIENCE_S)
         return plainly(number)
 
     monkeypatch.setattr(session, "frame", slow)
     window.show_step("trends")
     window.measure_all()
     line, kinds = window.status_line, window.timeline.scrubber
-    qtbot.waitUntil(lambda: line.bar.value() > 0, timeout=60_000)
-    qtbot.waitUntil(lambda: bool((kinds.kinds == Standing.NOT_MEASURABLE).any()), timeout=60_000)
+    qtbot.waitUntil(lambda: line.bar.value() > 0)
+    qtbot.waitUntil(lambda: bool((kinds.kinds == Standing.NOT_MEASURABLE).any()))
     assert line.bar.maximum() == FRAMES
     window.workspace.show_frame(STOPS_AT + 5)  # the window answers meanwhile
     assert window.timeline.scrubber.position == STOPS_AT + 5

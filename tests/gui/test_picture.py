@@ -10,6 +10,7 @@ from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.views.picture import DragPoint, PictureView, Tool, auto_levels, level_at
+from tests.gui.conftest import let_draw
 
 KEPT: list[PictureView] = []
 """Windows with pyqtgraph live to the end of the process: some crash when they are destroyed."""
@@ -25,7 +26,7 @@ def view(qtbot: QtBot) -> PictureView:
     view.show_picture(GREY)
     view.show()
     qtbot.waitExposed(view)
-    QTest.qWait(30)
+    let_draw()
     return view
 
 
@@ -58,9 +59,9 @@ def drag(view: PictureView, start: QPoint, end: QPoint) -> None:
     QTest.mousePress(port, Qt.MouseButton.LeftButton, pos=start)
     for part in (0.3, 0.6, 1.0):
         QTest.mouseMove(port, start + (end - start) * part)
-        QTest.qWait(5)
+        let_draw()
     QTest.mouseRelease(port, Qt.MouseButton.LeftButton, pos=end)
-    QTest.qWait(5)
+    let_draw()
 
 
 def test_the_tool_hears_of_clicks_and_drags_in_px_u_right_v_down(view: PictureView) -> None:
@@ -109,18 +110,18 @@ def test_it_fits_again_in_another_size_until_the_hand_has_zoomed(view: PictureVi
 
     for size in ((300, 700), (1200, 400), (700, 560)):
         view.resize(*size)
-        QTest.qWait(20)
+        let_draw()
         assert all_seen()
         assert as_large_as_can_be()
     drag(view, at(view, 80, 60), at(view, 100, 60))
     moved = view.box.viewRect().center()
     view.resize(600, 500)
-    QTest.qWait(20)
+    let_draw()
     assert view.box.viewRect().center().x() == pytest.approx(moved.x(), abs=0.5)
     view.fit()
     view.zoom(4)
     view.resize(700, 560)
-    QTest.qWait(20)
+    let_draw()
     assert not all_seen()
 
 
@@ -157,7 +158,7 @@ def test_a_point_is_dragged_and_nudged(view: PictureView, qtbot: QtBot) -> None:
     first, second = DragPoint("O′", 40, 40), DragPoint("X axis", 120, 40)
     for point in (first, second):
         view.add_point(point)
-    QTest.qWait(20)
+    let_draw()
     with qtbot.waitSignal(second.dropped) as told:
         drag(view, at(view, 120, 40), at(view, 130, 60))
     assert told.args == pytest.approx([130, 60], abs=0.5)
@@ -176,7 +177,7 @@ def test_a_point_is_dragged_and_nudged(view: PictureView, qtbot: QtBot) -> None:
 def test_what_is_seen_can_be_copied_overlays_and_all(view: PictureView) -> None:
     bare = view.grab_picture()
     view.add(pg.ScatterPlotItem([80], [60], size=30, brush="r", pen=None))
-    QTest.qWait(20)
+    let_draw()
     picture = view.grab_picture()
     assert picture.size() == bare.size()
     assert picture.pixelColor(at(view, 80, 60)).red() == 255

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.curves import Axis, Curve, Mark, as_table, nearest, next_key, point_in_words
 from labapp.gui.theme import palette
 from labapp.gui.views.plots import MOST_POINTS, PlotStack
+from tests.gui.conftest import let_draw
 
 KEPT: list[PlotStack] = []
 """Windows with pyqtgraph live to the end of the process: some crash when they are destroyed."""
@@ -88,7 +88,7 @@ def view(qtbot: QtBot) -> Iterator[PlotStack]:
     view.show_curves([curve(), curve(name="Width"), current()], TIME)
     view.show()
     qtbot.waitExposed(view)
-    QTest.qWait(40)
+    let_draw()
     yield view
     view.hide()
 
@@ -152,23 +152,18 @@ def test_copies(view: PlotStack) -> None:
 def test_it_follows_the_palette(view: PlotStack) -> None:
     for dark in (True, False):
         view.setPalette(palette(dark))
-        QTest.qWait(20)
+        let_draw()
         corner = view.grab_picture().pixelColor(3, 3)
         assert (corner.lightness() < 128) == dark
 
 
-def test_ten_thousand_frames_pan_at_speed(view: PlotStack) -> None:
+def test_of_ten_thousand_frames_no_more_points_are_drawn_than_can_be_seen(view: PlotStack) -> None:
     many = [curve(10_000, name, 1) for name in ("Width", "Length", "Height", "ARE")]
     view.show_curves(many, TIME)
-    QTest.qWait(50)
-    took = []
-    for step in range(12):
-        began = time.perf_counter()
-        view._plots[0].setXRange(step, 100 + step * 75, padding=0)
-        view.canvas.grab()
-        took.append(time.perf_counter() - began)
-    assert len(view._plots[0].points.data) <= MOST_POINTS
-    assert float(np.median(took)) < 0.2  # 4 plots, software, another program beside
+    for seen in (100, 1000):
+        view._plots[0].setXRange(0, seen, padding=0)
+        let_draw()
+        assert 0 < len(view._plots[0].points.data) <= MOST_POINTS
 
 
 def test_a_frame_without_a_point_is_marked_where_it_is(view: PlotStack) -> None:
@@ -189,13 +184,13 @@ def test_nothing_stays_of_plots_that_were_taken_out(view: PlotStack, qtbot: QtBo
     six = [curve(name=name) for name in ("Width", "Length", "Height", "Depth", "Area", "ARE")]
     for curves in (six, six[:4]):
         view.show_curves(curves, TIME)
-        QTest.qWait(40)
+        let_draw()
     fresh = PlotStack("Trends")
     KEPT.append(fresh)
     fresh.resize(view.size())
     fresh.show_curves(six[:4], TIME)
     fresh.show()
     qtbot.waitExposed(fresh)
-    QTest.qWait(40)
+    let_draw()
     assert view.grab().toImage() == fresh.grab().toImage()
     fresh.hide()

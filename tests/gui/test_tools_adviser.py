@@ -19,8 +19,6 @@ from labapp.session.session import Session
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
 
-TIMEOUT = 300_000
-
 SMALL = {
     "pools.width_mm": (6.5, 6.5),
     "pools.length_mm": (7.0, 7.0),
@@ -68,7 +66,7 @@ def test_it_gives_what_the_command_gives_and_undo_takes_it_back(
     before = session.setup_text
     click(adviser.start_button)
     assert not adviser.start_button.isEnabled()
-    qtbot.waitUntil(lambda: adviser.advice is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: adviser.advice is not None)
     adviser.save(tmp_path / "window")
     values = adviser.values()
     lines = []
@@ -98,7 +96,7 @@ def test_it_gives_what_the_command_gives_and_undo_takes_it_back(
 def test_the_impossible_is_said_in_words(adviser: AdviserWindow, qtbot: QtBot):
     adviser.ranges["pools.height_mm"].set_value((0.5, 0.6))
     click(adviser.start_button)
-    qtbot.waitUntil(lambda: adviser.advice is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: adviser.advice is not None)
     assert "No set-up is possible" in adviser.headline.text()
     assert "dots on the plate" in adviser.headline.text()
     assert not adviser.use_button.isEnabled()

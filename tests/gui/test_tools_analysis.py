@@ -20,8 +20,7 @@ from labapp.session.session import Session
 from labapp.simulation import error_analysis, setup_budget
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
-
-TIMEOUT = 300_000
+from tests.waiting import PATIENCE_S
 
 
 @pytest.fixture
@@ -56,7 +55,7 @@ def work_out(tool: AnalysisWindow, qtbot: QtBot) -> None:
     QTest.keyClick(tool.start_button, Qt.Key.Key_Space)
     assert tool.working
     assert tool.focusWidget() is tool.cancel_button
-    qtbot.waitUntil(lambda: not tool.working, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: not tool.working)
     assert tool.message.text() == "Done"
     assert tool.focusWidget() is tool.start_button
 
@@ -135,14 +134,14 @@ def test_a_cancel_keeps_what_is_finished(
 
     def slow(kind: str, *given: Any, **more: Any) -> object:
         if kind == "LE":
-            gate.wait(60)
+            gate.wait(PATIENCE_S)
         return survey(kind, *given, **more)
 
     monkeypatch.setattr(error_analysis, "survey", slow)
     tick(analysis, "CE", "LE")
     analysis.scheme.set_value("ers")
     click(analysis.start_button)
-    qtbot.waitUntil(lambda: "errors" in analysis.tables, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: "errors" in analysis.tables)
     threading.Timer(0.1, gate.set).start()
     if how == "escape":
         QTest.keyClick(analysis, Qt.Key.Key_Escape)
@@ -150,7 +149,7 @@ def test_a_cancel_keeps_what_is_finished(
         click(analysis.close_button)
     else:
         window.close()
-    qtbot.waitUntil(lambda: not analysis.working, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: not analysis.working)
     assert [row[0] for row in analysis.tables["errors"].rows[::3]] == ["CE-D", "CE-B"]
     assert analysis.message.text() == "Stopped"
     assert analysis.save_button.isEnabled()

@@ -19,8 +19,6 @@ from labapp.gui.window import MainWindow
 from labapp.session.scenario import shipped_scenarios
 from tests.conftest import Run
 
-TIMEOUT = 300_000
-
 
 @pytest.fixture
 def simulator(window: MainWindow, qtbot: QtBot) -> SimulatorWindow:
@@ -28,7 +26,7 @@ def simulator(window: MainWindow, qtbot: QtBot) -> SimulatorWindow:
     window.menus.do("simulator")
     tool = window.findChild(SimulatorWindow)
     assert tool is not None
-    qtbot.waitUntil(lambda: tool.preview is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: tool.preview is not None)
     return tool
 
 
@@ -38,7 +36,7 @@ def choose(tool: SimulatorWindow, name: str, qtbot: QtBot) -> Path:
     tool.scenario.set_value(str(path))
     tool.scenario.edited.emit(str(path))
     assert not tool.start_button.isEnabled()
-    qtbot.waitUntil(lambda: tool.preview is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: tool.preview is not None)
     return path
 
 
@@ -65,7 +63,7 @@ def test_it_shows_the_first_frame_with_its_true_dots(
     before = simulator.picture.picture
     simulator.seed.set_value(1)
     simulator.seed.edited.emit(1)
-    qtbot.waitUntil(lambda: simulator.preview is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: simulator.preview is not None)
     assert (simulator.picture.picture != before).mean() > 0.3
     assert simulator.seed.value() == 1
 
@@ -80,7 +78,7 @@ def test_it_writes_what_the_command_writes_and_opens_it(
     simulator.folder.editor.setText(str(out))
     assert not simulator.open_button.isEnabled()
     click(simulator.start_button)
-    qtbot.waitUntil(lambda: simulator.made is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: simulator.made is not None)
     assert "3 frames" in simulator.message.text()
     given = ("--frames", 3, "--seed", 8)
     assert labapp("simulate", path, "--out", tmp_path / "command", *given)[0] == 0
@@ -89,7 +87,7 @@ def test_it_writes_what_the_command_writes_and_opens_it(
     for name in names:
         assert (tmp_path / "command" / name).read_bytes() == (out / name).read_bytes(), name
     click(simulator.open_button)
-    qtbot.waitUntil(lambda: window.workspace.session is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: window.workspace.session is not None)
     session = window.workspace.session
     assert session is not None
     assert session.path == out / "low_rear.labsession"
@@ -108,13 +106,13 @@ def test_a_stack_gets_its_time_base(simulator: SimulatorWindow, window: MainWind
     own = tmp_path / "stack.toml"
     own.write_text(shipped.read_text("utf-8") + 'format = "tif"\n', "utf-8")
     simulator.take(own)
-    qtbot.waitUntil(lambda: simulator.preview is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: simulator.preview is not None)
     simulator.frames.set_value(2)
     simulator.folder.editor.setText(str(tmp_path / "out"))
     click(simulator.start_button)
-    qtbot.waitUntil(lambda: simulator.made is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: simulator.made is not None)
     click(simulator.open_button)
-    qtbot.waitUntil(lambda: window.workspace.session is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: window.workspace.session is not None)
     session = window.workspace.session
     assert session is not None
     assert session.frame(1).time_s == pytest.approx(1 / 60)
@@ -135,7 +133,7 @@ def test_what_is_wrong_is_said_and_nothing_is_written(
     (mine / "mine.txt").write_text("mine")
     simulator.folder.editor.setText(str(mine))
     click(simulator.start_button)
-    qtbot.waitUntil(lambda: "holds mine.txt" in simulator.message.text(), timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: "holds mine.txt" in simulator.message.text())
     assert [path.name for path in mine.iterdir()] == ["mine.txt"]
     assert not simulator.open_button.isEnabled()
 
@@ -150,11 +148,11 @@ def test_a_process_that_ends_is_said_and_it_can_begin_again(
         patched.setattr("labapp.gui.tools.simulator.simulate", killed)
         simulator.folder.editor.setText(str(tmp_path / "out"))
         click(simulator.start_button)
-        qtbot.waitUntil(lambda: not simulator.working, timeout=TIMEOUT)
+        qtbot.waitUntil(lambda: not simulator.working)
     assert "a process that simulates has ended" in simulator.message.text()
     simulator.frames.set_value(1)
     click(simulator.start_button)
-    qtbot.waitUntil(lambda: simulator.made is not None, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: simulator.made is not None)
 
 
 @pytest.mark.parametrize("how", ["escape", "close", "app"])
@@ -165,7 +163,7 @@ def test_it_can_be_stopped_and_leaves_nothing(
     (tmp_path / "results").mkdir()
     simulator.folder.editor.setText(str(tmp_path / "results" / "out"))
     click(simulator.start_button)
-    qtbot.waitUntil(lambda: simulator.bar.value() > 0, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: simulator.bar.value() > 0)
     if how == "escape":
         QTest.keyClick(simulator, Qt.Key.Key_Escape)
         assert simulator.isVisible()
@@ -174,7 +172,7 @@ def test_it_can_be_stopped_and_leaves_nothing(
         assert not simulator.isVisible()
     else:
         window.close()
-    qtbot.waitUntil(lambda: not simulator.working, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: not simulator.working)
     assert list((tmp_path / "results").iterdir()) == []
     assert simulator.made is None
 
@@ -183,8 +181,8 @@ def test_the_scenario_chosen_last_is_shown(simulator: SimulatorWindow, qtbot: Qt
     for path in shipped_scenarios()[:6]:
         simulator.scenario.set_value(str(path))
         simulator.scenario.edited.emit(str(path))
-    qtbot.waitUntil(lambda: simulator.preview is not None, timeout=TIMEOUT)
-    qtbot.waitUntil(lambda: not simulator.previews.active, timeout=TIMEOUT)
+    qtbot.waitUntil(lambda: simulator.preview is not None)
+    qtbot.waitUntil(lambda: not simulator.previews.active)
     assert simulator.preview is not None
     assert simulator.preview.scenario.text == path.read_text("utf-8")
 

@@ -21,6 +21,8 @@ from labapp.gui.help import TITLES
 from labapp.gui.pages import PAGES
 from labapp.gui.tools import TOOLS
 from tests.conftest import Run
+from tests.screen import screen
+from tests.waiting import PATIENCE_S
 
 GUI = Path(labapp.__file__).parent / "gui"
 SIZE = (1280, 760)
@@ -37,16 +39,15 @@ def environment(home: Path, platform: str) -> dict[str, str]:
 def taken(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Path]:
     """The pictures' folder, what was said, and the home folder of who took the tour."""
     out, home = tmp_path_factory.mktemp("tour"), tmp_path_factory.mktemp("home")
-    size = f"{SIZE[0]}x{SIZE[1]}"
-    screen = ["xvfb-run", "-a", "-s", f"-screen 0 {size}x24 -nolisten tcp"]
-    done = subprocess.run(
-        [*screen, sys.executable, "-m", "labapp", "tour", "--out", out, "--size", size],
-        env=environment(home, "xcb"),
-        capture_output=True,
-        text=True,
-        timeout=400,
-        check=False,
-    )
+    with screen(*SIZE) as display:
+        done = subprocess.run(
+            [sys.executable, "-m", "labapp", "tour", "--out", out, "--size", "{}x{}".format(*SIZE)],
+            env={**environment(home, "xcb"), "DISPLAY": display},
+            capture_output=True,
+            text=True,
+            timeout=5 * PATIENCE_S,
+            check=False,
+        )
     assert done.returncode == 0, f"{done.stdout[-300:]}\n{done.stderr}"
     return out, done.stdout, home
 
@@ -226,7 +227,7 @@ def test_a_page_that_throws_ends_it_and_is_named(tmp_path: Path, page: str, kind
         env=environment(tmp_path / "home", "offscreen"),
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
         check=False,
     )
     assert done.returncode == 1, done.stderr

@@ -17,6 +17,8 @@ from labapp.gui.views import view3d
 from labapp.gui.views.view3d import NOTHING_HERE, OffscreenView, View3d, make_view3d
 from labapp.session.scene import Scene
 from tests.gui.conftest import KEPT
+from tests.screen import screen
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.usefixtures("opengl")
 
@@ -245,11 +247,20 @@ def test_a_scene_is_drawn_once_however_often_it_changes_and_is_painted(view: Vie
 REAL = """
 import sys
 import numpy as np
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QDeadlineTimer, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from labapp.gui.views.view3d import InteractiveView, OffscreenView, make_view3d
+from tests.gui.conftest import let_draw
 from tests.gui.test_view3d import hill
+from tests.waiting import PATIENCE_S
+
+def wait(reached):
+    until = QDeadlineTimer(round(1000 * PATIENCE_S))
+    while not reached():
+        assert not until.hasExpired(), "it did not happen"
+        let_draw()
+
 app = QApplication([])
 made = make_view3d()
 assert isinstance(made, OffscreenView), type(made)  # Mesa draws here, on the processor
@@ -259,30 +270,25 @@ view.camera_changed.connect(told.append)
 view.show_scene(hill())
 assert view.camera is None
 view.show()
-QTest.qWait(300)
+wait(lambda: view.picture() is not None and view.picture().std() > 20)
 picture = view.picture()
-assert picture.std() > 20, picture.std()
 camera = view.camera
 plotter = view._drawing.plotter
 QTest.mousePress(plotter, Qt.MouseButton.LeftButton, pos=view.rect().center())
 QTest.mouseMove(plotter, view.rect().center() / 2)
 QTest.mouseRelease(plotter, Qt.MouseButton.LeftButton, pos=view.rect().center() / 2)
-QTest.qWait(100)
-assert view.camera != camera and told
+wait(lambda: view.camera != camera and told)
 for key in (Qt.Key.Key_Q, Qt.Key.Key_1, Qt.Key.Key_Left):
     QTest.keyClick(view, key)
-QTest.qWait(50)
-assert (view.picture() != picture).any()
+wait(lambda: (view.picture() != picture).any())
 view.show_scene(None)
-QTest.qWait(50)
+let_draw()
 view.show_scene(hill(0.1))
-QTest.qWait(50)
-assert view.picture().std() > 20
+wait(lambda: view.picture() is not None and view.picture().std() > 20)
 view.close()
 assert view.camera is None
 view.show()
-QTest.qWait(100)
-assert view.camera is not None
+wait(lambda: view.camera is not None)
 view.close()
 print("well")
 """
@@ -293,14 +299,14 @@ def test_with_a_display_it_draws_in_the_window() -> None:
     """The real thing, under Xvfb: a process of its own, since Qt has one platform per process."""
     environment = {**os.environ, "QT_QPA_PLATFORM": "xcb", "LIBGL_ALWAYS_SOFTWARE": "1"}
     environment.pop("VTK_DEFAULT_OPENGL_WINDOW", None)
-    screen = ["xvfb-run", "-a", "-s", "-screen 0 1000x800x24 -nolisten tcp"]
-    done = subprocess.run(
-        [*screen, sys.executable, "-c", REAL],
-        cwd=Path(__file__).parents[2],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    with screen(1000, 800) as display:
+        done = subprocess.run(
+            [sys.executable, "-c", REAL],
+            cwd=Path(__file__).parents[2],
+            env={**environment, "DISPLAY": display},
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
     assert (done.returncode, done.stdout.strip()[-4:]) == (0, "well"), done.stderr[-3000:]

@@ -60,9 +60,6 @@ FRAMES = (4, 6, 2)
 
 CORRECTED = 6
 
-PATIENCE_MS = 120_000
-"""For a few fits on a machine that has other things to do."""
-
 
 def place_of(ray: tuple[int, int]) -> tuple[float, float]:
     """Where a ray's dot is in the frame to be corrected, (u, v) px, from the sample's truth."""
@@ -98,7 +95,7 @@ def page(hand: Hand, kind: type[P]) -> P:
 
 
 def settle(hand: Hand, qtbot: QtBot) -> None:
-    qtbot.waitUntil(lambda: not hand.window.workspace.tasks.active, timeout=PATIENCE_MS)
+    qtbot.waitUntil(lambda: not hand.window.workspace.tasks.active)
     assert hand.window.status_line.unread == []
 
 
@@ -168,7 +165,7 @@ def export(hand: Hand, qtbot: QtBot, folder: Path, scheme: str) -> None:
     hand.choose(shown.scheme, scheme)
     hand.enter(shown.folder, str(folder))
     hand.button("Export")
-    qtbot.waitUntil(lambda: shown.written is not None, timeout=PATIENCE_MS)
+    qtbot.waitUntil(lambda: shown.written is not None)
     settle(hand, qtbot)
 
 

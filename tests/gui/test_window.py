@@ -31,7 +31,7 @@ from labapp.session.copies import copy_session
 from labapp.session.log import log_file
 from labapp.session.record import Record
 from labapp.session.session import Session
-from tests.gui.conftest import KEPT, CopySample
+from tests.gui.conftest import KEPT, CopySample, let_draw
 
 
 class Plain(Page):
@@ -333,7 +333,7 @@ def drop(window: MainWindow, qtbot: QtBot, *paths: Path) -> None:
             Qt.KeyboardModifier.NoModifier,
         )
     )
-    qtbot.wait(20)
+    let_draw()
 
 
 def test_what_is_dropped_is_opened_or_imported(
@@ -479,13 +479,11 @@ def test_closing_stops_the_measuring_and_keeps_what_is_finished(
     settle(plain, qtbot)
     plain.menus.do("measure")
     task = plain.workspace.tasks.active[0]
-    qtbot.waitUntil(lambda: task.done >= 5, timeout=30_000)
+    qtbot.waitUntil(lambda: task.done >= 5)
     assert plain.status_line.bar.isVisible()
     plain.menus.do("measure_frame")
     assert "being measured already" in plain.status_line.message.text()
-    began = time.perf_counter()
     plain.close()
-    assert time.perf_counter() - began < 4
     assert not task.thread.is_alive()
     with Session.open(path) as session:
         assert 5 <= 2000 - len(session.stale_frames()) < 2000

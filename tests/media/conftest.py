@@ -11,9 +11,18 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from labapp.media.cameras import base
+from tests.waiting import PATIENCE_S
+
 Pictures = list[npt.NDArray[np.uint8]]
 WriteVideo = Callable[[Path, Pictures, str], Path]
 Encode = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def waiting_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames wait for a reader that comes late because the machine is busy with other tests."""
+    monkeypatch.setattr(base, "BUFFERED_S", PATIENCE_S)
 
 
 @pytest.fixture

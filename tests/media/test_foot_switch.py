@@ -25,8 +25,9 @@ from labapp.media.hid import (
     why_closed,
 )
 from labapp.media.space_mouse import SixAxes, SpaceMouse
-from tests.media.cameras.watching import Heard, wait_until
+from tests.media.cameras.watching import Heard
 from tests.media.pedals import AXES, INFINITY, KEYBOARD, MOUSE_3D, PCSENSOR, THREE, Device
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
 
@@ -103,7 +104,8 @@ def test_pedals_do_what_they_are_mapped_to() -> None:
     assert heard.words() == "note: VEC Infinity foot pedal: connected"
 
 
-def test_a_pedal_that_bounces_was_pressed_once() -> None:
+def test_a_pedal_that_bounces_was_pressed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foot_switch, "time", SimpleNamespace(monotonic=lambda: 100.0))
     device, done = Device(), []
     with switch(device, INFINITY, done.append, lambda _: None, mark=0, next=1):
         device.send("0100", "0000", "0100", "0000", "0200")

@@ -20,7 +20,8 @@ from labapp.media.events import Event
 from labapp.media.nut import NutWriter
 from labapp.media.recorder import Plan, Recorder, Take, recording_path
 from labapp.session.session import Session
-from tests.media.cameras.watching import Heard, number_in, numbered, wait_until
+from tests.media.cameras.watching import Heard, number_in, numbered
+from tests.waiting import PATIENCE_S, wait_until
 
 RATE_HZ = 100.0
 
@@ -105,7 +106,7 @@ def test_it_records_until_it_is_stopped_and_every_third_frame(start: Start) -> N
         recorder.stop()
         for k in range(40, 60):
             recorder.take(frame(k))
-        assert take.finished.wait(10)
+        assert take.finished.wait(PATIENCE_S)
     assert numbers(take) == list(range(12, 40, 3))
     with open_source(take.path) as video:
         assert video.frame_rate_hz == pytest.approx(RATE_HZ / 3, rel=1e-3)
@@ -398,7 +399,7 @@ def test_nothing_recorded_is_lost_through_unplugging_garbage_and_a_stalled_disk(
             disk.goes.clear()
             wait_until(lambda: device.disconnects >= 40)
             disk.goes.set()
-            wait_until(lambda: device.disconnects >= 50, 60)
+            wait_until(lambda: device.disconnects >= 50)
     assert take.lost == 0
     assert take.frames == len(handed) == running.counts.frames
     with open_source(tmp_path / "disk.nut") as video:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import socket
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,6 +25,7 @@ from labapp.session.live_watch import LiveWatch
 from labapp.session.scene import Scene, empty_scene
 from labapp.session.setup import Setup, read_setup
 from labapp.session.streams import LineStream
+from tests.waiting import connect
 
 SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
 
@@ -157,7 +157,7 @@ def test_no_figure_for_long_is_an_alarm_until_there_is_one(
 def test_measuring_that_ends_by_itself_is_an_alarm_and_is_told(watch: LiveWatch, told: Told):
     stream = LineStream()
     watch.tell_by("lines", stream)
-    with socket.create_connection(("127.0.0.1", stream.port), timeout=30) as heard:
+    with connect(stream.port) as heard:
         lines = heard.makefile(encoding="utf-8")
         lines.readline()
 
@@ -216,7 +216,7 @@ def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
     stream = LineStream()
     watch.tell_by("lines", stream)
     assert watch.stream("lines") is stream
-    with socket.create_connection(("127.0.0.1", stream.port), timeout=30) as connected:
+    with connect(stream.port) as connected:
         file = connected.makefile("rb")
         file.readline()
         for number in range(3):
@@ -242,7 +242,7 @@ def test_a_stream_that_comes_when_all_is_over_is_closed(watch: LiveWatch):
     stream = LineStream()
     watch.tell_by("lines", stream)
     with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.1", stream.port), timeout=30)
+        connect(stream.port)
 
 
 def test_a_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, told: Told):

@@ -15,15 +15,16 @@ import pytest
 
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
+from labapp.session import streams
 from labapp.session.alarms import Alarm
 from labapp.session.streams import LineStream, OpcuaStream, live_values, open_stream, told_values
 from labapp.session.tables import SIZES
+from tests.waiting import PATIENCE_S, connect
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "STARTING_S", PATIENCE_S)
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def lines() -> Iterator[LineStream]:
 
 def listener(stream: LineStream) -> Any:
     """A file of lines, the first already read."""
-    connected = socket.create_connection(("127.0.0.1", stream.port), timeout=30)
+    connected = connect(stream.port)
     file = connected.makefile("rb")
     connected.close()
     assert "labapp" in json.loads(file.readline())
@@ -75,8 +76,8 @@ def test_who_does_not_read_is_told_what_it_missed_and_holds_nobody_up(lines: Lin
         assert json.loads(eager.readline())["frame"] == frame
     seen, missed = [], 0
     while not seen or seen[-1] < 2999:
-        if not missed:
-            lines.publish({"frame": 3000 + len(seen), "reason": ""})
+        # Each tells what was missed before it, if there is room again.
+        lines.publish({"frame": 3000 + len(seen), "reason": ""})
         told = json.loads(idle.readline())
         seen.append(told["frame"])
         missed += told.get("missed", 0)
@@ -87,7 +88,8 @@ def test_who_does_not_read_is_told_what_it_missed_and_holds_nobody_up(lines: Lin
     eager.close()
 
 
-def test_what_was_missed_is_told_at_the_end_too() -> None:
+def test_what_was_missed_is_told_at_the_end_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "PATIENCE_S", PATIENCE_S)  # this listener does read, if late
     stream = LineStream()
     idle = listener(stream)
     for frame in range(1500):
@@ -101,7 +103,7 @@ def test_what_was_missed_is_told_at_the_end_too() -> None:
 
 
 def test_a_listener_that_says_no_more_is_told_on(lines: LineStream) -> None:
-    with socket.create_connection(("127.0.0.1", lines.port), timeout=30) as connected:
+    with connect(lines.port) as connected:
         file = connected.makefile("rb")
         file.readline()
         connected.shutdown(socket.SHUT_WR)
@@ -163,14 +165,14 @@ def test_a_port_that_is_taken_is_said(lines: LineStream) -> None:
 
 
 @pytest.mark.parametrize("kind", [LineStream, OpcuaStream])
-def test_a_place_that_is_not_on_this_machine_is_said(kind: Any) -> None:
+def test_a_place_that_is_not_on_this_machine_is_said(kind: Any, port: int) -> None:
     with pytest.raises(InputError, match="an address of this machine"):
-        kind("192.0.2.1", free_port(), anywhere=True)
+        kind("192.0.2.1", port, anywhere=True)
 
 
-def test_opc_ua_clients_cannot_write(caplog: pytest.LogCaptureFixture) -> None:
+def test_opc_ua_clients_cannot_write(port: int, caplog: pytest.LogCaptureFixture) -> None:
     asyncua = pytest.importorskip("asyncua")
-    stream = OpcuaStream(port=free_port())
+    stream = OpcuaStream(port=port)
 
     async def write(user: str) -> None:
         client = asyncua.Client(stream.address)
@@ -191,9 +193,9 @@ def test_opc_ua_clients_cannot_write(caplog: pytest.LogCaptureFixture) -> None:
     assert not caplog.records
 
 
-def test_opc_ua_clients_read_the_newest_frame(measured: Measurement) -> None:
+def test_opc_ua_clients_read_the_newest_frame(port: int, measured: Measurement) -> None:
     asyncua = pytest.importorskip("asyncua")
-    stream = OpcuaStream(port=free_port())
+    stream = OpcuaStream(port=port)
     alarm = Alarm("width-high", "Width 7.1 mm is above 6.9 mm", 40, 0.4, acknowledged=True)
     wanted = live_values(41, 0.5, measured, [alarm, replace(alarm, code="height-low")])
     assert wanted["alarm"] == "width-high height-low"

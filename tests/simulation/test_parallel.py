@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from labapp.simulation.parallel import NICE, behind_a_window, in_parallel
+from tests.waiting import PATIENCE_S, wait_until
 
 BUSY = """
 import sys, time
@@ -55,16 +56,12 @@ def test_what_progress_raises_ends_them() -> None:
 def test_they_end_when_who_they_work_for_is_killed(tmp_path: Path) -> None:
     program = tmp_path / "busy.py"
     program.write_text(BUSY, "utf-8")
-    until = time.monotonic() + 120
     with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE) as running:
         assert running.stdout is not None
         while len(workers := spawned(running.pid)) < 2:
             assert running.stdout.readline()
-            assert time.monotonic() < until
         running.send_signal(signal.SIGKILL)
-    while any(is_there(pid) for pid in workers):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    wait_until(lambda: not any(is_there(pid) for pid in workers))
 
 
 def stat(pid: int) -> list[str]:
@@ -96,4 +93,4 @@ def test_one_that_is_ended_while_it_tells_much_holds_nobody_up(tmp_path: Path) -
     """What is told is larger than what a pipe holds: each is ended half through one."""
     program = tmp_path / "ended.py"
     program.write_text(ENDED, "utf-8")
-    subprocess.run([sys.executable, program], timeout=120, check=True)
+    subprocess.run([sys.executable, program], timeout=PATIENCE_S, check=True)

@@ -178,6 +178,7 @@ class SimulatedCamera(Camera):
             triggers=("free", "software"),
         )
         self._device = device
+        self._disconnects = device.disconnects
         self._begun_s: float | None = None
         self._next = 0
         self._pulled = threading.Semaphore(0)
@@ -211,7 +212,8 @@ class SimulatedCamera(Camera):
         until_s = time.monotonic() + timeout_s
         while True:
             number = self._await(until_s)
-            if not self._device.plugged:
+            # One that was pulled out and put back meanwhile has to be opened anew, too.
+            if not self._device.plugged or self._device.disconnects > self._disconnects:
                 self._begun_s = None
                 raise CameraLost(f"{self.info.name} was unplugged")
             if number is None:

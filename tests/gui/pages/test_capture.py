@@ -41,6 +41,7 @@ from labapp.session.record import Record
 from labapp.session.session import Session
 from tests.gui.conftest import CopySample
 from tests.gui.hand import Hand
+from tests.waiting import PATIENCE_S
 
 KEPT: list[object] = []
 
@@ -194,7 +195,7 @@ def test_an_import_that_is_cancelled_leaves_the_session_as_it_was(
 
     def slow(control, done: int, total: int) -> None:
         begun.set()
-        go_on.wait(5)
+        go_on.wait(PATIENCE_S)
         progress(control, done, total)
 
     monkeypatch.setattr("labapp.gui.tasks.Control.progress", slow)

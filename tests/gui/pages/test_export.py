@@ -140,7 +140,7 @@ def test_the_button_writes_what_a_script_would(
     page.folder.set_value(str(tmp_path / "out"))
     page.export_button.click()
     assert not page.export_button.isEnabled()
-    qtbot.waitUntil(lambda: page.written is not None, timeout=20_000)
+    qtbot.waitUntil(lambda: page.written is not None)
     assert page.result.text().startswith("✓ 6 files and the manifest")
     assert page.export_button.isEnabled()
     script = tmp_path / "script"
@@ -170,7 +170,7 @@ def test_a_cancelled_export_leaves_nothing(
 
     monkeypatch.setattr(Session, "export", cancelled_midway)
     page.export()
-    qtbot.waitUntil(lambda: not page.workspace.tasks.active, timeout=20_000)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     assert page.written is None
     assert not folder.exists()
     assert list(tmp_path.glob(".out*")) == []
@@ -186,7 +186,7 @@ def test_a_folder_of_somebody_s_is_refused_in_words(
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     page.folder.set_value(str(tmp_path / "mine"))
     page.export()
-    qtbot.waitUntil(lambda: bool(said), timeout=20_000)
+    qtbot.waitUntil(lambda: bool(said))
     assert said[0][1]
     assert "mine" in said[0][0]
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import csv
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,9 +29,10 @@ from labapp.session.live_watch import Followed
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from labapp.session.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
-from tests.gui.conftest import SAMPLES
+from tests.gui.conftest import SAMPLES, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
+from tests.waiting import PATIENCE_S, wait_until
 
 SHAPE = (48, 64)
 
@@ -46,13 +46,6 @@ def numbered(k: int) -> GreyImage:
 
 def number_in(image: GreyImage) -> int:
     return int(np.frombuffer(image[0, :4].astype(np.uint8).tobytes(), np.uint32)[0])
-
-
-def wait_until(reached: Callable[[], bool], seconds: float = 30.0) -> None:
-    until_s = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < until_s, "it did not happen"
-        time.sleep(0.005)
 
 
 # --- without widgets ------------------------------------------------------------------------------
@@ -105,7 +98,7 @@ def test_the_newest_frame_is_given_once_and_judged(live: Live):
 
     def picture(k: int) -> GreyImage:
         if k == 20:
-            gate.wait(30)
+            gate.wait(PATIENCE_S)
         return numbered(k)
 
     live.open(SimulatedDevice("test", picture).open)
@@ -157,12 +150,12 @@ def test_one_that_is_closed_while_it_opens_leaves_nothing(live: Live):
 
     def slow():
         begun.set()
-        gate.wait(30)
+        gate.wait(PATIENCE_S)
         return device.open()
 
     opening = threading.Thread(target=live.open, args=(slow,))
     opening.start()
-    begun.wait(30)
+    begun.wait(PATIENCE_S)
     live.close()
     gate.set()
     opening.join()
@@ -226,9 +219,9 @@ def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
         watch = with_setup.watch
         assert watch is not None
         found: list[Followed | None] = []
-        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]), 120)
+        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]))
         # The first is measured by itself, those right after it from the one before.
-        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]), 120)
+        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]))
     finally:
         with_setup.close()
     first, measured = [each for each in found if each is not None]
@@ -376,8 +369,8 @@ def test_large_figures_where_the_set_up_is_complete(
     view = page.live_view
     assert view.figures.isVisible()
     shown = view.figures.findChildren(QLabel)
-    qtbot.waitUntil(lambda: "Height" in [each.text() for each in shown], timeout=5_000)
-    qtbot.waitUntil(lambda: any("±" in each.text() for each in shown), timeout=120_000)
+    qtbot.waitUntil(lambda: "Height" in [each.text() for each in shown])
+    qtbot.waitUntil(lambda: any("±" in each.text() for each in shown))
     assert {"Width", "Length", "Height", "mm"} <= {each.text() for each in shown}
 
 
@@ -415,7 +408,7 @@ def test_faults_are_told_in_words(window: MainWindow, page: CapturePage, device,
     qtbot.waitUntil(lambda: view.state.text().startswith("▲ Not connected"))
     assert "unplugged. Trying to get it back" in said_in(window)
     device.plug()
-    qtbot.waitUntil(lambda: view.state.text().startswith("● Live"), timeout=10_000)
+    qtbot.waitUntil(lambda: view.state.text().startswith("● Live"))
     assert "it is back after" in said_in(window)
     device.faults = Faults(garbage=1.0)
     qtbot.waitUntil(lambda: "not whole, left out" in said_in(window))
@@ -484,7 +477,7 @@ def test_an_opening_that_is_cancelled(
 
     def slow(_text: str, progress):
         begun.set()
-        gate.wait(30)
+        gate.wait(PATIENCE_S)
         progress(1, 2)
 
     monkeypatch.setattr(live_view, "pool_camera", slow)
@@ -527,7 +520,7 @@ def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePag
     assert page.live_view.record_button in reached
     assert page.live_view.camera_fields.fields["rate_hz"].editor in reached
     window.resize(911, 512)  # 1366 × 768 at 150 %
-    QTest.qWait(20)
+    let_draw()
     for button in window.findChildren(QAbstractButton):
         if button.isVisible() and button.text():
             assert button.width() >= button.sizeHint().width() - 1, button.text()
@@ -535,5 +528,5 @@ def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePag
     # Whatever is to be said of the camera, the window does not grow beyond the screen.
     for words in (*(words for _, words in STATES.values()), *WAITS.values()):
         page.live_view.state.setText(f"▲ {words}, 1000.0 frames/s")
-        QTest.qWait(20)
+        let_draw()
         assert (window.width(), window.height()) == (911, 512), words

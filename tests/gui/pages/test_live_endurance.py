@@ -76,7 +76,7 @@ def test_nothing_recorded_is_lost_and_all_is_said(
         if k in STALLED:
             goes.set()
             qtbot.waitUntil(lambda n=stalls: how_many(told(), CAUGHT_UP) > n)
-    qtbot.waitUntil(lambda: truth.broken > 5, timeout=20_000)
+    qtbot.waitUntil(lambda: truth.broken > 5)
     device.faults = Faults()
     qtbot.waitUntil(lambda: how_many(told(), "not whole, left out") == truth.broken)
     ended_s = time.monotonic()

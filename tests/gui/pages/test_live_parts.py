@@ -46,7 +46,7 @@ from labapp.session.scene import HEIGHT, Scene
 from tests.gui.conftest import SAMPLES
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
-from tests.session.test_streams import free_port
+from tests.waiting import PATIENCE_S, connect
 
 MEASURES = Measures(*[0.0] * 4, 6.7, 7.5, 0.30, -0.01, *[0.0] * 6, *[0.03, 0.04, 0.003] * 2)
 QUALITY = Quality(
@@ -156,7 +156,7 @@ class Prepared:
         pass
 
     def measure(self, _image: Any, drawn: bool) -> LiveMeasurement:
-        Prepared.gate.wait(60)
+        Prepared.gate.wait(PATIENCE_S)
         drawn = drawn and Prepared.found.measures is not None
         return replace(Prepared.found, scene=surface() if drawn else None)
 
@@ -374,18 +374,17 @@ def test_what_is_old_does_not_look_as_if_it_were_seen_now(
 
 
 def test_control_software_is_told_while_a_camera_is_watched(
-    window: MainWindow, page: CapturePage, qtbot: QtBot
+    window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
 ):
     hand, view = Hand(window), page.live_view
     streams = view.canvas.streams
     start(page, qtbot)
     choose(page, "Control software")
     assert streams.words["lines"].text() == "○ Off"
-    port = free_port()
     hand.enter(streams.ports["lines"], str(port))
     streams.boxes["lines"].click()
     qtbot.waitUntil(lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}: 0 pro"))
-    connected = socket.create_connection(("127.0.0.1", port), timeout=30)
+    connected = connect(port)
     file = connected.makefile("rb")
     connected.close()
     assert "labapp" in json.loads(file.readline())
@@ -414,31 +413,30 @@ def test_control_software_is_told_while_a_camera_is_watched(
     qtbot.waitUntil(lambda: streams.words["lines"].text() == "○ Off")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.1", port), timeout=30)
+        connect(port)
 
 
 def test_a_port_that_is_taken_is_said_with_what_to_do(
-    window: MainWindow, page: CapturePage, qtbot: QtBot
+    window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
 ):
     hand, streams = Hand(window), page.live_view.canvas.streams
     start(page, qtbot)
     choose(page, "Control software")
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+        its_port = taken.getsockname()[1]
         for kind in ("lines", "opcua"):
-            hand.enter(streams.ports[kind], str(port))
+            hand.enter(streams.ports[kind], str(its_port))
             streams.boxes[kind].click()
-            qtbot.waitUntil(lambda kind=kind: not streams.boxes[kind].isChecked(), timeout=30_000)
+            qtbot.waitUntil(lambda kind=kind: not streams.boxes[kind].isChecked())
             assert "Choose another port" in streams.words[kind].text()
     assert said_in(window).count("Choose another port") == 2
     streams.boxes["lines"].click()
     qtbot.waitUntil(lambda: streams.words["lines"].text().startswith("● 127.0.0.1"))
     assert page.live_view.live.watch.stream("opcua") is None
-    port = free_port()
     hand.enter(streams.ports["opcua"], str(port))
     streams.boxes["opcua"].click()
     told = f"● opc.tcp://127.0.0.1:{port}/labapp: 0 programs listen, 0 frames told"
-    qtbot.waitUntil(lambda: streams.words["opcua"].text() == told, timeout=30_000)
+    qtbot.waitUntil(lambda: streams.words["opcua"].text() == told)
 
 
 @pytest.mark.parametrize("part", ["Picture", "Surface", "Trends and limits", "Control software"])

@@ -25,6 +25,7 @@ from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.workspace import Workspace
 from labapp.session.heights import profile
 from tests.gui.conftest import KEPT, CopySample
+from tests.waiting import PATIENCE_S
 
 
 class OneThread(ThreadPoolExecutor):
@@ -98,7 +99,7 @@ def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) ->
     assert not page.side.one.isEnabled()
     assert "under way" in page.side.one.toolTip()
     assert not page.side.progress.isHidden()
-    with qtbot.waitSignal(page.workspace.said, timeout=30_000):
+    with qtbot.waitSignal(page.workspace.said):
         pass
     assert page.side.status.text() == "✓ Measured."
     assert page.side.one.isEnabled()
@@ -116,7 +117,7 @@ def test_measuring_can_be_watched_and_cancelled(
         assert numbers == list(range(30))
         for number in numbers:
             if number == 3:
-                cancelled.wait(60)
+                cancelled.wait(PATIENCE_S)
             yield number, None
 
     monkeypatch.setattr(page.workspace.session, "measure", slowly)
@@ -223,7 +224,7 @@ def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None
     page.comparing.click()
     compare = page.compare
     assert (compare.first.choice.value(), compare.second.choice.value()) == ("fit", "ers")
-    qtbot.waitUntil(lambda: compare.table.rowCount() == 10, timeout=20_000)
+    qtbot.waitUntil(lambda: compare.table.rowCount() == 10)
     page.grab()
     first, second, difference = compare.views
     assert difference.scene.diverging
@@ -237,10 +238,10 @@ def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None
     before = compare.words.text()
     compare.second.choice.set_value("irs-opa")
     compare.second.choice.edited.emit("irs-opa")
-    qtbot.waitUntil(lambda: "IRS" in compare.words.text(), timeout=20_000)
+    qtbot.waitUntil(lambda: "IRS" in compare.words.text())
     assert compare.words.text() != before
     page.workspace.show_frame(5)
-    qtbot.waitUntil(lambda: not page.workspace.tasks.active, timeout=20_000)
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     assert "IRS" in compare.words.text()
     page.comparing.click()
     assert page.view.scene is not None

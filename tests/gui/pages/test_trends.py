@@ -16,6 +16,7 @@ from labapp.gui.pages.trends.presenter import CORRECTED, STALE, Wish, show
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.session.signals import Signals
+from tests.gui.conftest import let_draw
 
 KEPT: list[object] = []
 
@@ -103,7 +104,7 @@ def page(qtbot: QtBot, gtaw: Path) -> TrendsPage:
         widget.resize(800, 600)
         widget.show()
     page.refresh()
-    QTest.qWait(30)
+    let_draw()
     yield page
     for widget in (page, page.panel):
         widget.hide()

@@ -28,7 +28,8 @@ from labapp.media.cameras import (
 )
 from labapp.media.recorder import Plan, Recorder
 from tests.conftest import lacks
-from tests.media.cameras.watching import Heard, wait_until
+from tests.media.cameras.watching import Heard
+from tests.waiting import wait_until
 
 FAKE = Path(__file__).with_name("fake_gige.py")
 ID = "aravis:Aravis-Fake-LAB1"
@@ -87,10 +88,10 @@ def test_it_is_discovered_streamed_recorded_killed_and_brought_back(
         earlier = running.counts.frames
         wait_until(lambda: running.counts.frames >= earlier + 50)
         fake.kill()
-        wait_until(lambda: running.state == "lost", 60)
+        wait_until(lambda: running.state == "lost")
         before = running.counts.frames
         plug()
-        wait_until(lambda: running.counts.frames >= before + 50, 60)
+        wait_until(lambda: running.counts.frames >= before + 50)
         frames.append(running.camera.read(1.0) or pytest.fail("no frame"))
         settings = running.camera.settings
     assert frames[0].image.shape == (96, 128)
@@ -117,7 +118,7 @@ def test_a_frame_with_packets_missing_is_left_out_and_counted(plug: Plug) -> Non
     frames: list[CameraFrame] = []
     wanted = CameraSettings(region=(0, 0, 128, 96), rate_hz=100)
     with Feed(ID, lambda: open_camera(ID), frames.append, heard.append, wanted) as running:
-        wait_until(lambda: running.counts.broken >= 10 and len(frames) >= 50, 60)
+        wait_until(lambda: running.counts.broken >= 10 and len(frames) >= 50)
     counts = running.counts
     assert (counts.frames, counts.lost) == (len(frames), 0)
     # The fake camera's picture is a ramp that begins again at 255, which a missing packet breaks.

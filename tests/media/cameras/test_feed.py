@@ -19,7 +19,8 @@ from labapp.media.cameras import (
     SimulatedDevice,
     feed,
 )
-from tests.media.cameras.watching import Heard, number_in, numbered, wait_until
+from tests.media.cameras.watching import Heard, number_in, numbered
+from tests.waiting import PATIENCE_S, wait_until
 
 LONG_AGO_S = 0.05
 """In place of seconds: a camera is silent for so long before it is said."""
@@ -88,15 +89,18 @@ def test_it_survives_fifty_disconnects_and_garbage_and_says_all_of_it() -> None:
     assert "lost on the way" in said
 
 
-@pytest.mark.usefixtures("hasty")
-def test_a_camera_that_stalls_is_said_to_and_goes_on() -> None:
+def test_a_camera_that_stalls_is_said_to_and_goes_on(
+    hasty: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed, "HOPELESS_S", 3600)
     device = SimulatedDevice("test", numbered, rate_hz=1000)
     frames: list[CameraFrame] = []
     heard = Heard()
     with Feed("test", device.open, frames.append, heard.append) as running:
         wait_until(lambda: bool(frames))
-        device.stall(0.15)
+        device.stall(3600)
         wait_until(lambda: running.state == "stalled")
+        device.stall(0)
         seen = len(frames)
         wait_until(lambda: len(frames) > seen)
         assert running.counts.lost == 0
@@ -132,10 +136,10 @@ def test_a_camera_that_waits_for_a_trigger_does_not_stall() -> None:
             running.trigger()
             wait_until(lambda count=count: len(frames) == count)
         # By itself it takes none on being told: what was told meanwhile is not made up for.
-        running.apply(CameraSettings(trigger="free")).result(10)
+        running.apply(CameraSettings(trigger="free")).result(PATIENCE_S)
         running.trigger()
         wait_until(lambda: len(frames) > 5)
-        running.apply(CameraSettings(trigger="software")).result(10)
+        running.apply(CameraSettings(trigger="software")).result(PATIENCE_S)
         time.sleep(LONG_AGO_S)
         seen = len(frames)
         time.sleep(LONG_AGO_S)
@@ -178,11 +182,11 @@ def test_it_is_set_between_two_frames_and_stays_so_when_it_comes_back(hasty: Non
     frames: list[CameraFrame] = []
     with Feed("test", device.open, frames.append) as running:
         wait_until(lambda: len(frames) > 10)
-        found = running.apply(CameraSettings(region=(0, 0, 20, 16))).result(10)
+        found = running.apply(CameraSettings(region=(0, 0, 20, 16))).result(PATIENCE_S)
         assert found == running.settings
         assert found.region == (0, 0, 20, 16)
         with pytest.raises(InputError, match="rate_hz"):
-            running.apply(CameraSettings(rate_hz=-1)).result(10)
+            running.apply(CameraSettings(rate_hz=-1)).result(PATIENCE_S)
         wait_until(lambda: frames[-1].image.shape == (16, 20))
         device.settings = CameraSettings(rate_hz=500, region=(0, 0, 32, 24))
         device.unplug(0.02)
@@ -219,9 +223,9 @@ def test_frames_that_do_not_come_while_it_is_set_are_said_and_numbered() -> None
         ):
             seen = len(frames)
             wait_until(lambda seen=seen: len(frames) > seen + 5)
-            running.apply(wanted).exception(10)
+            running.apply(wanted).exception(PATIENCE_S)
             wait_until(lambda count=count: len(heard) == count)
-        running.apply(CameraSettings(trigger="software")).result(10)
+        running.apply(CameraSettings(trigger="software")).result(PATIENCE_S)
         wait_until(lambda: len(heard) == 3)
         assert running.counts.dropped == 0
     pauses = [(a, b) for a, b in itertools.pairwise(frames) if b.number - a.number > 1]
@@ -275,7 +279,7 @@ def test_one_that_has_ended_refuses_to_be_set() -> None:
     running = Feed("test", SimulatedDevice("test", numbered).open, lambda _: None)
     running.stop()
     with pytest.raises(CameraError, match="test is closed"):
-        running.apply(CameraSettings(rate_hz=10)).result(10)
+        running.apply(CameraSettings(rate_hz=10)).result(PATIENCE_S)
 
 
 def test_a_fault_of_whoever_takes_frames_is_said_and_lets_go_of_the_camera() -> None:

@@ -124,6 +124,19 @@ def test_unplugged_it_is_lost_and_cannot_be_opened_until_it_is_plugged_in() -> N
     assert read(again, 2)[0].number == 0
 
 
+def test_it_is_lost_though_its_cable_was_put_back_before_anybody_looked() -> None:
+    device = SimulatedDevice("test", numbered, rate_hz=1000)
+    with device.open() as camera:
+        camera.start()
+        device.unplug()
+        device.plug()
+        with pytest.raises(CameraLost, match="unplugged"):
+            read(camera, 2)
+        with device.open() as again:
+            again.start()
+            read(again, 2)
+
+
 def test_faults_come_as_often_as_they_are_asked_for_and_the_same_each_time() -> None:
     def fates(seed: int) -> list[str]:
         faults = Faults(garbage=0.2, dropped=0.1, seed=seed)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 
 from labapp.media.base import GreyImage
@@ -23,14 +20,6 @@ def numbered(k: int) -> GreyImage:
 def number_in(image: GreyImage) -> int:
     """The number that `numbered` wrote."""
     return int(np.frombuffer(image[0, :4].astype(np.uint8).tobytes(), np.uint32)[0])
-
-
-def wait_until(reached: Callable[[], bool], seconds: float = 30.0) -> None:
-    """Wait for something that happens in another thread; fail when it does not."""
-    until_s = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < until_s, "it did not happen"
-        time.sleep(0.005)
 
 
 class Heard(list[Event]):
