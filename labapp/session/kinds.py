@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection
 from typing import Any, Never
 
 import numpy as np
+import numpy.typing as npt
 
 from labapp.core.surface import Surface
 
@@ -107,8 +108,8 @@ def is_a(value: object, hint: Any) -> bool:
         return any(is_a(value, part) for part in parts)
     if origin is typing.Literal:
         return isinstance(value, str) and value in parts
-    if origin is np.ndarray:
-        return _is_array(value, typing.get_args(parts[1])[0])
+    if origin in (np.ndarray, npt.NDArray):
+        return _is_array(value, parts[-1])
     if origin in (tuple, list, frozenset):
         return isinstance(value, origin) and _holds(value, parts)
     if hint in (int, float):
@@ -128,7 +129,9 @@ def _holds(value: Collection[object], parts: tuple[Any, ...]) -> bool:
 
 
 def _is_array(value: object, of: Any) -> bool:
-    return isinstance(value, np.ndarray) and (of is Any or value.dtype.kind in ARRAYS[of])
+    # NDArray[T] is ndarray[..., dtype[T]]; under Python 3.12, NumPy 2.5 leaves it as it is.
+    (scalar,) = typing.get_args(of) or (of,)
+    return isinstance(value, np.ndarray) and (scalar is Any or value.dtype.kind in ARRAYS[scalar])
 
 
 @functools.cache

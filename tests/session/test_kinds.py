@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from labapp.core.pipeline import Settings
@@ -42,6 +43,9 @@ def blob_of(tree: object) -> bytes:
         (frozenset({1}), frozenset[int], True),
         (np.zeros(2), FloatArray, True),
         (np.array(["a"]), FloatArray, False),
+        (np.zeros(2), npt.NDArray[np.bool_], False),
+        (np.array(["a"]), npt.NDArray[Any], True),
+        (None, FloatArray | None, True),
         (3, Any, True),
     ],
 )
