@@ -71,6 +71,17 @@ def test_a_recording_with_its_truth_is_written(written: Path) -> None:
     assert (written / "scenario.toml").read_text("utf-8") == SCENARIO
 
 
+def test_a_scenario_that_comes_with_labapp_goes_by_its_name(
+    tmp_path: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):  # a folder of that name is no scenario
+        code, _, err = labapp("simulate", "egg", "--out", "egg", "--frames", 1)
+        assert code == 0, err
+    used = (tmp_path / "egg" / "scenario.toml").read_text("utf-8")
+    assert used == (EXAMPLES / "egg.toml").read_text("utf-8")
+
+
 def test_the_truth_lies_on_the_pool_and_on_its_dots(written: Path) -> None:
     """Re-read from the files alone: rays, law of reflection and picture agree."""
     setup = read_setup(written / "setup.toml")

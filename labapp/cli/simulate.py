@@ -14,7 +14,10 @@ from labapp.words import several
 def simulate(
     scenario: Annotated[
         Path,
-        typer.Argument(help="Pool, bench and camera (TOML; mm, degrees, px): docs/simulation.md."),
+        typer.Argument(
+            help="Pool, bench and camera (TOML; mm, degrees, px): docs/simulation.md. Or the name "
+            "of a scenario that comes with labapp: egg."
+        ),
     ],
     out: Annotated[
         Path,
@@ -33,10 +36,10 @@ def simulate(
 
     The folder is whole or not there. The same file and seed give the same frames.
     """
-    from labapp.session.scenario import read_scenario
+    from labapp.session.scenario import find_scenario, read_scenario
     from labapp.session.simulate import simulate as write
 
-    read = read_scenario(scenario, frames, seed)
+    read = read_scenario(find_scenario(scenario), frames, seed)
     count = len(read.recording.pools)
     with progress_bar() as bar:
         task = bar.add_task(scenario.name, total=count)

@@ -9,9 +9,9 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
+from labapp.bundled import bundled
 from labapp.errors import InputError
 from labapp.media.events import Event, Kind, Say, silent
 
@@ -29,9 +29,6 @@ MISSING = "hidapi is needed to read foot switches: pip install 'labapp[gui]'"
 AWAY, UNPLUGGED = "it is not connected", "it was unplugged"
 
 RULES = "resources/udev/70-labapp.rules"
-
-REPOSITORY = Path(__file__).parents[2]
-"""Where the rules are, unless the package is installed without it."""
 
 RULES_FOLDER = "/etc/udev/rules.d/"
 
@@ -189,7 +186,7 @@ def may_be_read(info: HidInfo) -> bool:
 
 def commands(info: HidInfo) -> str:
     """What to type for the right to read a device: it installs `RULES`, or a rule of its own."""
-    rules = REPOSITORY / RULES
+    rules = bundled(RULES)
     if (info.is_pedal or info.is_3d) and rules.is_file():
         install = f"sudo cp {shlex.quote(str(rules))} {RULES_FOLDER}"
     else:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import labapp
+from labapp.bundled import bundled
 from labapp.core.correction import block_row, set_reference
 from labapp.core.pipeline import start_correction
 from labapp.errors import InputError
@@ -97,16 +97,17 @@ SAMPLES = {
 
 
 def sample_folder(name: str) -> Path:
-    """Folder of a sample, beside the package in the repository.
+    """Folder of a sample that comes with labapp.
 
     Raises
     ------
     InputError
-        If it is not there, as in an installed package.
+        If it is not there: labapp was installed without its data.
     """
-    folder = Path(labapp.__file__).parents[1] / "sample_sessions" / name
+    folder = bundled("sample_sessions") / name
     if not folder.is_dir():
-        raise InputError(folder, "sample run", "missing", "a checkout of labapp's repository")
+        expected = "a folder that comes with labapp; install it again"
+        raise InputError(folder, "sample run", "missing", expected)
     return folder
 
 

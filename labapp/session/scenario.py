@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-import labapp
+from labapp.bundled import bundled
 from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
@@ -66,9 +66,14 @@ class Scenario:
 
 
 def shipped_scenarios() -> list[Path]:
-    """Those that come with the repository; none in an installed package."""
-    folder = Path(labapp.__file__).parents[1] / "resources" / "simulations"
-    return sorted(folder.glob("*.toml"))
+    """Those that come with labapp."""
+    return sorted(bundled("resources/simulations").glob("*.toml"))
+
+
+def find_scenario(name: Path) -> Path:
+    """Scenario of a command line: a file, or the name of one that comes with labapp, "egg"."""
+    shipped = {path.stem: path for path in shipped_scenarios()}
+    return name if name.is_file() else shipped.get(str(name), name)
 
 
 def read_scenario(

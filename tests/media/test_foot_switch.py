@@ -315,8 +315,8 @@ def test_which_rule_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.Monke
     other = HidInfo(str(node), 0x1234, 0x00AB, 0, (1, 6), "Some pedal")
     rule = 'KERNEL=="hidraw*", ATTRS{idVendor}=="1234", ATTRS{idProduct}=="00ab", TAG+="uaccess"'
     assert f"echo '{rule}' | sudo tee -a /etc/udev/rules.d/70-labapp.rules" in why_closed(other)
-    # Where the program is not in its repository the rule is written, not copied.
-    monkeypatch.setattr(hid, "REPOSITORY", tmp_path / "site-packages")
+    # Where the file of rules is not there, the rule is written, not copied.
+    monkeypatch.setattr(hid, "bundled", tmp_path.joinpath)
     assert 'ATTRS{idVendor}=="05f3"' in commands(known)
     assert commands(known).startswith("echo '")
 
@@ -328,7 +328,7 @@ def test_the_commands_are_what_a_shell_takes(
     place = tmp_path / "a folder"
     (place / "resources" / "udev").mkdir(parents=True)
     (place / hid.RULES).write_text("a rule\n")
-    monkeypatch.setattr(hid, "REPOSITORY", place)
+    monkeypatch.setattr(hid, "bundled", place.joinpath)
     monkeypatch.setattr(hid, "RULES_FOLDER", f"{tmp_path}/")
     for info in (INFINITY, replace(INFINITY, vendor=0x1234)):
         subprocess.run(

@@ -59,12 +59,14 @@ def test_the_session_with_blocked_rows_holds_a_correction():
         assert correction.lattice.reference == (6, 8)
 
 
-def test_a_sample_that_is_not_there_is_told():
+def test_a_sample_that_is_not_there_is_told(tmp_path: Path):
     with (
-        mock.patch.object(samples.labapp, "__file__", "/nowhere/labapp/__init__.py"),
-        pytest.raises(InputError, match="expected a checkout"),
+        mock.patch.object(samples, "bundled", tmp_path.joinpath),
+        pytest.raises(InputError) as told,
     ):
         sample_folder("gtaw")
+    assert told.value.source == str(tmp_path / "sample_sessions/gtaw")
+    assert told.value.value == "missing"
 
 
 def test_a_session_that_cannot_be_made_leaves_nothing(tmp_path: Path):
