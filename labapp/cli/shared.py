@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from labapp.errors import InputError
+from labapp.system import quoted
 from labapp.words import several
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def failure(frame: int, measurement: Measurement) -> str:
 
 def command(name: str, file: Path) -> str:
     """Tell how to call a command on a session, for the shell: names may have spaces."""
-    return f"labapp session {name} {shlex.quote(str(file))}"
+    return f"labapp session {name} {quoted(str(file))}"
 
 
 def frames_text(frames: Collection[int]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 from collections.abc import Collection, Sequence
@@ -15,6 +14,7 @@ import typer
 
 from labapp.cli.shared import NOTHING
 from labapp.errors import InputError
+from labapp.system import has_display, quoted
 
 
 def asks_for_app(arguments: Sequence[str], commands: Collection[str]) -> bool:
@@ -49,8 +49,8 @@ def _lacking(error: ImportError) -> InputError:
 
 def show_in_app(session: Path) -> None:
     """Open a session in the app where there is a display; elsewhere tell how to."""
-    if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
-        typer.echo(f"To see it in the app: labapp {shlex.quote(os.fspath(session))}")
+    if not has_display(os.environ):
+        typer.echo(f"To see it in the app: labapp {quoted(os.fspath(session))}")
         return
     typer.echo("The app opens with it; close its window to end.")
     # A process of its own: whatever comes over the window, the results are there.

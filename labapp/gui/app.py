@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ from PySide6.QtWidgets import QApplication
 import labapp
 from labapp.errors import InputError
 from labapp.session.log import NAME, start_log
+from labapp.system import has_display
 
 if TYPE_CHECKING:
     from labapp.gui.preferences import Preferences
@@ -49,12 +50,6 @@ NEEDED_LATER = (
 
 HEARTBEAT_MS = 300
 """So often Python gets a turn to notice Ctrl-C in the terminal."""
-
-
-def has_display(environment: Mapping[str, str]) -> bool:
-    """Whether a window can be shown."""
-    names = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
-    return any(environment.get(name) for name in names)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -143,7 +138,7 @@ def start_app() -> QApplication:
     InputError
         If there is no display.
     """
-    if not has_display(os.environ):
+    if not (has_display(os.environ) or os.environ.get("QT_QPA_PLATFORM")):
         value = "none: neither DISPLAY nor WAYLAND_DISPLAY is set"
         raise InputError("the app", "display", value, f"a desktop; {WITHOUT}")
     # Before numpy is loaded: the matrices are small, and waiting threads keep the window from it.

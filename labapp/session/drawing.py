@@ -8,7 +8,6 @@ from __future__ import annotations
 import ctypes.util
 import functools
 import os
-import sys
 from typing import Any, Literal
 
 import numpy as np
@@ -16,6 +15,7 @@ import numpy.typing as npt
 
 from labapp.core.values import FloatArray, IntArray
 from labapp.session.scene import EMPTY, Scene
+from labapp.system import IS_LINUX
 
 VIEW_ANGLE_DEG = 30.0
 
@@ -321,7 +321,7 @@ def _label_format(limits: tuple[float, float]) -> str:
 
 def draw_without_display() -> None:
     """Have VTK draw through EGL where there is no display; before it draws for the first time."""
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    if IS_LINUX and not os.environ.get("DISPLAY"):
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
 
 

@@ -6,7 +6,6 @@ import atexit
 import functools
 import multiprocessing
 import os
-import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
@@ -15,6 +14,8 @@ from contextvars import ContextVar
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
+
+from labapp.system import deaf, give_way, turn_deaf
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -138,8 +139,8 @@ def begin_worker(nice: int = 0, become: Callable[..., None] | None = None, *give
     the one that it works for is gone, killed even. At its own end nothing is taken down: what was
     registered with `atexit` before is not called.
     """
-    if hasattr(os, "nice"):
-        os.nice(nice)
+    turn_deaf()
+    give_way(nice)
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     threadpool_limits(1)  # of what is loaded already
     parent = multiprocessing.parent_process()
@@ -163,13 +164,3 @@ def behind_a_window() -> Iterator[None]:
         yield
     finally:
         _behind.reset(former)
-
-
-@contextmanager
-def deaf() -> Iterator[None]:
-    """Hold Ctrl-C back: processes that are started now never hear it; this one does afterwards."""
-    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, former)

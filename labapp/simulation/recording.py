@@ -20,10 +20,11 @@ from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
-from labapp.simulation.parallel import Progress, awaited, deaf, processes
+from labapp.simulation.parallel import Progress, awaited, processes
 from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
 from labapp.simulation.target import Target, TargetLook, render_target
 from labapp.simulation.torch import Torch
+from labapp.system import deaf
 
 TARGET = Target()
 

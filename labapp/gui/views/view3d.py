@@ -8,7 +8,6 @@ every picture, which costs more than the scene does. Where nothing can be drawn,
 from __future__ import annotations
 
 import functools
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -60,6 +59,9 @@ TURNS = {
 KEYS_TOLD = "arrow keys turn, + and − zoom, 1 to 4 look from the top, side, front and obliquely"
 
 GL_RENDERER = 0x1F01
+
+SHARED = ("xcb", "windows", "cocoa")
+"""Qt's desktops whose OpenGL it shares with VTK."""
 
 ON_THE_PROCESSOR = (
     *("llvmpipe", "softpipe", "software", "swiftshader", "swrast"),
@@ -426,8 +428,7 @@ class InteractiveView(View3d):
 
 def make_view3d(name: str = "3-D view") -> View3d:
     """A view in the window's own OpenGL where a card draws it for Qt and VTK, else of pictures."""
-    shared = {"linux": "xcb", "win32": "windows", "darwin": "cocoa"}.get(sys.platform)
-    if QGuiApplication.platformName() == shared and has_card(_renderer()):
+    if QGuiApplication.platformName() in SHARED and has_card(_renderer()):
         return InteractiveView(name)
     return OffscreenView(name)
 

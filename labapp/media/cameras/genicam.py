@@ -12,12 +12,14 @@ from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, 
 from typing import Any
 
 from labapp.media.cameras.base import CameraError
+from labapp.system import IS_LINUX, library
 
-LIBRARY = "libaravis-0.8.so.0"
+LIBRARY = library("aravis-0.8", 0)
 
-INSTALL = (
-    "GigE Vision and USB3 Vision cameras need Aravis: "
+INSTALL = "GigE Vision and USB3 Vision cameras need Aravis: " + (
     "sudo apt install --no-install-recommends libaravis-0.8-0"
+    if IS_LINUX
+    else f"{LIBRARY} is not found"
 )
 
 VOID, CAMERA, STREAM, BUFFER, ERROR = None, c_void_p, c_void_p, c_void_p, c_void_p
@@ -112,8 +114,8 @@ class Aravis:
     def __init__(self) -> None:
         try:
             self.arv = ctypes.CDLL(LIBRARY)
-            self._gobject = ctypes.CDLL("libgobject-2.0.so.0")
-            self._glib = ctypes.CDLL("libglib-2.0.so.0")
+            self._gobject = ctypes.CDLL(library("gobject-2.0", 0))
+            self._glib = ctypes.CDLL(library("glib-2.0", 0))
         except OSError as error:
             raise CameraError(INSTALL) from error
         for name, (result, arguments) in SIGNATURES.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import struct
 import time
@@ -27,6 +26,7 @@ from labapp.media.cameras.base import (
     check_settings,
 )
 from labapp.media.quiet import quiet_opencv
+from labapp.system import IS_LINUX
 
 PREFIX = "uvc:"
 
@@ -84,6 +84,10 @@ def _is_present(number: int) -> bool:
 
 def query_control(number: int, control: int) -> Range | None:
     """Ask the driver what a control may be set to; None where there is no such control."""
+    if not IS_LINUX:
+        return None
+    import fcntl
+
     asked = QUERY.pack(control, 0, b"", 0, 0, 0, 0, 0)
     try:
         device = os.open(f"/dev/video{number}", os.O_RDWR | os.O_NONBLOCK)

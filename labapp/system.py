@@ -1,0 +1,79 @@
+"""What differs between Linux, macOS and Windows: no other module asks which of them it runs on."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+IS_WINDOWS = sys.platform == "win32"
+IS_MACOS = sys.platform == "darwin"
+IS_LINUX = sys.platform.startswith("linux")
+
+
+def has_display(environment: Mapping[str, str]) -> bool:
+    """Whether there is a screen for windows; Windows and macOS name none in the environment."""
+    names = ("DISPLAY", "WAYLAND_DISPLAY")
+    return IS_WINDOWS or IS_MACOS or any(environment.get(name) for name in names)
+
+
+def sync_folder(path: Path) -> None:
+    """Have the disk hold the names that a folder has now; Windows sees to that by itself.
+
+    Raises
+    ------
+    OSError
+        If the disk cannot.
+    """
+    if IS_WINDOWS:  # opens no folders
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def deaf() -> Iterator[None]:
+    """Hold Ctrl-C back: processes that are started now never hear it; this one does afterwards.
+
+    Windows has nothing like it: a process that is started there calls `turn_deaf` itself.
+    """
+    if IS_WINDOWS:
+        yield
+        return
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, former)
+
+
+def turn_deaf() -> None:
+    """Hear no Ctrl-C from now on, where `deaf` cannot have seen to it; in the main thread."""
+    if IS_WINDOWS:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def give_way(nice: int) -> None:
+    """Let processes go first that others wait for, by so much; not on Windows."""
+    if not IS_WINDOWS:
+        os.nice(nice)
+
+
+def library(name: str, version: int) -> str:
+    """File name of a shared library of a version: "libm.so.6" of ("m", 6) on Linux."""
+    if IS_WINDOWS:
+        return f"lib{name}-{version}.dll"
+    return f"lib{name}.{version}.dylib" if IS_MACOS else f"lib{name}.so.{version}"
+
+
+def quoted(text: str) -> str:
+    """A word of a command, as it is typed in the system's shell."""
+    return subprocess.list2cmdline([text]) if IS_WINDOWS else shlex.quote(text)
