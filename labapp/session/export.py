@@ -7,15 +7,16 @@ written: somebody's own files are never deleted.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 import labapp
 from labapp.core.coordinates import ImageCalibration
@@ -36,6 +37,7 @@ from labapp.session.results import SURFACES, now, surface_files
 from labapp.session.studio import PICTURE_PX, drawing_process, told
 from labapp.session.summary import Summary
 from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables
+from labapp.system import sync_folder
 
 MANIFEST = "manifest.json"
 HDF5_FILE = "results.h5"
@@ -362,16 +364,16 @@ def _beside(target: Path) -> Iterator[Path]:
     part = target.with_name(f".{target.name}.part")
     old = target.with_name(f".{target.name}.old")
     target.parent.mkdir(parents=True, exist_ok=True)
-    part.mkdir(exist_ok=True)
-    with _alone(target, part) as handle:
+    with _alone(target):
         try:
             if old.exists() and not target.exists():  # ended between the two steps of `_swap`
                 old.rename(target)
             _check_replaceable(target)
+            part.mkdir(exist_ok=True)
             for path in part.iterdir():
                 path.unlink()
             yield part
-            os.fsync(handle)
+            sync_folder(part)
             _check_replaceable(target)
             _swap(part, target, old)
         finally:
@@ -379,21 +381,26 @@ def _beside(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _alone(target: Path, part: Path) -> Iterator[int]:
-    """Keep a second export to the same place out; yields a handle of the folder."""
-    handle = os.open(part, os.O_RDONLY)
+def _alone(target: Path) -> Iterator[None]:
+    """Keep a second export to the same place out."""
+    path = target.with_name(f".{target.name}.lock")
+    lock = FileLock(path)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(
-                target, "export", "is being written by another program", "to wait for it"
-            ) from error
-        except OSError:
-            pass  # some network drives have no locks
-        yield handle
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise InputError(
+            target, "export", "is being written by another program", "to wait for it"
+        ) from error
+    except (OSError, NotImplementedError):
+        pass  # some network drives have no locks
+    try:
+        yield
     finally:
-        os.close(handle)
+        if lock.is_locked:
+            # While it is held: who comes next makes a new one. Windows removes it at the release.
+            with suppress(OSError):
+                path.unlink()
+            lock.release()
 
 
 def _swap(part: Path, target: Path, old: Path) -> None:
@@ -449,7 +456,7 @@ def _manifest(folder: Path) -> tuple[ExportedFile, ...]:
 
 def _synced(path: Path) -> str:
     """SHA-256 of a file that is on the disk for good."""
-    with path.open("rb") as file:
+    with path.open("rb+") as file:  # to be written to: Windows syncs no other
         os.fsync(file.fileno())
     return _sha256(path)
 
