@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+import stat
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
@@ -38,6 +39,11 @@ HEADER_BYTES = 100
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROLLBACK_JOURNAL = b"\x01\x01"
 """In the header, of the program that wrote the file last and of those that may read it."""
+
+JOURNAL_MAGIC = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
+"""A journal begins with it, and ends with it if it names a super-journal before."""
+
+OWN_JOURNAL = "one that labapp wrote, or none: this came from elsewhere"
 
 
 class SessionInUse(InputError):
@@ -113,6 +119,7 @@ class Database:
         """
         path = Path(path).absolute()
         _check_header(path)
+        _check_journal(path)
         lock = None if read_only else _lock(path)
         try:
             with _told(path):
@@ -143,10 +150,9 @@ class Database:
         folder = Path(tempfile.mkdtemp(prefix="labapp-"))
         try:
             copy = folder / path.name
-            for suffix in ("", "-journal"):
-                part = path.with_name(path.name + suffix)
-                if part.exists():
-                    shutil.copyfile(part, copy.with_name(part.name))
+            shutil.copyfile(path, copy)
+            if (journal := _journal_of(path)).exists():
+                shutil.copyfile(journal, _journal_of(copy))
             with _closing(_connect(copy, read_only=False)) as connection:
                 _take_back(connection)
             _apply_migrations(copy, _check_header(copy))
@@ -284,6 +290,35 @@ def _check_header(path: Path) -> int:
     if version < 1:
         raise InputError(path, "version", version, f"1 to {VERSION}")
     return version
+
+
+def _journal_of(path: Path) -> Path:
+    """Where SQLite keeps the journal of a session: beside the file itself, not beside a link."""
+    return Path(f"{os.path.realpath(path)}-journal")
+
+
+def _check_journal(path: Path) -> None:
+    """Refuse a journal that is not one of ours, before SQLite sees it.
+
+    A journal that ends with the name of a super-journal has SQLite read that file as a list of
+    further journals, and delete it. Only changes over several databases have one: no session's.
+    """
+    journal = _journal_of(path)
+    try:
+        if not os.path.lexists(journal):
+            return
+        if not stat.S_ISREG(journal.lstat().st_mode):
+            raise InputError(journal, "journal", "is no file", OWN_JOURNAL)
+        with journal.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - len(JOURNAL_MAGIC)))
+            names_another = file.read() == JOURNAL_MAGIC
+    except FileNotFoundError:
+        return  # the change has ended
+    except OSError as error:
+        raise InputError(journal, "journal", error.strerror, OWN_JOURNAL) from error
+    if names_another:
+        raise InputError(journal, "journal", "names another file", OWN_JOURNAL)
 
 
 def _connect(path: Path, read_only: bool) -> sqlite3.Connection:

@@ -204,6 +204,43 @@ def test_reading_one_with_a_change_cut_off_leaves_the_file_alone(path: Path):
     assert {entry: entry.read_bytes() for entry in copy.parent.iterdir()} == before
 
 
+def with_super_journal(journal: Path, named: Path) -> None:
+    """End a journal as SQLite does when a change goes over several databases."""
+    name = os.fsencode(named)
+    with journal.open("ab") as file:
+        file.write(b"\xff" * 4 + name)
+        file.write(len(name).to_bytes(4, "big") + sum(name).to_bytes(4, "big"))
+        file.write(bytes.fromhex("d9d505f920a163d7"))
+
+
+@pytest.mark.parametrize("read_only", [True, False])
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_journal_that_names_another_file_is_never_acted_upon(
+    path: Path, tmp_path: Path, read_only: bool, linked: bool
+):
+    copy, victim = cut_off(path), tmp_path / "mine.txt"
+    victim.write_text("mine")
+    with_super_journal(copy.with_name(f"{copy.name}-journal"), victim)
+    if linked:
+        (tmp_path / "link.labsession").symlink_to(copy)
+        copy = tmp_path / "link.labsession"
+    with pytest.raises(InputError, match="journal: names another file"):
+        Database.open(copy, read_only)
+    assert victim.read_text() == "mine"
+
+
+@pytest.mark.parametrize("read_only", [True, False])
+@pytest.mark.parametrize("place", ["mine.txt", "/dev/zero"])
+def test_a_journal_that_is_a_link_is_refused(
+    path: Path, tmp_path: Path, place: str, read_only: bool
+):
+    (tmp_path / "mine.txt").write_text("mine")
+    path.with_name(f"{path.name}-journal").symlink_to(place)
+    with pytest.raises(InputError, match="journal: is no file"):
+        Database.open(path, read_only)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
 # --- versions ---------------------------------------------------------------------------------
 
 
