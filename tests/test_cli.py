@@ -483,6 +483,54 @@ def test_detect_on_a_picture_without_dots_says_so(labapp: Run, tmp_path: Path) -
     assert table(tmp_path / "d.csv") == []
 
 
+@pytest.fixture
+def two_sizes(tmp_path: Path) -> Path:
+    """A picture of 40 dots of 5 px, each with a spot of 1 px amid it."""
+    v, u = np.mgrid[:240, :380]
+    frame = np.random.default_rng(1).normal(20, 1, u.shape)
+    for at_v, at_u in np.ndindex(5, 8):
+        square = (u - 37 - 44 * at_u) ** 2 + (v - 33 - 44 * at_v) ** 2
+        frame += 80 * np.exp(-square / 50) + 60 * np.exp(-square / 2)
+    path = tmp_path / "two_sizes.png"
+    cv2.imwrite(str(path), np.clip(frame, 0, 255).astype(np.uint8))
+    return path
+
+
+def test_detect_takes_the_size_that_is_given(labapp: Run, tmp_path: Path, two_sizes: Path) -> None:
+    peaks = {}
+    for size in ("1.2", "5"):
+        out = tmp_path / "dots.csv"
+        code, said, complained = labapp("detect", two_sizes, "--size", size, "--out", out)
+        assert (code, complained) == (0, "")
+        assert said.startswith("40 dots, 40 with")
+        peaks[size] = np.median([float(row["snr"]) for row in table(out)])
+    assert peaks["1.2"] != pytest.approx(peaks["5"], rel=0.1)
+
+
+@pytest.mark.parametrize("size", ["0", "-2", "0.4", "21", "nan", "inf", "large"])
+def test_detect_refuses_an_impossible_size(
+    labapp: Run, tmp_path: Path, two_sizes: Path, size: str
+) -> None:
+    out = tmp_path / "dots.csv"
+    code, _, complained = labapp("detect", two_sizes, "--size", size, "--out", out)
+    assert code == 2
+    assert "--size" in complained
+    assert not out.exists()
+
+
+def test_detect_that_numbers_no_dot_says_so(labapp: Run, tmp_path: Path) -> None:
+    v, u = np.mgrid[:120, :160]
+    frame = np.random.default_rng(2).normal(20, 1, u.shape)
+    for at in np.random.default_rng(3).uniform(15, 105, (5, 2)):
+        frame += 90 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / 8)
+    cv2.imwrite(str(tmp_path / "few.png"), np.clip(frame, 0, 255).astype(np.uint8))
+    code, said, complained = labapp("detect", tmp_path / "few.png", "--out", tmp_path / "d.csv")
+    assert code == 1
+    assert "too-few-dots" in complained
+    assert ", none with a row and a column" in said
+    assert len(table(tmp_path / "d.csv")) == 5
+
+
 def test_calibrate_laser_prints_and_writes(labapp: Run, tmp_path: Path) -> None:
     """A laser 90 mm away at 30° with a 10° fan draws l₂ = 18.561 and l₃ = 7.874 mm."""
     setup = tmp_path / "new.toml"

@@ -307,24 +307,35 @@ def detect(
     out: Annotated[
         Path, typer.Option(help="CSV file for the dots: px, reflected row and column, SNR.")
     ],
+    size: Annotated[
+        float | None,
+        typer.Option(
+            min=0.5,
+            max=20.0,
+            metavar="PX",
+            help="Standard deviation of a dot's light (px), about a quarter of what is seen "
+            "across; without it, it is estimated from the image.",
+        ),
+    ] = None,
 ) -> None:
     """Find the dots of one image and their rows and columns, without a setup.
 
     Rows are counted from the bottom up, columns from left to right.
 
-    A dot in doubt has none: its cells are empty.
+    A dot in doubt has none: its cells are empty. Exit code 1: no dot has any.
     """
     from labapp.session.detect import detect_dots, write_detected
 
-    dots, lattice, doubt = detect_dots(image)
+    dots, lattice, doubt = detect_dots(image, size)
     if out.exists() and out.samefile(image):
         raise InputError(out, "--out", "the image itself", "another file, for the dots (CSV)")
     write_detected(out, dots, lattice)
     if doubt:
         typer.echo(f"{image}: {doubt}", err=True)
     placed = 0 if lattice is None else int((lattice.row > 0).sum())
-    typer.echo(f"{len(dots)} dots, {placed} with a row and a column, in {out.absolute()}")
-    if not len(dots):
+    told = placed or "none"
+    typer.echo(f"{len(dots)} dots, {told} with a row and a column, in {out.absolute()}")
+    if not placed:
         raise typer.Exit(NOTHING)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
-from labapp.core.dots import Dots
+from labapp.core.dots import BandPassSettings, Dots
 from labapp.core.lattice import Lattice
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
@@ -19,8 +19,12 @@ from labapp.session.tables import PX_DIGITS, as_csv, number
 COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".split()
 
 
-def detect_dots(path: str | os.PathLike[str]) -> tuple[Dots, Lattice | None, str]:
+def detect_dots(
+    path: str | os.PathLike[str], size_px: float | None = None
+) -> tuple[Dots, Lattice | None, str]:
     """Find the dots of a source's first frame, their rows and columns, and what is in doubt.
+
+    ``size_px`` is the standard deviation of a dot's light; None: it is estimated.
 
     Returns
     -------
@@ -34,9 +38,10 @@ def detect_dots(path: str | os.PathLike[str]) -> tuple[Dots, Lattice | None, str
     """
     with open_source(path) as source:
         image = source.frame(0).image
+    settings = DotSettings(band_pass=BandPassSettings(size_px=size_px))
     dots = Dots(*np.empty((7, 0)))
     try:
-        dots = find_dots(image, DotSettings())
+        dots = find_dots(image, settings)
         return dots, find_lattice(dots, (image.shape[0], image.shape[1]), LatticeSettings()), ""
     except CannotMeasure as answer:
         return dots, None, str(answer)
