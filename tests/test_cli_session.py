@@ -218,6 +218,42 @@ def test_import_says_what_was_read(labapp: Run, tmp_path: Path) -> None:
         assert session.frames.tolist() == [0, 3, 6, 9]
 
 
+@pytest.mark.parametrize("options", [("--all",), ("--frames", "1:4")])
+def test_a_frame_that_was_damaged_since_keeps_its_result(
+    labapp: Run, measured: Path, options: tuple[str, ...]
+) -> None:
+    stack = measured.parent / "stack.npy"
+    content = bytearray(stack.read_bytes())
+    content[-4 * 160 * 200 : -3 * 160 * 200] = bytes(160 * 200)
+    stack.write_bytes(content)
+    with opened(measured) as session:
+        before = session.result(2), session.result(3), session.overview().status
+    code, said, complained = labapp("session", "measure", measured, *options)
+    assert code == 2
+    assert "1 unreadable" in said
+    assert f"{stack}: frame 2: no longer what was imported" in complained.splitlines()[-1]
+    with opened(measured) as session:
+        assert session.overview().status == before[2]
+        for frame, kept in ((2, before[0]), (3, before[1])):
+            result = session.result(frame)
+            assert result is not None
+            assert kept is not None
+            assert result.measurement.measures == kept.measurement.measures
+            assert not result.stale
+        assert session.problems() != []
+    code, _, _ = labapp("session", "verify", measured)
+    assert code == 1
+
+
+def test_a_frame_that_was_damaged_since_is_not_measured(labapp: Run, file: Path) -> None:
+    stack = file.parent / "stack.npy"
+    stack.write_bytes(stack.read_bytes()[: -160 * 200 - 1] + bytes(160 * 200 + 1))
+    code, _, _ = labapp("session", "measure", file)
+    assert code == 2
+    with opened(file) as session:
+        assert session.stale_frames().tolist() == [4, 5]
+
+
 def test_hints_are_for_the_shell(labapp: Run, tmp_path: Path) -> None:
     file = tmp_path / "Schweißung 1.labsession"
     _, said, _ = labapp("session", "new", file, "--setup", SETUP)

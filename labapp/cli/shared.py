@@ -124,7 +124,9 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
             note(progress.console, f"{done}; the others: {command('measure', session.path)}")
             raise typer.Exit(INTERRUPTED) from None
         except InputError:
-            if summary.frames:
+            if len(summary.frames) == len(frames):  # it is about frames that cannot be read
+                typer.echo(summary.text())
+            elif summary.frames:
                 done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
                 note(progress.console, done)
             raise

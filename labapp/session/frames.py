@@ -250,6 +250,16 @@ class Frames:
         Raises
         ------
         InputError
+    def was_readable(self, number: int) -> bool:
+        """Whether a frame of the session could be read at import."""
+        noted = self._database.value("SELECT checksum FROM frame WHERE number = ?", number)
+        return noted is not None
+
+    @property
+    def place(self) -> Path:
+        """Where frames are read from: the session itself, if it holds them, or the recording."""
+        return self._database.path if self._imported().embedded else self._place()
+
             If what is there is another recording.
         """
         path = Path(path).absolute()

@@ -38,6 +38,7 @@ from labapp.session.run import measure_each
 from labapp.session.sequence import follow_each
 from labapp.session.setup import Setup, parse_setup, updated_setup
 from labapp.session.signals import Signals
+from labapp.session.summary import runs_text
 
 if TYPE_CHECKING:
     from labapp.session.export import ExportChoice, ExportedFile
@@ -351,7 +352,8 @@ class Session:
     ) -> Iterator[tuple[int, Measurement]]:
         """Measure frames and keep what they give; yields (frame, measurement) once it is kept.
 
-        A frame that cannot be read is kept with the status ``unreadable``.
+        A frame that could not be read at import is kept with the status ``unreadable``. One that
+        could, and no longer can, is yielded with it, and what was kept of it before stays.
 
         Parameters
         ----------
@@ -365,7 +367,8 @@ class Session:
         Raises
         ------
         InputError
-            If the setup is not complete, or a result cannot be saved.
+            If the setup is not complete, or a result cannot be saved; once all other frames are
+            measured, if any of them is no longer what was imported.
         """
         chosen = self.stale_frames() if frames is None else frames
         basis = Basis(self.setup, self.settings)
@@ -382,13 +385,17 @@ class Session:
         for number, _, measurement in measured:
             # What it was measured with, whatever has been corrected meanwhile.
             used = corrections.pop(number, None)
-            self._results.put(
-                number, measurement, basis, None if used is None else fingerprint(used)
-            )
+            if measurement.status == "unreadable" and self._frames.was_readable(number):
+                lost.append(number)
+            else:
+                self._results.put(
+                    number, measurement, basis, None if used is None else fingerprint(used)
+                )
             yield number, measurement
 
     def result(self, frame: int, scheme: str | None = None) -> Result | None:
         """What a frame gave, and what it was measured from; None if it was not measured.
+        lost = []
 
         Parameters
         ----------
@@ -396,6 +403,13 @@ class Session:
             Its number.
         scheme
             ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+        if lost:
+            raise InputError(
+                self._frames.place,
+                f"frame{'s' * (len(lost) > 1)} {runs_text(lost)}",
+                "no longer what was imported (what was measured before is kept)",
+                "the recording as it was at import",
+            )
         """
         return self._results.get(
             frame,
