@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 
 from labapp.media import open_source
 from labapp.media.cameras import CameraInfo, CameraLost
+from labapp.media.recorder import Take
 from labapp.session.cameras import simulated_device
 from labapp.session.session import Session
 from tests.conftest import HEEDING, Run
@@ -72,6 +74,32 @@ def test_ctrl_c_ends_a_recording_and_keeps_it(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None:
+def test_a_session_that_cannot_take_it_is_refused_before_filming(
+    tmp_path: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def film(*_: object) -> Take:
+        pytest.fail("it was filmed")
+
+    monkeypatch.setattr("labapp.session.cameras.record", film)
+    measured = shutil.copytree(SAMPLE.parent, tmp_path / "run") / "gtaw.labsession"
+    in_use = tmp_path / "a.labsession"
+    damaged = tmp_path / "b.labsession"
+    damaged.write_bytes(b"no session")
+    with Session.open(measured) as session:
+        ((_, measurement),) = session.measure([2])
+    assert measurement.status == "ok"
+    with Session.create(in_use):
+        for path, expected in (
+            (measured, "frames of recording.avi are measured or corrected in it"),
+            (in_use, "in use"),
+            (damaged, "b.labsession"),
+        ):
+            code, told, said = labapp("record", CAMERA, "--session", path, "--seconds", "0.1")
+            assert (code, told) == (2, "")
+            assert expected in said
+    assert not list(tmp_path.rglob("*.nut"))
+
+
     out = tmp_path / "run.nut"
     (tmp_path / "there.nut").write_text("mine")
     for arguments, expected in (

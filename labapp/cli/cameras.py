@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from labapp.media.cameras import Camera, CameraSettings, Feed, Range
     from labapp.media.events import Event
     from labapp.media.recorder import Plan, Take
+    from labapp.session.session import Session
 
 POLL_S = 0.05
 
@@ -113,9 +115,10 @@ def record(
     settings = CameraSettings(
         exposure_us=exposure, gain_db=gain, rate_hz=rate, region=region, trigger=trigger
     )
-    place = _place(out, session)
-    taken = _film(camera, place, Plan(every=every, codec=codec), settings, seconds)
-    _tell(taken, session)
+    plan = Plan(every=every, codec=codec)
+    with _opened(session) as into:
+        taken = _film(camera, _place(out, session), plan, settings, seconds)
+        _tell(taken, into)
     if taken.trouble:
         raise InputError(taken.path, "recording", taken.trouble, "a place that can be written")
     if not taken.frames:
@@ -162,23 +165,33 @@ def _film(
 
 
 def _place(out: Path | None, session: Path | None) -> Callable[[], Path]:
-    """What gives the recording's file: the one named, or one beside a session that is there."""
+    """What gives the recording's file: the one named, or one beside the session."""
     from labapp.media.recorder import recording_path
 
     if session is None:
         return lambda: out or Path()
-    if not session.is_file():
-        raise InputError(session, "--session", "is not there", "one: labapp session new")
     return lambda: recording_path(session.parent, "recording")
 
 
-def _tell(take: Take, session: Path | None) -> None:
-    """Say what was recorded; import it where a session was named."""
+@contextmanager
+def _opened(path: Path | None) -> Iterator[Session | None]:
+    """The session to record into, held while filming: what would refuse the film does so before."""
     from labapp.session.session import Session
 
+    if path is None:
+        yield None
+        return
+    if not path.is_file():
+        raise InputError(path, "--session", "is not there", "one: labapp session new")
+    with Session.open(path) as session:
+        session.refuse_another_recording()
+        yield session
+
+
+def _tell(take: Take, session: Session | None) -> None:
+    """Say what was recorded; import it where a session was named."""
     lost = f", {several(take.lost, 'frame')} lost" * (take.lost > 0)
     typer.echo(f"{several(take.frames, 'frame')}{lost} in {take.path.absolute()}")
     if session is not None and take.frames:
-        with Session.open(session) as opened:
-            opened.import_recording(take.path)
-        typer.echo(f"Imported into {session}")
+        session.import_recording(take.path)
+        typer.echo(f"Imported into {session.path}")

@@ -161,19 +161,9 @@ class Frames:
             assert recording.frame_rate_hz is not None
             time_s = np.arange(recording.frames) / recording.frame_rate_hz
         with self._database.transaction() as connection:
-            kept = {
-                frame
-                for (frame,) in connection.execute(
-                    "SELECT frame FROM result UNION SELECT frame FROM document WHERE frame >= 0"
-                )
-            }
-            if kept and before is not None and before.sha256 != recording.sha256:
-                raise InputError(
-                    self._database.path,
-                    "recording",
-                    f"frames of {Path(before.path).name} are measured or corrected in it",
-                    "a new session for another recording",
-                )
+            if before is not None and before.sha256 != recording.sha256:
+                self.refuse_another()
+            kept = self._worked_on()
             if not kept <= set(selected):
                 raise InputError(
                     self._database.path,
@@ -203,6 +193,30 @@ class Frames:
             connection.execute("INSERT OR REPLACE INTO recording VALUES (1, ?)", (pack(recording),))
         self.close()
         return recording
+
+    def refuse_another(self) -> None:
+        """Refuse a recording other than the session's, if that would end what was made of it.
+
+        Raises
+        ------
+        InputError
+            If frames are measured or corrected.
+        """
+        recording = self.recording
+        if recording is not None and self._worked_on():
+            raise InputError(
+                self._database.path,
+                "recording",
+                f"frames of {Path(recording.path).name} are measured or corrected in it",
+                "a new session for another recording",
+            )
+
+    def _worked_on(self) -> set[int]:
+        """Frames that are measured or corrected."""
+        rows = self._database.rows(
+            "SELECT frame FROM result UNION SELECT frame FROM document WHERE frame >= 0"
+        )
+        return {frame for (frame,) in rows}
 
     def _fingerprint(self) -> str:
         """SHA-256 of what is noted of every frame: its number, time and checksum."""
@@ -236,6 +250,16 @@ class Frames:
             )
         return Frame(number, time_s, image)
 
+    def was_readable(self, number: int) -> bool:
+        """Whether a frame of the session could be read at import."""
+        noted = self._database.value("SELECT checksum FROM frame WHERE number = ?", number)
+        return noted is not None
+
+    @property
+    def place(self) -> Path:
+        """Where frames are read from: the session itself, if it holds them, or the recording."""
+        return self._database.path if self._imported().embedded else self._place()
+
     @property
     def missing(self) -> Path | None:
         """Where the recording should be and is not; None if frames can be read."""
@@ -250,16 +274,6 @@ class Frames:
         Raises
         ------
         InputError
-    def was_readable(self, number: int) -> bool:
-        """Whether a frame of the session could be read at import."""
-        noted = self._database.value("SELECT checksum FROM frame WHERE number = ?", number)
-        return noted is not None
-
-    @property
-    def place(self) -> Path:
-        """Where frames are read from: the session itself, if it holds them, or the recording."""
-        return self._database.path if self._imported().embedded else self._place()
-
             If what is there is another recording.
         """
         path = Path(path).absolute()

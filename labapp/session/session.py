@@ -318,6 +318,16 @@ class Session:
             path, frames, frame_rate_hz=frame_rate_hz, embed=embed, progress=progress
         )
 
+    def refuse_another_recording(self) -> None:
+        """Refuse what `import_recording` would refuse of any other recording, before it is made.
+
+        Raises
+        ------
+        InputError
+            If frames are measured or corrected.
+        """
+        self._frames.refuse_another()
+
     @property
     def recording(self) -> Recording | None:
         """Where the frames come from; None before a recording was imported."""
@@ -382,6 +392,7 @@ class Session:
         numbers = (int(number) for number in chosen)
         given = (numbers, self.frame, basis.setup, basis.settings, correction)
         measured = follow_each(*given) if warm else measure_each(*given, pool)
+        lost = []
         for number, _, measurement in measured:
             # What it was measured with, whatever has been corrected meanwhile.
             used = corrections.pop(number, None)
@@ -392,17 +403,6 @@ class Session:
                     number, measurement, basis, None if used is None else fingerprint(used)
                 )
             yield number, measurement
-
-    def result(self, frame: int, scheme: str | None = None) -> Result | None:
-        """What a frame gave, and what it was measured from; None if it was not measured.
-        lost = []
-
-        Parameters
-        ----------
-        frame
-            Its number.
-        scheme
-            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
         if lost:
             raise InputError(
                 self._frames.place,
@@ -410,6 +410,16 @@ class Session:
                 "no longer what was imported (what was measured before is kept)",
                 "the recording as it was at import",
             )
+
+    def result(self, frame: int, scheme: str | None = None) -> Result | None:
+        """What a frame gave, and what it was measured from; None if it was not measured.
+
+        Parameters
+        ----------
+        frame
+            Its number.
+        scheme
+            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
         """
         return self._results.get(
             frame,
