@@ -304,7 +304,8 @@ def test_a_stream_that_cannot_be_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_ctrl_c_leaves_whole_frames(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_it_leaves_whole_frames(tmp_path: Path, sent: signal.Signals, code: int) -> None:
     out = tmp_path / "out"
     recording = SAMPLE / "recording.avi"
     arguments = ["reconstruct", recording, "--setup", SETUP, "--out", out]
@@ -316,12 +317,13 @@ def test_ctrl_c_leaves_whole_frames(tmp_path: Path) -> None:
     )
     measures = out / "measures.csv"
     wait_until(lambda: measures.exists() and len(table(measures)) >= 3)
-    started.send_signal(signal.SIGINT)
+    started.send_signal(sent)
     _, complained = started.communicate(timeout=PATIENCE_S)
     rows = table(measures)
-    assert started.returncode == 130
+    assert started.returncode == code
     assert 3 <= len(rows) < 30
-    assert complained.splitlines()[-1] == f"stopped: {len(rows)} of 30 frames are done, in {out}"
+    assert f"stopped: {len(rows)} of 30 frames are done, in {out}" in complained.splitlines()
+    assert ("SIGTERM" in complained) == (sent == signal.SIGTERM)
     assert "Traceback" not in complained
     assert len(table(out / "dots.csv")) == 5 * len(rows)
     told = json.loads((out / "run.json").read_text())

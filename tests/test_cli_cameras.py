@@ -58,13 +58,14 @@ def test_it_is_recorded_into_a_session(tmp_path: Path, labapp: Run) -> None:
         assert len(session.frames) == recording.frames > 0
 
 
-def test_ctrl_c_ends_a_recording_and_keeps_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_a_recording_is_kept(tmp_path: Path, sent: signal.Signals) -> None:
     out = tmp_path / "run.nut"
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
     command = [sys.executable, "-c", HEEDING, "record", CAMERA, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         wait_until(lambda: out.exists() and out.stat().st_size >= 1_000_000)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(sent)
         assert process.stdout is not None
         told = process.stdout.read()
     assert process.returncode == 0
@@ -73,7 +74,6 @@ def test_ctrl_c_ends_a_recording_and_keeps_it(tmp_path: Path) -> None:
         assert not video.warnings
 
 
-def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None:
 def test_a_session_that_cannot_take_it_is_refused_before_filming(
     tmp_path: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,7 +91,7 @@ def test_a_session_that_cannot_take_it_is_refused_before_filming(
     with Session.create(in_use):
         for path, expected in (
             (measured, "frames of recording.avi are measured or corrected in it"),
-            (in_use, "in use"),
+            (in_use, "another program"),
             (damaged, "b.labsession"),
         ):
             code, told, said = labapp("record", CAMERA, "--session", path, "--seconds", "0.1")
@@ -100,6 +100,7 @@ def test_a_session_that_cannot_take_it_is_refused_before_filming(
     assert not list(tmp_path.rglob("*.nut"))
 
 
+def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None:
     out = tmp_path / "run.nut"
     (tmp_path / "there.nut").write_text("mine")
     for arguments, expected in (

@@ -453,27 +453,40 @@ def test_what_a_session_lacks_is_told(labapp: Run, tmp_path: Path) -> None:
         assert session.settings == Settings()
 
 
-def test_ctrl_c_keeps_what_was_finished(
-    labapp: Run, file: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("sent", "usual", "told"),
+    [
+        (signal.SIGINT, signal.default_int_handler, (130, "")),
+        (signal.SIGTERM, signal.SIG_DFL, (143, "labapp: stopped by SIGTERM\n")),
+    ],
+)
+def test_stopped_it_keeps_what_was_finished(
+    labapp: Run,
+    file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    sent: signal.Signals,
+    usual: signal.Handlers,
+    told: tuple[int, str],
 ) -> None:
     seen: list[object] = []
 
     def pressed(*given: object) -> Measurement:
         seen.append(given)
         if len(seen) == 3:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), sent)
         return measure(*given)  # type: ignore[arg-type]
 
     monkeypatch.setattr(run, "measure", pressed)
-    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    former = signal.signal(sent, usual)
     try:
         code, said, complained = labapp("session", "measure", file)
     finally:
-        signal.signal(signal.SIGINT, former)
-    assert (code, said) == (130, "")
-    assert complained == (
-        f"stopped: 2 of 6 frames are done and kept; the others: labapp session measure {file}\n"
-    )
+        signal.signal(sent, former)
+    assert (code, said) == (told[0], "")
+    kept = "stopped: 2 of 6 frames are done and kept; the others: labapp session measure"
+    assert complained == f"{kept} {file}\n{told[1]}"
+    with opened(file) as session:
+        assert session.stale_frames().tolist() == [2, 3, 4, 5]
     with opened(file) as session:
         assert session.stale_frames().tolist() == [2, 3, 4, 5]
         assert session.problems() == []

@@ -391,7 +391,8 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, labapp: Run) -> No
     assert "expected a folder that can be written" in err
 
 
-def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_it_leaves_nothing(tmp_path: Path, sent: signal.Signals, code: int) -> None:
     path, out = scenario(tmp_path, frames="500"), tmp_path / "results" / "out"
     running = subprocess.Popen(
         [sys.executable, "-c", HEEDING, "simulate", path, "--out", out],
@@ -402,9 +403,9 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
     parts = "results/.out.*/out/recording.avi"
     wait_until(lambda: running.poll() is not None or any(tmp_path.glob(parts)))
     assert running.poll() is None
-    running.send_signal(signal.SIGINT)
+    running.send_signal(sent)
     _, err = running.communicate(timeout=PATIENCE_S)
-    assert running.returncode == 130
+    assert running.returncode == code
     assert "nothing is written" in err
     assert "Traceback" not in err
     assert list((tmp_path / "results").iterdir()) == []

@@ -29,6 +29,7 @@ from labapp.cli.shared import (
     INTERRUPTED,
     NOTHING,
     RECORDING_HELP,
+    TERMINATED,
     failure,
     measure_frames,
     note,
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from labapp.session.summary import Summary
 
 IMPATIENT_S = 2.0
-"""Ctrl-C again within this time does nothing: the first is being obeyed."""
+"""Asked to stop again within this time, nothing more happens: the first is being obeyed."""
 
 app = typer.Typer(
     name="labapp",
@@ -56,7 +57,7 @@ app = typer.Typer(
     "Lengths are in mm, angles in degrees, places in an image in px (u right, v down, the "
     "centre of the first pixel is 0, 0), times in s.",
     epilog="Exit codes: 0 done; 1 done, but nothing could be measured, or a session is not whole; "
-    "2 bad input or output; 3 a fault in labapp; 130 stopped by Ctrl-C.",
+    "2 bad input or output; 3 a fault in labapp; 130 stopped by Ctrl-C; 143 by SIGTERM.",
 )
 calibrate = typer.Typer(no_args_is_help=True, help="Calibrate the laser or the imaging plane.")
 app.add_typer(calibrate, name="calibrate")
@@ -81,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without "±" is no reason to stop
-    with _ctrl_c() as pressed_s:
+    with _stoppable() as stops:
         try:
             given = sys.argv[1:] if arguments is None else arguments
             if asks_for_app(given, _commands()):
@@ -95,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             sys.exit(INTERRUPTED)
         except Exception as error:
             log.exception("fault")
-            if pressed_s:
+            if stops:
                 # Compiled modules that are being loaded turn the interrupt into an ImportError.
                 sys.exit(INTERRUPTED)
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
@@ -118,25 +119,41 @@ def _commands() -> frozenset[str]:
 
 
 @contextmanager
-def _ctrl_c() -> Iterator[list[float]]:
-    """Interrupt at Ctrl-C, but not what the first one set going; yields when it was pressed, s."""
-    pressed_s: list[float] = []
+def _stoppable() -> Iterator[list[tuple[float, int]]]:
+    """Interrupt at Ctrl-C or SIGTERM, but not what the first one set going.
 
-    def interrupt(*_: object) -> None:
+    Yields when which of them came, (s, number of the signal). A program that SIGTERM interrupted
+    says so and has a code of its own: who sent it sees neither a terminal nor a ^C.
+    """
+    stops: list[tuple[float, int]] = []
+
+    def interrupt(number: int, _: object) -> None:
         now = time.monotonic()
-        if not pressed_s or now - pressed_s[-1] > IMPATIENT_S:
-            pressed_s.append(now)
+        if not stops or now - stops[-1][0] > IMPATIENT_S:
+            stops.append((now, number))
             raise KeyboardInterrupt
 
-    former = signal.getsignal(signal.SIGINT)
-    if former is not signal.default_int_handler:  # a job in the background ignores Ctrl-C
-        yield pressed_s
-        return
-    signal.signal(signal.SIGINT, interrupt)
+    heeded = {  # a job in the background ignores Ctrl-C
+        number: usual
+        for number, usual in (
+            (signal.SIGINT, signal.default_int_handler),
+            (signal.SIGTERM, signal.SIG_DFL),
+        )
+        if signal.getsignal(number) is usual
+    }
+    for number in heeded:
+        signal.signal(number, interrupt)
     try:
-        yield pressed_s
+        yield stops
+    except SystemExit as ended:
+        if ended.code != INTERRUPTED or not stops or stops[-1][1] != signal.SIGTERM:
+            raise
+        typer.echo("labapp: stopped by SIGTERM", err=True)
+        sys.exit(TERMINATED)
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN if pressed_s else former)
+        came = {number for _, number in stops}
+        for number, usual in heeded.items():
+            signal.signal(number, signal.SIG_IGN if number in came else usual)
 
 
 def _print_version(wanted: bool) -> None:
@@ -209,7 +226,7 @@ def reconstruct(
 ) -> None:
     """Measure frames and write measures, dots, points, boundaries and surfaces.
 
-    Ctrl-C stops after whole frames: what was finished stays readable.
+    Ctrl-C or SIGTERM stops after whole frames: what was finished stays readable.
 
     A frame that cannot be measured keeps its row in measures.csv, with the reason.
     """

@@ -103,7 +103,7 @@ def record(
 
     What happens meanwhile is told on stderr, and kept beside the recording as FILE-notes.csv.
 
-    Ctrl-C ends the recording: what was recorded is kept.
+    Ctrl-C or SIGTERM ends the recording: what was recorded is kept, and the exit code is 0.
     """
     from labapp.media.cameras import CameraSettings
     from labapp.media.recorder import Plan
@@ -132,7 +132,7 @@ def _film(
     settings: CameraSettings,
     seconds: float | None,
 ) -> Take:
-    """Record for some seconds, or until Ctrl-C; what happens is told on stderr."""
+    """Record for some seconds, or until Ctrl-C or SIGTERM; what happens is told on stderr."""
     from labapp.media.cameras import CameraError
     from labapp.session.cameras import camera_opener
     from labapp.session.cameras import record as film
@@ -147,7 +147,7 @@ def _film(
                     time.sleep(POLL_S)
                     bar.update(task, completed=take.frames)
             except KeyboardInterrupt:
-                return
+                note(bar.console, "stopped: the recording ends here")
 
         try:
             opened = camera_opener(

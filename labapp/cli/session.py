@@ -228,7 +228,7 @@ def measure(
 
     Scheme, algorithm and correspondence are kept as settings of the session; that can be undone.
 
-    Ctrl-C stops after whole frames: what was finished is kept.
+    Ctrl-C or SIGTERM stops after whole frames: what was finished is kept.
     """
     from labapp.session.session import Session
 

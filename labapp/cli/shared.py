@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from labapp.session.summary import Summary
     from labapp.simulation import parallel
 
-INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 130, 3, 2, 1
+TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 143, 130, 3, 2, 1
 """Exit codes; 0 is done. `NOTHING`: done, but nothing was measured, or a session is not whole."""
 
 RUNS_SHOWN = 6

@@ -49,7 +49,7 @@ NEEDED_LATER = (
 """Sessions, the pages and what draws in 3-D: one or two seconds."""
 
 HEARTBEAT_MS = 300
-"""So often Python gets a turn to notice Ctrl-C in the terminal."""
+"""So often Python gets a turn to notice Ctrl-C in the terminal, or SIGTERM."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -105,7 +105,8 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     heartbeat = QTimer(window)
     heartbeat.timeout.connect(lambda: None)
     heartbeat.start(HEARTBEAT_MS)
-    former = signal.signal(signal.SIGINT, lambda *_: window.close())
+    stops = (signal.SIGINT, signal.SIGTERM)
+    former = {number: signal.signal(number, lambda *_: window.close()) for number in stops}
     window.show()
     loading = threading.Thread(target=_load_what_is_needed, name="loading", daemon=True)
     load = QTimer(window)
@@ -119,7 +120,8 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
         heartbeat.stop()
         if loading.is_alive():
             loading.join()
-        signal.signal(signal.SIGINT, former)
+        for number, handler in former.items():
+            signal.signal(number, handler)
         faults.uninstall()
 
 

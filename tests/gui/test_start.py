@@ -36,9 +36,22 @@ import labapp.gui.pages.surface
 print(*sys.modules)
 """
 
+STOPPED = """
+import os, signal, sys
+from pathlib import Path
+from labapp.gui.app import open_window, start_app
+from labapp.gui.preferences import Preferences
+app = start_app()
+from PySide6.QtCore import QTimer
+with open_window(app, Preferences(), Path(sys.argv[1])) as window:
+    QTimer.singleShot(0, window, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    ended = app.exec()
+print(ended, window.isVisible(), Path(sys.argv[1]).exists())
+"""
+
 
 def loaded(program: str, *arguments: object) -> set[str]:
-    """Names of the modules that a program says it has loaded."""
+    """Words that a program says, such as the names of the modules that it has loaded."""
     ran = subprocess.run(
         [sys.executable, "-c", program, *map(str, arguments)],
         capture_output=True,
@@ -59,3 +72,7 @@ def test_a_surface_is_shown_without_what_reads_and_writes_other_files():
     found = loaded(SURFACE_PAGE)
     assert "scipy" in found
     assert found & NOT_FOR_A_SURFACE == set()
+
+
+def test_sigterm_closes_the_window(tmp_path: Path):
+    assert loaded(STOPPED, tmp_path / "preferences.json") == {"0", "False", "True"}
