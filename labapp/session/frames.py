@@ -10,7 +10,7 @@ import datetime
 import hashlib
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from labapp.session.database import Database
 from labapp.session.kept import Kept
 from labapp.session.record import Recording
 from labapp.session.run import select_frames
+from labapp.session.summary import runs_text
 
 Progress = Callable[[int, int], None]
 """Called with how much is done and of how much; may raise to stop."""
@@ -255,10 +256,21 @@ class Frames:
         noted = self._database.value("SELECT checksum FROM frame WHERE number = ?", number)
         return noted is not None
 
-    @property
-    def place(self) -> Path:
-        """Where frames are read from: the session itself, if it holds them, or the recording."""
-        return self._database.path if self._imported().embedded else self._place()
+    def refuse_lost(self, numbers: Sequence[int]) -> None:
+        """Refuse frames that could be read at import and no longer can; none is none.
+
+        Raises
+        ------
+        InputError
+            If there are any.
+        """
+        if numbers:
+            raise InputError(
+                self._database.path if self._imported().embedded else self._place(),
+                f"frame{'s' * (len(numbers) > 1)} {runs_text(numbers)}",
+                "no longer what was imported (what was measured before is kept)",
+                "the recording as it was at import",
+            )
 
     @property
     def missing(self) -> Path | None:
@@ -267,6 +279,17 @@ class Frames:
         if recording is None or recording.embedded or self._place().exists():
             return None
         return self._place()
+
+    def refuse_missing(self) -> None:
+        """Refuse to go on without the recording.
+
+        Raises
+        ------
+        InputError
+            If it is not where it should be.
+        """
+        if (missing := self.missing) is not None:
+            raise InputError(missing, "recording", "is not there", THE_RECORDING)
 
     def relink(self, path: str | os.PathLike[str]) -> None:
         """Say where the recording is now.

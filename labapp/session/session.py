@@ -28,7 +28,7 @@ from labapp.media import Frame, GreyImage, open_source
 from labapp.session.blobs import fingerprint
 from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Change, Documents, KeptSignals, Key
-from labapp.session.frames import THE_RECORDING, Frames, Progress
+from labapp.session.frames import Frames, Progress
 from labapp.session.kept_pictures import KeptPictures
 from labapp.session.limits import Limits
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
@@ -38,7 +38,6 @@ from labapp.session.run import measure_each
 from labapp.session.sequence import follow_each
 from labapp.session.setup import Setup, parse_setup, updated_setup
 from labapp.session.signals import Signals
-from labapp.session.summary import runs_text
 
 if TYPE_CHECKING:
     from labapp.session.export import ExportChoice, ExportedFile
@@ -153,7 +152,7 @@ class Session:
         InputError
             If a section is not one; whether values are possible is told by `setup`.
         """
-        self._change(label, {("setup", WHOLE): self._updated(values)})
+        self._change(label, {("setup", WHOLE): updated_setup(self.setup_text, self.path, values)})
 
     @property
     def laser_calibration(self) -> LaserReadings | None:
@@ -181,7 +180,7 @@ class Session:
         lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
         readings = LaserReadings(*lengths, fan_angle_deg, found, kept)
         laser = {"projection_angle_deg": found.angle_deg, "distance_mm": found.distance_mm}
-        setup = self._updated({"laser": laser})
+        setup = updated_setup(self.setup_text, self.path, {"laser": laser})
         values: dict[Key, Any] = {("laser-calibration", WHOLE): readings, ("setup", WHOLE): setup}
         self._change("laser calibration", values)
         return found
@@ -227,7 +226,7 @@ class Session:
         """
         _ = found.image_calibration  # which refuses such points
         readings = PlanePicture(unit_mm, found, self._pictures.keep(name, image))
-        setup = self._updated({"image_calibration": found.setup_keys})
+        setup = updated_setup(self.setup_text, self.path, {"image_calibration": found.setup_keys})
         values: dict[Key, Any] = {("plane-calibration", WHOLE): readings, ("setup", WHOLE): setup}
         self._change("imaging-plane calibration", values)
 
@@ -319,13 +318,7 @@ class Session:
         )
 
     def refuse_another_recording(self) -> None:
-        """Refuse what `import_recording` would refuse of any other recording, before it is made.
-
-        Raises
-        ------
-        InputError
-            If frames are measured or corrected.
-        """
+        """Refuse any recording but the present one; see `Frames.refuse_another`."""
         self._frames.refuse_another()
 
     @property
@@ -377,13 +370,12 @@ class Session:
         Raises
         ------
         InputError
-            If the setup is not complete, or a result cannot be saved; once all other frames are
-            measured, if any of them is no longer what was imported.
+            If the setup is not complete, or a result cannot be saved; at the end, if frames are no
+            longer what was imported.
         """
         chosen = self.stale_frames() if frames is None else frames
         basis = Basis(self.setup, self.settings)
-        if (missing := self.missing_recording) is not None:
-            raise InputError(missing, "recording", "is not there", THE_RECORDING)
+        self._frames.refuse_missing()
         corrections: dict[int, Correction | None] = {}
 
         def correction(number: int) -> Correction | None:
@@ -399,17 +391,10 @@ class Session:
             if measurement.status == "unreadable" and self._frames.was_readable(number):
                 lost.append(number)
             else:
-                self._results.put(
-                    number, measurement, basis, None if used is None else fingerprint(used)
-                )
+                made_with = None if used is None else fingerprint(used)
+                self._results.put(number, measurement, basis, made_with)
             yield number, measurement
-        if lost:
-            raise InputError(
-                self._frames.place,
-                f"frame{'s' * (len(lost) > 1)} {runs_text(lost)}",
-                "no longer what was imported (what was measured before is kept)",
-                "the recording as it was at import",
-            )
+        self._frames.refuse_lost(lost)
 
     def result(self, frame: int, scheme: str | None = None) -> Result | None:
         """What a frame gave, and what it was measured from; None if it was not measured.
@@ -495,10 +480,7 @@ class Session:
         recording
             Whether to read through the recording, or the frames kept in the session, too.
         """
-        found = self._database.problems()
-        if found:
-            return found
-        return [
+        return self._database.problems() or [
             *self._documents.problems(),
             *self._pictures.problems(),
             *(self._frames.problems(progress) if recording else ()),
@@ -509,9 +491,6 @@ class Session:
 
     def _change(self, label: str, values: Mapping[Key, Any]) -> None:
         self._documents.change(label, values)
-
-    def _updated(self, values: Mapping[str, Mapping[str, object]]) -> str:
-        return updated_setup(self.setup_text, self.path, values)
 
     def _basis(self) -> Basis | None:
         try:
