@@ -67,7 +67,8 @@ class Files:
         elif self._window.workspace.session is not None or self._create(
             dialogs.new_path(path.parent, path.stem)
         ):
-            self._window.remember(replace(self._window.preferences, last_folder=str(path.parent)))
+            folder = str(path.parent)
+            self._window.remember(lambda before: replace(before, last_folder=folder))
             self._window.show_step("capture")
             if self._window.page is not None:
                 self._window.page.take(path)
@@ -123,7 +124,7 @@ class Files:
 
     def forget(self, path: Path) -> None:
         """Take a session off the list of recent ones; the file stays."""
-        self._window.remember(self._window.preferences.without_recent(path))
+        self._window.remember(lambda before: before.without_recent(path))
         self.list_recent()
 
     def _create(self, proposed: Path) -> bool:
@@ -149,7 +150,7 @@ class Files:
             return Session.open(path, read_only=True)
 
     def _show(self, session: Session) -> None:
-        self._window.remember(self._window.preferences.with_recent(session.path))
+        self._window.remember(lambda before: before.with_recent(session.path))
         self._window.workspace.show(session)
         missing = self._window.workspace.tried(lambda: session.missing_recording)
         if missing is not None:
@@ -157,8 +158,16 @@ class Files:
 
     def list_recent(self) -> None:
         """List the sessions opened before, in the menu and on the welcome page."""
+        self._window.recall()
         self._window.menus.show_recent(self._window.preferences.recent)
         if self._window.workspace.session is None:
             self._window.welcome.show_recent(
                 [Path(name) for name in self._window.preferences.recent]
             )
+
+
+def title(session: Session | None) -> str:
+    """Title of a window with a session, or with none."""
+    if session is None:
+        return "labapp"
+    return f"{session.path.stem}{' (read-only)' if session.read_only else ''} — labapp"

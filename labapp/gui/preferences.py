@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import platformdirs
+from filelock import FileLock, Timeout
 
 from labapp.session.files import as_bytes, write_whole
 from labapp.session.log import NAME
@@ -19,6 +21,8 @@ VERSION = 1
 KEPT_RECENT = 12
 THEMES = ("system", "light", "dark")
 LARGEST_BYTES = 1_000_000
+LOCK_S = 2.0
+"""So long a window waits for another one's change."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,40 @@ def read_preferences(path: Path) -> tuple[Preferences, str]:
         return _checked(held), ""
     except (TypeError, ValueError):
         return Preferences(), _keep_aside(path, "is damaged")
+
+
+def recall_preferences(path: Path, own: Preferences) -> Preferences:
+    """What is remembered by now: another window may have added to it; ``own`` if it is gone."""
+    found, problem = read_preferences(path)
+    return found if not problem and path.exists() else own
+
+
+def change_preferences(
+    path: Path, own: Preferences, change: Callable[[Preferences], Preferences]
+) -> tuple[Preferences, str]:
+    """Change what is remembered by now, one window at a time, and write it.
+
+    Parameters
+    ----------
+    path
+        The file.
+    own
+        What the window knows, in case nothing is remembered.
+    change
+        Gives the preferences to write for those that are there.
+
+    Returns
+    -------
+    preferences, problem
+        Those that hold now, and why they could not be written; empty if they were.
+    """
+    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=LOCK_S)
+    with ExitStack() as held:
+        with suppress(OSError, Timeout):  # better written without a turn than not at all
+            path.parent.mkdir(parents=True, exist_ok=True)
+            held.enter_context(lock)
+        preferences = change(recall_preferences(path, own))
+        return preferences, write_preferences(path, preferences)
 
 
 def write_preferences(path: Path, preferences: Preferences) -> str:

@@ -248,3 +248,11 @@ def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict
         "trends": results,
         "export": export,
     }
+
+
+def first_step(session: Session) -> str:
+    """Key of the step to begin with: results if there are some, else what is to be done next."""
+    if session.recording is not None:
+        measured = any(status != "" for status in session.overview().status)
+        return "surface" if measured else "dots"
+    return "capture" if states(session)["setup"].why == "Complete" else "setup"

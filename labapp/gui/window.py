@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PySide6.QtCore import QByteArray, QSize, Qt, QTimer, QUrl
+from PySide6.QtCore import QByteArray, QEvent, QSize, Qt, QTimer, QUrl
 from PySide6.QtGui import QCloseEvent, QDesktopServices, QDragEnterEvent, QDropEvent, QKeyEvent
 from PySide6.QtWidgets import (
     QApplication,
@@ -23,7 +24,7 @@ from PySide6.QtWidgets import (
 from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.gui.actions import ACTIONS
-from labapp.gui.files import Files
+from labapp.gui.files import Files, title
 from labapp.gui.focus import finish_edit
 from labapp.gui.help import HelpDialog
 from labapp.gui.menus import Menus
@@ -31,10 +32,10 @@ from labapp.gui.messages import LogPanel, StatusLine
 from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.welcome import Welcome
-from labapp.gui.preferences import Preferences, write_preferences
+from labapp.gui.preferences import Preferences, change_preferences, recall_preferences
 from labapp.gui.standing import DOUBTFUL, Standing, next_frame, standings
 from labapp.gui.step_list import SidePanel, StepList
-from labapp.gui.steps import STEPS, states
+from labapp.gui.steps import STEPS, first_step, states
 from labapp.gui.theme import apply_theme
 from labapp.gui.views.tables import table_text
 from labapp.gui.views.timeline import Tick, Timeline
@@ -42,7 +43,7 @@ from labapp.gui.workspace import Workspace
 from labapp.session.log import log_file
 
 if TYPE_CHECKING:
-    from labapp.session.session import Session
+    pass
 
 REST = 4
 """After showing a change the window rests so many times as long as that took, for the hands."""
@@ -165,7 +166,7 @@ class MainWindow(QMainWindow):
         space.asked.connect(self.menus.do)
         space.next_wanted.connect(self.files.begin_next)
         space.pedals_kept.connect(
-            lambda held: self.remember(replace(self.preferences, foot_switches=held))
+            lambda held: self.remember(lambda before: replace(before, foot_switches=held))
         )
         space.tasks.changed.connect(self.menus.refresh)
         self.step_list.chosen.connect(self.show_step)
@@ -366,7 +367,7 @@ class MainWindow(QMainWindow):
 
     def set_theme(self, theme: str) -> None:
         """Show the app light, dark or as the desktop is."""
-        self.remember(replace(self.preferences, theme=theme))
+        self.remember(lambda before: replace(before, theme=theme))
         self.apply_theme()
 
     def apply_theme(self) -> None:
@@ -430,13 +431,18 @@ class MainWindow(QMainWindow):
             self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
             self._wanted["log"] = False  # what was said then is not said now
 
-    def remember(self, preferences: Preferences) -> None:
-        """Keep preferences for the next start."""
-        self.preferences = preferences
-        problem = write_preferences(self._preferences_file, preferences)
+    def remember(self, change: Callable[[Preferences], Preferences]) -> None:
+        """Change what is kept for the next start, other windows' part of it included."""
+        self.preferences, problem = change_preferences(
+            self._preferences_file, self.preferences, change
+        )
         if problem:
             self.say(problem)
-        self.menus.show_recent(preferences.recent)
+        self.menus.show_recent(self.preferences.recent)
+
+    def recall(self) -> None:
+        """Look up what is remembered: other windows may have opened sessions meanwhile."""
+        self.preferences = recall_preferences(self._preferences_file, self.preferences)
 
     # --- events -----------------------------------------------------------------------------
 
@@ -445,6 +451,17 @@ class MainWindow(QMainWindow):
         taken = self.page is not None and self.page.takes_key(event)
         if not taken and not self.menus.key(event):
             super().keyPressEvent(event)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Look at what other windows have remembered when this one is worked in again."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.ActivationChange and self.isActiveWindow():
+            before = self.preferences
+            self.recall()
+            if self.preferences.recent != before.recent:
+                self.files.list_recent()
+            if self.preferences.theme != before.theme:
+                self.apply_theme()
 
     def dragEnterEvent(self, event: QDragEnterEvent) -> None:
         """Take files."""
@@ -466,32 +483,12 @@ class MainWindow(QMainWindow):
             beside.close()
         self.timeline.set_playing(False)
         self._show_docks(everywhere=True)
-        self.remember(
-            replace(
-                self.preferences,
-                geometry=_text(self.saveGeometry()),
-                layout=_text(self.saveState(LAYOUT_VERSION)),
-            )
-        )
+        geometry, layout = _text(self.saveGeometry()), _text(self.saveState(LAYOUT_VERSION))
+        self.remember(lambda before: replace(before, geometry=geometry, layout=layout))
         self.workspace.opened.disconnect(self._session_opened)
         self.workspace.close()
         self._rest.stop()
         event.accept()
-
-
-def title(session: Session | None) -> str:
-    """The window's title."""
-    if session is None:
-        return "labapp"
-    return f"{session.path.stem}{' (read-only)' if session.read_only else ''} — labapp"
-
-
-def first_step(session: Session) -> str:
-    """Key of the step to begin with: results if there are some, else what is to be done next."""
-    if session.recording is not None:
-        measured = any(status != "" for status in session.overview().status)
-        return "surface" if measured else "dots"
-    return "capture" if states(session)["setup"].why == "Complete" else "setup"
 
 
 def _text(held: QByteArray) -> str:

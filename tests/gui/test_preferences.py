@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from labapp.gui.preferences import (
     KEPT_RECENT,
     VERSION,
     Preferences,
+    change_preferences,
     read_preferences,
     write_preferences,
 )
@@ -98,3 +101,26 @@ def test_the_session_opened_last_comes_first_and_once(tmp_path: Path):
 
 def test_a_last_folder_that_is_gone_is_not_begun_in(tmp_path: Path):
     assert replace(SOME, last_folder=str(tmp_path / "gone")).folder.is_dir()
+
+
+def test_windows_change_what_is_remembered_one_after_the_other(tmp_path: Path):
+    file = tmp_path / "preferences.json"
+    known = Preferences(theme="dark")
+
+    def open_three(window: int) -> None:
+        for number in range(3):
+            path = tmp_path / f"{window}_{number}.labsession"
+            change_preferences(file, known, partial(Preferences.with_recent, path=path))
+
+    with ThreadPoolExecutor(4) as windows:
+        list(windows.map(open_three, range(4)))
+    found, problem = read_preferences(file)
+    assert problem == ""
+    assert (len(set(found.recent)), found.theme) == (12, "dark")
+
+
+def test_what_is_gone_is_written_again(tmp_path: Path):
+    file = tmp_path / "preferences.json"
+    changed, problem = change_preferences(file, SOME, lambda before: before)
+    assert (changed, problem) == (SOME, "")
+    assert read_preferences(file)[0] == SOME

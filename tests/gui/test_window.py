@@ -17,14 +17,15 @@ from pytestqt.qtbot import QtBot
 from labapp.errors import InputError
 from labapp.gui import app, dialogs
 from labapp.gui import window as window_module
+from labapp.gui.files import title
 from labapp.gui.pages.dots.presenter import NUMBERS, detector_value
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.recent import look_at
 from labapp.gui.step_list import StepList, mark_icon
-from labapp.gui.steps import STEPS, Mark, states
+from labapp.gui.steps import STEPS, Mark, first_step, states
 from labapp.gui.views.tables import table_text
-from labapp.gui.window import MainWindow, first_step, title
+from labapp.gui.window import MainWindow
 from labapp.gui.workspace import Workspace
 from labapp.session.copies import copy_sample as copied_sample
 from labapp.session.copies import copy_session
@@ -431,6 +432,32 @@ def test_trying_the_sample_opens_it(
     assert plain.workspace.session is not None
     assert plain.workspace.session.path == tmp_path / "documents" / "gtaw" / "gtaw.labsession"
     assert "copy of the sample" in plain.status_line.message.text()
+
+
+def test_what_another_window_opens_is_recent_here_too(
+    window: MainWindow, tmp_path: Path, qtbot: QtBot
+):
+    file = tmp_path / "config" / "preferences.json"
+    own, others = tmp_path / "own.labsession", tmp_path / "other.labsession"
+    for path in (own, others):
+        Session.create(path).close()
+    window.files.open(own)
+    window.menus.do("close")
+    other = MainWindow(read_preferences(file)[0], file)
+    KEPT.append(other)
+    other.show()
+    other.activateWindow()
+    qtbot.waitUntil(other.isActiveWindow)
+    other.files.open(others)
+    window.activateWindow()
+    qtbot.waitUntil(lambda: window.welcome.list.count() == 2)
+    settle(window, qtbot)
+    assert [action.toolTip() for action in window.menus.recent.actions()] == [str(others), str(own)]
+    window.menus.do("theme_light")
+    other.close()
+    window.close()
+    found = read_preferences(file)[0]
+    assert (found.recent, found.theme) == ((str(others), str(own)), "light")
 
 
 def test_the_layout_and_the_theme_are_remembered(

@@ -229,8 +229,7 @@ class SimulatorWindow(ToolWindow):
         self.made = scenario, folder
         frames = several(len(scenario.recording.pools), "frame")
         self.say(f"{frames}, set-up and truth are in {folder}")
-        preferences = self._window.preferences
-        self._window.remember(replace(preferences, last_folder=str(folder.parent)))
+        self._window.remember(lambda before: replace(before, last_folder=str(folder.parent)))
         self.show_state()
 
     def open_session(self) -> None:
