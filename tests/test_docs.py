@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from pathlib import Path
 
 import pytest
+import typer.core
+import typer.main
 
+from labapp import cli
 from labapp.session.export import verify_export
 from labapp.session.session import Session
 from tests.conftest import Run
@@ -66,3 +70,71 @@ def test_the_worked_example_of_the_command_line_says_what_it_says(
     )
     assert code == 0
     assert verify_export("results") == []
+
+
+TEXTS = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/*.md"))]
+
+LONG = (
+    *(["analyze", part] for part in ("positioning", "correspondence", "errors", "budget")),
+    *(["advise"], ["cameras"], ["session", "correct"], ["session", "export"]),
+)
+"""Examples that are not run here: they take minutes, need a camera, or are run above."""
+
+FEWER = {"simulate": "--frames 2", "reconstruct": "--frames 0", "record": "--seconds 0.2"}
+"""What makes examples short."""
+
+
+def examples(text: str) -> list[list[str]]:
+    """The commands of a text's examples: their words after ``labapp``."""
+    joined = re.sub(r"\\\n\s*", " ", (ROOT / text).read_text("utf-8"))
+    lines = re.findall(r"^    labapp (.*)$", joined, re.MULTILINE)
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_examples_can_be_typed_as_they_are(text: str, tmp_path: Path) -> None:
+    """The options are there, and so is every file: in a checkout, or made by an example before."""
+    made = {"bench.toml"}  # shown in the text itself
+    for words in examples(text):
+        command: object = typer.main.get_command(cli.app)
+        context, rest = None, words
+        while isinstance(command, typer.core.TyperGroup):
+            context = command.make_context(command.name or "", list(rest), parent=context)
+            name, command, rest = command.resolve_command(context, rest)
+            assert name is not None, words
+        assert isinstance(command, typer.core.TyperCommand)
+        command.make_context(command.name or "", list(rest), parent=context)
+        for before, word in zip(["", *words], words, strict=False):
+            path = word.removeprefix("simulated:")
+            if before in ("--out", "new") or (before == "--setup" and words[0] == "calibrate"):
+                made.add(word)
+            elif re.search(r"\.[a-z]+$", path) and path.partition("/")[0] not in made:
+                assert (ROOT / path).is_file(), words
+
+
+@pytest.mark.parametrize("text", [text for text in TEXTS if examples(text)])
+def test_examples_run_one_after_the_other(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, labapp: Run
+) -> None:
+    for folder in ("sample_sessions", "resources"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
+    monkeypatch.chdir(tmp_path)
+    for words in examples(text):
+        if any(words[: len(long)] == long for long in LONG):
+            continue
+        fewer = FEWER.get(words[0], "").split()
+        if words[:2] == ["session", "measure"]:
+            fewer = ["--frames", "0"]
+        if fewer and fewer[0] in words:
+            place = words.index(fewer[0])
+            words[place : place + 2] = []
+        if "--lines" in words:
+            words[words.index("--lines") + 1] = "0"  # a port that is free
+        code, _, said = labapp(*words, *fewer)
+        assert code == 0, said
+
+
+def test_commands_in_the_texts_have_no_gaps() -> None:
+    for text in (*TEXTS, *(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/guide/*.md"))):
+        found = re.findall(r"`((?:\./run )?labapp [^`]*)`", (ROOT / text).read_text("utf-8"))
+        assert not [command for command in found if "…" in command], text
