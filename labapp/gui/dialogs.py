@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
 
 from labapp.session.database import SUFFIX
@@ -54,6 +55,7 @@ def ask_read_only(parent: QWidget, path: Path) -> bool:
     box.setObjectName("read-only")
     box.setIcon(QMessageBox.Icon.Question)
     box.setWindowTitle("The session is in use")
+    box.setTextFormat(Qt.TextFormat.PlainText)
     box.setText(f"{path.name} is open in another window or program.")
     box.setInformativeText(
         "You can look at it read-only: nothing can be changed or measured in it until it is "

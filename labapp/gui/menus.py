@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QMenu
 from labapp.gui.action import MENUS, Action
 from labapp.gui.actions import ACTIONS
 from labapp.gui.filming import live_page
+from labapp.gui.views.labels import plain_tip
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
@@ -110,7 +111,7 @@ class Menus:
             path = Path(name)
             text = f"{path.stem} — {path.parent}".replace("&", "&&")
             made = self.recent.addAction(f"&{number} {text}" if number < 10 else text)
-            made.setToolTip(name)
+            made.setToolTip(plain_tip(name))
             made.triggered.connect(lambda *_, chosen=path: self._window.files.open(chosen))
 
 

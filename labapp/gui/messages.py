@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.tasks import Tasks
+from labapp.gui.views.labels import plain_label, plain_tip
 
 KEPT_MESSAGES = 1000
 
@@ -67,7 +68,7 @@ class ElidedLabel(QLabel):
     def _tell(self) -> None:
         line = " ".join(self.text().split())
         too_long = self.fontMetrics().horizontalAdvance(line) > self.width()
-        self.setToolTip(self.text() if too_long else "")
+        self.setToolTip(plain_tip(self.text() if too_long else ""))
 
 
 class LogPanel(QListWidget):
@@ -143,7 +144,7 @@ class StatusLine(QWidget):
         self.read_button.setToolTip("Show all messages, and take the problem off this line (F4)")
         self.read_button.setAccessibleName("Read the problem")
         self.read_button.clicked.connect(self.read)
-        self.title = QLabel()
+        self.title = plain_label()
         self.bar = QProgressBar()
         self.bar.setFixedWidth(180)
         self.bar.setFormat("%v of %m")

@@ -8,7 +8,6 @@ from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QIcon, QPainter, QPalette, QPen, QPixmap, QPolygonF
 from PySide6.QtWidgets import (
     QFrame,
-    QLabel,
     QListWidget,
     QListWidgetItem,
     QScrollArea,
@@ -20,6 +19,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.steps import Mark, State, Step
 from labapp.gui.theme import is_dark
+from labapp.gui.views.labels import plain_label, plain_tip
 
 ICON_PX = 18
 COLOURS = {
@@ -116,7 +116,7 @@ class StepList(QListWidget):
         for row, step in enumerate(self._steps):
             state, item = states[step.key], self.item(row)
             item.setIcon(mark_icon(state.mark, dark, selected))
-            item.setToolTip(f"{state.mark.value.capitalize()}: {state.why}")
+            item.setToolTip(plain_tip(f"{state.mark.value.capitalize()}: {state.why}"))
             told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
             item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
 
@@ -137,16 +137,15 @@ class SidePanel(QWidget):
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self.title = QLabel()
+        self.title = plain_label()
         font = self.title.font()
         font.setPointSizeF(font.pointSizeF() * 1.25)
         font.setBold(True)
         self.title.setFont(font)
-        self.hint = QLabel()
-        self.state = QLabel()
+        self.hint = plain_label()
+        self.state = plain_label()
         for label in (self.hint, self.state):
             label.setWordWrap(True)
-            label.setTextFormat(Qt.TextFormat.PlainText)
             label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.stack = QStackedWidget()
         self._areas: dict[QWidget, QScrollArea] = {}

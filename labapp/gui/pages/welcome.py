@@ -10,7 +10,6 @@ from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPixmap
 from PySide6.QtWidgets import (
     QFrame,
     QHBoxLayout,
-    QLabel,
     QListWidget,
     QListWidgetItem,
     QPushButton,
@@ -20,6 +19,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
 from labapp.gui.tasks import Control
+from labapp.gui.views.labels import plain_label, plain_tip
 from labapp.gui.workspace import Workspace
 
 BUTTONS = (
@@ -58,12 +58,12 @@ class Welcome(QWidget):
         inner.setMaximumWidth(WIDTH_PX)
         column = QVBoxLayout(inner)
         column.setSpacing(12)
-        title = QLabel("labapp")
+        title = plain_label("labapp")
         font = title.font()
         font.setPointSizeF(font.pointSizeF() * 2.2)
         title.setFont(font)
         column.addWidget(title)
-        about = QLabel(
+        about = plain_label(
             "The surface of a molten weld pool, measured from the reflections of a laser dot "
             "matrix. An experiment is one session file; everything you do is saved in it at once."
         )
@@ -78,7 +78,7 @@ class Welcome(QWidget):
             self.buttons[name] = button
             row.addWidget(button)
         column.addLayout(row)
-        self.label = QLabel("&Recent sessions")
+        self.label = plain_label("&Recent sessions")
         column.addWidget(self.label)
         self.list = QListWidget()
         self.list.setAccessibleName("Recent sessions")
@@ -92,7 +92,7 @@ class Welcome(QWidget):
         self.list.itemActivated.connect(self._open)
         self.label.setBuddy(self.list)
         column.addWidget(self.list, 1)
-        self.nothing = QLabel(
+        self.nothing = plain_label(
             "No session was opened yet. Drop a video, an image, a folder of images or a session "
             "anywhere on this window to begin, or try the sample."
         )
@@ -114,7 +114,7 @@ class Welcome(QWidget):
         for path in paths:
             item = QListWidgetItem(QIcon(blank), f"{path.stem}\n \n{path.parent}")
             item.setData(Qt.ItemDataRole.UserRole, path)
-            item.setToolTip(str(path))
+            item.setToolTip(plain_tip(str(path)))
             self.list.addItem(item)
         for widget in (self.label, self.list):
             widget.setVisible(bool(paths))

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtWidgets import (
     QFileDialog,
-    QLabel,
     QScrollArea,
     QTableWidget,
     QTabWidget,
@@ -19,7 +18,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
 from labapp.gui.tools.tool import ToolWindow, told
 from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
-from labapp.gui.views.labels import headed
+from labapp.gui.views.labels import headed, plain_label
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.views.sheet import Sheet
 from labapp.gui.views.tables import CellTable
@@ -103,7 +102,7 @@ class AdviserWindow(ToolWindow):
         self.form.add(self.effort)
 
     def _make_results(self) -> None:
-        self.headline = QLabel("Enter pools and limits, then press Advise.")
+        self.headline = plain_label("Enter pools and limits, then press Advise.")
         self.headline.setWordWrap(True)
         self.place = ResultTable("Recommended set-up")
         self.kept = ResultTable("What it must keep, and by how much it does")

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QCheckBox, QFileDialog, QLabel, QStackedWidget
+from PySide6.QtWidgets import QCheckBox, QFileDialog, QStackedWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysing
 from labapp.gui.tools.analysing import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import ToolWindow, told
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.views.labels import plain_label
 from labapp.gui.views.sheet import Sheet
 from labapp.gui.views.tables import CellTable
 from labapp.session.analysis import (
@@ -125,7 +126,7 @@ class AnalysisWindow(ToolWindow):
         self.which.edited.connect(lambda _: self._show_chosen())
         line = FieldForm()
         line.add(self.which)
-        self.words = QLabel(
+        self.words = plain_label(
             "Tick what is to be worked out, then press Work out. All of it is simulated; the "
             "calibration is taken to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
         )

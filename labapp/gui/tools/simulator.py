@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pyqtgraph as pg
 from PySide6.QtGui import QCloseEvent
-from PySide6.QtWidgets import QFileDialog, QLabel
+from PySide6.QtWidgets import QFileDialog
 
 from labapp.gui.dialogs import new_path
 from labapp.gui.tasks import Control, Tasks
@@ -17,6 +17,7 @@ from labapp.gui.tools import simulating
 from labapp.gui.tools.simulating import Preview
 from labapp.gui.tools.tool import ToolWindow, told
 from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.labels import plain_label
 from labapp.gui.views.path_field import PathField
 from labapp.gui.views.picture import PictureView
 from labapp.session.scenario import Scenario, read_scenario
@@ -71,7 +72,7 @@ class SimulatorWindow(ToolWindow):
             "Scenario", simulating.choices(None), tooltip="The pool, the bench and the camera"
         )
         self.scenario.edited.connect(lambda _: self.show_scenario())
-        self.words = QLabel()
+        self.words = plain_label()
         self.words.setWordWrap(True)
         self.frames = NumberField(
             "Frames", lowest=1, highest=1_000_000, decimals=0, tooltip="How many are rendered"

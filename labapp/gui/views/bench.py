@@ -6,10 +6,11 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QColor, QPalette
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QVBoxLayout
+from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout
 
 from labapp.core.values import FloatArray
 from labapp.gui.views.canvas import Drawn
+from labapp.gui.views.labels import plain_label
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
@@ -28,10 +29,9 @@ class BenchView(Drawn):
     def __init__(self) -> None:
         super().__init__("Side view of the bench")
         self._view: SideView | None = None
-        self.words = QLabel()
+        self.words = plain_label()
         self.words.setWordWrap(True)
         self.words.setMargin(6)
-        self.words.setTextFormat(Qt.TextFormat.PlainText)
         self.whole, self.near = _plot(), _plot()
         self.whole.setLabel("left", "Z, mm")
         self.near.setLabel("bottom", "enlarged, mm")

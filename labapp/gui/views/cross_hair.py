@@ -6,10 +6,11 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QPalette
-from PySide6.QtWidgets import QLabel, QVBoxLayout
+from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.core.laser_calibration import LaserCalibration
 from labapp.gui.views.canvas import Drawn
+from labapp.gui.views.labels import plain_label
 
 
 class CrossHairView(Drawn):
@@ -24,7 +25,7 @@ class CrossHairView(Drawn):
         self.plot.hideButtons()
         self.plot.setLabel("bottom", "Y, mm")
         self.plot.setLabel("left", "Z, mm")
-        self.words = QLabel()
+        self.words = plain_label()
         self.words.setWordWrap(True)
         self.words.setMargin(6)
         layout = QVBoxLayout(self)

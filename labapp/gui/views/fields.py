@@ -23,7 +23,6 @@ from PySide6.QtWidgets import (
     QGridLayout,
     QHBoxLayout,
     QHeaderView,
-    QLabel,
     QLineEdit,
     QPlainTextEdit,
     QSizePolicy,
@@ -33,7 +32,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import ResultRow, as_csv, as_text, entered, parsed
-from labapp.gui.views.labels import heading
+from labapp.gui.views.labels import heading, plain_label, plain_tip
 from labapp.gui.views.tables import ReadTable
 
 STEP_PAUSE_MS = 300
@@ -60,7 +59,7 @@ class Field(QWidget):
 
     def __init__(self, label: str, editor: QWidget, tooltip: str, unit: str = "") -> None:
         super().__init__()
-        self.label = QLabel(label)
+        self.label = plain_label(label)
         self.label.setWordWrap(True)
         self.label.setBuddy(editor)
         self.label.setToolTip(tooltip)
@@ -68,8 +67,8 @@ class Field(QWidget):
         editor.setToolTip(tooltip)
         editor.setAccessibleName(f"{label}, {unit}" if unit else label)
         self._tooltip = tooltip
-        self.unit = QLabel(unit)
-        self.problem = QLabel()
+        self.unit = plain_label(unit)
+        self.problem = plain_label()
         self.problem.setWordWrap(True)
         self.problem.hide()
         self.setFocusProxy(editor)
@@ -360,7 +359,8 @@ class ChoiceField(Field):
         self._combo.clear()
         for key, words in choices:
             self._combo.addItem(words, key)
-            self._combo.setItemData(self._combo.count() - 1, words, Qt.ItemDataRole.ToolTipRole)
+            place, tip = self._combo.count() - 1, plain_tip(words)
+            self._combo.setItemData(place, tip, Qt.ItemDataRole.ToolTipRole)
         self.set_value(present or (choices[0][0] if choices else ""))
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
@@ -448,7 +448,7 @@ class ResultTable(ReadTable):
                         item.setTextAlignment(right)
                     self.setItem(k, column, item)
                 item.setText(text)
-                item.setToolTip(row.note or " ".join(row.texts))
+                item.setToolTip(plain_tip(row.note or " ".join(row.texts)))
         self._fit_height()
 
     def _fit_height(self) -> None:

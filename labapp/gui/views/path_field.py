@@ -7,6 +7,7 @@ from PySide6.QtGui import QPainter, QPaintEvent
 from PySide6.QtWidgets import QLineEdit, QStyle, QStyleOptionFrame
 
 from labapp.gui.views.fields import TextField
+from labapp.gui.views.labels import plain_tip
 
 TEXT_MARGIN_PX = 2
 """Between the frame's contents and the text: QLineEdit's own, which Qt does not tell."""
@@ -29,7 +30,7 @@ class PathField(TextField):
 
     def _tell_whole(self, path: str) -> None:
         self._tooltip = f"{path}\n{self._purpose}" if path else self._purpose
-        self.editor.setToolTip(self._tooltip)
+        self.editor.setToolTip(plain_tip(self._tooltip))
         self.set_problem(self.problem.text().removeprefix("⚠ "))
 
 

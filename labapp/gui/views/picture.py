@@ -16,7 +16,6 @@ from PySide6.QtWidgets import (
     QGraphicsItem,
     QGridLayout,
     QHBoxLayout,
-    QLabel,
     QSizePolicy,
     QSlider,
     QToolButton,
@@ -25,6 +24,7 @@ from PySide6.QtWidgets import (
 
 from labapp.core.values import BoolArray
 from labapp.gui.views.canvas import Drawn
+from labapp.gui.views.labels import plain_label
 from labapp.media import GreyImage
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -121,11 +121,10 @@ class PictureView(Drawn):
         self._item = pg.ImageItem()
         self._item.setZValue(-100)
         self.box.addItem(self._item)
-        self._place = QLabel()
-        self._place.setTextFormat(Qt.TextFormat.PlainText)
+        self._place = plain_label()
         # Or the window would grow as the pointer comes.
         self._place.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
-        self._empty = QLabel("", self.canvas)
+        self._empty = plain_label("", self.canvas)
         self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self._empty.setWordWrap(True)
         # It lies over the whole canvas, which takes the mouse.
@@ -273,7 +272,7 @@ class PictureView(Drawn):
         button("−", "Zoom out", "Zoom out (−)", lambda: self.zoom(1 / ZOOM_STEP))
         button("+", "Zoom in", "Zoom in (+)", lambda: self.zoom(ZOOM_STEP))
         bar.addSpacing(8)
-        label = QLabel("Contrast")
+        label = plain_label("Contrast")
         bar.addWidget(label)
         self._contrast = QSlider(Qt.Orientation.Horizontal)
         self._contrast.setRange(-3 * CONTRAST_STEPS, 5 * CONTRAST_STEPS)

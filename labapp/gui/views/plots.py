@@ -21,12 +21,13 @@ from PySide6.QtGui import (
     QKeySequence,
     QPalette,
 )
-from PySide6.QtWidgets import QFrame, QGraphicsItem, QLabel, QScrollArea, QSizePolicy, QVBoxLayout
+from PySide6.QtWidgets import QFrame, QGraphicsItem, QScrollArea, QSizePolicy, QVBoxLayout
 
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in_words
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.canvas import Plotted
+from labapp.gui.views.labels import plain_label, plain_tip
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
@@ -82,11 +83,10 @@ class PlotStack(Plotted):
         area.setFrameShape(QFrame.Shape.NoFrame)
         area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         area.setMinimumSize(240, 110)
-        self.legend = QLabel()
+        self.legend = plain_label()
         self.legend.setWordWrap(True)
         self.legend.setContentsMargins(8, 0, 8, 0)
-        self.read_out = QLabel(" ")
-        self.read_out.setTextFormat(Qt.TextFormat.PlainText)
+        self.read_out = plain_label(" ")
         self.read_out.setContentsMargins(8, 0, 8, 4)
         self.read_out.setWordWrap(True)
         self.read_out.setAlignment(Qt.AlignmentFlag.AlignTop)
@@ -212,7 +212,7 @@ class PlotStack(Plotted):
         # It grows where a line wraps, and does not shrink: what is above must not jump.
         height = self.read_out.heightForWidth(self.read_out.width())
         self.read_out.setFixedHeight(max(self.read_out.minimumHeight(), height))
-        self.read_out.setToolTip(words)
+        self.read_out.setToolTip(plain_tip(words))
         self.describe(words)
 
     def _under(self, at: QPointF) -> tuple[_Plot, Curve] | None:

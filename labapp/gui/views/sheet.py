@@ -6,9 +6,10 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QAction, QGuiApplication, QImage, QKeySequence, QPixmap, QResizeEvent
-from PySide6.QtWidgets import QFrame, QLabel, QScrollArea
+from PySide6.QtWidgets import QFrame, QScrollArea
 
 from labapp.gui.theme import is_dark
+from labapp.gui.views.labels import plain_label
 
 MOST_SCALE = 1.25
 """Larger than so many times as it was printed it is not shown."""
@@ -26,7 +27,7 @@ class Sheet(QScrollArea):
     def __init__(self, name: str) -> None:
         super().__init__()
         self._printed = QImage()
-        self._paper = QLabel()
+        self._paper = plain_label()
         self._paper.setAlignment(Qt.AlignmentFlag.AlignHCenter | Qt.AlignmentFlag.AlignTop)
         self.setWidget(self._paper)
         self.setWidgetResizable(True)

@@ -16,6 +16,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import cell_text, heading
+from labapp.gui.views.labels import plain_tip
 
 if TYPE_CHECKING:
     from labapp.simulation.tables import Table
@@ -91,7 +92,7 @@ class CellTable(ReadTable):
                 item = QTableWidgetItem(cell_text(cell))
                 if not isinstance(cell, str):
                     item.setTextAlignment(right)
-                item.setToolTip(item.text())
+                item.setToolTip(plain_tip(item.text()))
                 self.setItem(row, column, item)
         self.resizeRowsToContents()
 

@@ -25,7 +25,6 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import (
     QAbstractSlider,
     QHBoxLayout,
-    QLabel,
     QSizePolicy,
     QSpinBox,
     QStyle,
@@ -35,6 +34,8 @@ from PySide6.QtWidgets import (
     QVBoxLayout,
     QWidget,
 )
+
+from labapp.gui.views.labels import plain_label
 
 PLAY_HZ = 30.0
 """Most frames a second while playing; every frame is shown."""
@@ -308,9 +309,9 @@ class Timeline(QWidget):
         self.number.setKeyboardTracking(False)
         self.number.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.number.valueChanged.connect(self._typed)
-        self.told = QLabel()
+        self.told = plain_label()
         self.told.setMinimumWidth(self.fontMetrics().horizontalAdvance("of 10000 · 0000.0000 s  "))
-        self.counts = QLabel()
+        self.counts = plain_label()
         self.counts.setTextFormat(Qt.TextFormat.RichText)
         self.counts.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         self.counts.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
@@ -343,7 +344,7 @@ class Timeline(QWidget):
         for kind, words, key in (("doubtful", "in doubt", "F8"), ("corrected", "corrected", "F7")):
             row.addSpacing(8)
             row.addWidget(self._jump(kind, f"previous frame {words}", "◂", f"Shift+{key}", False))
-            row.addWidget(QLabel(words))
+            row.addWidget(plain_label(words))
             row.addWidget(self._jump(kind, f"next frame {words}", "▸", key, True))
         row.addSpacing(8)
         row.addWidget(self.counts, 1)

@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QVBoxLayout, QWidget
 from labapp.gui.pages.capture.parts import button, whole, wrapped
 from labapp.gui.pages.capture.presenter import Choice, Preview, choice_in_words, refusal
 from labapp.gui.views.fields import FieldForm, NumberField
-from labapp.gui.views.labels import headed
+from labapp.gui.views.labels import headed, plain_tip
 from labapp.session.session import Session
 
 MOST_HZ = 1e7
@@ -132,7 +132,9 @@ class ImportChoice(QWidget):
         why_not = refusal(session, choice, working)
         self.setVisible(preview is not None)
         self.import_button.setEnabled(not why_not)
-        self.import_button.setToolTip(why_not or "Read it through once, and take its frames in")
+        self.import_button.setToolTip(
+            plain_tip(why_not or "Read it through once, and take its frames in")
+        )
         if preview is not None and choice is not None:
             words = choice_in_words(preview, choice)
             self.choice_words.setText(f"{words}. {why_not}" if why_not else words)

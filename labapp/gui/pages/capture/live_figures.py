@@ -14,6 +14,7 @@ from PySide6.QtWidgets import QFrame, QGridLayout, QHBoxLayout, QLabel, QVBoxLay
 from labapp.gui.digits import NOTHING, plain
 from labapp.gui.pages.capture.parts import button, wrapped
 from labapp.gui.theme import RED, is_dark
+from labapp.gui.views.labels import plain_label
 from labapp.session.alarms import Alarm
 from labapp.session.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.session.live_watch import Followed, Pace
@@ -165,7 +166,7 @@ class LiveFigures(QWidget):
 
     def _label(self, row: int, column: int) -> QLabel:
         if (row, column) not in self._labels:
-            label = self._labels[row, column] = QLabel()
+            label = self._labels[row, column] = plain_label()
             if column in (1, 2):
                 label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
             if column == 1:

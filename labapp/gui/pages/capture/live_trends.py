@@ -8,11 +8,12 @@ from functools import partial
 import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QResizeEvent
-from PySide6.QtWidgets import QBoxLayout, QGridLayout, QLabel, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QBoxLayout, QGridLayout, QVBoxLayout, QWidget
 
 from labapp.errors import InputError
 from labapp.gui.curves import PLAIN, Axis, Curve, Mark
 from labapp.gui.views.fields import FieldForm, NumberField
+from labapp.gui.views.labels import plain_label
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.workspace import Workspace
 from labapp.session.limits import LARGEST_MM, NAMES, Ends, Limits
@@ -132,12 +133,12 @@ class LiveTrends(QWidget):
     def _limits(self) -> QGridLayout:
         grid = QGridLayout()
         for column, words in enumerate(("Limits (mm)", "lowest", "highest")):
-            label = QLabel(words)
+            label = plain_label(words)
             label.setToolTip(RULE)
             grid.addWidget(label, 0, column)
             grid.setColumnStretch(column, int(column > 0))
         for row, name in enumerate(NAMES, 1):
-            grid.addWidget(QLabel(name.capitalize()), row, 0)
+            grid.addWidget(plain_label(name.capitalize()), row, 0)
             for end in (0, 1):
                 grid.addWidget(self.fields[name, end], row, 1 + end)
         return grid

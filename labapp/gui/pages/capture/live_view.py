@@ -8,7 +8,7 @@ from functools import partial
 
 import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QHBoxLayout, QProgressBar, QVBoxLayout, QWidget
 
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
@@ -27,7 +27,7 @@ from labapp.gui.pages.capture.plan_fields import PlanFields
 from labapp.gui.pages.capture.presenter import calibrated_px
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import headed
+from labapp.gui.views.labels import headed, plain_label
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
@@ -459,7 +459,7 @@ class LiveView(QObject):
         self.ring.setToolTip("How much from before the trigger is in memory")
         line = QHBoxLayout()
         line.addWidget(self.state, 1)
-        line.addWidget(QLabel("Before the trigger:"))
+        line.addWidget(plain_label("Before the trigger:"))
         line.addWidget(self.ring)
         layout.addLayout(line)
         self.recording = wrapped()

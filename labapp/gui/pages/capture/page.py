@@ -10,7 +10,6 @@ from PySide6.QtWidgets import (
     QFileDialog,
     QGridLayout,
     QHBoxLayout,
-    QLabel,
     QSlider,
 )
 
@@ -33,7 +32,7 @@ from labapp.gui.pages.capture.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.labels import headed
+from labapp.gui.views.labels import headed, plain_label
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media.recorder import Take
@@ -72,7 +71,7 @@ class CapturePage(Page):
         self._last_folder = Path()
         self._kept: Path | None = None
         """The last recording that was kept beside the session; of this session."""
-        self.title = QLabel()
+        self.title = plain_label()
         self.title.setContentsMargins(8, 4, 8, 0)
         self.title.setWordWrap(True)
         self.picture_view = PictureView("Frame of the recording")
@@ -198,7 +197,7 @@ class CapturePage(Page):
                 widget.deleteLater()
         rows = recording_in_words(recording)
         for row, (name, words) in enumerate(rows):
-            self.told.addWidget(QLabel(f"{name}:"), row, 0)
+            self.told.addWidget(plain_label(f"{name}:"), row, 0)
             self.told.addWidget(wrapped(words), row, 1)
         unlike = other_size(calibrated_px(session), (recording.rows, recording.columns))
         warnings = (*recording.warnings, *[unlike] * bool(unlike))

@@ -19,7 +19,7 @@ from labapp.core.exposure import Exposure
 from labapp.gui.pages.capture.presenter import bars
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.fields import NumberField
-from labapp.gui.views.labels import headed
+from labapp.gui.views.labels import headed, plain_label, plain_tip
 
 
 class ExposureBars(QWidget):
@@ -48,17 +48,16 @@ class ExposureBars(QWidget):
             widget.setValue(round(100 * bar.part))
             widget.setFormat(bar.words)
             widget.setAccessibleName(f"{bar.name}: {bar.words}")
-            widget.setToolTip(bar.tip)
+            widget.setToolTip(plain_tip(bar.tip))
         self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
 
 
 def wrapped(text: str = "") -> QLabel:
     """Words that wrap, even a SHA-256, and can be copied."""
-    label = QLabel(breakable(text))
+    label = plain_label(breakable(text))
     label.setWordWrap(True)
-    label.setTextFormat(Qt.TextFormat.PlainText)
     label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-    label.setToolTip(text)
+    label.setToolTip(plain_tip(text))
     return label
 
 

@@ -10,7 +10,6 @@ from PySide6.QtWidgets import (
     QAbstractItemView,
     QGridLayout,
     QHeaderView,
-    QLabel,
     QSizePolicy,
     QTableWidget,
     QTableWidgetItem,
@@ -23,7 +22,7 @@ from labapp.core.pipeline import Settings
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
-from labapp.gui.views.labels import heading, plain_words
+from labapp.gui.views.labels import heading, plain_label, plain_tip, plain_words
 
 MOST_ROWS = 60
 COLUMNS_OF_BUTTONS = 3
@@ -140,13 +139,13 @@ class DotsPanel(QWidget):
             part.edited.connect(lambda _: self._tell_reference())
         grid = QGridLayout()
         for k, words in enumerate(("", "Row", "Column")):
-            grid.addWidget(QLabel(words), 0, k)
+            grid.addWidget(plain_label(words), 0, k)
         lines = (
             ("Chosen dots", self.row, self.column),
             ("Reference", self.reference_row, self.reference_column),
         )
         for line, (words, *pair) in enumerate(lines, 1):
-            grid.addWidget(QLabel(words), line, 0)
+            grid.addWidget(plain_label(words), line, 0)
             for k, one in enumerate(pair, 1):
                 grid.addWidget(one, line, k)
         return grid
@@ -221,7 +220,7 @@ class _RowList(QTableWidget):
                         self.setItem(k, column, item)
                     if item.text() != text:
                         item.setText(text)
-                        item.setToolTip(text)
+                        item.setToolTip(plain_tip(text))
         self.choose(chosen)
         self.resizeRowsToContents()
         height = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()

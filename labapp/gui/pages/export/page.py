@@ -37,7 +37,7 @@ from labapp.gui.pages.export.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.views.labels import heading, plain_words
+from labapp.gui.views.labels import heading, plain_tip, plain_words
 from labapp.gui.views.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.meshes import SMALLEST_SPACING_MM
@@ -122,7 +122,7 @@ class ExportPage(Page):
         why_not = "It is being written." if writing else made.why_not
         self.export_button.setEnabled(not why_not)
         self.export_button.setToolTip(
-            why_not or "Write all of it: the folder is whole or not there"
+            plain_tip(why_not or "Write all of it: the folder is whole or not there")
         )
         count = len(made.frames)
         ready = f"{count} frame{'s' * (count != 1)} will be written."

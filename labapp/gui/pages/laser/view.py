@@ -9,7 +9,6 @@ from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import (
     QFileDialog,
     QHeaderView,
-    QLabel,
     QPushButton,
     QStackedWidget,
     QTableWidget,
@@ -22,6 +21,7 @@ from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place
 from labapp.gui.pages.page import Page
 from labapp.gui.views.cross_hair import CrossHairView
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
+from labapp.gui.views.labels import plain_label, plain_tip
 from labapp.gui.views.picture import DragPoint, PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -125,19 +125,19 @@ class LaserPage(Page):
         self.panel_layout.addWidget(self._picture_part())
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
-        readings = QLabel("Readings, mm: a line each, as often as you like")
+        readings = plain_label("Readings, mm: a line each, as often as you like")
         readings.setWordWrap(True)
         self.panel_layout.addWidget(readings)
         self.panel_layout.addWidget(self.table)
         self.result = ResultTable("The laser that follows")
         self.panel_layout.addWidget(self.result)
-        self.words = QLabel()
+        self.words = plain_label()
         self.words.setWordWrap(True)
         self.panel_layout.addWidget(self.words)
         self.use_button = QPushButton("Use these")
         self.use_button.clicked.connect(self.use)
         self.panel_layout.addWidget(self.use_button)
-        self.panel_layout.addWidget(QLabel("In the rig now"))
+        self.panel_layout.addWidget(plain_label("In the rig now"))
         self.in_use = ResultTable("Laser in use")
         self.panel_layout.addWidget(self.in_use)
         self.panel_layout.addStretch(1)
@@ -160,7 +160,7 @@ class LaserPage(Page):
         self.scale.set_value(10.0)
         self.scale.edited.connect(lambda _: self._dragged())
         self.picture_part.add(self.scale)
-        self.lengths = QLabel()
+        self.lengths = plain_label()
         self.lengths.setWordWrap(True)
         self.picture_part.add_wide(self.lengths)
         self.add_button = QPushButton("Add as a reading")
@@ -225,7 +225,7 @@ class LaserPage(Page):
         self.words.setText("\n".join(refused or warnings or ["✓ The three lengths agree."]))
         self.use_button.setEnabled(result.found is not None)
         tip = "Put angle and distance into the rig; undo brings the former back"
-        self.use_button.setToolTip(result.why_not or tip)
+        self.use_button.setToolTip(plain_tip(result.why_not or tip))
         means = [row.value for row in result.rows[:2]]
         l1, l2 = (value if isinstance(value, float) else 0.0 for value in means)
         explained = f"{EXPLAINED}\n\n{result.why_not}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pyqtgraph as pg
-from PySide6.QtWidgets import QFileDialog, QLabel, QPushButton
+from PySide6.QtWidgets import QFileDialog, QPushButton
 
 from labapp.core.mark_fit import Model
 from labapp.core.plane_calibration import PlaneCalibration
@@ -15,6 +15,7 @@ from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
 from labapp.gui.tasks import Control
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
+from labapp.gui.views.labels import plain_label, plain_tip
 from labapp.gui.views.picture import DragPoint, PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -154,7 +155,7 @@ class PlanePage(Page):
         )
         form.add_wide(self.find_button)
         self.panel_layout.addWidget(form)
-        help_text = QLabel(
+        help_text = plain_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
             "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
         )
@@ -175,15 +176,15 @@ class PlanePage(Page):
         self.model.edited.connect(self.choose_model)
         model.add(self.model)
         self.panel_layout.addWidget(model)
-        self.why = QLabel()
+        self.why = plain_label()
         self.why.setWordWrap(True)
         self.panel_layout.addWidget(self.why)
-        self.words = QLabel()
+        self.words = plain_label()
         self.words.setWordWrap(True)
         self.panel_layout.addWidget(self.words)
         self.use_button = self._button("Use", "", self.use)
         self.panel_layout.addWidget(self.use_button)
-        self.panel_layout.addWidget(QLabel("In use now"))
+        self.panel_layout.addWidget(plain_label("In use now"))
         self.in_use = ResultTable("Image calibration in use")
         self.panel_layout.addWidget(self.in_use)
         self.panel_layout.addWidget(
@@ -310,7 +311,7 @@ class PlanePage(Page):
         usable = not result.why_not
         self.use_button.setEnabled(usable)
         self.use_button.setToolTip(
-            result.why_not or "Measure with this; undo brings the former back"
+            plain_tip(result.why_not or "Measure with this; undo brings the former back")
         )
         self.find_button.setEnabled(self.view.picture is not None)
         self._axes.setVisible(self.found is not None)

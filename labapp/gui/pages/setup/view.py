@@ -22,6 +22,7 @@ from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
 from labapp.gui.views.bench import BenchView
 from labapp.gui.views.fields import FieldForm, NumberField, ResultTable, TextField
+from labapp.gui.views.labels import plain_label
 from labapp.gui.workspace import Workspace
 
 SETUP_FILES = "Set-up files (*.toml)"
@@ -142,8 +143,8 @@ class SetupPage(Page):
             box.setAccessibleDescription(meaning)
             box.clicked.connect(lambda on, item=item: self._tick(item, on))
             layout.addWidget(box)
-            time = QLabel()
-            for label in (QLabel(meaning), time):
+            time = plain_label()
+            for label in (plain_label(meaning), time):
                 label.setWordWrap(True)
                 label.setIndent(24)
                 layout.addWidget(label)
@@ -169,7 +170,7 @@ class SetupPage(Page):
                 ),
             )
         )
-        self.others = QLabel()
+        self.others = plain_label()
         self.others.setWordWrap(True)
         form.add_wide(self.others)
         for heading, entries in RIG:

@@ -8,12 +8,13 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QPointF, Qt, Signal
 from PySide6.QtGui import QKeyEvent, QPalette
-from PySide6.QtWidgets import QLabel, QVBoxLayout
+from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.core.boundary import Boundary
 from labapp.core.values import FloatArray
 from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.canvas import Plotted
+from labapp.gui.views.labels import plain_label
 from labapp.session.heights import Profile
 
 BAND_ALPHA = 70
@@ -38,7 +39,7 @@ class Chart(Plotted):
     def __init__(self, name: str, x_label: str, y_label: str, equal: bool) -> None:
         super().__init__(name, KEYS)
         self.setToolTip(f"{name}: wheel to zoom, drag to move; {KEYS}")
-        self.title = QLabel(name)
+        self.title = plain_label(name)
         self.title.setWordWrap(True)
         self.plot = pg.PlotWidget()
         self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)

@@ -8,7 +8,6 @@ from PySide6.QtWidgets import (
     QAbstractItemView,
     QHBoxLayout,
     QHeaderView,
-    QLabel,
     QTableWidget,
     QTableWidgetItem,
     QVBoxLayout,
@@ -20,6 +19,7 @@ from labapp.gui.pages.surface.comparison import Comparison, compared, other_sche
 from labapp.gui.pages.surface.presenter import SCHEMES, Options
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField
+from labapp.gui.views.labels import plain_label, plain_tip
 from labapp.gui.views.parts import PartsBar
 from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.workspace import Workspace
@@ -48,7 +48,7 @@ class CompareView(QWidget):
         self.workspace = workspace
         self.first, self.second = (_SchemeBox(order) for order in ("First", "Second"))
         self.difference = make_view3d("Difference of the two surfaces")
-        self.words = QLabel()
+        self.words = plain_label()
         self.words.setWordWrap(True)
         self.table = _table()
         self._options = Options()
@@ -141,7 +141,8 @@ class CompareView(QWidget):
                 if 0 < column < 4:
                     right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
                     item.setTextAlignment(right)
-                item.setToolTip(f"{row[0]}: {text} {row[4] if 0 < column < 4 else ''}".strip())
+                tip = f"{row[0]}: {text} {row[4] if 0 < column < 4 else ''}".strip()
+                item.setToolTip(plain_tip(tip))
                 self.table.setItem(k, column, item)
         self.table.resizeRowsToContents()
         self._make_room()

@@ -16,7 +16,7 @@ from labapp.gui.pages.surface.presenter import (
 )
 from labapp.gui.tasks import Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, ResultTable
-from labapp.gui.views.labels import heading
+from labapp.gui.views.labels import heading, plain_label, plain_tip
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
 
@@ -125,7 +125,7 @@ class SurfacePanel:
         for button in (self.one, self.missing, self.all, self.again):
             button.setEnabled(not why)
             tooltip = button.property("what")
-            button.setToolTip(f"{tooltip}. {why}" if why else tooltip)
+            button.setToolTip(plain_tip(f"{tooltip}. {why}" if why else tooltip))
         self.progress.setVisible(working)
         self.cancel.setVisible(working)
         if working and task is not None:
@@ -183,6 +183,6 @@ def _button(text: str, what: str, work: Callable[[], None]) -> QPushButton:
 
 
 def _words() -> QLabel:
-    label = QLabel()
+    label = plain_label()
     label.setWordWrap(True)
     return label

@@ -13,7 +13,6 @@ from PySide6.QtWidgets import (
     QFileDialog,
     QGridLayout,
     QHBoxLayout,
-    QLabel,
     QPushButton,
     QSplitter,
     QWidget,
@@ -23,7 +22,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
 from labapp.gui.tasks import Control
 from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
-from labapp.gui.views.labels import heading, plain_words
+from labapp.gui.views.labels import heading, plain_label, plain_words
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.workspace import Workspace
 from labapp.session.signals import Signals, read_signals
@@ -166,7 +165,7 @@ class TrendsPage(Page):
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        self.nothing = QLabel(
+        self.nothing = plain_label(
             "Nothing to show yet: tick a measure at the right, or measure some frames first."
         )
         self.nothing.setAlignment(Qt.AlignmentFlag.AlignCenter)
