@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from labapp.bundled import bundled
 from labapp.errors import InputError
 from labapp.media.events import Event, Kind, Say, silent
+from labapp.system import IS_LINUX
 
 LONGEST = 64
 """Bytes of a report, at most."""
@@ -169,7 +170,7 @@ def open_hid(info: HidInfo) -> HidDevice:
 
 def why_closed(info: HidInfo) -> str:
     """Why a device cannot be opened, and what to do."""
-    if not os.path.exists(info.path):
+    if IS_LINUX and not os.path.exists(info.path):
         return f"{info.name} is not connected"
     if may_be_read(info):
         return f"{info.name} does not answer: plug it in anew"
@@ -180,8 +181,8 @@ def why_closed(info: HidInfo) -> str:
 
 
 def may_be_read(info: HidInfo) -> bool:
-    """Whether the user has the right to."""
-    return os.access(info.path, os.R_OK | os.W_OK)
+    """Whether the user has the right to; elsewhere than on Linux only opening it tells."""
+    return not IS_LINUX or os.access(info.path, os.R_OK | os.W_OK)
 
 
 def commands(info: HidInfo) -> str:
@@ -328,7 +329,10 @@ class HidReader:
 def _hidraw() -> Any:
     """The part of hidapi that reads through the system, which leaves its drivers alone."""
     try:
-        import hidraw
+        if IS_LINUX:
+            import hidraw
+        else:
+            import hid as hidraw
     except ImportError as error:
         raise HidError(MISSING) from error
     return hidraw
