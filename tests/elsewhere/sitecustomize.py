@@ -1,0 +1,180 @@
+"""Let labapp run as on another system: what is not there is taken away from its modules.
+
+Python loads this at its start where this folder is on PYTHONPATH, in processes that are started
+too. LABAPP_ELSEWHERE is "win32" or "darwin". Only modules of labapp see the other system: libraries
+know the one that they are installed on. For "win32" files behave as they do there, for all.
+"""
+
+from __future__ import annotations
+
+import builtins
+import fcntl
+import os
+import sys
+import warnings
+from types import ModuleType
+from typing import Any
+
+SYSTEM = os.environ.get("LABAPP_ELSEWHERE", "")
+
+NO_DISPLAY = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
+
+LINUX_ONLY = {
+    "modules": {"hidraw", "spwd"},
+    "os": {"O_TMPFILE", "memfd_create", "sched_setaffinity", "sched_getaffinity", "splice"},
+    "signal": {"sigtimedwait", "sigwaitinfo"},
+    "socket": {"AF_NETLINK", "AF_PACKET", "AF_ALG"},
+}
+
+POSIX_ONLY = {
+    "modules": {"fcntl", "termios", "tty", "pty", "pwd", "grp", "resource", "syslog", "curses"},
+    "os": {
+        *("O_NOFOLLOW", "O_DIRECTORY", "O_CLOEXEC", "O_NONBLOCK", "O_SYNC", "O_DSYNC", "O_NOCTTY"),
+        *("fchmod", "fchown", "chown", "lchown", "fchdir", "chroot", "mkfifo", "mknod", "nice"),
+        *("getuid", "geteuid", "getgid", "getpgid", "killpg", "fork", "forkpty", "setsid"),
+        *("uname", "statvfs", "fstatvfs", "pread", "pwrite", "readv", "writev", "sendfile"),
+        *("posix_spawn", "posix_fallocate", "posix_fadvise", "sync", "fdatasync", "sysconf"),
+        *("pathconf", "register_at_fork", "getloadavg", "lockf", "openpty", "wait", "WNOHANG"),
+    },
+    "signal": {
+        *("pthread_sigmask", "pthread_kill", "sigwait", "sigpending", "SIG_BLOCK", "SIG_SETMASK"),
+        *("SIGHUP", "SIGKILL", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGCHLD", "SIGPIPE", "SIGSTOP"),
+        *("SIGQUIT", "alarm", "setitimer", "siginterrupt", "pause"),
+    },
+    "socket": {"AF_UNIX", "socketpair_unix", "sendmsg", "SO_REUSEPORT", "CMSG_LEN"},
+    "time": {"tzset", "clock_settime", "pthread_getcpuclockid"},
+}
+
+
+class Elsewhere(ModuleType):
+    """A module of Python as it is on the other system; what is set, is set in the true one."""
+
+    def __init__(self, true: ModuleType, lacking: set[str], other: dict[str, Any]) -> None:
+        super().__init__(true.__name__)
+        own = object.__getattribute__(self, "__dict__")
+        own.update(_true=true, _lacking=lacking, _other=other)
+
+    def __getattribute__(self, name: str) -> Any:
+        own = object.__getattribute__(self, "__dict__")
+        if name in own["_lacking"]:
+            raise AttributeError(f"module {own['_true'].__name__!r} has no {name!r} on {SYSTEM}")
+        return own["_other"][name] if name in own["_other"] else getattr(own["_true"], name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(object.__getattribute__(self, "__dict__")["_true"], name, value)
+
+
+def take_away() -> None:
+    """Show labapp's modules the other system from now on."""
+    lacking = {
+        name: LINUX_ONLY.get(name, set())
+        | (POSIX_ONLY.get(name, set()) if SYSTEM == "win32" else set())
+        for name in {*LINUX_ONLY, *POSIX_ONLY}
+    }
+    absent = lacking.pop("modules")
+    other: dict[str, dict[str, Any]] = {
+        "sys": {"platform": SYSTEM},
+        "os": {"environ": {k: v for k, v in os.environ.items() if k not in NO_DISPLAY}},
+    }
+    if SYSTEM == "win32":
+        other["os"]["name"] = "nt"
+    import signal
+    import socket
+    import time
+
+    true = {module.__name__: module for module in (os, sys, signal, socket, time)}
+    views = {
+        name: Elsewhere(module, lacking.get(name, set()), other.get(name, {}))
+        for name, module in true.items()
+    }
+    former = builtins.__import__
+
+    def imported(
+        name: str, globals: Any = None, locals: Any = None, fromlist: Any = (), level: int = 0
+    ) -> Any:
+        if level == 0 and (globals or {}).get("__name__", "").partition(".")[0] == "labapp":
+            if name.partition(".")[0] in absent:
+                raise ModuleNotFoundError(f"No module named {name!r} on {SYSTEM}", name=name)
+            if name in views:
+                return views[name]
+        return former(name, globals, locals, fromlist, level)
+
+    builtins.__import__ = imported
+
+
+# --- files, as on Windows -----------------------------------------------------------------------
+
+TRUE = {name: getattr(os, name) for name in ("open", "fsync", "rename", "replace", "unlink")}
+
+
+def _refused(path: Any, why: str) -> PermissionError:
+    return PermissionError(13, f"refused on Windows, as {why}", os.fsdecode(path))
+
+
+def _refuse_if_open(*paths: Any) -> None:
+    """Refuse a change of name where this process has one of some paths open, or what is below."""
+    names = [os.path.abspath(os.fsdecode(path)) for path in paths]
+    for handle in os.listdir("/proc/self/fd"):
+        try:
+            found = os.readlink(f"/proc/self/fd/{handle}")
+        except OSError:  # the list's own
+            continue
+        if any(found == name or found.startswith(f"{name}/") for name in names):
+            raise _refused(found, "it is open")
+
+
+def _open(path: Any, flags: int, *more: Any, **options: Any) -> int:
+    if not isinstance(path, int) and os.path.isdir(path):
+        raise _refused(path, "it is a folder")
+    return int(TRUE["open"](path, flags, *more, **options))
+
+
+def _fsync(handle: Any) -> None:
+    number = handle if isinstance(handle, int) else handle.fileno()
+    if fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+        raise OSError(9, "refused on Windows, as the handle is not to be written to")
+    TRUE["fsync"](number)
+
+
+def _rename(source: Any, target: Any) -> None:
+    if os.path.lexists(target):
+        raise FileExistsError(17, "refused on Windows, as it is there", os.fsdecode(target))
+    _refuse_if_open(source)
+    TRUE["rename"](source, target)
+
+
+def _replace(source: Any, target: Any) -> None:
+    if os.path.isdir(target):
+        raise _refused(target, "it is a folder")
+    _refuse_if_open(source, target)
+    TRUE["replace"](source, target)
+
+
+def _unlink(path: Any) -> None:
+    _refuse_if_open(path)
+    TRUE["unlink"](path)
+
+
+def be_windows_about_files() -> None:
+    """Refuse what Windows refuses."""
+    import shutil
+
+    shutil._use_fd_functions = False  # type: ignore[attr-defined]  # they open folders
+    for name, function in {
+        "open": _open,
+        "fsync": _fsync,
+        "rename": _rename,
+        "replace": _replace,
+        "unlink": _unlink,
+        "remove": _unlink,
+    }.items():
+        setattr(os, name, function)
+
+
+if SYSTEM:
+    take_away()
+    # What is not told its encoding is read in another one there.
+    warnings.filterwarnings("ignore", category=EncodingWarning)
+    warnings.filterwarnings("error", category=EncodingWarning, module=r"labapp(\.|$)")
+    if SYSTEM == "win32":
+        be_windows_about_files()

@@ -1,0 +1,41 @@
+"""labapp as on Windows and macOS: what those lack is taken away, and nothing misses it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from labapp.gui.pages import PAGES
+from labapp.session.export import verify_export
+from tests.waiting import PATIENCE_S
+
+ELSEWHERE = Path(__file__).parent / "elsewhere"
+ROOT = ELSEWHERE.parents[1]
+
+
+@pytest.mark.parametrize("system", ["win32", "darwin"])
+def test_the_whole_way_can_be_gone_elsewhere(system: str, tmp_path: Path) -> None:
+    folders = ("HOME", "XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_CACHE_HOME")
+    done = subprocess.run(
+        [sys.executable, ELSEWHERE / "way.py", tmp_path / "bench"],
+        env={
+            **os.environ,
+            **dict.fromkeys(folders, str(tmp_path / "home")),
+            "LABAPP_ELSEWHERE": system,
+            "PYTHONPATH": f"{ELSEWHERE}{os.pathsep}{ROOT}",
+            "PYTHONWARNDEFAULTENCODING": "1",
+            "QT_QPA_PLATFORM": "offscreen",
+        },
+        capture_output=True,
+        text=True,
+        timeout=5 * PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, f"{done.stdout[-500:]}\n{done.stderr[-3000:]}"
+    assert f"{system}: every module is imported" in done.stdout
+    assert f"pages: {' '.join(sorted(PAGES))}" in done.stdout
+    assert verify_export(tmp_path / "bench" / "results") == []
