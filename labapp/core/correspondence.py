@@ -19,7 +19,9 @@ from scipy.spatial import cKDTree
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.dots import Dots
 from labapp.core.hypothesis import (
+    STANDING_OUT,
     Hypothesis,
+    contested,
     from_grid,
     joined,
     moved,
@@ -27,11 +29,12 @@ from labapp.core.hypothesis import (
     turned,
     weigh,
     with_rows_beyond,
+    without_false_ends,
 )
-from labapp.core.lattice import Lattice, Site, lattice_of_sites
+from labapp.core.lattice import Lattice, Site, empty_sites, lattice_of_sites
 from labapp.core.orientation import ORIENTATIONS, Orientation, ways
 from labapp.core.quadric_search import search_quadrics
-from labapp.core.ray_growth import LEAST_LABELS, UNLABELLED, Scene
+from labapp.core.ray_growth import LEAST_LABELS, UNLABELLED, Scene, try_fit
 from labapp.core.rig import Rig
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, freeze
 
@@ -160,7 +163,9 @@ def match_rays(
     scene = Scene.of(dots, rig, calibration, frame_shape)
     orientations = settings.orientations
     found = _by_grid(scene, lattice, orientations)
-    if not any(_explains(scene, hypothesis) for hypothesis in found):
+    if not _any_explains(scene, found):
+        found += _by_placement(scene, lattice, orientations)
+    if not _any_explains(scene, found):
         found += _by_optics(scene, lattice, orientations)
     found = with_rows_beyond(scene, found)
     # Followed to its end, a hypothesis may have come round to a correspondence not asked for.
@@ -278,6 +283,33 @@ def _by_grid(
     return [hypothesis for labels in labelled if (hypothesis := pursue(scene, labels)) is not None]
 
 
+MOST_PLACES = 8
+"""So many places of the marker in the grid are followed, of those that fit it best."""
+
+
+def _by_placement(
+    scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+) -> list[Hypothesis]:
+    """Follow the grid with the marker at each empty site, also at its rim, each way round.
+
+    False dots, missing ones or the torch may leave the marker without three lit neighbours.
+    """
+    pattern = scene.rig.pattern
+    if lattice is None or pattern.marker is None:
+        return []
+    shape = (pattern.rows, pattern.columns)
+    rough = []
+    for site in empty_sites(lattice):
+        for orientation in orientations:
+            labels = from_grid(lattice, site, pattern.marker, orientation, shape)
+            pool = try_fit(scene, labels)
+            if pool is not None:
+                rough.append((float(np.mean(pool.residual_mm**2)), labels))
+    rough.sort(key=lambda one: one[0])
+    pursued = (pursue(scene, labels) for _, labels in rough[:MOST_PLACES])
+    return [hypothesis for hypothesis in pursued if hypothesis is not None]
+
+
 def _by_optics(
     scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
@@ -298,9 +330,13 @@ def _by_optics(
 
 
 def _explains(scene: Scene, hypothesis: Hypothesis) -> bool:
-    """Hardly a dot is left over and hardly one is missing."""
+    """Hardly a dot is left over, hardly one is missing, and none is where the marker is."""
     few = max(2, 0.05 * len(scene.plane_mm))
-    return hypothesis.stray <= few and hypothesis.missed <= few
+    return hypothesis.stray <= few and hypothesis.missed <= few and hypothesis.marker != "lit"
+
+
+def _any_explains(scene: Scene, found: list[Hypothesis]) -> bool:
+    return any(_explains(scene, hypothesis) for hypothesis in found)
 
 
 def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hypothesis:
@@ -317,6 +353,7 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
         if better is None or better.cost >= best.cost:
             break
         best = better
+    best = without_false_ends(scene, best)
     strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
     if best.stray > strays or best.missed > settings.missed[0] + settings.missed[1] * best.count:
         raise CannotMeasure(
@@ -325,7 +362,16 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
             f"{_counted(best.missed, 'ray')} without a dot amid {best.count} pairs",
         )
     own = best.orientation(scene)
-    doubtful: list[int] = []
+    if best.marker == "lit":
+        raise CannotMeasure(
+            "ambiguous-rows" if _any_explains(scene, found) else "no-reference",
+            "where the best rows have the absent centre dot, there is a dot",
+        )
+    if best.marker == "unknown":
+        raise CannotMeasure(
+            "no-reference", "the absent centre dot is not amid dots that have their ray"
+        )
+    doubtful: list[int] = contested(scene, best).tolist()
     for other in [*found, *neighbours]:
         if other.cost >= best.cost + settings.margin:
             continue
@@ -343,7 +389,8 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
             )
     if doubtful:
         certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
-        best = weigh(scene, certain) or best
+        witness = np.where(certain == best.labels, best.witness, 0)
+        best = replace(weigh(scene, certain) or best, witness=witness)
     return best
 
 
@@ -398,7 +445,7 @@ def _bound(
     lit = labels != UNLABELLED
     if lit.sum() < (rows.row > 0).sum():  # a site beyond the pattern, or where no ray is
         return None
-    hypothesis = weigh(scene, labels)
+    hypothesis = weigh(scene, labels, STANDING_OUT)
     if hypothesis is None:
         return None
     wider = pursue(scene, labels)
@@ -414,7 +461,7 @@ def _bound(
         more = ~against.any(axis=-1)
         labels = labels.copy()
         labels[ray[more, 0] - 1, ray[more, 1] - 1] = dot[more]
-        further = weigh(scene, labels)
+        further = weigh(scene, labels, STANDING_OUT)
         if further is not None and further.cost < hypothesis.cost:
             hypothesis = further
     return _Bound(scene, orientation, hypothesis, contested)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,6 +15,7 @@ from labapp.core.pool_fit import FitSettings, FittedPool
 from labapp.core.ray_growth import (
     NEAR,
     UNLABELLED,
+    Prediction,
     Scene,
     amid,
     blocked,
@@ -23,19 +25,31 @@ from labapp.core.ray_growth import (
     try_fit,
     within_rings,
 )
-from labapp.core.values import CannotMeasure, IntArray
+from labapp.core.values import BoolArray, CannotMeasure, IntArray, median
 
-MODEL_MM = 0.03
-"""How far the right surface's dots may be off for no fault of theirs, mm."""
+MODEL_MM = 0.045
+"""How far the right surface's dots may be off for no fault of theirs, mm: what the knots of the fit
+leave of a dent."""
 
-_WEIGHED = FitSettings(knot_mm=1.0)  # fine enough to tell hypotheses apart
+FOLLOWING, STANDING_OUT = FitSettings(), FitSettings(knot_mm=1.0)
+"""Of the surface that a hypothesis is weighed with: fine enough for a dip under the torch; or so
+wide that a row which somebody shifted stands out."""
 
 BEYOND, FEW = 0.25, 2
 """A lit ray is beyond the boundary when it lands so far outside, in spacings of the rays; so many
 of them are put down to false dots."""
 
-STRAY, MISSED = 16.0, 12.0
-"""What a dot without a ray, and a ray without its dot amid the others, cost in units of χ²."""
+STRAY, MISSED, LIT_MARKER = 16.0, 12.0, 60.0
+"""What a dot without a ray, a ray without its dot amid the others, and a dot where the marker's
+absent ray would make one, cost in units of χ². The last is rarely a false dot: labels a row or a
+column off put one there nearly always."""
+
+Marker = Literal["dark", "lit", "unknown"]
+"""What shows where the marker's absent ray would make its dot: nothing amid labelled rays, a dot,
+or nothing where nothing need be seen."""
+
+CONTESTED = 0.5
+"""A label is in doubt where a rival is nearer than this, in spacings of the dots."""
 
 LEAST_ROW, MOST_BEYOND = 3, 0.6
 """A dot or two beyond the last row may be false; so many where one surface has them are not. If a
@@ -56,8 +70,10 @@ class Hypothesis:
         See `Match.witness`.
     stray, missed
         How many dots have no ray; how many rays amid the others have no dot.
+    marker
+        What shows at the marker's absent ray; None if the pattern has no marker.
     cost
-        χ² of the dots, plus `STRAY` and `MISSED` for those.
+        χ² of the dots, plus `STRAY`, `MISSED` and `LIT_MARKER` for those.
     """
 
     labels: IntArray
@@ -65,6 +81,7 @@ class Hypothesis:
     witness: IntArray
     stray: int
     missed: int
+    marker: Marker | None
     cost: float
 
     @property
@@ -113,21 +130,86 @@ def _outside(scene: Scene, hypothesis: Hypothesis) -> IntArray:
     return np.asarray(at[level.sign * over < -BEYOND * rise])
 
 
-def weigh(scene: Scene, labels: IntArray) -> Hypothesis | None:
+def weigh(scene: Scene, labels: IntArray, settings: FitSettings = FOLLOWING) -> Hypothesis | None:
     """Fit the surface to labels as they are and count what speaks against them."""
     pool = try_fit(scene, labels)
     if pool is None:
         return None
     try:
-        pool = scene.fit(labels, _witness(scene, labels, pool), _WEIGHED)
+        pool = scene.fit(labels, _witness(scene, labels, pool), settings)
     except CannotMeasure:
         return None
     lit = labels != UNLABELLED
-    missed, stray = _unexplained(scene, labels, pool)
+    unseen, stray = _unexplained(scene, labels, pool)
+    marker = _marker(scene, lit, pool)
     variance = scene.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
     surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY)
-    cost = float(surprise.sum()) + STRAY * stray + MISSED * missed
-    return Hypothesis(labels, pool, _witness(scene, labels, pool), stray, missed, cost)
+    cost = float(surprise.sum()) + STRAY * len(stray) + MISSED * len(unseen.at)
+    cost += LIT_MARKER * (marker == "lit")
+    witness = _witness(scene, labels, pool)
+    return Hypothesis(labels, pool, witness, len(stray), len(unseen.at), marker, cost)
+
+
+def _marker(scene: Scene, lit: BoolArray, pool: FittedPool) -> Marker | None:
+    """Look where the marker's absent ray would make its dot."""
+    site = scene.rig.pattern.marker
+    if site is None:
+        return None
+    at = (site[0] - 1, site[1] - 1)
+    around = np.zeros_like(lit)
+    around[max(at[0] - 1, 0) : at[0] + 2, max(at[1] - 1, 0) : at[1] + 2] = True
+    predicted = predict(scene, pool, around)
+    own = (predicted.at == at).all(axis=-1)
+    if not own.any():
+        return "unknown"
+    place, spacing = predicted.plane_mm[own][0], predicted.spacing_mm[own][0]
+    if np.linalg.norm(scene.plane_mm - place, axis=-1).min() < spacing / 3:
+        return "lit"
+    return "dark" if amid(lit)[at] else "unknown"
+
+
+def contested(scene: Scene, hypothesis: Hypothesis) -> IntArray:
+    """Return the labelled dots next to a dot without a ray, or to where a ray lacks its dot.
+
+    Either may be the right pair there. Indices of dots.
+    """
+    labels = hypothesis.labels
+    unseen, stray = _unexplained(scene, labels, hypothesis.pool)
+    dots = labels[labels != UNLABELLED]
+    rivals = np.concatenate([unseen.plane_mm, scene.plane_mm[stray]])
+    if len(rivals) == 0 or len(dots) < 2:
+        return np.zeros(0, np.int64)
+    spacing = median(cKDTree(scene.plane_mm[dots]).query(scene.plane_mm[dots], k=2)[0][:, 1])
+    near = cKDTree(rivals).query(scene.plane_mm[dots])[0] < CONTESTED * spacing
+    return np.asarray(dots[near])
+
+
+def without_false_ends(scene: Scene, hypothesis: Hypothesis) -> Hypothesis:
+    """Take labels away that alone put a dark ray amid the lit ones, as far as that costs less.
+
+    Beyond the last row a false dot may lie where a ray's should.
+    """
+    unseen, _ = _unexplained(scene, hypothesis.labels, hypothesis.pool)
+    lit = hypothesis.labels != UNLABELLED
+    fewer = []
+    for at in {at for ray in unseen.at.tolist() for at in _alone_around(lit, ray)}:
+        labels = hypothesis.labels.copy()
+        labels[at] = UNLABELLED
+        fewer.append(weigh(scene, labels))
+    best = min((h for h in fewer if h), key=lambda h: h.cost, default=hypothesis)
+    return without_false_ends(scene, best) if best.cost < hypothesis.cost else hypothesis
+
+
+def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
+    """Lit rays, counted from 0, that alone put a dark ray amid the lit ones."""
+    i, j = ray
+    across = [np.flatnonzero(lit[i, :j]), np.flatnonzero(lit[i, j + 1 :]) + j + 1]
+    along = [np.flatnonzero(lit[:i, j]), np.flatnonzero(lit[i + 1 :, j]) + i + 1]
+    if min(map(len, across)) and min(map(len, along)):
+        return []
+    row = [(i, int(side[0])) for side in across if len(side) == 1 and min(map(len, across))]
+    column = [(int(side[0]), j) for side in along if len(side) == 1 and min(map(len, along))]
+    return row + column
 
 
 def from_grid(
@@ -170,20 +252,24 @@ def moved(scene: Scene, labels: IntArray) -> Iterator[IntArray]:
 
 
 def with_rows_beyond(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
-    """Add what the cheapest hypothesis leads to if a row that its growth did not reach is begun.
+    """Add what the cheapest hypotheses lead to if a row that growth did not reach is begun.
 
     Beyond the last row a surface may be so uncertain that several rays come into question for
     every dot there; then `grow_labels` gives none of them a ray. Here each is tried, and what has
     come of it is a hypothesis to be held against the others: a row given to the wrong rays costs
     the dots of the rays that it jumps, or comes too near to another way to be told from it.
     """
-    while found:
-        best = min(found, key=lambda hypothesis: hypothesis.cost)
-        most = MOST_BEYOND * len(scene.plane_mm)
-        wider = _rows_begun(scene, best) if LEAST_ROW <= best.stray <= most else []
-        found = [*found, *wider]
-        if min((h.cost for h in wider), default=np.inf) >= best.cost:
-            break
+    # The cheapest of all, and of those that have the marker dark: all it lacks may be a row.
+    groups = (found, [hypothesis for hypothesis in found if hypothesis.marker == "dark"])
+    starts = [min(group, key=lambda hypothesis: hypothesis.cost) for group in groups if group]
+    for start in starts[:1] + [start for start in starts[1:] if start is not starts[0]]:
+        best: Hypothesis | None = start
+        while best is not None:
+            most = MOST_BEYOND * len(scene.plane_mm)
+            wider = _rows_begun(scene, best) if LEAST_ROW <= best.stray <= most else []
+            found = [*found, *wider]
+            cheapest = min(wider, key=lambda hypothesis: hypothesis.cost, default=best)
+            best = cheapest if cheapest.cost < best.cost else None
     return found
 
 
@@ -229,8 +315,8 @@ def _labelled(ray: IntArray, dot: IntArray, shape: tuple[int, ...]) -> IntArray:
     return labels
 
 
-def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int, int]:
-    """Count rays that should have a dot and have none, and dots that have no ray.
+def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[Prediction, IntArray]:
+    """Find rays that should have a dot and have none, and the indices of dots that have no ray.
 
     Where the surface lets dots run into each other there is nothing to be told of either.
     """
@@ -240,12 +326,12 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[int,
     rays = scene.rays[among.at[:, 0], among.at[:, 1]]
     hidden = blocked(among.points_mm, rays, scene.rig, pool)
     silent = ~lit[among.at[:, 0], among.at[:, 1]] & ~merged & ~hidden
-    missed = int(np.sum(silent & scene.in_view(among.plane_mm)))
+    unseen = among.part(silent & scene.in_view(among.plane_mm))
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
     if merged.any() and len(stray):
         off = np.asarray(cKDTree(among.plane_mm[merged]).query(scene.plane_mm[stray])[0])
         stray = stray[off > scene.resolution_mm]
-    return missed, len(stray)
+    return unseen, stray
 
 
 def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:

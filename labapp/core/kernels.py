@@ -238,6 +238,33 @@ def add_gram(
                 normal[row + column] += along_x * by_x[other] + along_y * by_y[other]
 
 
+@_compiled(_f2, types.Array(types.int64, 2, "A", readonly=True), _f3)
+def covariance_of(lower: FloatArray, splines: IntArray, parts: FloatArray) -> FloatArray:
+    """`SlopeFit.covariance_of`: with L the factor and R the parts, (L⁻¹R)ᵀ L⁻¹R of each pair."""
+    width, count, pairs = lower.shape[0] - 1, lower.shape[1], len(splines)
+    right, first = np.zeros((count, 2 * pairs)), count
+    for k in range(pairs):
+        for s in range(splines.shape[1]):
+            first = min(first, splines[k, s])
+            right[splines[k, s], 2 * k] += parts[k, 0, s]
+            right[splines[k, s], 2 * k + 1] += parts[k, 1, s]
+    made = np.zeros((pairs, 2, 2))
+    for i in range(first, count):
+        row = right[i]
+        for j in range(max(first, i - width), i):
+            factor, before = lower[i - j, j], right[j]
+            for k in range(2 * pairs):
+                row[k] -= factor * before[k]
+        row /= lower[0, i]
+        for k in range(pairs):
+            a, b = row[2 * k], row[2 * k + 1]
+            made[k, 0, 0] += a * a
+            made[k, 0, 1] += a * b
+            made[k, 1, 1] += b * b
+    made[:, 1, 0] = made[:, 0, 1]
+    return made
+
+
 @_compiled(_f2, _f1, _f2, _f3, _f1, _f2)
 def pull(
     grid: FloatArray,

@@ -83,17 +83,18 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         )
     points = dots.image_px * [1.0, -1.0]
     tree = cKDTree(points)
-    best: dict[Site, int] = {}
-    tried: set[int] = set()
     plane = [complex(*point) for point in points]
+    grid: dict[Site, int] = {}
+    tried: set[int] = set()
     for seed, first, second in _seeds(points, tree):
         if seed in tried:
             continue
-        grid = _sound_part(_Growth(points, tree, settings).run(seed, first, second), plane)
-        tried.update(grid.values())
-        if len(grid) > len(best):
-            best = grid
-    grid = _without_slips(_upright(_unsheared(best, plane), points), plane) if best else best
+        grown = _sound_part(_Growth(points, tree, settings).run(seed, first, second), plane)
+        tried.update(grown.values())
+        # Held against the best so far by what is left of it: a slip halves the largest grid.
+        if len(grown) > len(grid):
+            grown = _without_slips(_upright(_unsheared(grown, plane), points), plane)
+            grid = max(grid, grown, key=len)
     if len(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
     grid = _from_one(grid)
@@ -418,6 +419,13 @@ def find_holes(grid: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
         if nearest > 0.5 * np.linalg.norm(right - left) / 2:
             holes.append(((k, t), sum(lit)))
     return sorted(holes, key=lambda hole: (-hole[1], hole[0]))
+
+
+def empty_sites(lattice: Lattice) -> list[Site]:
+    """Sites (k, t) without a dot, next to at least one with a dot."""
+    on = lattice.row > 0
+    taken = set(zip(lattice.row[on].tolist(), lattice.column[on].tolist(), strict=True))
+    return sorted({(k + dk, t + dt) for k, t in taken for dk, dt in _NEXT} - taken)
 
 
 def _blocked_rows(grid: dict[Site, int]) -> frozenset[int]:

@@ -55,10 +55,15 @@ LEAST_LABELS = 6
 """A quadric wants three slopes each way; the six dots nearest a hole give twice that."""
 
 # While dots are being labelled the surface is kept stiffer than in the final fit: a wrong label
-# must stand out rather than be bent to. Shallow pools are followed farther by the stiffer of the
-# two, steep ones only by the softer.
-_STIFF = FitSettings(rounds=5, knot_mm=1.2, jerk=0.036, floor_mm=0.03, settled_mm=2e-3)
-_SOFT = replace(_STIFF, jerk=0.12)
+# must stand out rather than be bent to. Shallow pools are followed farther by a stiff surface,
+# steep ones only by a soft one. Only knots as fine as the final fit's follow a dent; a few labels
+# lead farther with wider ones.
+_FINE = FitSettings(rounds=5, jerk=0.05, floor_mm=0.03, settled_mm=2e-3)
+_WIDE = replace(_FINE, knot_mm=1.2, jerk=0.036)
+_SOFT, _WIDE_SOFT = replace(_FINE, jerk=0.12), replace(_WIDE, jerk=0.12)
+
+FEW_LABELS = 25
+"""A whole grid labels more dots than this, a quadric round a hole fewer."""
 
 
 @dataclass(frozen=True)
@@ -180,13 +185,18 @@ class Prediction:
     plane_mm: FloatArray
     spacing_mm: FloatArray
 
+    def part(self, which: BoolArray) -> Prediction:
+        """Only some of the rays, by a mask of shape (m,)."""
+        return Prediction(
+            self.at[which], self.points_mm[which], self.plane_mm[which], self.spacing_mm[which]
+        )
+
     def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
         """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
         cells = pool.surface.basis.cells(*self.points_mm[:, :2].T)
         slopes = np.swapaxes(cells.value_and_slopes()[1:], 0, 1)
         moved = np.linalg.inv(slope_of_dot(self.points_mm, self.plane_mm, rig)) @ slopes
-        own = pool.covariance[cells.splines[:, :, None], cells.splines[:, None, :]]
-        return np.asarray(moved @ own @ np.swapaxes(moved, -1, -2))
+        return pool.slopes.covariance_of(cells.splines, moved)
 
 
 def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
@@ -206,8 +216,10 @@ def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
     """
     best: IntArray | None = None
     enough = (1 - FEW_LEFT) * len(scene.plane_mm)
+    few = _count(labels) < FEW_LABELS
+    course = (_WIDE, _WIDE_SOFT, _WIDE) if few else (_FINE, _SOFT, _FINE)
     for attempt in range(2):
-        for settings in (_STIFF, _SOFT, _STIFF):
+        for settings in course:
             grown = _settled(scene, labels, settings)
             if grown is not None and (best is None or _count(grown) > _count(best)):
                 best = grown
@@ -252,7 +264,7 @@ def try_fit(scene: Scene, labels: IntArray, settings: FitSettings = _SOFT) -> Fi
         return None
     try:
         return scene.fit(labels, np.zeros(labels.shape, np.int64), settings)
-    except (CannotMeasure, np.linalg.LinAlgError):
+    except CannotMeasure:
         return None
 
 

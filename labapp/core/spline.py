@@ -11,9 +11,9 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
 DEGREE = 3
 
@@ -73,30 +73,31 @@ def _values_and_slopes(*step_mm: float) -> FloatArray:
     return pieces
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _roughness(nx: int, ny: int, *step_mm: float) -> FloatArray:
     """`SplineBasis.roughness`; kept, as a search lays the same splines again and again."""
-    grams = []
     node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
     power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
-    for count, step in zip((nx, ny), step_mm, strict=True):
-        gram = np.zeros((DEGREE + 1, count, count))
+    x, y = grams = [np.zeros((DEGREE + 1, count, count)) for count in (nx, ny)]
+    for gram, step in zip(grams, step_mm, strict=True):
         for order, pieces in enumerate(_PIECES):
             part = power @ (pieces / step**order)
             within = (part * (weight * step / 2)[:, None]).T @ part
-            for cell in range(count - DEGREE):
+            for cell in range(gram.shape[1] - DEGREE):
                 own = slice(cell, cell + DEGREE + 1)
                 gram[order, own, own] += within
-        grams.append(gram)
-    x, y = grams
-    roughness = (
-        np.kron(x[3], y[0])
-        + 3 * np.kron(x[2], y[1])
-        + 3 * np.kron(x[1], y[2])
-        + np.kron(x[0], y[3])
-    )
-    roughness.flags.writeable = False
-    return np.asarray(roughness)
+    # Where splines i and i + a along x, j and j + b along y meet; columns together, as LAPACK
+    # has them.
+    band = np.zeros((nx, ny, DEGREE * (ny + 1) + 1))
+    for a in range(DEGREE + 1):
+        for b in range(-DEGREE if a else 0, DEGREE + 1):
+            along, across = (np.diagonal(gram, k, 1, 2) for gram, k in ((x, a), (y, abs(b))))
+            own = slice(max(-b, 0), ny - max(b, 0))
+            band[: nx - a, own, a * ny + b] = np.einsum(
+                "o,oi,oj->ij", [1.0, 3.0, 3.0, 1.0], along[::-1], across
+            )
+    band.flags.writeable = False
+    return band.reshape(nx * ny, -1).T
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,10 @@ class SplineBasis:
 
     @property
     def roughness(self) -> FloatArray:
-        """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc, shape (splines, splines)."""
+        """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc.
+
+        Its lower band, shape (width + 1, splines), as LAPACK has it.
+        """
         return _roughness(*self.shape, *self.step_mm)
 
 
@@ -251,7 +255,8 @@ class SlopeFit:
     surface
         The surface, its mean height over the points 0.
     factor
-        Upper triangular factor U, UᵀU the normal matrix, shape (splines, splines), mm⁻².
+        Cholesky factor of the normal matrix with one spline held, lower band, shape
+        (width + 1, splines).
     level
         Mean value of each spline over the points, shape (splines,).
     """
@@ -264,10 +269,30 @@ class SlopeFit:
     def covariance(self) -> FloatArray:
         """Covariance of the coefficients, the level left out, shape (splines, splines), mm²."""
         level, ones = self.level, np.ones(len(self.level))
-        covariance = cho_solve((self.factor, False), np.eye(len(ones)), check_finite=False)
-        # What the held level seems to know about itself is taken out again.
+        covariance = dpbtrs(self.factor, np.eye(len(ones), order="F"), lower=1, overwrite_b=1)[0]
+        # What the held spline seems to know about the level is taken out again.
         held = covariance - np.outer(ones, level @ covariance) - np.outer(covariance @ level, ones)
         return np.asarray(held + (level @ covariance @ level) * np.outer(ones, ones))
+
+    def covariance_of(self, splines: IntArray, parts: FloatArray) -> FloatArray:
+        """Covariance of pairs of linear combinations of coefficients, blind to the level.
+
+        Parameters
+        ----------
+        splines
+            Numbers of the 16 splines of each pair, shape (n, 16).
+        parts
+            What each of these coefficients counts for in either, shape (n, 2, 16); either adds up
+            to 0.
+
+        Returns
+        -------
+        FloatArray
+            Shape (n, 2, 2).
+        """
+        from labapp.core import kernels
+
+        return kernels.covariance_of(self.factor, splines, parts)
 
 
 def fit_slopes(
@@ -292,6 +317,11 @@ def fit_slopes(
     stiffness
         Weight of the roughness, mm⁶: the area over which the third derivatives go together, over
         their expected variance.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if the slopes do not settle the surface.
     """
     from labapp.core import kernels
 
@@ -299,14 +329,42 @@ def fit_slopes(
     splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
     pull = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
     target = np.bincount(splines.ravel(), pull.ravel(), count)
-    normal = stiffness * basis.roughness
-    kernels.add_gram(basis.grid, points_mm, weights, normal.reshape(-1), count)
-    # Slopes say nothing of the level: hold the mean height at 0, as firmly as the slopes hold.
+    factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
+    coefficients = dpbtrs(factor, target, lower=1)[0]
     level = np.bincount(splines.ravel(), value.ravel(), count) / len(points_mm)
-    scale = np.trace(normal) / count
-    normal += scale * np.outer(level, level)
-    normal[np.diag_indices(count)] += 1e-11 * scale
-    factor, _ = cho_factor(normal)
-    coefficients = cho_solve((factor, False), target, check_finite=False)
     surface = SplineSurface(basis, coefficients - level @ coefficients)
     return SlopeFit(surface, factor, level)
+
+
+def normal_factor(
+    basis: SplineBasis, stiffness: FloatArray, points_mm: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """Cholesky factor of the normal matrix of slopes at points, lower band, shape (width + 1, p).
+
+    Slopes leave the level open; it is held by one spline in the middle, which moves nothing else.
+
+    Parameters
+    ----------
+    basis
+        The p splines.
+    stiffness
+        Weight of the roughness times its matrix, lower band, shape (width + 1, p).
+    points_mm, weights
+        See `fit_slopes`.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if there is none.
+    """
+    from labapp.core import kernels
+
+    columns, (height, count) = stiffness.flatten(order="F"), stiffness.shape
+    kernels.add_gram(basis.grid, points_mm, weights, columns, height - 1)
+    band = columns.reshape(count, height).T
+    middle = kernels.splines_at(basis.grid, points_mm[len(points_mm) // 2, None])[0]
+    band[0, middle[0, 5]] += band[0].mean()
+    lower, info = dpbtrf(band, lower=1, overwrite_ab=1)
+    if info:
+        raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
+    return np.asarray(lower)

@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numba import types
 from scipy.linalg.blas import dsbmv
-from scipy.linalg.lapack import dpbtrf, dpbtrs
+from scipy.linalg.lapack import dpbtrs
 
 from labapp.core import kernels
 from labapp.core.compiled import compiled
 from labapp.core.optics import meet_level, ray_directions
 from labapp.core.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
 from labapp.core.rig import Rig
-from labapp.core.spline import DEGREE, SplineBasis
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.spline import SplineBasis, normal_factor
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 
 ROUNDS = 8
 SETTLED_MM, SERVES_MM = 3e-4, 5e-3
@@ -83,11 +83,6 @@ class Bed:
         spacing = landing_spacing(landing)
         at = np.argwhere(basis.contains(landing[..., 0], landing[..., 1]))
         rays, landing = rays[at[:, 0], at[:, 1]], landing[at[:, 0], at[:, 1]]
-        count, width = basis.shape[0] * basis.shape[1], DEGREE * (basis.shape[1] + 1)
-        stiffness = np.zeros((width + 1, count), order="F")  # columns together, as LAPACK has it
-        matrix = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
-        for k in range(width + 1):
-            stiffness[k, : count - k] = np.diagonal(matrix, -k)
         number = {(i, j): k for k, (i, j) in enumerate((at + 1).tolist())}
         hole = None
         if rig.pattern.marker is not None:
@@ -106,7 +101,7 @@ class Bed:
             spacing_mm=spacing,
             laser_mm=rig.laser.position_mm,
             plane=rig.imaging_plane.pose_mm,
-            stiffness=stiffness,
+            stiffness=CORRELATED_MM2 / settings.jerk**2 * basis.roughness,
             settings=settings,
         )
 
@@ -210,8 +205,8 @@ def fit_slopes_to(
     Returns
     -------
     pool, lower, moved_mm
-        The surface; the factor of the normal matrix (`factor`); how far the reflection point moved
-        that moved most in the last round.
+        The surface; the factor of the normal matrix (`spline.normal_factor`); how far the
+        reflection point moved that moved most in the last round.
 
     Raises
     ------
@@ -221,10 +216,10 @@ def fit_slopes_to(
     grid, rays, weights = bed.basis.grid, bed.rays[slopes.ray], slopes.weights
     coefficients, points = pool.coefficients, pool.points_mm[slopes.ray]
     width, moved = len(bed.stiffness) - 1, 0.0
-    lower = factor(bed, points, weights) if lower is None else lower
+    lower = normal_factor(bed.basis, bed.stiffness, points, weights) if lower is None else lower
     for _ in range(rounds):
         if moved > SERVES_MM:
-            lower = factor(bed, points, weights)
+            lower = normal_factor(bed.basis, bed.stiffness, points, weights)
         target = kernels.pull(grid, coefficients, points, weights, bed.laser_mm, slopes.dots_mm)
         target -= dsbmv(width, 1.0, bed.stiffness, coefficients - rest, lower=1)
         coefficients = coefficients + solve(lower, target)
@@ -236,29 +231,8 @@ def fit_slopes_to(
     return met(bed, coefficients, every, 1), lower, moved
 
 
-def factor(bed: Bed, points_mm: FloatArray, weights: FloatArray) -> FloatArray:
-    """Cholesky factor of the normal matrix of slopes at points, lower band, shape (width + 1, p).
-
-    Slopes leave the level open; it is held by one spline in the middle, which moves nothing else.
-
-    Raises
-    ------
-    CannotMeasure
-        ``no-surface`` if there is none.
-    """
-    columns, (height, count) = bed.stiffness.flatten(order="F"), bed.stiffness.shape
-    kernels.add_gram(bed.basis.grid, points_mm, weights, columns, height - 1)
-    band = columns.reshape(count, height).T
-    middle = kernels.splines_at(bed.basis.grid, points_mm[len(points_mm) // 2, None])[0]
-    band[0, middle[0, 5]] += band[0].mean()
-    lower, info = dpbtrf(band, lower=1, overwrite_ab=1)
-    if info:
-        raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
-    return np.asarray(lower)
-
-
 def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve the normal equations of a `factor` for right sides, shape (p,) or (p, m)."""
+    """Solve the normal equations of a factor for right sides, shape (p,) or (p, m)."""
     return np.asarray(dpbtrs(lower, right, lower=1)[0])
 
 

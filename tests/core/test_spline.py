@@ -62,11 +62,17 @@ def test_derivatives_are_those_of_the_splines(dx: int, dy: int) -> None:
     np.testing.assert_allclose(BASIS.matrix(x, y, dx, dy), (after - before) / (2 * h), atol=1e-6)
 
 
+def roughness() -> FloatArray:
+    """The whole symmetric matrix of the band."""
+    lower = sum(np.diag(line[: len(line) - k], -k) for k, line in enumerate(BASIS.roughness))
+    return np.asarray(lower + np.tril(lower, -1).T)
+
+
 @given(st.tuples(*[st.floats(-2.0, 2.0)] * 5))
 def test_quadrics_are_not_rough(terms: tuple[float, ...]) -> None:
     xy = places(300)
     coefficients = through(quadric(np.array(terms), xy), xy)
-    assert coefficients @ BASIS.roughness @ coefficients == pytest.approx(0.0, abs=1e-9)
+    assert coefficients @ roughness() @ coefficients == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_roughness_of_a_cubic_is_its_integral() -> None:
@@ -76,9 +82,9 @@ def test_the_roughness_of_a_cubic_is_its_integral() -> None:
     area = np.prod(HIGH - LOW)
     for cubic, integrand in ((x**3, 36), (x**2 * y, 3 * 4), (x * y**2, 3 * 4), (y**3, 36)):
         coefficients = through(cubic, xy)
-        rough = coefficients @ BASIS.roughness @ coefficients
+        rough = coefficients @ roughness() @ coefficients
         assert rough == pytest.approx(integrand * area, rel=1e-6)
-    assert np.linalg.eigvalsh(BASIS.roughness).min() > -1e-9
+    assert np.linalg.eigvalsh(roughness()).min() > -1e-9
 
 
 def test_a_surface_is_nan_outside_and_rises_as_a_whole() -> None:
@@ -139,3 +145,17 @@ def test_the_covariance_is_the_spread_of_repeated_fits() -> None:
     np.testing.assert_allclose(found / told, 1.0, atol=0.2)
     level = BASIS.matrix(*xy.T).mean(axis=0)
     assert level @ fitted.covariance @ level == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_covariance_of_slopes_is_that_of_the_coefficients() -> None:
+    xy, at = places(120), places(12, seed=3) * 0.8
+    weights = np.tile(np.diag([4e4, 1e4]), (len(xy), 1, 1))
+    fitted = fit_slopes(BASIS, xy, np.zeros_like(xy), weights, 1e-3)
+    matrix = np.stack([BASIS.matrix(*at.T, 1, 0), BASIS.matrix(*at.T, 0, 1)], axis=1)
+    cells = BASIS.cells(*at.T)
+    parts = np.swapaxes(cells.value_and_slopes()[1:], 0, 1)
+    np.testing.assert_allclose(
+        fitted.covariance_of(cells.splines, parts),
+        matrix @ fitted.covariance @ np.swapaxes(matrix, 1, 2),
+        rtol=1e-6,
+    )

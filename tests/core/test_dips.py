@@ -1,0 +1,74 @@
+"""Pools with a dip under the torch, where a shift by a row explains the dots nearly as well."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.hypothesis import Hypothesis, contested, moved, weigh
+from labapp.core.ray_growth import UNLABELLED, Scene
+from labapp.core.values import IntArray
+from tests.benchmarks.dips import answer, draw
+from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots
+
+SHIFTED = 37
+"""A pool that was once answered with every ray a row off."""
+
+
+def scene_of(seen: SeenDots) -> tuple[Scene, IntArray]:
+    """The scene, and the true labels."""
+    labels = np.full((BENCH_RIG.pattern.rows, BENCH_RIG.pattern.columns), UNLABELLED, np.int64)
+    dot = np.flatnonzero(seen.ray[:, 0] > 0)
+    labels[seen.ray[dot, 0] - 1, seen.ray[dot, 1] - 1] = dot
+    return Scene.of(seen.dots, BENCH_RIG, BENCH_VIEW, FRAME_SHAPE), labels
+
+
+def weighed(scene: Scene, labels: IntArray) -> Hypothesis:
+    hypothesis = weigh(scene, labels)
+    assert hypothesis is not None
+    return hypothesis
+
+
+@pytest.mark.parametrize("seed", [SHIFTED, 1, 2, 3])
+def test_a_pool_with_a_dip_has_its_rows_told_right(seed: int) -> None:
+    got = answer(*draw(seed))
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.95 * got.shown
+    assert abs(got.height) < 0.03
+
+
+def test_the_true_rows_cost_less_than_those_that_put_a_dot_on_the_absent_ray() -> None:
+    scene, labels = scene_of(draw(SHIFTED)[1])
+    true = weighed(scene, labels)
+    shifted = [weighed(scene, other) for other in moved(scene, labels)]
+    assert (true.marker, true.stray, true.missed) == ("dark", 0, 0)
+    assert [other.marker for other in shifted] == ["lit"] * 4
+    assert true.cost < min(other.cost for other in shifted) - 50
+
+
+def test_a_marker_that_is_not_amid_labelled_rays_is_unknown() -> None:
+    scene, labels = scene_of(draw(SHIFTED)[1])
+    assert BENCH_RIG.pattern.marker is not None
+    apart = labels.copy()
+    apart[: BENCH_RIG.pattern.marker[0]] = UNLABELLED
+    apart[:, : BENCH_RIG.pattern.marker[1]] = UNLABELLED
+    assert weighed(scene, apart).marker == "unknown"
+
+
+def test_labels_next_to_a_dot_without_a_ray_are_in_doubt() -> None:
+    _, seen = draw(SHIFTED)
+    scene, labels = scene_of(seen)
+    assert len(contested(scene, weighed(scene, labels))) == 0
+    # A false dot beside a true one may be the right one.
+    dot = int(labels[labels != UNLABELLED][20])
+    nearest = np.sort(np.linalg.norm(scene.plane_mm - scene.plane_mm[dot], axis=-1))[1]
+    beside = scene.plane_mm[dot] + [0.2 * nearest, 0.0]
+    crowded = Scene(
+        np.vstack([scene.plane_mm, beside]),
+        np.concatenate([scene.covariance_mm2, scene.covariance_mm2[dot][None]]),
+        1e-3,
+        scene.rig,
+        scene.calibration,
+        scene.frame_shape,
+    )
+    assert contested(crowded, weighed(crowded, labels)).tolist() == [dot]
