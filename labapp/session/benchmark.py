@@ -24,6 +24,7 @@ from labapp.core.quick_dots import Exposure, quick_dots
 from labapp.core.values import FloatArray, IntArray
 from labapp.core.warm import WarmChain
 from labapp.media import open_source
+from labapp.session.files import made_whole
 from labapp.session.results import ResultsWriter
 from labapp.session.scenario import read_scenario
 from labapp.session.sequence import Job, await_ready, followers, measure_sequence
@@ -135,8 +136,11 @@ def _rows(path: Path) -> Iterator[dict[str, str]]:
 
 
 def _write_raw(source_path: Path, path: Path) -> None:
-    part = path.with_suffix(".part.avi")
-    with open_source(source_path) as source, av.open(str(part), "w", format="avi") as container:
+    with (
+        made_whole(path) as part,
+        open_source(source_path) as source,
+        av.open(str(part), "w", format="avi") as container,
+    ):
         stream = container.add_stream("rawvideo", rate=round(RATE_HZ))
         stream.height, stream.width = source.shape
         stream.pix_fmt = "gray"
@@ -144,7 +148,6 @@ def _write_raw(source_path: Path, path: Path) -> None:
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame.image), format="gray")
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
-    part.replace(path)
 
 
 # --- the chain ----------------------------------------------------------------------------------

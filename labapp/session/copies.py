@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+import tempfile
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from urllib.parse import quote
 from labapp.errors import InputError
 from labapp.session.database import SUFFIX, new_session_path
 from labapp.session.documents import WHOLE, Key, Kind
+from labapp.session.files import made_whole
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 
@@ -42,18 +44,15 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
         If there is a file of that name, or it cannot be written.
     """
     path = new_session_path(path)
-    beside = path.with_name(f".{path.name}.part")
+    uri = f"file:{quote(os.fspath(source))}?mode=ro"
     try:
-        beside.unlink(missing_ok=True)
-        uri = f"file:{quote(os.fspath(source))}?mode=ro"
         with (
+            made_whole(path) as part,
             closing(sqlite3.connect(uri, uri=True, timeout=BUSY_S)) as there,
-            closing(sqlite3.connect(beside)) as here,
+            closing(sqlite3.connect(part)) as here,
         ):
             there.backup(here)
-        beside.rename(path)
     except (OSError, sqlite3.Error) as error:
-        beside.unlink(missing_ok=True)
         raise InputError(path, "file", error, "a folder that can be written") from error
     with Session.open(path) as copy:
         recording = copy.recording
@@ -124,14 +123,14 @@ def copy_sample(name: str, folder: Path) -> Path:
     session = f"{name}{SUFFIX}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for part in (SAMPLES[name].recording, session):
-            if not (folder / part).exists():
-                beside = folder / f".{part}.part"
-                if (sample / part).is_dir():
-                    shutil.copytree(sample / part, beside, dirs_exist_ok=True)
-                else:
-                    shutil.copyfile(sample / part, beside)
-                beside.rename(folder / part)
+        for each in (SAMPLES[name].recording, session):
+            if (folder / each).exists():
+                continue
+            with tempfile.TemporaryDirectory(prefix=".", dir=folder) as hidden:
+                part = Path(hidden) / each
+                copy = shutil.copytree if (sample / each).is_dir() else shutil.copyfile
+                copy(sample / each, part)
+                part.rename(folder / each)
     except OSError as error:
         raise InputError(folder, "folder", error.strerror, "one that can be written") from error
     return folder / session

@@ -1,6 +1,6 @@
 """Chosen results of many frames in one folder that is whole or not there, with a manifest.
 
-The folder is made beside its place, as ``.NAME.part``, and renamed when all of it is there. An
+The folder is made beside its place, as ``.NAME.….part``, and renamed when all of it is there. An
 export that was there before is replaced then and not earlier, and only if it still is as it was
 written: somebody's own files are never deleted.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -24,7 +25,7 @@ from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.media import GreyImage
 from labapp.session.drawing import VIEWS, Direction
-from labapp.session.files import as_bytes
+from labapp.session.files import as_bytes, beside
 from labapp.session.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.session.hdf5 import Hdf5Writer
 from labapp.session.meshes import FORMATS, SMALLEST_SPACING_MM, SPACING_MM
@@ -44,6 +45,7 @@ HDF5_FILE = "results.h5"
 TREND_FILE = "trends.png"
 TREND = ("width", "length", "height")
 FILM_FILE = "film.mp4"
+OLD = ".old"
 PICTURES = ("frames", "surfaces", "trends", "film")
 
 SIZES_PX = range(320, 3841, 2)
@@ -361,28 +363,23 @@ def _draw_trend(path: Path, summary: Summary) -> None:
 @contextmanager
 def _beside(target: Path) -> Iterator[Path]:
     """A folder beside the target, which takes its place when all went well."""
-    part = target.with_name(f".{target.name}.part")
-    old = target.with_name(f".{target.name}.old")
     target.parent.mkdir(parents=True, exist_ok=True)
     with _alone(target):
+        _check_replaceable(target)
+        part = beside(target)
+        part.mkdir()
         try:
-            if old.exists() and not target.exists():  # ended between the two steps of `_swap`
-                old.rename(target)
-            _check_replaceable(target)
-            part.mkdir(exist_ok=True)
-            for path in part.iterdir():
-                path.unlink()
             yield part
             sync_folder(part)
             _check_replaceable(target)
-            _swap(part, target, old)
+            _swap(part, target, part.with_suffix(OLD))
         finally:
             shutil.rmtree(part, ignore_errors=True)
 
 
 @contextmanager
 def _alone(target: Path) -> Iterator[None]:
-    """Keep a second export to the same place out."""
+    """Keep a second export to the same place out; tidy up after one that was killed."""
     path = target.with_name(f".{target.name}.lock")
     lock = FileLock(path)
     try:
@@ -394,6 +391,8 @@ def _alone(target: Path) -> Iterator[None]:
     except (OSError, NotImplementedError):
         pass  # some network drives have no locks
     try:
+        if lock.is_locked:
+            _tidy(target)
         yield
     finally:
         if lock.is_locked:
@@ -403,12 +402,22 @@ def _alone(target: Path) -> Iterator[None]:
             lock.release()
 
 
+def _tidy(target: Path) -> None:
+    """Take away what a killed export left; put back what it was about to replace."""
+    ours = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.(part|old)")
+    for path in target.parent.iterdir():
+        if not ours.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
+            continue
+        if path.suffix == OLD and not target.exists():  # ended between the two steps of `_swap`
+            path.rename(target)
+        else:
+            shutil.rmtree(path, ignore_errors=True)
+
+
 def _swap(part: Path, target: Path, old: Path) -> None:
     """Put the folder in its place; what was there is back if that fails, and gone if not."""
     try:
         if target.exists():
-            if old.exists():
-                shutil.rmtree(old)
             target.rename(old)
         part.rename(target)
     except BaseException:

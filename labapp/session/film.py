@@ -23,6 +23,7 @@ from av.video.stream import VideoStream
 from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
+from labapp.session.files import made_whole
 from labapp.session.scene import Scene, empty_scene, scene_of
 from labapp.session.studio import Picture, draw_there
 
@@ -184,23 +185,18 @@ def write_video(path: Path, pictures: Iterable[Picture], times_s: FloatArray) ->
         rate = 1 / np.diff(times_s).min()
         most = f"at most {TICKS_HZ} frames/s: a film that is slower than the recording"
         raise InputError("export", "film_rate_hz", f"{rate:.6g}", most)
-    beside = path.with_name(f".{path.name}.part")
-    try:
-        # Written through Python's file, that a full disk is told as such.
-        with beside.open("wb") as file:
-            container = av.open(file, "w", format="mp4")
-            try:
-                _encode(container, pictures, ticks)
-            except BaseException:
-                with contextlib.suppress(FFmpegError, OSError):  # what failed first is told
-                    container.close()
-                raise
-            container.close()
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    # Written through Python's file, that a full disk is told as such.
+    with made_whole(path) as part, part.open("wb") as file:
+        container = av.open(file, "w", format="mp4")
+        try:
+            _encode(container, pictures, ticks)
+        except BaseException:
+            with contextlib.suppress(FFmpegError, OSError):  # what failed first is told
+                container.close()
+            raise
+        container.close()
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _encode(container: OutputContainer, pictures: Iterable[Picture], ticks: IntArray) -> None:

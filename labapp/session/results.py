@@ -204,6 +204,8 @@ class ResultsWriter:
 
 def _clear(folder: Path) -> None:
     """Take away a former run's results, `measures.csv` first: no row without its files."""
+    if (folder / RUN_FILE).is_symlink():  # `write_whole` would write to where it points
+        raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
     ours = [path for path in folder.iterdir() if OURS.fullmatch(path.name)]
     if ours and not _is_run(folder / RUN_FILE):
         raise InputError(

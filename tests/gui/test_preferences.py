@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -77,8 +78,8 @@ def test_a_folder_in_its_place_is_said(tmp_path: Path):
 def test_a_file_that_was_there_stays_whole_when_it_cannot_be_written(tmp_path: Path):
     file = tmp_path / "preferences.json"
     assert write_preferences(file, SOME) == ""
-    (tmp_path / ".preferences.json.part").mkdir()
-    assert "could not be saved" in write_preferences(file, Preferences())
+    with mock.patch("os.fsync", side_effect=OSError(28, "No space left on device")):
+        assert "could not be saved" in write_preferences(file, Preferences())
     assert json.loads(file.read_bytes())["version"] == VERSION
     assert read_preferences(file)[0] == SOME
 

@@ -330,6 +330,18 @@ CHANGES = {
 }
 
 
+def test_a_link_in_the_place_of_the_folder_in_the_making_is_not_followed(
+    run: Run, tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    mine(tmp_path / "mine")
+    for name in (".out.part", ".out.old", ".out.0123456789abcdef.part", ".out.lock"):
+        (tmp_path / name).symlink_to("mine")
+    for _ in range(2):
+        run(tmp_path / "out")
+    assert contents(tmp_path / "mine") == {"notes.txt": b"mine"}
+
+
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
 def test_somebodys_own_files_are_never_deleted(
     run: Run, tmp_path: Path, change: Callable[[Path], None]
@@ -448,9 +460,11 @@ def test_what_a_killed_export_left_is_cleared_away(run: Run, tmp_path: Path) -> 
     out = tmp_path / "out"
     run(out, ExportChoice())
     before = contents(out)
-    (tmp_path / ".out.part").mkdir()
-    (tmp_path / ".out.part" / "measures.csv").write_text("half")
-    out.rename(tmp_path / ".out.old")  # ended between the two steps of putting it in place
+    for made in (tmp_path / ".out.0123456789abcdef.part", tmp_path / ".out.fedcba9876543210.part"):
+        made.mkdir()
+        (made / "measures.csv").write_text("half")
+    # Ended between the two steps of putting it in place.
+    out.rename(tmp_path / ".out.0123456789abcdef.old")
     with pytest.raises(Stopped):
         run(out, progress=mock.Mock(side_effect=Stopped))
     assert contents(out) == before

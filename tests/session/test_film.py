@@ -122,6 +122,14 @@ def test_frames_that_come_too_fast_are_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_link_beside_it_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / ".a.mp4.part").symlink_to("mine.txt")
+    write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)], np.arange(2.0))
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert len(read(tmp_path / "a.mp4")[0]) == 1
+
+
 # --- what is shown -------------------------------------------------------------------------------
 
 

@@ -179,6 +179,19 @@ def test_somebody_elses_file_is_not_replaced(out: Path, writer: Writer, run: str
     assert (out / "dots.csv").read_text() == "mine"
 
 
+def test_a_link_is_not_followed(out: Path, writer: Writer) -> None:
+    out.mkdir(parents=True)
+    (out.parent / "mine.json").write_text("mine")
+    (out / "run.json").symlink_to("../mine.json")
+    with pytest.raises(InputError, match=r"run\.json: is a link"):
+        writer(out)
+    (out / "run.json").unlink()
+    (out / ".run.json.part").symlink_to("../mine.json")
+    with writer(out):
+        pass
+    assert (out.parent / "mine.json").read_text() == "mine"
+
+
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, writer: Writer) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):

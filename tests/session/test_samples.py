@@ -11,6 +11,7 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.session import samples
+from labapp.session.copies import copy_sample
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 
@@ -48,6 +49,20 @@ def test_a_sample_session_is_whole_and_near_the_truth(name: str):
         assert np.abs(error).max() < 0.03
         assert session.frame(int(session.frames[-1])).image.any()
     assert path.read_bytes() == before
+
+
+def test_links_beside_the_copy_of_a_sample_are_not_followed(name: str, tmp_path: Path):
+    folder = tmp_path / "copy"
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine.txt").write_text("mine")
+    folder.mkdir()
+    for each in (SAMPLES[name].recording, f"{name}.labsession"):
+        is_folder = (sample_folder(name) / each).is_dir()
+        (folder / f".{each}.part").symlink_to("../mine" if is_folder else "../mine.txt")
+    with Session.open(copy_sample(name, folder)) as session:
+        assert session.frame(int(session.frames[0])).image.any()
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert not list((tmp_path / "mine").iterdir())
 
 
 def test_the_session_with_blocked_rows_holds_a_correction():
