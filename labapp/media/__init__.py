@@ -14,6 +14,7 @@ from labapp.media.images import IMAGE_SUFFIXES, ImageSequence, files_in, images_
 from labapp.media.numpy_stack import NPY_MAGIC, ZIP_MAGIC, NumpyStack
 from labapp.media.photron import PHOTRON_SUFFIXES, PhotronSource
 from labapp.media.quiet import quiet_opencv
+from labapp.media.stored import regular_size
 from labapp.media.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.media.video import VideoSource
 
@@ -46,7 +47,7 @@ def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> Fra
     try:
         if path.is_dir():
             return _open_folder(path, index)
-        size = path.stat().st_size
+        size = regular_size(path)
         with path.open("rb") as file:
             head = file.read(12)
     except OSError as error:

@@ -11,7 +11,7 @@ import numpy as np
 
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
-from labapp.media.stored import StoredFrames, finite
+from labapp.media.stored import StoredFrames, finite, regular_size
 from labapp.media.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 
 IMAGE_SUFFIXES = frozenset(
@@ -96,6 +96,7 @@ def read_image(path: Path) -> GreyImage:
     """
     # Read here rather than by OpenCV: it says why a file cannot be opened.
     try:
+        regular_size(path)
         content = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(path, "file", error.strerror, "a file that may be read") from error

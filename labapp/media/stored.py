@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -105,10 +107,35 @@ def finite(path: Path, image: GreyImage) -> GreyImage:
     return image
 
 
-def file_size(path: Path) -> int:
-    """Bytes in a file."""
+def regular_size(path: Path) -> int:
+    """Bytes in a regular file. A device has no end, and a pipe would be waited for: neither is one.
+
+    Raises
+    ------
+    OSError
+        If it is none, or not there.
+    """
     try:
-        return path.stat().st_size
+        found = path.stat()
+    except ValueError as error:  # a NUL byte in the name
+        raise OSError(errno.EINVAL, str(error)) from error
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "is a folder")
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "a device or a pipe, no file")
+    return found.st_size
+
+
+def file_size(path: Path) -> int:
+    """Bytes in a regular file.
+
+    Raises
+    ------
+    InputError
+        If it is none, or not there.
+    """
+    try:
+        return regular_size(path)
     except OSError as error:
         raise _unreadable(path, error) from error
 

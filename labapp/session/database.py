@@ -23,6 +23,8 @@ import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from labapp.errors import InputError
+from labapp.media.stored import regular_size
+from labapp.session.files import made_whole
 from labapp.session.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 
 SUFFIX = ".labsession"
@@ -39,6 +41,9 @@ HEADER_BYTES = 100
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROLLBACK_JOURNAL = b"\x01\x01"
 """In the header, of the program that wrote the file last and of those that may read it."""
+
+COUNTERS = "CREATE TABLE sqlite_sequence(name,seq)"
+"""SQLite's own table, for AUTOINCREMENT."""
 
 JOURNAL_MAGIC = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 """A journal begins with it, and ends with it if it names a super-journal before."""
@@ -83,22 +88,22 @@ class Database:
         """
         path = new_session_path(path)
         lock = _lock(path)
-        # Made beside its place: a crash on the way leaves no session that is none.
-        beside = path.with_name(f".{path.name}.part")
         try:
-            beside.unlink(missing_ok=True)
-            with _told(path), _closing(_connect(beside, read_only=False)) as connection:
+            # Made beside its place: a crash on the way leaves no session that is none.
+            with (
+                made_whole(path) as part,
+                _told(path),
+                _closing(_connect(part, read_only=False)) as connection,
+            ):
                 connection.execute("BEGIN IMMEDIATE")
                 for statement in TABLES:
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
                 connection.execute("COMMIT")
-            beside.rename(path)
             with _told(path):
                 return cls(path, read_only=False, lock=lock)
         except BaseException as error:
-            beside.unlink(missing_ok=True)
             _release(lock)
             if isinstance(error, OSError):
                 raise InputError(
@@ -238,8 +243,10 @@ class Database:
     def _checked(self) -> Database:
         """Refuse a file whose tables are not those of this version."""
         try:
-            found = self.rows("SELECT sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_%'")
-            if sorted(str(sql) for (sql,) in found) != sorted(TABLES):
+            # Every statement counts, whatever the name: a trigger could rewrite results. Without
+            # one are the indexes of unique columns only.
+            found = self.rows("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")
+            if sorted(str(sql) for (sql,) in found) != sorted((*TABLES, COUNTERS)):
                 raise InputError(self.path, "tables", "not those of a session", A_SESSION)
         except BaseException:
             self.close()
@@ -266,8 +273,7 @@ def new_session_path(path: str | os.PathLike[str]) -> Path:
 def _check_header(path: Path) -> int:
     """Version of a session file, told without SQLite, which would not say what is wrong."""
     try:
-        if path.is_dir():
-            raise IsADirectoryError(21, "is a folder")
+        regular_size(path)
         with path.open("rb") as file:
             header = file.read(HEADER_BYTES)
     except OSError as error:
@@ -364,12 +370,8 @@ def _migrate(path: Path, version: int) -> None:
     """Bring a file up to date, its former self kept beside it."""
     kept = path.with_name(f"{path.stem}.version-{version}{SUFFIX}")
     if not kept.exists():
-        beside = path.with_name(f".{kept.name}.part")
-        try:
-            shutil.copyfile(path, beside)
-            beside.rename(kept)
-        finally:
-            beside.unlink(missing_ok=True)
+        with made_whole(kept) as part:
+            shutil.copyfile(path, part)
     _apply_migrations(path, version)
 
 

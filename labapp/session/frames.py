@@ -22,6 +22,7 @@ import numpy.typing as npt
 from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource, GreyImage, open_source
+from labapp.media.stored import regular_size
 from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.session.blobs import MAGIC, pack, unpack_from
 from labapp.session.database import Database
@@ -426,14 +427,15 @@ def identify(path: Path) -> tuple[int, str]:
     """
     try:
         files = _files(path)
+        size = 0
         digests = []
         for file in files:
+            size += regular_size(file)
             digest = hashlib.sha256()
             with file.open("rb") as stream:
                 while part := stream.read(READ_BYTES):
                     digest.update(part)
             digests.append((file.name, digest.hexdigest()))
-        size = sum(file.stat().st_size for file in files)
     except OSError as error:
         raise InputError(path, "recording", error.strerror, "one that can be read") from error
     if len(files) == 1 and files[0] == path:

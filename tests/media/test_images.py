@@ -13,6 +13,7 @@ from labapp.media.base import to_grey
 from labapp.media.images import natural_key
 from tests.media.cine_writer import write_cine
 from tests.media.conftest import WriteVideo
+from tests.scripts import run_python
 
 GREY = (np.indices((20, 30)).sum(axis=0) * 5).astype(np.uint8)
 
@@ -197,6 +198,22 @@ def test_half_an_image_is_refused(
     with pytest.raises(InputError, match="expected a whole image"):
         open_source(path)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["pipe", "pipe.png", "pipe.avi", "pipe.mraw", "a\0.png", "folder"])
+def test_what_is_no_regular_file_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "folder").mkdir()
+    for pipe in ("pipe", "pipe.png", "pipe.avi", "pipe.mraw", "folder/1.png", "folder/2.png"):
+        os.mkfifo(tmp_path / pipe)
+    script = f"""
+        from labapp.errors import InputError
+        from labapp.media import open_source
+        try:
+            open_source({str(tmp_path / name)!r})
+        except InputError as error:
+            print(error.problems[0].expected)
+    """
+    assert run_python(script).strip()
 
 
 def test_what_is_no_source_is_refused(tmp_path: Path) -> None:

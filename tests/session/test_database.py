@@ -13,6 +13,7 @@ from labapp.errors import InputError
 from labapp.session import database as module
 from labapp.session.database import Database, SessionInUse
 from labapp.session.schema import APPLICATION_ID, TABLES, VERSION
+from tests.scripts import run_python
 
 DATA = Path(__file__).parent / "data"
 
@@ -90,12 +91,40 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
+def test_what_is_no_regular_file_is_refused(tmp_path: Path):
+    os.mkfifo(tmp_path / "pipe.labsession")
+    (tmp_path / "zero.labsession").symlink_to("/dev/zero")
+    for name in ("pipe.labsession", "zero.labsession", "a\0b.labsession"):
+        script = f"""
+            from labapp.errors import InputError
+            from labapp.session.database import Database
+            for read_only in (False, True):
+                try:
+                    Database.open({str(tmp_path / name)!r}, read_only)
+                except InputError as error:
+                    print(error.field)
+        """
+        assert run_python(script).splitlines() == ["file"] * 2
+
+
 def test_tables_of_another_make_are_refused(path: Path):
     connection = sqlite3.connect(path)
     connection.execute("DROP TABLE detail")
     connection.close()
     with pytest.raises(InputError, match="not those of a session"):
         Database.open(path)
+
+
+def test_a_trigger_is_refused_whatever_its_name(path: Path):
+    """To LIKE an underscore is any letter, and what is SQLite's own begins with sqlite_."""
+    connection = sqlite3.connect(path)
+    connection.execute(
+        "CREATE TRIGGER sqliteXevil AFTER INSERT ON document BEGIN DELETE FROM document; END"
+    )
+    connection.close()
+    for read_only in (False, True):
+        with pytest.raises(InputError, match="not those of a session"):
+            Database.open(path, read_only)
 
 
 def test_a_newer_version_is_refused_and_left_alone(path: Path):
@@ -264,6 +293,14 @@ def test_an_older_version_is_copied_and_brought_up_to_date(path: Path):
     kept = path.with_name(f"a.version-{VERSION}.labsession")
     assert kept.read_bytes() == before
     assert kinds(Database.open(path)) == ["ONE"]  # and only once
+
+
+@pytest.mark.usefixtures("next_version")
+def test_the_copy_of_an_older_version_follows_no_link(path: Path, tmp_path: Path):
+    (tmp_path / "mine.txt").write_text("mine")
+    path.with_name(f".a.version-{VERSION}.labsession.part").symlink_to("mine.txt")
+    Database.open(path).close()
+    assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
 @pytest.mark.usefixtures("next_version")

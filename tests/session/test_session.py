@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,6 +17,7 @@ from labapp.core.pipeline import Settings
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.media import open_source
+from labapp.session.blobs import pack
 from labapp.session.export import ExportChoice, verify_export
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
@@ -23,6 +25,7 @@ from labapp.session.results import ResultsWriter
 from labapp.session.run import measuring_pool
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
+from tests.scripts import run_python
 from tests.session.test_blobs import same
 
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
@@ -62,6 +65,31 @@ def pretend(session: Session, frame: int, **changes: object) -> None:
         session._basis(),  # type: ignore[arg-type]
         session._documents.fingerprint("correction", frame),
     )
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "nul", "folder with a pipe"])
+def test_a_recording_that_is_no_regular_file_is_refused(folder: Path, kind: str):
+    place = {"device": "/dev/zero", "pipe": "pipe.avi", "nul": "a\0.avi"}.get(kind, "films")
+    (folder / "films").mkdir()
+    for pipe in ("pipe.avi", "films/a.mraw", "films/a.png"):
+        os.mkfifo(folder / pipe)
+    with Session.open(folder / "run.labsession") as session:
+        assert session.recording is not None
+        forged = pack(replace(session.recording, path=place, size=0))
+        with session._database.transaction() as connection:
+            connection.execute("UPDATE recording SET content = ?", (forged,))
+    script = """
+        import sys
+        from labapp.errors import InputError
+        from labapp.session.session import Session
+        with Session.open(sys.argv[1], read_only=True) as session:
+            print(len(session.problems()) > 0)
+            try:
+                session.frame(0)
+            except InputError as error:
+                print("refused")
+    """
+    assert run_python(script, folder / "run.labsession").splitlines() == ["True", "refused"]
 
 
 def test_the_package_offers_it():

@@ -1,0 +1,34 @@
+"""Python in a process of its own, for what may hang or fill the memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+from tests.waiting import PATIENCE_S
+
+SHOW_PEAK = """
+import resource
+print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def run_python(script: str, *arguments: object) -> str:
+    """Run a script, which must end in time and without an error; what it printed."""
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+        env={"PYTHONPATH": ":".join(sys.path)},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def peak_mb(script: str, *arguments: object) -> int:
+    """Most memory that a script had at one time, MB."""
+    printed = run_python(textwrap.dedent(script) + SHOW_PEAK, *arguments)
+    return int(printed.split()[-1])
