@@ -24,6 +24,9 @@ from labapp.session.alarms import Alarm
 from labapp.session.log import NAME
 from labapp.session.tables import SIZES
 
+MOST_LISTENERS = 32
+"""Each takes an open file, of which the measurement needs some itself."""
+
 MOST_WAITING = 1_000_000
 """Bytes that may wait for a listener; one that does not read misses lines, and is told so."""
 
@@ -99,7 +102,8 @@ class LineStream:
     """A line of JSON a frame, to every program that connects by TCP.
 
     The first line says what sends: ``{"labapp": "0.1.0"}``. A line has ``missed`` where lines
-    before it were not sent because the listener did not read.
+    before it were not sent because the listener did not read. Beyond `MOST_LISTENERS` the first
+    line says ``refused``, and is the last.
 
     Parameters
     ----------
@@ -120,7 +124,9 @@ class LineStream:
         self._missed: dict[asyncio.StreamWriter, int] = {}
         self._loop = _Loop("labapp line stream")
         try:
-            self._server = self._loop.run(asyncio.start_server(self._connected, host, port))
+            # So many are taken in at once, those to be refused among them.
+            serving = asyncio.start_server(self._connected, host, port, backlog=MOST_LISTENERS)
+            self._server = self._loop.run(serving)
         except OSError as error:
             self._loop.close()
             raise _taken(host, port, error) from error
@@ -143,7 +149,13 @@ class LineStream:
         self._loop.close()
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(json.dumps({"labapp": labapp.__version__}).encode() + b"\n")
+        about = {"labapp": labapp.__version__}
+        if len(self._missed) >= MOST_LISTENERS:
+            refusal = {**about, "refused": f"{MOST_LISTENERS} programs are connected"}
+            writer.write(json.dumps(refusal).encode() + b"\n")
+            writer.close()
+            return
+        writer.write(json.dumps(about).encode() + b"\n")
         self._missed[writer] = 0
         try:
             while await reader.read(1024):

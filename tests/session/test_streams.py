@@ -6,8 +6,12 @@ import asyncio
 import json
 import math
 import socket
+import subprocess
+import sys
+import textwrap
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -66,6 +70,43 @@ def test_every_listener_gets_every_line(lines: LineStream) -> None:
                 "height_mm": 0.1 * frame,
             }
         file.close()
+
+
+def test_too_many_listeners_are_refused_and_harm_nobody() -> None:
+    """The measurement opens files while more programs connect than a process may have open."""
+    script = """
+        import resource, sys
+        resource.setrlimit(resource.RLIMIT_NOFILE, (200, 200))
+        from labapp.session.streams import LineStream
+        stream = LineStream()
+        print(stream.port, flush=True)
+        sys.stdin.readline()
+        for frame in range(100):
+            with open(sys.executable, "rb"):
+                stream.publish({"frame": frame})
+        stream.close()
+    """
+    measuring = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={"PYTHONPATH": ":".join(sys.path)},
+    )
+    assert measuring.stdin is not None
+    assert measuring.stdout is not None
+    with ExitStack() as stack:
+        port = int(measuring.stdout.readline())
+        first = stack.enter_context(connect(port)).makefile("rb")
+        assert list(json.loads(first.readline())) == ["labapp"]
+        connected = [stack.enter_context(connect(port)) for _ in range(300)]
+        # The last is answered when all before it were.
+        for each in (connected[0], connected[-1]):
+            assert "labapp" in json.loads(each.makefile("rb").readline())
+        _, told = measuring.communicate(b"go\n", PATIENCE_S)
+        assert (measuring.returncode, told) == (0, b"")
+        assert [json.loads(line)["frame"] for line in first] == list(range(100))
+        assert connected[-1].recv(1) == b""
 
 
 def test_who_does_not_read_is_told_what_it_missed_and_holds_nobody_up(lines: LineStream) -> None:
