@@ -44,6 +44,13 @@ EXPECTED = {
 }
 """What an entry of the header is called in a message, and what it should be."""
 
+MOST_HELD = 2**30
+"""A compressed array is held in memory whole, unpacked: no more bytes than this."""
+
+NOT_HELD = f"at most {MOST_HELD} bytes, or an array saved as it is (numpy.savez)"
+
+READ_BYTES = 2**20
+
 DEFLATE_RATIO = 1032
 """Deflate makes data at most so many times smaller."""
 
@@ -170,10 +177,14 @@ def _from_archive(
         frames = _archived_frames(path, file, archive, members)
         time_s = rate = None
         if "time_s" in members:
-            time_s = _load(path, archive, members["time_s"], _is_times)
-            if time_s.shape != (len(frames),) or not increasing(time_s.astype(np.float64)):
-                expected = f"{len(frames)} times that grow, s"
-                raise InputError(path, "time_s", f"shape {time_s.shape}", expected)
+            time_s = _load(
+                path,
+                archive,
+                members["time_s"],
+                lambda at, shape: _is_times(at, shape, len(frames)),
+            )
+            if not increasing(time_s.astype(np.float64)):
+                raise InputError(path, "time_s", "times that do not", _times_of(len(frames)))
             time_s = time_s.astype(np.float64) - float(time_s[0])
             if len(frames) > 1:
                 rate = plausible_rate(float(1 / np.median(np.diff(time_s))))
@@ -199,6 +210,7 @@ def _archived_frames(
         file.seek(entry.header_offset)
         head = file.read(30)
         if len(head) == 30 and head[:4] == ZIP_MAGIC:
+            _check_sum(path, archive, entry)
             lengths = int.from_bytes(head[26:28], "little") + int.from_bytes(head[28:], "little")
             start = entry.header_offset + 30 + lengths
             frames, claimed = _map_array(
@@ -210,9 +222,24 @@ def _archived_frames(
     return _load(path, archive, entry, _is_stack)
 
 
-def _is_times(path: Path, shape: tuple[int, ...]) -> None:
-    if len(shape) != 1:
-        raise InputError(path, "time_s", f"shape {shape}", "a time for every frame, s")
+def _check_sum(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
+    """Read a member through: at its end its checksum must fit."""
+    try:
+        with archive.open(entry) as file:
+            while file.read(READ_BYTES):
+                pass
+    except Exception as error:  # as in `_load`
+        raise InputError(path, entry.filename, error, "a whole array") from error
+
+
+def _is_times(path: Path, shape: tuple[int, ...], count: int) -> None:
+    if shape != (count,):
+        raise InputError(path, "time_s", f"shape {shape}", _times_of(count))
+
+
+def _times_of(count: int) -> str:
+    """What times are expected to be."""
+    return f"{count} times that grow, a time for every frame, s"
 
 
 def _is_one(path: Path, shape: tuple[int, ...]) -> None:
@@ -236,12 +263,21 @@ def _load(
                 raise InputError(
                     path, entry.filename, f"{entry.file_size} bytes", f"{needed} bytes"
                 )
-            content = file.read(needed)
+            if needed > MOST_HELD:
+                raise InputError(path, entry.filename, f"{needed} bytes, compressed", NOT_HELD)
+            content = np.empty(needed, np.uint8)
+            done = 0
+            # To the end, where the checksum is looked at.
+            while part := file.read(READ_BYTES):
+                start, done = done, done + len(part)
+                if done > needed:
+                    break
+                content[start:done] = np.frombuffer(part, np.uint8)
     except InputError:
         raise
     except Exception as error:
         # Damage, a password, a compression that is not there: each raises a kind of its own.
         raise InputError(path, entry.filename, error, "a whole array") from error
-    if len(content) != needed:
-        raise InputError(path, entry.filename, f"{len(content)} bytes", f"{needed} bytes")
+    if done != needed:
+        raise InputError(path, entry.filename, f"{done} bytes", f"{needed} bytes")
     return np.ndarray(shape, kind, content, order="F" if columns_first else "C")

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from labapp.errors import InputError
 from labapp.media import open_source
 from tests.media.mutate import survives_damage
+from tests.scripts import peak_mb
 
 RNG = np.random.default_rng(13)
 GREY = RNG.integers(0, 256, (6, 9, 13), np.uint8)
@@ -98,6 +101,53 @@ def test_an_archive_that_cannot_be_meant_is_refused(
     np.savez(path, **arrays)
     with pytest.raises(InputError, match=said):
         open_source(path)
+
+
+@pytest.mark.parametrize("write", [np.savez, np.savez_compressed])
+def test_levels_that_do_not_fit_the_checksum_are_refused(tmp_path: Path, write: object) -> None:
+    """Only the sum in the archive's directory is changed: all else is as it was."""
+    path = tmp_path / "run.npz"
+    write(path, frames=GREY)
+    content = bytearray(path.read_bytes())
+    entry = content.rindex(b"PK\x01\x02")
+    content[entry + 16] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="Bad CRC-32"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("grow", [1, 2_000_000])
+def test_an_array_with_more_behind_it_is_refused(tmp_path: Path, grow: int) -> None:
+    path = tmp_path / "run.npz"
+    array = io.BytesIO()
+    np.save(array, GREY)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("frames.npy", array.getvalue() + bytes(grow))
+    with pytest.raises(InputError, match=f"expected {GREY.nbytes} bytes"):
+        open_source(path)
+
+
+def test_a_compressed_array_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    header = {"descr": "|u1", "fortran_order": False, "shape": (2000, 1000, 1000)}
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("frames.npy", "w", force_zip64=True) as file,
+    ):
+        np.lib.format.write_array_header_1_0(file, header)
+        for _ in range(2000):
+            file.write(bytes(10**6))
+    assert path.stat().st_size < 4e6
+    script = """
+        import sys
+        from labapp.errors import InputError
+        from labapp.media import open_source
+        try:
+            open_source(sys.argv[1])
+        except InputError as error:
+            assert "frames.npy: 2000000000 bytes, compressed" in str(error)
+    """
+    assert peak_mb(script, path) < 1000
 
 
 @pytest.mark.parametrize(
