@@ -8,10 +8,10 @@ import numpy as np
 
 from labapp.core.boundary import BoundaryModel, boundary_on_work_piece
 from labapp.core.correspondence import Match
-from labapp.core.interpolation import ThinPlateSurface, whole_surface
+from labapp.core.interpolation import ThinPlateSurface
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
-from labapp.core.slopes import Paths, best_of_loops, parents_from, reflected_rays
+from labapp.core.slopes import Paths, best_of_loops, parents_from, reflected_rays, whole_pool
 from labapp.core.values import CannotMeasure, IntArray
 
 
@@ -59,16 +59,7 @@ def reconstruct(match: Match, rig: Rig, settings: ErsSettings | None = None) -> 
     outline = boundary_on_work_piece(match, rig, settings.boundary)
     x, y, _ = outline.points_mm.T
     boundary = outline.at_height(best.surface.height(x, y))
-    points = best.points_mm[: rays.measured]
-    return Reconstruction(
-        scheme="ers",
-        surface=whole_surface(best.points_mm, boundary),
-        boundary=boundary,
-        ray=match.ray,
-        points_mm=points,
-        residual_mm=best.residual_mm,
-        sigma_mm=np.full(len(points), np.nan),
-    )
+    return whole_pool("ers", match, rays, best, boundary)
 
 
 def head_left(ray: IntArray) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from labapp.core.boundary import BoundaryModel, boundary_on_work_piece
 from labapp.core.correspondence import Match
-from labapp.core.interpolation import CloughTocherSurface, whole_surface
+from labapp.core.interpolation import CloughTocherSurface
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
 from labapp.core.slopes import (
@@ -22,6 +22,7 @@ from labapp.core.slopes import (
     parents_along,
     parents_from,
     reflected_rays,
+    whole_pool,
 )
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
@@ -82,16 +83,7 @@ def reconstruct(match: Match, rig: Rig, settings: IrsSettings | None = None) -> 
             estimates.append((height, estimate))
     best = _best(estimates, settings.are_margin)
     boundary = boundary_on_work_piece(match, rig, settings.boundary)
-    points = best.points_mm[: rays.measured]
-    return Reconstruction(
-        scheme="irs",
-        surface=whole_surface(best.points_mm, boundary),
-        boundary=boundary,
-        ray=match.ray,
-        points_mm=points,
-        residual_mm=best.residual_mm,
-        sigma_mm=np.full(len(points), np.nan),
-    )
+    return whole_pool("irs", match, rays, best, boundary)
 
 
 def lower_left(match: Match) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +35,10 @@ class ReflectionErrors:
         The same without the first and the last row and both ends of each row (ARE-I, MRE-I of
         §6.4.2), mm; NaN if nothing is left.
     per_dot_mm
-        E_ij of each reflection point (Eq. 6-5), shape (n,), mm.
+        E_ij of each reflection point (Eq. 6-5), shape (n,), mm; NaN, and in none of the above,
+        where the ray does not meet the surface.
+    scale
+        See `reflection_scale`, shape (2,).
     """
 
     are_mm: float
@@ -43,6 +46,7 @@ class ReflectionErrors:
     are_inner_mm: float
     mre_inner_mm: float
     per_dot_mm: FloatArray
+    scale: FloatArray
 
     def __post_init__(self) -> None:
         freeze(self)
@@ -73,6 +77,11 @@ class Measures:
         Standard uncertainties; NaN where the scheme gives none.
     area_sigma_mm2, volume_sigma_mm3
         The same of area and volume.
+    own_are_mm
+        See `Reconstruction`; NaN where the scheme gives none.
+    scale_x, scale_z
+        What takes a residual along X′, Z′ to the error along X, Y on the work piece: W_p/W_r and
+        L_p/L_r (Eq. 6-5). NaN in results of versions that did not keep them.
     """
 
     are_mm: float
@@ -95,6 +104,9 @@ class Measures:
     depth_sigma_mm: float
     area_sigma_mm2: float
     volume_sigma_mm3: float
+    own_are_mm: float = math.nan
+    scale_x: float = math.nan
+    scale_z: float = math.nan
 
 
 def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
@@ -107,7 +119,9 @@ def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
     boundary = reconstruction.boundary
     size, peak = size_of(reconstruction.surface, boundary)
     variants = [size_of(surface, outline)[0] for surface, outline in reconstruction.variants]
-    return measures_of(errors, size, peak, boundary.center_mm, _sigma(variants, len(size)))
+    sigma = _sigma(variants, len(size))
+    made = measures_of(errors, size, peak, boundary.center_mm, sigma)
+    return replace(made, own_are_mm=reconstruction.own_are_mm)
 
 
 def measures_of(
@@ -139,6 +153,8 @@ def measures_of(
         depth_sigma_mm=float(sigma[3]),
         area_sigma_mm2=float(sigma[4]),
         volume_sigma_mm3=float(sigma[5]),
+        scale_x=float(errors.scale[0]),
+        scale_z=float(errors.scale[1]),
     )
 
 
@@ -166,13 +182,15 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
 def scaled_errors(reconstruction: Reconstruction, scale: FloatArray) -> ReflectionErrors:
     """Reflection errors where the scale, shape (2,), is known (`reflection_scale`)."""
     error = np.hypot(*(reconstruction.residual_mm * scale).T)
-    inner = error[_inner(reconstruction.ray)]
+    met = np.isfinite(error)
+    every, inner = error[met], error[met & _inner(reconstruction.ray)]
     return ReflectionErrors(
-        are_mm=float(error.mean()),
-        mre_mm=float(error.max()),
-        are_inner_mm=float(inner.mean()) if len(inner) else float("nan"),
-        mre_inner_mm=float(inner.max()) if len(inner) else float("nan"),
+        are_mm=float(every.mean()) if len(every) else math.nan,
+        mre_mm=float(every.max()) if len(every) else math.nan,
+        are_inner_mm=float(inner.mean()) if len(inner) else math.nan,
+        mre_inner_mm=float(inner.max()) if len(inner) else math.nan,
         per_dot_mm=error,
+        scale=scale,
     )
 
 

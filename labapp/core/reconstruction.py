@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,9 +31,11 @@ class Reconstruction:
     ray
         Ray (i, j) of each reflection point, counted from 1, shape (n, 2).
     points_mm
-        Reflection points, UCS, shape (n, 3), mm.
+        Reflection points, UCS, shape (n, 3), mm. Those of IRS and ERS are where the scheme put
+        them; `surface`, which the boundary holds too, need not pass through them.
     residual_mm
-        Computed minus captured reflected dot on the imaging plane (X′, Z′), shape (n, 2), mm.
+        Computed minus captured reflected dot on the imaging plane (X′, Z′), shape (n, 2), mm:
+        where the ray goes from `surface`; NaN if it does not meet it within the boundary.
     sigma_mm
         Standard uncertainty of each reflection point's height, shape (n,), mm; NaN where the
         scheme gives none.
@@ -40,6 +43,9 @@ class Reconstruction:
         Surfaces and boundaries one standard deviation away along each principal direction of
         the result's uncertainty, in pairs (plus, minus); empty where the scheme gives none.
         `measures` turns them into the ± of width, length, height, area and volume.
+    own_are_mm
+        ARE of the points as the scheme has them, with the surface through nothing else (step 4 of
+        §6.3.1 and §7.1), mm: what the text tells. NaN for fit, whose points are the surface's.
     """
 
     scheme: Scheme
@@ -50,6 +56,7 @@ class Reconstruction:
     residual_mm: FloatArray
     sigma_mm: FloatArray
     variants: tuple[tuple[Surface, Boundary], ...] = ()
+    own_are_mm: float = math.nan
 
     def __post_init__(self) -> None:
         freeze(self)

@@ -19,8 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.boundary import Boundary
 from labapp.core.correspondence import Match
-from labapp.core.interpolation import SurfaceThroughPoints
+from labapp.core.interpolation import SurfaceThroughPoints, whole_surface
 from labapp.core.measures import reflection_scale
 from labapp.core.optics import (
     bisecting_gradient,
@@ -29,7 +30,9 @@ from labapp.core.optics import (
     reflect,
     surface_normal,
 )
+from labapp.core.reconstruction import Reconstruction, Scheme
 from labapp.core.rig import ImagingPlane, Rig
+from labapp.core.surface import Surface, intersect
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, freeze
 
 FEWEST_DOTS = 9
@@ -97,6 +100,16 @@ class ReflectedRays:
         return meet_plane(
             point_mm, reflect(self.direction, surface_normal(gradient)), self.imaging_plane
         )
+
+    def residual(self, surface: Surface, boundary: Boundary) -> FloatArray:
+        """Computed minus captured dots of the measured rays, shape (measured, 2), mm.
+
+        Each ray is met with the surface; NaN where it does not meet it within the boundary.
+        """
+        points = intersect(surface, self.laser_mm, self.direction)
+        points[~boundary.contains(points[:, 0], points[:, 1])] = np.nan
+        gradient = surface.gradient(points[:, 0], points[:, 1])
+        return (self.reflected(points, gradient) - self.plane_mm)[: self.measured]
 
 
 def reflected_rays(match: Match, rig: Rig) -> ReflectedRays:
@@ -304,13 +317,12 @@ def _crossing(ray: IntArray, before: IntArray, row: IntArray, middle: int) -> tu
 class Estimate:
     """What one loop gives: points, the surface through them and how it explains the dots.
 
-    ``points_mm`` has shape (n, 3); ``residual_mm``, computed minus captured dot, shape
-    (measured, 2), leaves out the centre reference, which is no actual dot; ``are_mm`` is Eq. 6-3.
+    ``points_mm`` has shape (n, 3); ``are_mm``, Eq. 6-3, leaves out the centre reference, which is
+    no actual dot.
     """
 
     points_mm: FloatArray
     surface: SurfaceThroughPoints
-    residual_mm: FloatArray
     are_mm: float
 
 
@@ -358,9 +370,32 @@ def best_of_loops(
         residual = (rays.reflected(points, surface.point_gradient) - rays.plane_mm)[: rays.measured]
         are = float(np.mean(np.hypot(*(residual * scale).T)))
         if np.isfinite(are) and (best is None or are < best.are_mm):
-            best, since_best = Estimate(points, surface, residual, are), 0
+            best, since_best = Estimate(points, surface, are), 0
         else:
             since_best += 1
         if np.abs(distance - before).max() < SETTLED_MM or since_best >= PATIENCE:
             break
     return best
+
+
+def whole_pool(
+    scheme: Scheme, match: Match, rays: ReflectedRays, best: Estimate, boundary: Boundary
+) -> Reconstruction:
+    """Interpolate the whole surface through an estimate's points and the boundary, and test it.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if no reflection point lies within the boundary.
+    """
+    surface = whole_surface(best.points_mm, boundary)
+    return Reconstruction(
+        scheme=scheme,
+        surface=surface,
+        boundary=boundary,
+        ray=match.ray,
+        points_mm=best.points_mm[: rays.measured],
+        residual_mm=rays.residual(surface, boundary),
+        sigma_mm=np.full(rays.measured, np.nan),
+        own_are_mm=best.are_mm,
+    )

@@ -147,10 +147,13 @@ def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
 def rays_of(reconstruction: Reconstruction, match: Match, rig: Rig) -> dict[str, FloatArray]:
     """Ends of the incident and the reflected rays near the pool, by name, shapes (n, 2, 3), mm.
 
-    The reflected rays run to where the computed dots are on the imaging plane.
+    The reflected rays run to where the computed dots are on the imaging plane; rays without one
+    are left out.
     """
-    points = reconstruction.points_mm
-    seen = rig.imaging_plane.to_universal(match.plane_mm + reconstruction.residual_mm)
+    met = np.isfinite(reconstruction.residual_mm).all(axis=1)
+    points = reconstruction.points_mm[met]
+    computed = match.plane_mm[met] + reconstruction.residual_mm[met]
+    seen = rig.imaging_plane.to_universal(computed)
     return {
         name: np.stack([points, points + RAY_MM * way / np.linalg.norm(way, axis=1)[:, None]], 1)
         for name, way in (

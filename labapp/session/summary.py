@@ -18,6 +18,7 @@ TOLD = {
     "height": "height_mm",
     "depth": "depth_mm",
     "ARE": "are_mm",
+    "own ARE": "own_are_mm",
 }
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.coordinates import ImageCalibration
-from labapp.core.measures import surface_grid
+from labapp.core.measures import Measures, surface_grid
 from labapp.core.pipeline import Measurement
 from labapp.core.reconstruction import Reconstruction
 
@@ -80,6 +80,10 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("z_mm", "height of the reflection point above the work piece"),
         Column("residual_mm", "distance of computed and captured dot on the imaging plane"),
         Column("sigma_mm", "standard uncertainty of the height"),
+        Column("residual_x_mm", "computed minus captured dot on the imaging plane, along X′"),
+        Column("residual_z_mm", "computed minus captured dot on the imaging plane, along Z′"),
+        Column("error_x_mm", "reflection error on the work piece, along X"),
+        Column("error_y_mm", "reflection error on the work piece, along Y"),
     ),
     "boundary": (
         FRAME,
@@ -116,6 +120,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("volume_sigma_mm3", "standard uncertainty of the volume"),
         Column("are_inner_mm", "average reflection error of inside points"),
         Column("mre_inner_mm", "maximum reflection error of inside points"),
+        Column("own_are_mm", "irs, ers: average reflection error of the scheme's own points"),
         Column("reason", "why there is no surface, in a sentence", None),
     ),
 }
@@ -141,7 +146,7 @@ def frame_tables(
     reconstruction = measurement.reconstruction
     columns = {
         "dots": _dots(measurement, calibration),
-        "points": [] if reconstruction is None else _points(reconstruction),
+        "points": [] if reconstruction is None else _points(reconstruction, measurement.measures),
         "boundary": [] if reconstruction is None else _boundary(reconstruction),
         "measures": _measures(time_s, measurement),
     }
@@ -191,14 +196,17 @@ def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.N
     return [*dots.image_px.T, *plane.T, *site.T, *ray.T, blocked, source]
 
 
-def _points(reconstruction: Reconstruction) -> list[npt.NDArray[Any]]:
-    """Reflection points, and how far their dots are off."""
-    residual = np.linalg.norm(reconstruction.residual_mm, axis=-1)
+def _points(reconstruction: Reconstruction, measures: Measures | None) -> list[npt.NDArray[Any]]:
+    """Reflection points, and how far their dots are off on either plane."""
+    residual = reconstruction.residual_mm
+    scale = (math.nan, math.nan) if measures is None else (measures.scale_x, measures.scale_z)
     return [
         *reconstruction.ray.T,
         *reconstruction.points_mm.T,
-        residual,
+        np.linalg.norm(residual, axis=-1),
         reconstruction.sigma_mm,
+        *residual.T,
+        *(residual * scale).T,
     ]
 
 

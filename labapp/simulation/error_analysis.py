@@ -74,6 +74,12 @@ def relative_errors(measures: Measures, cap: Pool) -> tuple[float, float]:
     return depth / abs(cap.peak_mm) - 1, diameter / cap.footprint.width_mm - 1
 
 
+def computed_are(measures: Measures) -> float:
+    """The computed ARE as the text has it, mm: of IRS and ERS that of their own points."""
+    own = measures.own_are_mm
+    return own if np.isfinite(own) else measures.are_mm
+
+
 def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: Scheme) -> FloatArray:
     """`ERRORS` of one reconstruction, shape (4,); NaN where the scheme finds no surface."""
     try:
@@ -84,7 +90,7 @@ def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: Sche
     true = seen.point_mm[tuple(match.ray.T - 1)]
     actual = np.linalg.norm(made.points_mm - true, axis=-1).mean()
     depth, boundary = relative_errors(measures, cap)
-    return np.array([abs(depth), abs(boundary), measures.are_mm, actual])
+    return np.array([abs(depth), abs(boundary), computed_are(measures), actual])
 
 
 @dataclass(frozen=True)

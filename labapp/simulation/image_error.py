@@ -19,7 +19,13 @@ from labapp.core.reconstruction import Scheme
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.camera import CameraView
-from labapp.simulation.error_analysis import SCHEMES, circle_settings, followed, relative_errors
+from labapp.simulation.error_analysis import (
+    SCHEMES,
+    circle_settings,
+    computed_are,
+    followed,
+    relative_errors,
+)
 from labapp.simulation.forward import exact_match
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.parameter_deviation import AxisPoints, KnownPool
@@ -155,7 +161,7 @@ def _sizes(known: KnownPool, scheme: Scheme) -> FloatArray:
     except CannotMeasure:
         return np.full(3, np.nan)
     measures = measure(made, known.match, known.rig)
-    return np.array([*relative_errors(measures, known.cap), measures.are_mm])
+    return np.array([*relative_errors(measures, known.cap), computed_are(measures)])
 
 
 def _off(seen: Measurement, frame: Frame) -> tuple[FloatArray, int]:

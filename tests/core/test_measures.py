@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from labapp.core import ers, irs
 from labapp.core.boundary import Boundary
 from labapp.core.measures import (
     measure,
@@ -17,6 +18,7 @@ from labapp.core.measures import (
     surface_grid,
     surface_mesh,
 )
+from labapp.core.optics import meet_plane, ray_directions, reflect, surface_normal
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.simulation.forward import exact_match, trace
@@ -181,3 +183,36 @@ def test_the_mesh_ends_at_the_boundary_and_looks_up():
     rim = np.unique(pairs[count == 1])
     np.testing.assert_allclose(vertices[rim], reconstruction.boundary.points_mm)
     assert vertices[:, 2].max() == pytest.approx(0.29, abs=0.01)
+
+
+@pytest.mark.parametrize("scheme", [irs, ers])
+def test_residuals_and_are_of_the_text_s_schemes_are_those_of_the_surface_they_give(scheme):
+    match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.35), RIG), RIG)
+    made = scheme.reconstruct(match, RIG)
+    told = measure(made, match, RIG)
+    # Down each ray to the surface in steps of 1 µm, not by the way that the program takes.
+    laser = RIG.laser.position_mm
+    distance = np.arange(-0.2, 1.2, 0.001)
+    dots = []
+    for i, j in match.ray:
+        ray = ray_directions(RIG.laser, RIG.pattern)[i - 1, j - 1]
+        way = laser + ((distance[::-1] - laser[2]) / ray[2])[:, None] * ray
+        over = way[:, 2] - made.surface.height(way[:, 0], way[:, 1])
+        met = np.flatnonzero((over[:-1] > 0) & (over[1:] <= 0))
+        if len(met) == 0 or not made.boundary.contains(*way[met[0], :2]):
+            dots.append([np.nan, np.nan])
+            continue
+        k = met[0]
+        at = way[k] + over[k] / (over[k] - over[k + 1]) * (way[k + 1] - way[k])
+        normal = surface_normal(made.surface.gradient(at[0], at[1]))
+        dots.append(meet_plane(at, reflect(ray, normal), RIG.imaging_plane))
+    residual = np.array(dots) - match.plane_mm
+    error = np.hypot(*(residual * reflection_scale(match, RIG)).T)
+    known = np.isfinite(error)
+    assert known.mean() > 0.9
+    np.testing.assert_array_equal(known, np.isfinite(made.residual_mm).all(axis=1))
+    np.testing.assert_allclose(np.median(made.residual_mm[known] / residual[known]), 1, rtol=1e-3)
+    assert told.are_mm == pytest.approx(error[known].mean(), rel=0.02)
+    assert told.mre_mm == pytest.approx(error[known].max(), rel=0.02)
+    assert told.own_are_mm < told.are_mm
+    assert (told.scale_x, told.scale_z) == tuple(reflection_scale(match, RIG))

@@ -7,16 +7,23 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import pytest
 
-from labapp.core.pipeline import Measurement
+from labapp.core.measures import measure
+from labapp.core.pipeline import Measurement, Settings, reconstruct
+from labapp.core.reconstruction import Scheme
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.errors import InputError
 from labapp.session import results
 from labapp.session.results import ResultsWriter
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.pools import egg
+from tests.session.conftest import dots
 
 Writer = Callable[[Path], ResultsWriter]
 CONVENTION = {
@@ -96,6 +103,37 @@ def test_points_carry_residual_and_sigma(written: Path) -> None:
     assert (first["ray_row"], first["ray_column"], first["z_mm"]) == ("10", "9", "0.300000")
     assert (first["residual_mm"], first["sigma_mm"]) == ("0.500000", "0.002000")
     assert (second["residual_mm"], second["sigma_mm"]) == ("0.010000", "")
+
+
+@pytest.mark.parametrize("scheme", ["fit", "ers", "irs"])
+def test_are_is_reckoned_from_the_points(out: Path, writer: Writer, scheme: Scheme) -> None:
+    rig = Rig(
+        Laser(31.14, 31.48),
+        DotPattern(),
+        Electrode(1e9),
+        ImagingPlane.vertical(50.0, 1e4, -1e4, 2e4, 2e4),
+    )
+    rng = np.random.default_rng(5)
+    match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.35), rig), rig, sigma_mm=0.05, rng=rng)
+    match = replace(match, dot=np.zeros(len(match.ray), int))
+    made = reconstruct(match, rig, Settings(scheme=scheme))
+    size = measure(made, match, rig)
+    with writer(out) as files:
+        files.write(0, 0.0, Measurement("ok", "", scheme, dots(1), None, match, made, size))
+    told = table(out / "measures.csv")[0]
+    points = [row for row in table(out / "points.csv") if row["residual_mm"]]
+    names = ("residual_mm", "residual_x_mm", "residual_z_mm", "error_x_mm", "error_y_mm")
+    column = {name: np.array([float(row[name]) for row in points]) for name in names}
+    on_plane = np.hypot(column["residual_x_mm"], column["residual_z_mm"])
+    np.testing.assert_allclose(on_plane, column["residual_mm"], atol=2e-6)
+    error = np.hypot(column["error_x_mm"], column["error_y_mm"])
+    assert error.mean() == pytest.approx(float(told["are_mm"]), abs=2e-6)
+    assert error.max() == pytest.approx(float(told["mre_mm"]), abs=2e-6)
+    # On the work piece errors are a fraction of those on the imaging plane, of the same sign.
+    assert error.mean() < 0.5 * on_plane.mean()
+    assert (column["residual_x_mm"] * column["error_x_mm"] >= 0).all()
+    assert {np.sign(value) for value in column["error_y_mm"]} >= {-1.0, 1.0}
+    assert bool(told["own_are_mm"]) == (scheme != "fit")
 
 
 def test_the_boundary_is_written(written: Path) -> None:
@@ -254,7 +292,10 @@ def test_a_write_that_takes_a_part_is_carried_on() -> None:
 FULL_DISK = """
     import resource, sys
     from labapp.core.coordinates import ImageCalibration
-    from labapp.core.pipeline import Measurement
+    from labapp.core.measures import measure
+from labapp.core.pipeline import Measurement, Settings, reconstruct
+from labapp.core.reconstruction import Scheme
+from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
     from labapp.core.dots import Dots
     from labapp.errors import InputError
     from labapp.session.results import ResultsWriter

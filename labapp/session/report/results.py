@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -133,10 +134,12 @@ def tell_example(story: Story, told: Told) -> None:
             "The electrode is over X = Y = 0.",
             figures.height_map(found),
         )
+        own = found.measures.own_are_mm
         story.figure(
             f"Frame {line.frame}: captured reflected dots and those computed from the surface, "
-            f"on the imaging plane; ARE {found.measures.are_mm:.4f} mm, "
-            f"MRE {found.measures.mre_mm:.4f} mm.",
+            f"on the imaging plane; mapped onto the work piece ARE {found.measures.are_mm:.4f} mm, "
+            f"MRE {found.measures.mre_mm:.4f} mm"
+            + (f"; ARE of the scheme's own points {own:.4f} mm." if math.isfinite(own) else "."),
             figures.dots_compared(found),
         )
 

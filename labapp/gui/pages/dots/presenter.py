@@ -181,7 +181,10 @@ def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) ->
 
 
 def computed_px(result: Result | None) -> FloatArray:
-    """Where a measured surface puts the dots that were matched, shape (m, 2), px."""
+    """Where a measured surface puts the dots that were matched, shape (m, 2), px.
+
+    Dots whose rays do not meet it are left out.
+    """
     if result is None:
         return NO_PLACES
     match, surface = result.measurement.match, result.measurement.reconstruction
@@ -195,7 +198,8 @@ def computed_px(result: Result | None) -> FloatArray:
     ]
     point, pair = np.array(points, int).reshape(-1, 2).T
     plane = match.plane_mm[pair] + surface.residual_mm[point]
-    return parse_setup(result.setup, "setup").calibration.to_image(plane)
+    met = np.isfinite(plane).all(axis=1)
+    return parse_setup(result.setup, "setup").calibration.to_image(plane[met])
 
 
 def needs_fit(seen: Shown) -> bool:

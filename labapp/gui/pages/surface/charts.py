@@ -110,6 +110,8 @@ class DotsChart(Chart):
         captured, computed = dots if dots is not None else (np.empty((0, 2)), np.empty((0, 2)))
         scale = error_scale(captured, computed)
         self._captured.setData(pos=captured)
+        known = np.isfinite(computed).all(axis=1)
+        captured, computed = captured[known], computed[known]
         self._computed.setData(pos=computed)
         ends = np.stack([captured, captured + scale * (computed - captured)], axis=1).reshape(-1, 2)
         self._errors.setData(ends[:, 0], ends[:, 1])

@@ -139,7 +139,9 @@ def compared_rows(one: Measures, other: Measures) -> tuple[Row, ...]:
         sigmas = [getattr(each, of_sigma) for each in (one, other)]
         rows.append(_row(name, [getattr(each, value) for each in (one, other)], sigmas, unit))
     for name, value, _ in ERRORS:
-        rows.append(_row(name, [getattr(each, value) for each in (one, other)], [], "mm"))
+        told = [getattr(each, value) for each in (one, other)]
+        if value != "own_are_mm" or np.isfinite(told).any():
+            rows.append(_row(name, told, [], "mm"))
     return tuple(rows)
 
 

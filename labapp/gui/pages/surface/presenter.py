@@ -55,7 +55,12 @@ ERRORS = (
     ("MRE", "mre_mm", "Maximum reflection error (Eq. 6-4)"),
     ("ARE-I", "are_inner_mm", "Average reflection error of the inside points"),
     ("MRE-I", "mre_inner_mm", "Maximum reflection error of the inside points"),
+    (
+        *("Own ARE", "own_are_mm"),
+        "ARE of the scheme's own points, as in the dissertation: the boundary is not in it",
+    ),
 )
+"""Words, value in `Measures`, and what it is; the last is told where the scheme gives it."""
 
 NO_SIGMA = "This scheme gives no ±"
 
@@ -196,12 +201,13 @@ def _noted(note: str, sigma: float) -> str:
 
 
 def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
-    """ARE … MRE-I; empty without measures."""
+    """ARE … MRE-I, and what else the scheme tells; empty without measures."""
     if measures is None:
         return ()
     return tuple(
         ResultRow(name, getattr(measures, value), None, "mm", decimals=4, note=note)
         for name, value, note in ERRORS
+        if value != "own_are_mm" or np.isfinite(measures.own_are_mm)
     )
 
 
@@ -297,7 +303,10 @@ def section_line(cut: Profile) -> FloatArray:
 
 
 def reflected_dots(measurement: Measurement) -> tuple[FloatArray, FloatArray] | None:
-    """Captured and computed dots on the imaging plane (X′, Z′), each of shape (n, 2), mm."""
+    """Captured and computed dots on the imaging plane (X′, Z′), each of shape (n, 2), mm.
+
+    NaN where the surface computes none.
+    """
     match, reconstruction = measurement.match, measurement.reconstruction
     if match is None or reconstruction is None:
         return None
@@ -321,7 +330,7 @@ def error_scale(captured: FloatArray, computed: FloatArray) -> float:
     """How many times as long errors are drawn, that the longest fills a tenth of the picture."""
     if not len(captured):
         return 1.0
-    longest = float(np.linalg.norm(computed - captured, axis=1).max())
+    longest = float(np.fmax.reduce(np.linalg.norm(computed - captured, axis=1), initial=0.0))
     wanted = 0.1 * float(np.ptp(captured, axis=0).max()) / max(longest, 1e-9)
     steps = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0])
     return float(steps[max(int(np.searchsorted(steps, wanted, side="right")) - 1, 0)])
