@@ -74,7 +74,7 @@ class Measures:
         Where the surface is farthest from the work piece: the highest point of a convex pool,
         the lowest of a concave one.
     width_sigma_mm, length_sigma_mm, height_sigma_mm, depth_sigma_mm
-        Standard uncertainties; NaN where the scheme gives none.
+        Standard uncertainties, noise and level only; NaN where the scheme gives none.
     area_sigma_mm2, volume_sigma_mm3
         The same of area and volume.
     own_are_mm
@@ -117,7 +117,7 @@ def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
     """
     errors = reflection_errors(reconstruction, match, rig)
     boundary = reconstruction.boundary
-    size, peak = size_of(reconstruction.surface, boundary)
+    size, peak = size_of(reconstruction.whole, boundary)
     variants = [size_of(surface, outline)[0] for surface, outline in reconstruction.variants]
     sigma = _sigma(variants, len(size))
     made = measures_of(errors, size, peak, boundary.center_mm, sigma)

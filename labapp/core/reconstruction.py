@@ -9,11 +9,47 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from labapp.core.boundary import Boundary
 from labapp.core.surface import Surface
-from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 
 Scheme = Literal["fit", "ers", "irs"]
+
+
+ROUNDING = 1e-9
+"""Share of the way from the centre by which a place may lie beyond the boundary and be on it."""
+
+
+@dataclass(frozen=True)
+class BoundedSurface:
+    """A surface that ends at the pool's boundary: NaN outside it.
+
+    Parameters
+    ----------
+    whole
+        The surface, which may go on beyond.
+    boundary
+        Where it ends.
+    """
+
+    whole: Surface
+    boundary: Boundary
+
+    def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Height z at (x, y), arrays of one shape, mm."""
+        return np.where(self._within(x_mm, y_mm), self.whole.height(x_mm, y_mm), np.nan)
+
+    def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
+        within = self._within(x_mm, y_mm)[..., None]
+        return np.where(within, self.whole.gradient(x_mm, y_mm), np.nan)
+
+    def _within(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+        x, y = self.boundary.center_mm
+        place = np.array([np.subtract(x_mm, x), np.subtract(y_mm, y)]) * (1 - ROUNDING)
+        return self.boundary.contains(x + place[0], y + place[1])
 
 
 @dataclass(frozen=True)
@@ -25,7 +61,7 @@ class Reconstruction:
     scheme
         Which scheme made it.
     surface
-        z = f(x, y); defined at least inside the boundary.
+        z = f(x, y); NaN outside the boundary, whatever surface it is made with (`whole`).
     boundary
         The pool's boundary.
     ray
@@ -37,8 +73,8 @@ class Reconstruction:
         Computed minus captured reflected dot on the imaging plane (X′, Z′), shape (n, 2), mm:
         where the ray goes from `surface`; NaN if it does not meet it within the boundary.
     sigma_mm
-        Standard uncertainty of each reflection point's height, shape (n,), mm; NaN where the
-        scheme gives none.
+        Standard uncertainty of each reflection point's height, noise and level only, shape (n,),
+        mm; NaN where the scheme gives none.
     variants
         Surfaces and boundaries one standard deviation away along each principal direction of
         the result's uncertainty, in pairs (plus, minus); empty where the scheme gives none.
@@ -60,3 +96,9 @@ class Reconstruction:
 
     def __post_init__(self) -> None:
         freeze(self)
+        object.__setattr__(self, "surface", BoundedSurface(self.whole, self.boundary))
+
+    @property
+    def whole(self) -> Surface:
+        """The surface as the scheme made it, which may go on beyond the boundary."""
+        return self.surface.whole if isinstance(self.surface, BoundedSurface) else self.surface

@@ -101,16 +101,16 @@ def begin(
     What is remembered of a ``former`` track, of the frames just before, stays.
     """
     match, made = measurement.match, measurement.reconstruction
-    if match is None or made is None or not isinstance(made.surface, SplineSurface):
+    if match is None or made is None or not isinstance(made.whole, SplineSurface):
         return None
     if settings.dots.method != "band-pass" or rig.pattern.marker is None:
         return None
-    own, pool = Bed.of(rig, made.surface.basis, settings.fit), None
+    own, pool = Bed.of(rig, made.whole.basis, settings.fit), None
     if former is not None and np.array_equal(own.at, former.bed.at):
         bed, pool = former.bed, _moved_to(former, match, made)
     if pool is None:
         former, bed = None, own
-        pool = met(bed, made.surface.coefficients, bed.landing_mm, 4)
+        pool = met(bed, made.whole.coefficients, bed.landing_mm, 4)
     witness = match.witness[tuple(bed.at.T)]
     told = witness != 0
     surface = SplineSurface(bed.basis, pool.coefficients)

@@ -29,7 +29,7 @@ from labapp.core.laser_calibration import LaserCalibration
 from labapp.core.measures import Measures
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.reconstruction import BoundedSurface, Reconstruction
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.spline import SplineBasis, SplineSurface
 from labapp.core.surface import FlatSurface
@@ -187,6 +187,8 @@ def _tree(value: object, arrays: dict[bytes, int]) -> object:
         return {type(value).__name__: [_tree(item, arrays) for item in items]}
     if isinstance(value, dict):
         return {"dict": [[key, _tree(item, arrays)] for key, item in value.items()]}
+    if isinstance(value, BoundedSurface):
+        value = value.whole  # the boundary is kept beside it, in the reconstruction
     name = type(value).__name__
     if name in SURFACES:
         return {name: _tree(getattr(value, SURFACES[name][1]), arrays)}

@@ -43,9 +43,7 @@ def difference_at(
     one: Reconstruction, other: Reconstruction, x_mm: FloatArray, y_mm: FloatArray
 ) -> FloatArray:
     """Height of the first surface minus the other's, shape (n,), mm; NaN outside either pool."""
-    difference = one.surface.height(x_mm, y_mm) - other.surface.height(x_mm, y_mm)
-    within = one.boundary.contains(x_mm, y_mm) & other.boundary.contains(x_mm, y_mm)
-    return np.where(within, difference, np.nan)
+    return one.surface.height(x_mm, y_mm) - other.surface.height(x_mm, y_mm)
 
 
 @dataclass(frozen=True)
@@ -97,9 +95,8 @@ def profile(
     along = np.linspace(reach.min(), reach.max(), PROFILE_POINTS)
     place = along[:, None] * way + offset_mm * aside
     x, y = place.T
-    within = reconstruction.boundary.contains(x, y)
-    height = np.where(within, reconstruction.surface.height(x, y), np.nan)
-    sigma = np.where(within, sigma_at(reconstruction, x, y), np.nan)
+    height = reconstruction.surface.height(x, y)
+    sigma = np.where(np.isfinite(height), sigma_at(reconstruction, x, y), np.nan)
     return Profile(along, place, height, sigma, edge)
 
 

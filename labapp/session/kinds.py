@@ -12,6 +12,7 @@ from typing import Any, Never
 import numpy as np
 import numpy.typing as npt
 
+from labapp.core.reconstruction import BoundedSurface
 from labapp.core.surface import Surface
 
 SHAPES: dict[str, dict[str, str]] = {
@@ -118,7 +119,8 @@ def is_a(value: object, hint: Any) -> bool:
     if hint in (Any, Never):
         return hint is Any
     if hint is Surface:
-        return hasattr(value, "height") and hasattr(value, "gradient")
+        made = value.whole if isinstance(value, BoundedSurface) else value
+        return hasattr(made, "height") and hasattr(made, "gradient")
     return value is None if hint is None else isinstance(value, hint)
 
 

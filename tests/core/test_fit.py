@@ -85,7 +85,7 @@ def test_a_dent_and_an_oscillation_are_followed(term: Term, rms_mm: float) -> No
     pool = egg(6.6, 3.2, 4.2, 0.3, terms=(term,))
     made, match = fitted(pool)
     xy = inside(pool)
-    error = made.surface.height(*xy.T) - pool.height(*xy.T)
+    error = made.whole.height(*xy.T) - pool.height(*xy.T)
     assert np.sqrt(np.mean(error**2)) < rms_mm
     measures = measure(made, match, OPEN_RIG)
     assert measures.height_mm == pytest.approx(pool.size.height_mm, abs=0.01)
@@ -99,7 +99,7 @@ def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
     assert made.scheme == "fit"
     np.testing.assert_array_equal(made.ray, match.ray)
     x, y, z = made.points_mm.T
-    np.testing.assert_allclose(z, made.surface.height(x, y), atol=1e-6)
+    np.testing.assert_allclose(z, made.whole.height(x, y), atol=1e-6)
     true = trace(pool, OPEN_RIG).point_mm[tuple(match.ray.T - 1)]
     np.testing.assert_allclose(made.points_mm, true, atol=0.02)
     assert np.linalg.norm(made.residual_mm, axis=-1).max() < 0.02
@@ -107,6 +107,11 @@ def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
     np.testing.assert_allclose(outline[:, 2], 0.0, atol=1e-12)
     np.testing.assert_allclose(made.surface.height(*outline[:, :2].T), 0.0, atol=1e-6)
     assert made.boundary.contains(x, y).mean() > 0.97
+    # Beyond the boundary there is no surface, though its splines go on.
+    beyond = outline[:, :2] + 1e-3 * (outline[:, :2] - made.boundary.center_mm)
+    assert np.isfinite(made.whole.height(*beyond.T)).all()
+    assert np.isnan(made.surface.height(*beyond.T)).all()
+    assert np.isnan(made.surface.gradient(*beyond.T)).all()
 
 
 def test_variants_lie_on_both_sides_and_end_where_they_reach_the_work_piece() -> None:
@@ -116,12 +121,12 @@ def test_variants_lie_on_both_sides_and_end_where_they_reach_the_work_piece() ->
     at = made.points_mm[:, :2].T
     for (up, _), (down, _) in zip(made.variants[0::2], made.variants[1::2], strict=True):
         middle = (up.height(*at) + down.height(*at)) / 2
-        np.testing.assert_allclose(middle, made.surface.height(*at), atol=1e-9)
+        np.testing.assert_allclose(middle, made.whole.height(*at), atol=1e-9)
     for surface, boundary in made.variants:
         height = surface.height(*boundary.points_mm[:, :2].T)
         assert np.abs(height).max() < 1e-3
     # Together they are the σ that the points carry.
-    spread = sum((up.height(*at) - made.surface.height(*at)) ** 2 for up, _ in made.variants[0::2])
+    spread = sum((up.height(*at) - made.whole.height(*at)) ** 2 for up, _ in made.variants[0::2])
     np.testing.assert_allclose(np.sqrt(spread), made.sigma_mm, rtol=0.35)
     assert np.median(np.sqrt(spread) / made.sigma_mm) > 0.9
 
