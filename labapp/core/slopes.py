@@ -162,6 +162,8 @@ class Paths:
         Axes of each step's plane through the laser and both points, shape (s, 3).
     start_components, end_components
         The two rays along these axes, shape (s, 2).
+    apart
+        Sine of the angle between the two rays, shape (s,).
     matrix
         1 where a step is on the way to a point, else 0, shape (n, s).
     """
@@ -173,6 +175,7 @@ class Paths:
     upward: FloatArray
     start_components: FloatArray
     end_components: FloatArray
+    apart: FloatArray
     matrix: FloatArray
 
     def __post_init__(self) -> None:
@@ -184,6 +187,7 @@ class Paths:
         end = np.flatnonzero(parent >= 0)
         start = parent[end]
         normal = np.cross(direction[start], direction[end])
+        apart = np.linalg.norm(normal, axis=-1)
         horizontal = np.stack([normal[:, 1], -normal[:, 0], np.zeros(len(normal))], axis=-1)
         horizontal /= np.linalg.norm(horizontal, axis=-1, keepdims=True)
         upward = np.cross(normal, horizontal)
@@ -197,6 +201,7 @@ class Paths:
             upward=upward,
             start_components=_components(direction[start], horizontal, upward),
             end_components=_components(direction[end], horizontal, upward),
+            apart=apart,
             matrix=matrix,
         )
 
@@ -217,7 +222,12 @@ class Paths:
         """
         slope_a = -_dot(normal[self.start], self.horizontal) / _dot(normal[self.start], self.upward)
         slope_b = -_dot(normal[self.end], self.horizontal) / _dot(normal[self.end], self.upward)
-        slope = np.sign(slope_a) * np.abs((slope_a + slope_b) / 2)  # Eq. 6-1, 7-1
+        mean = (slope_a + slope_b) / 2
+        # Points are left open by SETTLED_MM, slopes by what they change over that way. One that is
+        # less is nothing, and has no sign to lend: the mean keeps its own.
+        way = base_distance_mm[self.base[self.end]] * self.apart
+        told = np.abs(slope_a) > SETTLED_MM / way * np.abs(slope_b - slope_a)
+        slope = np.where(told, np.sign(slope_a) * np.abs(mean), mean)  # Eq. 6-1, 7-1
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.log(
                 (self.start_components[:, 1] - slope * self.start_components[:, 0])

@@ -131,7 +131,10 @@ def are_picture(survey: ErrorSurvey) -> Figure:
 
 
 def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> Figure:
-    """A plot for each error and each kind of surface; full lines D = B/20, dashed D = B/10."""
+    """A plot for each error and each kind of surface; full lines D = B/20, dashed D = B/10.
+
+    Lines join the means over the centres of a cap; bars reach from the least to the largest.
+    """
     size = np.array([(cap.footprint.width_mm, cap.peak_mm) for cap in survey.caps])
     with rc_context(STYLE):
         figure = new_figure(INCHES, 4.5)
@@ -140,11 +143,21 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
             for plot, sign in zip(line, (1, -1), strict=True):
                 for scheme in survey.schemes:
                     for ratio, style in ((20, "-"), (10, "--")):
+                        values = scale * survey.of(scheme, error)
                         chosen = np.isclose(size[:, 1] * sign * ratio, size[:, 0])
-                        plot.plot(
-                            size[chosen, 0],
-                            scale * survey.of(scheme, error)[chosen],
-                            style,
+                        chosen &= np.isfinite(values)
+                        diameter, cap = np.unique(size[chosen, 0], return_inverse=True)
+                        each = [values[chosen][cap == n] for n in range(len(diameter))]
+                        mean = np.array([own.mean() for own in each])
+                        plot.errorbar(
+                            diameter,
+                            mean,
+                            [
+                                mean - [own.min() for own in each],
+                                [own.max() for own in each] - mean,
+                            ],
+                            fmt=style,
+                            elinewidth=0.5,
                             marker=MARKERS[scheme],
                             color=COLOURS[scheme],
                             ms=3,
