@@ -39,6 +39,7 @@ from labapp.session.studio import PICTURE_PX, drawing_process, told
 from labapp.session.summary import Summary
 from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables
 from labapp.system import sync_folder
+from labapp.words import SIGMA_OF
 
 MANIFEST = "manifest.json"
 HDF5_FILE = "results.h5"
@@ -341,7 +342,8 @@ def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
 
 
 def _made() -> dict[str, object]:
-    return {"program": "labapp", "version": labapp.__version__, "created": now()}
+    made = {"program": "labapp", "version": labapp.__version__, "created": now()}
+    return {**made, "sigma_of": SIGMA_OF}
 
 
 def _root_attributes(provenance: Mapping[str, object]) -> dict[str, object]:

@@ -13,7 +13,10 @@ from labapp.core.values import BoolArray, FloatArray
 from labapp.errors import InputError
 
 CHANCE = 2.0
-"""Beyond a limit by no more than so many σ, a size may be there by chance: that is no alarm."""
+"""Beyond a limit by no more than so many σ, a size may be there by chance: that is no alarm.
+
+In σ are noise and level only: a set-up that is off moves all frames one way, and no σ tells.
+"""
 
 UNMEASURED = 3
 """So many frames in a row that cannot be measured are an alarm, unless told otherwise."""
@@ -38,7 +41,7 @@ class Size(NamedTuple):
     name
         ``width``, ``length``, ``height``; of a hollow pool ``depth``.
     value_mm, sigma_mm
-        NaN where they are not known.
+        NaN where they are not known; σ: noise and level only.
     """
 
     name: str

@@ -20,6 +20,7 @@ from labapp.errors import InputError
 from labapp.session.files import as_bytes, write_whole
 from labapp.session.meshes import FORMATS, SPACING_MM, solid, surface
 from labapp.session.tables import TABLES, csv_header, surface_csv, table_rows
+from labapp.words import SIGMA_OF
 
 RUN_FILE = "run.json"
 OURS = re.compile(r"(measures|dots|points|boundary|surface_\d{6,})\.csv|surface_\d{6,}\.stl")
@@ -104,6 +105,7 @@ class ResultsWriter:
         self._run = {
             "program": "labapp",
             "version": labapp.__version__,
+            "sigma_of": SIGMA_OF,
             "state": "running",
             "started": now(),
             "ended": None,

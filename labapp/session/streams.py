@@ -22,7 +22,7 @@ from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.session.alarms import Alarm
 from labapp.session.log import NAME
-from labapp.session.tables import SIZES
+from labapp.session.tables import SIZES, sigma_of
 
 MOST_LISTENERS = 32
 """Each takes an open file, of which the measurement needs some itself."""
@@ -60,6 +60,7 @@ def told_values(frame: int, time_s: float | None, measurement: Measurement) -> V
         "reason": measurement.reason,
         "scheme": measurement.scheme,
         **{name: number(name) for name in SIZES},
+        "sigma_of": sigma_of(measurement),
     }
 
 
@@ -261,7 +262,7 @@ class OpcuaStream:
         server.allow_remote_admin(False)  # or anybody could write, and take variables away
         space = await server.register_namespace(NAMESPACE)
         pool = await server.nodes.objects.add_object(space, "Pool")
-        words = dict.fromkeys(("status", "reason", "scheme", *ALARMS), "")
+        words = dict.fromkeys(("status", "reason", "scheme", "sigma_of", *ALARMS), "")
         sizes = dict.fromkeys(SIZES, math.nan)
         for name, empty in {"frame": -1, "time_s": math.nan, **words, **sizes}.items():
             self._variables[name] = await pool.add_variable(space, name, empty)

@@ -20,6 +20,7 @@ from labapp.core.coordinates import ImageCalibration
 from labapp.core.measures import Measures, surface_grid
 from labapp.core.pipeline import Measurement
 from labapp.core.reconstruction import Reconstruction
+from labapp.words import SIGMA_OF
 
 PX_DIGITS, MM_DIGITS = 4, 6
 
@@ -79,7 +80,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("y_mm", "Y of the reflection point, along the welding direction"),
         Column("z_mm", "height of the reflection point above the work piece"),
         Column("residual_mm", "distance of computed and captured dot on the imaging plane"),
-        Column("sigma_mm", "standard uncertainty of the height"),
+        Column("sigma_mm", f"standard uncertainty of the height, {SIGMA_OF}"),
         Column("residual_x_mm", "computed minus captured dot on the imaging plane, along X′"),
         Column("residual_z_mm", "computed minus captured dot on the imaging plane, along Z′"),
         Column("error_x_mm", "reflection error on the work piece, along X"),
@@ -112,21 +113,22 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("center_y_mm", "Y of the pool's centre"),
         Column("peak_x_mm", "X where the surface is farthest from the work piece"),
         Column("peak_y_mm", "Y where the surface is farthest from the work piece"),
-        Column("width_sigma_mm", "standard uncertainty of the width"),
-        Column("length_sigma_mm", "standard uncertainty of the length"),
-        Column("height_sigma_mm", "standard uncertainty of the height"),
-        Column("depth_sigma_mm", "standard uncertainty of the depth"),
-        Column("area_sigma_mm2", "standard uncertainty of the area"),
-        Column("volume_sigma_mm3", "standard uncertainty of the volume"),
+        Column("width_sigma_mm", f"standard uncertainty of the width, {SIGMA_OF}"),
+        Column("length_sigma_mm", f"standard uncertainty of the length, {SIGMA_OF}"),
+        Column("height_sigma_mm", f"standard uncertainty of the height, {SIGMA_OF}"),
+        Column("depth_sigma_mm", f"standard uncertainty of the depth, {SIGMA_OF}"),
+        Column("area_sigma_mm2", f"standard uncertainty of the area, {SIGMA_OF}"),
+        Column("volume_sigma_mm3", f"standard uncertainty of the volume, {SIGMA_OF}"),
         Column("are_inner_mm", "average reflection error of inside points"),
         Column("mre_inner_mm", "maximum reflection error of inside points"),
         Column("own_are_mm", "irs, ers: average reflection error of the scheme's own points"),
+        Column("sigma_of", "what is in the standard uncertainties, where there are any", None),
         Column("reason", "why there is no surface, in a sentence", None),
     ),
 }
 """The tables and their columns, in the order in which a frame is written to them."""
 
-SIZES = [column.name for column in TABLES["measures"][7:-1]]
+SIZES = [column.name for column in TABLES["measures"][7:-2]]
 
 
 def frame_tables(
@@ -169,9 +171,16 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
         0 if measurement.dots is None else len(measurement.dots),
         math.nan if lattice is None else float(len(np.unique(lattice.row[lattice.row > 0]))),
         *(getattr(measurement.measures, name, math.nan) for name in SIZES),
+        sigma_of(measurement),
         measurement.reason,
     ]
     return [np.array([cell], object if isinstance(cell, str) else None) for cell in row]
+
+
+def sigma_of(measurement: Measurement) -> str:
+    """What is in the standard uncertainties of a frame; empty where it has none."""
+    sigma = (getattr(measurement.measures, name, math.nan) for name in SIZES if "_sigma_" in name)
+    return SIGMA_OF if any(map(math.isfinite, sigma)) else ""
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:

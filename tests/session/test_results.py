@@ -21,8 +21,10 @@ from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.errors import InputError
 from labapp.session import results
 from labapp.session.results import ResultsWriter
+from labapp.session.tables import TABLES
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
+from labapp.words import SIGMA_OF
 from tests.session.conftest import dots
 
 Writer = Callable[[Path], ResultsWriter]
@@ -67,6 +69,7 @@ def test_every_frame_has_its_row_in_measures(written: Path) -> None:
     assert (ok["dots"], ok["rows"]) == ("3", "2")
     assert (ok["width_mm"], ok["area_mm2"], ok["width_sigma_mm"]) == ("1.250000",) * 3
     assert ok["depth_mm"] == "0.000000"
+    assert ok["sigma_of"] == "noise and level only"
     assert ok["volume_sigma_mm3"] == ""
     assert {key: value for key, value in other.items() if value} == {
         "frame": "7",
@@ -103,6 +106,13 @@ def test_points_carry_residual_and_sigma(written: Path) -> None:
     assert (first["ray_row"], first["ray_column"], first["z_mm"]) == ("10", "9", "0.300000")
     assert (first["residual_mm"], first["sigma_mm"]) == ("0.500000", "0.002000")
     assert (second["residual_mm"], second["sigma_mm"]) == ("0.010000", "")
+
+
+def test_what_is_in_sigma_is_said_beside_the_tables(written: Path) -> None:
+    assert json.loads((written / "run.json").read_text("utf-8"))["sigma_of"] == SIGMA_OF
+    sigmas = [c for name in TABLES for c in TABLES[name] if "_sigma_" in f"_{c.name}_" and c.digits]
+    assert len(sigmas) == 7
+    assert all(SIGMA_OF in column.description for column in sigmas)
 
 
 @pytest.mark.parametrize("scheme", ["fit", "ers", "irs"])

@@ -23,6 +23,7 @@ from labapp.session import streams
 from labapp.session.alarms import Alarm
 from labapp.session.streams import LineStream, OpcuaStream, live_values, open_stream, told_values
 from labapp.session.tables import SIZES
+from labapp.words import SIGMA_OF
 from tests.waiting import PATIENCE_S, connect
 
 
@@ -50,7 +51,8 @@ def listener(stream: LineStream) -> Any:
 def test_a_measurement_is_told_with_the_names_of_the_table(measured: Measurement) -> None:
     told = told_values(7, 0.1, measured)
     assert list(told)[:5] == ["frame", "time_s", "status", "reason", "scheme"]
-    assert list(told)[5:] == SIZES
+    assert list(told)[5:] == [*SIZES, "sigma_of"]
+    assert told["sigma_of"] == SIGMA_OF
     assert measured.measures is not None
     assert told["height_mm"] == measured.measures.height_mm
     without = told_values(8, None, Measurement("no-dots", "It is dark", "fit"))

@@ -16,6 +16,7 @@ from labapp.session.report.data import FrameLine, Told
 from labapp.session.report.layout import Story
 from labapp.session.setup import parse_setup
 from labapp.simulation.parameter_deviation import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX
+from labapp.words import SIGMA_OF
 
 LATEST_CHANGES = 40
 """So many of the newest changes are listed."""
@@ -46,7 +47,7 @@ def tell_results(story: Story, told: Told) -> None:
         story.table(
             f"Sizes over the {len(counted)} frames that count. Standard deviation: root of the "
             "variance of Eq. 7-2 … 7-4 (divided by the number of frames). ±: standard uncertainty "
-            "of a single frame, their median; – where the scheme gives none.",
+            f"of a single frame ({SIGMA_OF}), their median; – where the scheme gives none.",
             data.statistics_cells(lines),
             "lrrrrrrr",
             (0.19, 0.09, *[0.12] * 6),
@@ -86,7 +87,7 @@ def _trends(story: Story, lines: list[FrameLine]) -> None:
     ]
     states = [line.state for line in lines]
     story.figure(
-        "Sizes over time with ± one σ of each frame; dotted: mean. Doubtful: another "
+        f"Sizes over time with ± one σ of each frame ({SIGMA_OF}); dotted: mean. Doubtful: another "
         f"correspondence comes within a factor of {data.DOUBTFUL_MARGIN:g} of the residual; stale: "
         "made from what was changed since, in no mean.",
         figures.trends(axis, label, series, states),

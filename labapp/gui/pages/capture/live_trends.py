@@ -18,6 +18,7 @@ from labapp.gui.views.plots import PlotStack
 from labapp.gui.workspace import Workspace
 from labapp.session.limits import LARGEST_MM, NAMES, Ends, Limits
 from labapp.session.live_watch import TREND_S, LiveWatch, Trend
+from labapp.words import SIGMA_OF
 
 LAST_S = 30.0
 """So much is seen at first."""
@@ -31,9 +32,9 @@ ROOM_PX = 40
 """All fields stand beside each other where so much is left beside them."""
 
 RULE = (
-    "An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ±, or when so "
-    "many frames in a row cannot be measured. For a hollow pool, height is its depth, which is "
-    "negative."
+    f"An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ± "
+    f"({SIGMA_OF}), or when so many frames in a row cannot be measured. For a hollow pool, height "
+    "is its depth, which is negative."
 )
 
 

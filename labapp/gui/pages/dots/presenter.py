@@ -23,7 +23,7 @@ from labapp.gui.tasks import Cancelled, Control
 from labapp.session.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
 from labapp.session.setup import parse_setup
-from labapp.words import several
+from labapp.words import SIGMA_OF, several
 
 NO_PLACES: FloatArray = np.zeros((0, 2))
 
@@ -314,7 +314,12 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
         ResultRow("Dots matched", pair([t[1] for t in told])),
         ResultRow("ARE", length("are_mm"), unit="mm", note="Average reflection error (Eq. 6-3)"),
         ResultRow("MRE", length("mre_mm"), unit="mm", note="Largest reflection error (Eq. 6-4)"),
-        ResultRow("Height", height, unit="mm", note="Largest height, or depth (below 0), with ±"),
+        ResultRow(
+            "Height",
+            height,
+            unit="mm",
+            note=f"Largest height, or depth (below 0), with ± ({SIGMA_OF})",
+        ),
     ]
 
 

@@ -16,6 +16,7 @@ from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.labels import plain_label
 from labapp.session.heights import Profile
+from labapp.words import SIGMA_OF
 
 BAND_ALPHA = 70
 
@@ -231,7 +232,7 @@ class ProfileChart(Chart):
         self._low.setData(along, height - sigma)
         self._high.setData(along, height + sigma)
         self._edge.setData(pos=cut.edge_mm)
-        band = "; band: ±" if sigma.any() else "; this scheme gives no ±"
+        band = f"; band: ±, {SIGMA_OF}" if sigma.any() else "; this scheme gives no ±"
         self.say(f"Height along the section; ◆ boundary{band}")
         self.plot.autoRange()
 

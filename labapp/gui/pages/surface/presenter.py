@@ -22,6 +22,7 @@ from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.scene import Scene, rays_of, scene_of
 from labapp.session.session import Session
 from labapp.session.setup import parse_setup
+from labapp.words import SIGMA_OF
 
 SCHEMES = {
     "fit": "Fit: all dots at once",
@@ -62,7 +63,7 @@ ERRORS = (
 )
 """Words, value in `Measures`, and what it is; the last is told where the scheme gives it."""
 
-NO_SIGMA = "This scheme gives no ±"
+SIGMA, NO_SIGMA = f"±: one σ, {SIGMA_OF}", "This scheme gives no ±"
 
 
 def with_scheme(settings: Settings, name: str) -> Settings:
@@ -197,7 +198,7 @@ def size_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
 
 
 def _noted(note: str, sigma: float) -> str:
-    return note if np.isfinite(sigma) else f"{note}. {NO_SIGMA}"
+    return f"{note}. {SIGMA if np.isfinite(sigma) else NO_SIGMA}"
 
 
 def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
