@@ -165,6 +165,27 @@ def test_the_mean_slope_carries_the_sign_of_the_base_point():
         assert z[reached] == pytest.approx(0.1 * span, rel=0.1)
 
 
+@pytest.mark.parametrize("nothing", [1e-17, -1e-17, 0.0, 1e-9, -1e-9])
+def test_a_slope_of_nothing_has_no_sign(nothing):
+    # A base point on the summit: the mean goes down with its neighbour, whatever rounding says.
+    rays = reflected_rays(match_of(spherical_cap(6.0, 0.3)), RIG)
+    row = np.flatnonzero(rays.ray[:, 0] == 9)[:2]
+    direction, level = rays.direction[row], rays.distance_at(0.0)[row]
+    normals = np.array([[nothing, 0.0, 1.0], [0.05, 0.0, 1.0]])
+    distance = Paths.along(np.array([-1, 0]), direction).follow(normals, level)
+    z = RIG.laser.position_mm[2] + distance * direction[:, 2]
+    assert z[1] == pytest.approx(-0.025 * np.diff(direction[:, 0] * level)[0], rel=0.1)
+
+
+def test_caps_that_hardly_move_are_measured_alike():
+    for diameter in (5.0, 6.5, 8.0):
+        depth = []
+        for aside in (0.0, 1e-9, -1e-9):
+            match = match_of(spherical_cap(diameter, diameter / 10, (aside, 0.7 * aside)))
+            depth.append(measure(ers.reconstruct(match, RIG, CIRCLE), match, RIG).height_mm)
+        assert np.ptp(depth) < 1e-4
+
+
 def test_the_centre_reference_is_stood_in_for_between_its_neighbours():
     match = match_of(spherical_cap(6.0, 0.3))
     rays = reflected_rays(match, RIG)

@@ -12,7 +12,7 @@ from labapp.core.measures import measure
 from labapp.core.pool_fit import FitSettings
 from labapp.core.rig import Electrode, ImagingPlane
 from labapp.simulation import error_analysis, image_error, parameter_deviation
-from labapp.simulation.error_analysis import ErrorSurvey, error_table, survey
+from labapp.simulation.error_analysis import ErrorSurvey, aside, error_table, survey
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.image_error import BENCH, TACK, TACK_RIG, VIEW, axes_of, exactly_seen
 from labapp.simulation.parallel import in_parallel
@@ -24,8 +24,8 @@ from labapp.simulation.setup_budget import Bench, SetupBudget, budget_table, lik
 
 @pytest.fixture(scope="module")
 def ce() -> ErrorSurvey:
-    """Every scheme on the 28 caps of §8.3.1."""
-    return survey("CE", workers=1)
+    """Every scheme on the 28 caps of §8.3.1, each at one of its centres."""
+    return survey("CE", caps=aside(caps_8_3_1(), 1), workers=1)
 
 
 def test_ers_errs_as_the_text_has_it(ce: ErrorSurvey) -> None:
