@@ -9,7 +9,7 @@ from labapp.core.correspondence import Match
 from labapp.core.pool_fit import FitSettings, FittedPool, Level, Rear, fit_pool
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
-from labapp.core.spline import SplineSurface
+from labapp.core.spline import OpenSplineSurface, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
 
 LEAST_DOTS = 9
@@ -145,7 +145,8 @@ def _variants(
             break
         mode = covariance @ at_points.T @ direction[:, -k] / np.sqrt(variance[-k])
         for step in (mode, -mode):
-            moved = SplineSurface(surface.basis, surface.coefficients + step)
+            # The boundary of one may lie beyond the rectangle where that of the pool is near it.
+            moved = OpenSplineSurface(surface.basis, surface.coefficients + step)
             out = _refine_radius(moved, rear, center, way, radius, 0.3)
             variants.append((moved, _boundary_of(rear, center, way, out)))
     return tuple(variants)

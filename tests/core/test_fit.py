@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -206,3 +208,29 @@ def test_the_same_dots_give_the_same_surface() -> None:
     )
     np.testing.assert_array_equal(one.points_mm, other.points_mm)
     np.testing.assert_array_equal(one.boundary.points_mm, other.boundary.points_mm)
+
+
+def test_every_size_has_its_uncertainty_where_the_pool_ends_near_what_is_fitted() -> None:
+    # The torch hides the last two rows: the fitted rectangle reaches just beyond the pool's end,
+    # which one σ away lies outside it.
+    rng = np.random.default_rng(1)
+    pool = egg(7.16, 3.78, 4.62, 0.131)
+    match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG, sigma_mm=0.12, rng=rng)
+    hidden = match.ray[:, 0] < match.ray[:, 0].min() + 2
+    witness = match.witness.copy()
+    witness[tuple(match.ray[hidden].T - 1)] = 0
+    match = replace(
+        match,
+        dot=match.dot[~hidden],
+        ray=match.ray[~hidden],
+        reflected=match.reflected[~hidden],
+        plane_mm=match.plane_mm[~hidden],
+        plane_covariance_mm2=match.plane_covariance_mm2[~hidden],
+        witness=witness,
+    )
+    made = fit.reconstruct(match, OPEN_RIG, FitSettings())
+    size = measure(made, match, OPEN_RIG)
+    beyond = [np.isnan(made.whole.height(*edge.points_mm[:, :2].T)) for _, edge in made.variants]
+    assert np.any(beyond)
+    assert all(np.isfinite(value) for name, value in vars(size).items() if "_sigma_" in name)
+    assert 0 < size.volume_sigma_mm3 < 0.2 * size.volume_mm3
