@@ -81,7 +81,8 @@ def test_errors_are_written_part_by_part(labapp: Run, tmp_path: Path) -> None:
     assert rows[2]["text_worst_pct"] == "26.9"
     assert "CE-D" in out
     caps = table(tmp_path / "errors_by_cap.csv")
-    assert [row["height_mm"] for row in caps] == ["0.3", "-0.3"] * 2
+    assert [row["height_mm"] for row in caps] == ["0.3"] * 5 + ["-0.3"] * 5 + ["0.3", "-0.3"]
+    assert len({row["center_x_mm"] for row in caps[:10]}) == 10
     assert sorted(path.stem for path in tmp_path.glob("*.png")) == [
         "figure_8_6_CE",
         "figure_8_7_CE_are",

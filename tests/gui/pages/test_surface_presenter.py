@@ -162,7 +162,7 @@ def test_two_schemes_are_compared_on_the_same_dots(session: Session) -> None:
     assert "±" not in other  # ERS gives none
     wanted = fit.measures.width_mm - ers.measures.width_mm
     assert float(difference.replace("−", "-")) == pytest.approx(wanted, abs=0.001)
-    assert [row[0] for row in made.rows[-4:]] == ["ARE", "MRE", "ARE-I", "MRE-I"]
+    assert [row[0] for row in made.rows[-5:]] == ["ARE", "MRE", "ARE-I", "MRE-I", "Own ARE"]
     assert made.told.startswith("Fit minus ERS, from the same dots")
 
 
