@@ -158,7 +158,9 @@ def _unlink(path: Any) -> None:
 def be_windows_about_files() -> None:
     """Refuse what Windows refuses."""
     import shutil
+    import tempfile
 
+    tempfile.TemporaryFile = tempfile.NamedTemporaryFile  # type: ignore[assignment]
     shutil._use_fd_functions = False  # type: ignore[attr-defined]  # they open folders
     for name, function in {
         "open": _open,
