@@ -65,7 +65,16 @@ SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
 """Surfaces that are not dataclasses; the one thing each is made from, what it is, its shape."""
 
 LARGEST = 100_000_000
-"""No value takes more bytes, unpacked: a few bytes cannot fill the memory."""
+"""No value takes more bytes, unpacked, nor do all its arrays: few bytes cannot fill the memory.
+
+An array that is kept once may be named a thousand times; each is an array of its own when read.
+"""
+
+LARGEST_TREE = 8_000_000
+"""Of these, bytes of JSON: every two of them may become a list of sixty bytes."""
+
+MOST_SURFACE_POINTS = 4000
+"""A surface is made from so many: the system of a thin plate grows with their square."""
 
 UNREADABLE = (
     *(zlib.error, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError),
@@ -87,11 +96,13 @@ def pack(value: object) -> bytes:
     TypeError
         If a value of another class is in it.
     InputError
-        If it is larger than `LARGEST`.
+        If it is larger than `LARGEST`, or what is no array of it than `LARGEST_TREE`.
     """
     content = _canonical(value)
-    if len(content) > LARGEST:
-        raise InputError("session", "value", f"{len(content)} bytes", f"{LARGEST} bytes or less")
+    tree = int.from_bytes(content[:4], "little")
+    for size, most in ((len(content), LARGEST), (tree, LARGEST_TREE)):
+        if size > most:
+            raise InputError("session", "value", f"{size} bytes", f"{most} bytes or less")
     body = zlib.compress(content, 1)
     return HEAD.pack(MAGIC, zlib.crc32(body)) + body
 
@@ -119,7 +130,10 @@ def unpack(blob: object, kind: Any = Any) -> Any:
     try:
         content = _decompressed(blob[HEAD.size :])
         length = int.from_bytes(content[:4], "little")
-        value = _read(json.loads(content[4 : 4 + length]), memoryview(content)[4 + length :])
+        if length > LARGEST_TREE:
+            raise ValueError("it is too large")
+        tree = json.loads(content[4 : 4 + length])
+        value = _Reader(memoryview(content)[4 + length :]).read(tree)
     except UNREADABLE as error:
         raise Damaged(f"it cannot be read: {error}") from error
     if not is_a(value, kind):
@@ -212,34 +226,55 @@ def _place(array: npt.NDArray[Any], arrays: dict[bytes, int]) -> int:
     return arrays[content]
 
 
-def _read(tree: Any, content: memoryview) -> Any:
-    if not isinstance(tree, dict):
-        if isinstance(tree, list):
-            raise TypeError("a bare list")
-        return tree
-    ((kind, held),) = tree.items()
-    if kind == "array":
-        dtype, shape, place = held
+class _Reader:
+    """Makes a value from its JSON tree and the bytes of its arrays, of which it builds no end."""
+
+    def __init__(self, content: memoryview) -> None:
+        self._content = content
+        self._left = LARGEST
+
+    def read(self, tree: Any) -> Any:
+        if not isinstance(tree, dict):
+            if isinstance(tree, list):
+                raise TypeError("a bare list")
+            return tree
+        ((kind, held),) = tree.items()
+        if kind == "array":
+            return self._array(*held)
+        if kind == "bytes":
+            place, length = held
+            found = self._content[place : place + length]
+            self._take(len(found))
+            return bytes(found)
+        if kind in CONTAINERS:
+            return CONTAINERS[kind](self.read(item) for item in held)
+        if kind == "dict":
+            return {key: self.read(item) for key, item in held}
+        if kind in SURFACES:
+            return self._surface(kind, self.read(held))
+        value = DATACLASSES[kind](**{name: self.read(item) for name, item in held.items()})
+        check_fields(value)
+        return value
+
+    def _take(self, size: int) -> None:
+        self._left -= size
+        if self._left < 0:
+            raise ValueError(f"its arrays take more than {LARGEST} bytes")
+
+    def _array(self, dtype: Any, shape: Any, place: Any) -> npt.NDArray[Any]:
         if not (isinstance(dtype, str) and all(isinstance(n, int) and n >= 0 for n in shape)):
             raise TypeError(f"an array of {dtype}, {shape}")
         count = math.prod(shape)
-        array = np.frombuffer(content, dtype, count, place) if count else np.empty(0, dtype)
-        array = array.reshape(shape).copy()  # aligned, and free of the rest
+        self._take(count * np.dtype(dtype).itemsize)
+        found = np.frombuffer(self._content, dtype, count, place) if count else np.empty(0, dtype)
+        array = found.reshape(shape).copy()  # aligned, and free of the rest
         array.flags.writeable = False
         return array
-    if kind == "bytes":
-        place, length = held
-        return bytes(content[place : place + length])
-    if kind in CONTAINERS:
-        return CONTAINERS[kind](_read(item, content) for item in held)
-    if kind == "dict":
-        return {key: _read(item, content) for key, item in held}
-    if kind in SURFACES:
+
+    def _surface(self, kind: str, from_what: Any) -> Any:
         surface, _, hint, shape = SURFACES[kind]
-        from_what = _read(held, content)
         if not is_a(from_what, hint) or (shape and np.shape(from_what)[1:] != shape):
             raise TypeError(f"a {kind} of a {type(from_what).__name__}")
+        if shape and len(from_what) > MOST_SURFACE_POINTS:
+            raise ValueError(f"a {kind} through {len(from_what)} points")
         return surface(from_what)
-    value = DATACLASSES[kind](**{name: _read(item, content) for name, item in held.items()})
-    check_fields(value)
-    return value

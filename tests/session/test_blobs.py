@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,9 @@ from labapp.core.interpolation import CloughTocherSurface, ThinPlateSurface
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.errors import InputError
 from labapp.session.blobs import HEAD, MAGIC, Damaged, fingerprint, fingerprint_of, pack, unpack
+from tests.scripts import peak_mb
 
 plain = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -118,6 +122,68 @@ def test_what_only_a_later_version_knows_is_refused():
         body = zlib.compress(len(tree).to_bytes(4, "little") + tree)
         with pytest.raises(Damaged):
             unpack(HEAD.pack(MAGIC, zlib.crc32(body)) + body)
+
+
+def blob_of(tree: bytes, arrays: bytes = b"") -> bytes:
+    """A blob as somebody might forge it."""
+    body = zlib.compress(len(tree).to_bytes(4, "little") + tree + arrays, 9)
+    return HEAD.pack(MAGIC, zlib.crc32(body)) + body
+
+
+def many_times() -> bytes:
+    array = b'{"array":["|u1",[60000000],0]}'
+    return blob_of(b'{"list":[' + b",".join([array] * 50) + b"]}", bytes(60_000_000))
+
+
+def bytes_many_times() -> bytes:
+    return blob_of(
+        b'{"list":[' + b",".join([b'{"bytes":[0,60000000]}'] * 50) + b"]}", bytes(60_000_000)
+    )
+
+
+def empty_lists() -> bytes:
+    return blob_of(b'{"list":[' + b",".join([b'{"list":[]}'] * 8_000_000) + b"]}")
+
+
+def empty_of_a_long_type() -> bytes:
+    return blob_of(
+        b'{"list":[' + b",".join([b'{"array":["|V100000000",[1],0]}'] * 30) + b"]}",
+        bytes(99_000_000),
+    )
+
+
+def surface(kind: str) -> bytes:
+    points = np.random.default_rng(7).uniform(-3, 3, (12_000, 3))
+    tree = b'{"%s":{"array":["<f8",[12000,3],0]}}' % kind.encode()
+    return blob_of(tree, points.tobytes())
+
+
+@pytest.mark.parametrize(
+    "forge",
+    [many_times, bytes_many_times, empty_lists, empty_of_a_long_type]
+    + [functools.partial(surface, kind) for kind in ("ThinPlateSurface", "CloughTocherSurface")],
+    ids=["arrays", "bytes", "lists", "type", "thin plate", "triangles"],
+)
+def test_what_would_fill_the_memory_is_refused(tmp_path: Path, forge: Callable[[], bytes]):
+    (tmp_path / "blob").write_bytes(forge())
+    script = """
+        import sys
+        from pathlib import Path
+        from labapp.session.blobs import Damaged, unpack
+        try:
+            unpack(Path(sys.argv[1]).read_bytes())
+            sys.exit("it was unpacked")
+        except Damaged:
+            pass
+    """
+    assert peak_mb(script, tmp_path / "blob") < 700
+
+
+def test_what_could_not_be_read_again_is_not_packed():
+    with pytest.raises(InputError, match="8000000 bytes or less"):
+        pack("x" * 9_000_000)
+    with pytest.raises(InputError, match="100000000 bytes or less"):
+        pack([np.arange(20_000_000.0)])
 
 
 def test_every_changed_byte_is_noticed():
