@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from labapp import MOST_PIXELS
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.stored import StoredFrames, finite, regular_size
@@ -17,7 +18,7 @@ from labapp.media.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 IMAGE_SUFFIXES = frozenset(
     ".png .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()
 ) | set(TIFF_SUFFIXES)
-AN_IMAGE = "a whole image: PNG, TIFF, BMP, JPEG, PGM"
+AN_IMAGE = f"a whole image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PGM"
 
 
 class ImageSequence(StoredFrames):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import stat
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from labapp import MOST_PIXELS
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage, check_index, rate_in_words
@@ -36,6 +38,11 @@ class StoredFrames(FrameSource):
         Frames a second; None where the recording does not say.
     time_s
         Time of every frame since the first, shape (count,), s; None: from the frame rate.
+
+    Raises
+    ------
+    InputError
+        If a frame has more than `MOST_PIXELS`.
     """
 
     warnings: tuple[str, ...] = ()
@@ -52,6 +59,8 @@ class StoredFrames(FrameSource):
         frame_rate_hz: float | None = None,
         time_s: FloatArray | None = None,
     ) -> None:
+        if math.prod(shape) > MOST_PIXELS:
+            raise too_large(path, *shape)
         self.name = path.name or str(path)
         self.shape = shape
         self.bit_depth = bit_depth
@@ -81,6 +90,12 @@ class StoredFrames(FrameSource):
     def _grey(self, index: int) -> GreyImage:
         """Grey levels of frame ``index``, shape `shape`."""
         raise NotImplementedError
+
+
+def too_large(path: Path, rows: int, columns: int) -> InputError:
+    """The error for a frame of more pixels than are decoded."""
+    size = f"{columns}×{rows} px"
+    return InputError(path, "frame size", size, f"at most {MOST_PIXELS} px in a frame")
 
 
 def ends_early(name: str, claimed: int, whole: int) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from labapp import MOST_PIXELS
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
@@ -25,6 +26,7 @@ from labapp.media.stored import (
     increasing,
     plausible_rate,
     read_bytes,
+    too_large,
     unpack_bits,
 )
 
@@ -35,6 +37,9 @@ TIFF_MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 
 A_TIFF = "a whole image: TIFF, uncompressed or with Deflate, LZW, PackBits or JPEG"
+
+MOST_BITS = 64 * MOST_PIXELS
+"""Of a page, unpacked: four samples of 16 bit a pixel."""
 
 MAX_RATIO = 2000
 """No compression that is read makes a picture more times smaller than this."""
@@ -252,6 +257,8 @@ def _check_room(path: Path, page: tifffile.TiffPage, size: int) -> None:
     bits = math.prod(page.shape) * page.bitspersample
     if page.is_tiled:
         bits = max(bits, page.tilewidth * page.tilelength * page.bitspersample)
+    if bits > MOST_BITS or math.prod(page.shape) > 4 * MOST_PIXELS:
+        raise too_large(path, page.imagelength, page.imagewidth)
     if min(page.dataoffsets, default=0) <= 0 or _end(page) > size:
         raise InputError(path, "size", f"{size} bytes", A_TIFF)
     if bits > 8 * stored * (1 if page.compression == 1 else MAX_RATIO):

@@ -17,9 +17,11 @@ import numpy as np
 from av.container import InputContainer
 from av.error import ExitError, FFmpegError
 from av.packet import Packet
+from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from labapp import MOST_PIXELS
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, check_index, rate_in_words
 from labapp.media.ffv1 import slices_whole
@@ -40,8 +42,11 @@ NEAR_PACKETS = 8
 DAMAGED_READS = 50
 """More failures than this to read a packet, one after the other, are the end."""
 
-MOST_PIXELS = 2**26
-"""A frame of more pixels (8192×8192) is taken for a damaged header: 1 GB at 16 byte a pixel."""
+MOST_BYTES = 2**30
+"""Decoders hold no more in frames than this."""
+
+HELD_FRAMES, HELD_REORDERED = 2, 17
+"""Frames that a decoder may hold; of codecs that store them out of the order they are shown in."""
 
 READ_S = 8.0
 """No one step of opening or reading takes longer, s: a damaged table can send FFmpeg astray."""
@@ -448,16 +453,24 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
         if not isinstance(stream, VideoStream) or stream.codec_context is None:
             raise InputError(path, "content", "no pictures", A_VIDEO)
         context = stream.codec_context
-        if context.width * context.height > MOST_PIXELS:
+        most = _most_pixels(context)
+        if context.width * context.height > most:
             size = f"{context.width}×{context.height} px"
-            raise InputError(path, "frame size", size, f"at most {MOST_PIXELS} px in a frame")
+            raise InputError(path, "frame size", size, f"at most {most} px in a frame of its kind")
         # Frame threads would hold back each frame that is asked for until more are read.
         context.thread_type = "SLICE"
-        context.options = {"max_pixels": str(MOST_PIXELS), "err_detect": "explode"}
+        context.options = {"max_pixels": str(most), "err_detect": "explode"}
     except BaseException:
         container.close()
         raise
     return container, stream
+
+
+def _most_pixels(context: VideoCodecContext) -> int:
+    """Pixels that a frame may have: a small file can claim many, of which decoders hold several."""
+    bits = 64 if context.format is None else context.format.padded_bits_per_pixel
+    held = HELD_REORDERED if context.codec.reorder else HELD_FRAMES
+    return min(MOST_PIXELS, 8 * MOST_BYTES // (max(bits, 1) * held))
 
 
 def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:

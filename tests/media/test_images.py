@@ -1,11 +1,15 @@
 from __future__ import annotations
 
 import os
+import struct
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from labapp.errors import InputError
 from labapp.media import open_source
@@ -13,7 +17,7 @@ from labapp.media.base import to_grey
 from labapp.media.images import natural_key
 from tests.media.cine_writer import write_cine
 from tests.media.conftest import WriteVideo
-from tests.scripts import run_python
+from tests.scripts import peak_mb, run_python
 
 GREY = (np.indices((20, 30)).sum(axis=0) * 5).astype(np.uint8)
 
@@ -198,6 +202,54 @@ def test_half_an_image_is_refused(
     with pytest.raises(InputError, match="expected a whole image"):
         open_source(path)
     assert capfd.readouterr() == ("", "")
+
+
+def png(path: Path, side: int) -> Path:
+    """A black picture, made a row at a time."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            len(content).to_bytes(4, "big")
+            + kind
+            + content
+            + zlib.crc32(kind + content).to_bytes(4, "big")
+        )
+
+    packer = zlib.compressobj()
+    levels = [packer.compress(bytes(1 + 2 * side)) for _ in range(side)]
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">2I5B", side, side, 16, 0, 0, 0, 0))
+        + chunk(b"IDAT", b"".join(levels) + packer.flush())
+        + chunk(b"IEND", b"")
+    )
+    return path
+
+
+def tiff(path: Path, side: int) -> Path:
+    levels = np.broadcast_to(np.uint16(0), (side, side))
+    tifffile.imwrite(path, levels, compression="zlib", rowsperstrip=500)
+    return path
+
+
+@pytest.mark.parametrize("write", [png, tiff])
+def test_a_picture_that_would_fill_the_memory_is_refused(
+    tmp_path: Path, write: Callable[[Path, int], Path]
+) -> None:
+    path = write(tmp_path / "large", 20_000)
+    assert path.stat().st_size < 2e6
+    script = """
+        import sys
+        from labapp.errors import InputError
+        from labapp.media import open_source
+        try:
+            open_source(sys.argv[1])
+            sys.exit("it was opened")
+        except InputError as error:
+            assert "at most 67108864 px" in str(error)
+    """
+    path = path.rename(path.with_suffix(f".{write.__name__}"))
+    assert peak_mb(script, path) < 400
 
 
 @pytest.mark.parametrize("name", ["pipe", "pipe.png", "pipe.avi", "pipe.mraw", "a\0.png", "folder"])

@@ -386,6 +386,28 @@ def test_an_index_that_does_not_fit_is_ignored(tmp_path: Path, encode: Encode) -
             assert number_in(source.frame(count - 1).image) == count - 1
 
 
+def test_a_codec_that_holds_many_large_frames_is_refused(tmp_path: Path) -> None:
+    """What takes one frame of 42 million pixels at a time may be larger."""
+    for codec, refused in (("mpeg4", True), ("ffv1", False)):
+        path = tmp_path / f"{codec}.avi"
+        with av.open(str(path), "w") as container:
+            stream: Any = container.add_stream(codec, rate=10)
+            stream.width, stream.height = 6496, 6496
+            stream.pix_fmt = "yuv420p" if refused else "gray"
+            frame = av.VideoFrame(6496, 6496, stream.pix_fmt)
+            for plane in frame.planes:
+                plane.update(bytes(plane.buffer_size))
+            container.mux(stream.encode(frame))
+            container.mux(stream.encode(None))
+        assert path.stat().st_size < 2e6
+        if refused:
+            with pytest.raises(InputError, match="frame size: 6496×6496 px"):
+                open_source(path)
+        else:
+            with open_source(path) as source:
+                assert source.shape == (6496, 6496)
+
+
 def test_a_frame_too_large_to_be_true_is_refused(tmp_path: Path, encode: Encode) -> None:
     path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
     content = bytearray(path.read_bytes())
