@@ -9,6 +9,7 @@ from PySide6.QtGui import QColor, QPalette
 from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout
 
 from labapp.core.values import FloatArray
+from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Drawn
 from labapp.gui.views.labels import plain_label
 from labapp.simulation.positioning import Fate, SideView
@@ -32,9 +33,8 @@ class BenchView(Drawn):
         self.words = plain_label()
         self.words.setWordWrap(True)
         self.words.setMargin(6)
-        self.whole, self.near = _plot(), _plot()
-        self.whole.setLabel("left", "Z, mm")
-        self.near.setLabel("bottom", "enlarged, mm")
+        self.whole = make_plot("Y, welding direction, mm", "Z, mm")
+        self.near = make_plot("enlarged, mm")
         self._column = layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.setSpacing(0)
@@ -81,10 +81,7 @@ class BenchView(Drawn):
         self._dark = self._ground.lightness() < 128
         for plot in (self.whole, self.near):
             plot.setBackground(self._ground)
-            for side in ("bottom", "left"):
-                axis = plot.getAxis(side)
-                axis.setPen(self._faint(0.5))
-                axis.setTextPen(self._ink)
+            paint_axes(plot, self._faint(0.5), self._ink)
         self._draw()
 
     def _faint(self, share: float) -> QColor:
@@ -169,16 +166,6 @@ class BenchView(Drawn):
         item.setZValue(10)
         item.setPos(float(place[0]), float(place[1]))
         plot.addItem(item, ignoreBounds=True)
-
-
-def _plot() -> pg.PlotWidget:
-    plot = pg.PlotWidget()
-    plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
-    plot.setAspectLocked(True)
-    plot.setMenuEnabled(False)
-    plot.hideButtons()
-    plot.setLabel("bottom", "Y, welding direction, mm")
-    return plot
 
 
 def _line(

@@ -9,6 +9,7 @@ from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.core.laser_calibration import LaserCalibration
+from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Drawn
 from labapp.gui.views.labels import plain_label
 
@@ -18,13 +19,7 @@ class CrossHairView(Drawn):
 
     def __init__(self) -> None:
         super().__init__("Drawing of the laser and its cross hair")
-        self.plot = pg.PlotWidget()
-        self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
-        self.plot.setAspectLocked(True)
-        self.plot.setMenuEnabled(False)
-        self.plot.hideButtons()
-        self.plot.setLabel("bottom", "Y, mm")
-        self.plot.setLabel("left", "Z, mm")
+        self.plot = make_plot("Y, mm", "Z, mm")
         self.words = plain_label()
         self.words.setWordWrap(True)
         self.words.setMargin(6)
@@ -58,9 +53,7 @@ class CrossHairView(Drawn):
         ink = self.palette().color(QPalette.ColorRole.Text)
         beam = "#ff6b5e" if ground.lightness() < 128 else "#c62828"
         self.plot.setBackground(ground)
-        for side in ("bottom", "left"):
-            self.plot.getAxis(side).setPen(ink)
-            self.plot.getAxis(side).setTextPen(ink)
+        paint_axes(self.plot, ink, ink)
         self.plot.clear()
         found, l1, l2 = self._shown
         if found is None:

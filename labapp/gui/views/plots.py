@@ -26,6 +26,7 @@ from PySide6.QtWidgets import QFrame, QGraphicsItem, QScrollArea, QSizePolicy, Q
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in_words
 from labapp.gui.theme import RED, is_dark
+from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.labels import plain_label, plain_tip
 
@@ -281,7 +282,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
     """One curve with its axis: line, bars, points, level, and two upright lines."""
 
     def __init__(self, over: _Plot | None) -> None:
-        super().__init__()
+        super().__init__(axisItems=plain_axes())
         self._curve: Curve | None = None
         self._look = QPalette()
         self.hideButtons()
@@ -293,10 +294,8 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         if over is not None:
             self.setXLink(over)
         for side in ("left", "bottom"):
-            axis = self.getAxis(side)
-            axis.enableAutoSIPrefix(False)
             # Its grid is half of what drawing costs, and stepping moves only the upright line.
-            axis.setCacheMode(QGraphicsItem.CacheMode.DeviceCoordinateCache)
+            self.getAxis(side).setCacheMode(QGraphicsItem.CacheMode.DeviceCoordinateCache)
         self.getAxis("left").setWidth(AXIS_WIDTH)
         box.sigResized.connect(lambda *_: self._thin_out())
         # Above the plot: beside a low one its name would be cut off.
@@ -325,15 +324,10 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         """Take a palette's colours and a curve's title: an axis is drawn anew, which is dear."""
         self._look = look
         accent, text = look.color(Role.Accent), look.color(Role.Text)
-        for side in ("left", "bottom"):
-            axis = self.getAxis(side)
-            axis.setPen(look.color(Role.Mid))
-            axis.setTextPen(text)
+        paint_axes(self, look.color(Role.Mid), text)
         size = f"{QGuiApplication.font().pointSizeF():g}pt"
         look_of = {"color": text.name(), "bold": True, "justify": "left", "size": size}
         self.titleLabel.setText(curve.title, **look_of)
-        if self.getAxis("bottom").labelText:
-            self.setLabel("bottom", self.getAxis("bottom").labelText, color=text.name())
         self.showGrid(x=True, y=True, alpha=0.18)
         line = _faint(accent, 110) if len(curve.key) else accent
         self.line.setPen(pg.mkPen(line, width=1))

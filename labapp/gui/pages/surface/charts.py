@@ -13,6 +13,7 @@ from PySide6.QtWidgets import QVBoxLayout
 from labapp.core.boundary import Boundary
 from labapp.core.values import FloatArray
 from labapp.gui.pages.surface.presenter import error_scale
+from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.labels import plain_label
 from labapp.session.heights import Profile
@@ -42,14 +43,8 @@ class Chart(Plotted):
         self.setToolTip(f"{name}: wheel to zoom, drag to move; {KEYS}")
         self.title = plain_label(name)
         self.title.setWordWrap(True)
-        self.plot = pg.PlotWidget()
-        self.plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        self.plot = make_plot(x_label, y_label, equal)
         self.plot.setMinimumSize(88, 80)
-        self.plot.setMenuEnabled(False)
-        self.plot.setLabel("bottom", x_label)
-        self.plot.setLabel("left", y_label)
-        self.plot.setAspectLocked(equal)
-        self.plot.hideButtons()
         layout = QVBoxLayout(self)
         layout.setContentsMargins(1, 1, 1, 1)
         layout.setSpacing(0)
@@ -65,11 +60,7 @@ class Chart(Plotted):
         """Take the window's colours."""
         text = self.colour(QPalette.ColorRole.Text)
         self.plot.setBackground(self.colour(QPalette.ColorRole.Base))
-        for side in ("bottom", "left"):
-            self.plot.getAxis(side).enableAutoSIPrefix(False)
-            axis = self.plot.getAxis(side)
-            axis.setPen(text)
-            axis.setTextPen(text)
+        paint_axes(self.plot, text, text)
 
     def colour(self, role: QPalette.ColorRole) -> Any:
         """A colour of the window."""
