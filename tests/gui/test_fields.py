@@ -106,6 +106,32 @@ def test_what_is_wrong_is_said_and_the_former_value_stays(qtbot, number, text, w
     assert number.problem.isHidden()
 
 
+def test_a_refusal_is_said_until_the_field_is_mended(qtbot, number):
+    retype(qtbot, number, "abc")
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    number.set_value(27.0)  # as a page does when another field was accepted
+    number.set_problem("")
+    number.flush()
+    assert "not a number" in number.problem.text()
+    assert not number.problem.isHidden()
+    retype(qtbot, number, "27.00")  # what it holds already: accepted, too
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    assert number.problem.isHidden()
+    retype(qtbot, number, "91")
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    number.set_problem("it is missing")
+    assert "from 0 to 90" in number.problem.text()
+    retype(qtbot, number, "30")
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    assert "it is missing" in number.problem.text()
+    number.set_value(30.0)
+    assert number.problem.isHidden()
+    retype(qtbot, number, "91")
+    qtbot.keyClick(number.editor, Qt.Key.Key_Return)
+    qtbot.keyClick(number.editor, Qt.Key.Key_Up)
+    assert number.problem.isHidden()
+
+
 def test_steps_that_follow_each_other_are_one_edit(qtbot, number):
     number.editor.setFocus()
     for _ in range(3):

@@ -8,6 +8,7 @@ from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.steps import State
+from labapp.gui.views.fields import Field
 from labapp.gui.workspace import Workspace
 
 
@@ -41,6 +42,13 @@ class Page(QWidget):
         self.panel_layout = QVBoxLayout(self.panel)
         self.setObjectName(f"page-{self.key}")
         self.panel.setObjectName(f"panel-{self.key}")
+        workspace.opened.connect(self._take_session)
+
+    def _take_session(self) -> None:
+        """What was refused in the former session is of no interest in another."""
+        for side in (self, self.panel):
+            for field in side.findChildren(Field):
+                field.refuse("")
 
     def refresh(self) -> None:
         """Show what the session holds now; ``workspace.session`` is not None."""

@@ -1,7 +1,8 @@
 """Fields for numbers, words and choices, the form that lays them out, and tables of results.
 
 A field tells of an edit only when it is finished: Enter, leaving the field, or a pause after steps.
-What is wrong stands in words below it.
+What is wrong stands in words below it: why the last entry was refused, until another one is taken;
+else what is wrong with the value that it holds.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ class Field(QWidget):
         editor.setToolTip(tooltip)
         editor.setAccessibleName(f"{label}, {unit}" if unit else label)
         self._tooltip = tooltip
+        self._refusal = self._fault = ""
         self.unit = plain_label(unit)
         self.problem = plain_label()
         self.problem.setWordWrap(True)
@@ -85,6 +87,21 @@ class Field(QWidget):
 
     def set_problem(self, words: str) -> None:
         """Say what is wrong with what the field holds; empty: nothing is."""
+        self._fault = words
+        self._show_problem()
+
+    def refuse(self, words: str) -> None:
+        """Say why the last entry was refused, until this field takes or is shown another value."""
+        self._refusal = words
+        self._show_problem()
+
+    def _enter(self, value: object) -> None:
+        """Tell of an edit."""
+        self.refuse("")
+        self.edited.emit(value)
+
+    def _show_problem(self) -> None:
+        words = self._refusal or self._fault
         self.problem.setText(f"⚠ {words}" if words else "")
         self.problem.setVisible(bool(words))
         described = f"{words}. {self._tooltip}" if words else self._tooltip
@@ -129,6 +146,8 @@ class NumberField(Field):
         self.decimals, self.optional = decimals, optional
         self._value: float | None = None
         self._told: float | None = None
+        self._typed = False
+        self._box.line.textEdited.connect(self._note_typing)
         self._box.stepped.connect(self._step)
         self._box.editingFinished.connect(self._commit)
         self._pause = QTimer(self)
@@ -145,6 +164,8 @@ class NumberField(Field):
         if self._pause.isActive():
             return
         typing = self._box.text() != self._shown(self._value) and self._box.line.isModified()
+        if value != self._value:
+            self.refuse("")
         self._value = self._told = value
         if not typing:
             self._show()
@@ -161,14 +182,20 @@ class NumberField(Field):
         with QSignalBlocker(self._box):
             self._box.line.setText(self._shown(self._value))
 
+    def _note_typing(self) -> None:
+        self._typed = True
+
     def _commit(self) -> None:
         text = self._box.text()
         if text != self._shown(self._value):
             value, problem = self._read(text)
             if not problem:
                 self._value = value
-            self.set_problem(problem)
+            self.refuse(problem)
             self._show()
+        elif self._typed:  # what it held already, and is right
+            self.refuse("")
+        self._typed = False
         self._tell()
 
     def _read(self, text: str) -> tuple[float | None, str]:
@@ -196,7 +223,7 @@ class NumberField(Field):
             start = min(max(0.0, self.lowest), self.highest) - steps * self.step
         moved = min(max(start + steps * self.step, self.lowest), self.highest)
         self._value = int(moved) if self.decimals == 0 else round(moved, 9)
-        self.set_problem("")
+        self.refuse("")
         self._show()
         self._pause.start()
 
@@ -204,7 +231,7 @@ class NumberField(Field):
         self._pause.stop()
         if self._value != self._told:
             self._told = self._value
-            self.edited.emit(self._value)
+            self._enter(self._value)
 
 
 class _NumberBox(QAbstractSpinBox):
@@ -282,6 +309,8 @@ class TextField(Field):
         edit = self._edit
         modified = edit if isinstance(edit, QLineEdit) else edit.document()
         typing = modified.isModified() and self.value() != self._told
+        if value != self._told:
+            self.refuse("")
         self._told = value
         if typing or value == self.value():
             return
@@ -294,7 +323,7 @@ class TextField(Field):
         """Finish an edit under way, as leaving the field does."""
         if self.value() != self._told:
             self._told = self.value()
-            self.edited.emit(self._told)
+            self._enter(self._told)
 
 
 class _Paragraphs(QPlainTextEdit):
@@ -351,6 +380,8 @@ class ChoiceField(Field):
     def set_value(self, key: str) -> None:
         """Choose by key; tells nobody."""
         self._combo.setCurrentIndex(self._combo.findData(key))
+        if self.value() != self._told:
+            self.refuse("")
         self._told = self.value()
 
     def set_choices(self, choices: Sequence[tuple[str, str]]) -> None:
@@ -373,7 +404,7 @@ class ChoiceField(Field):
     def _activated(self, _: int) -> None:
         if self.value() != self._told:
             self._told = self.value()
-            self.edited.emit(self._told)
+            self._enter(self._told)
 
 
 class FieldForm(QWidget):

@@ -31,7 +31,7 @@ class PathField(TextField):
     def _tell_whole(self, path: str) -> None:
         self._tooltip = f"{path}\n{self._purpose}" if path else self._purpose
         self.editor.setToolTip(plain_tip(self._tooltip))
-        self.set_problem(self.problem.text().removeprefix("⚠ "))
+        self._show_problem()
 
 
 class PathLine(QLineEdit):

@@ -324,6 +324,7 @@ def test_limits_that_cannot_be_are_refused_and_others_undone(
     assert fields["length", 1].value() is None
     hand.enter(view.canvas.trends.unmeasured, "12")
     assert session.limits.unmeasured == 12
+    assert "the lowest below the highest" in fields["length", 1].problem.text()
     assert view.live.watch.alarms.limits == session.limits
     window.workspace.undo()
     window.workspace.undo()

@@ -144,6 +144,28 @@ def test_an_edit_changes_the_session_and_the_drawing_and_is_undone(
     assert page.bench.words.text() == words
 
 
+def test_a_refusal_stays_while_other_fields_are_accepted(
+    qtbot: QtBot, page: SetupPage, copy_sample: Callable[[str], Path]
+) -> None:
+    session = page.workspace.session
+    assert session is not None
+    angle, height = (
+        page.rig_fields[key] for key in ("laser.projection_angle_deg", "electrode.height_mm")
+    )
+    retype(qtbot, angle, "400")
+    told = angle.problem.text()
+    assert "0 to 90" in told
+    retype(qtbot, height, "1,5")
+    assert session.setup.rig.electrode.height_mm == 1.5
+    assert (angle.problem.text(), angle.problem.isHidden()) == (told, False)
+    retype(qtbot, height, "x")
+    retype(qtbot, angle, "30")
+    assert angle.problem.isHidden()
+    assert not height.problem.isHidden()
+    assert page.workspace.open(copy_sample("concave"))
+    assert height.problem.isHidden()
+
+
 def test_an_emptied_field_is_marked(qtbot: QtBot, page: SetupPage) -> None:
     field = page.rig_fields["laser.distance_mm"]
     field.editor.clear()

@@ -115,6 +115,8 @@ class CameraFields(QObject):
         """
         self._feed, self._calibrated = feed, calibrated
         self._answers.clear()
+        for field in self.fields.values():
+            field.refuse("")  # what another camera refused
         own_steps = feed.camera.info.kind == KIND  # which its driver does not tell in dB
         self.fields["gain_db"].unit.setText("" if own_steps else NUMBERS["gain_db"][1])
         self._show(feed.settings, feed.camera.limits)
@@ -138,10 +140,8 @@ class CameraFields(QObject):
             field.set_value(getattr(settings, name))
         self.trigger.set_choices([(name, TRIGGERS[name]) for name in limits.triggers])
         self.trigger.set_value(settings.trigger or "free")
-        self.trigger.set_problem("")
         whole = (0, 0, *limits.sensor)
         self.region.set_value(region_in_words(settings.region or whole))
-        self.region.set_problem("")
         for name, field in self.fields.items():
             for part in (field, field.label):
                 part.setVisible(there[name])
@@ -165,7 +165,7 @@ class CameraFields(QObject):
             except InputError as error:
                 kept = None if self._feed is None else self._feed.settings.region
                 self.region.set_value("" if kept is None else region_in_words(kept))
-                self.region.set_problem(f"“{error.value}” is not {error.expected}")
+                self.region.refuse(f"“{error.value}” is not {error.expected}")
                 return
         self._ask(name, value)
 
@@ -209,18 +209,18 @@ class CameraFields(QObject):
             differs = now != wanted
         if differs and now is not None:
             words = f"The camera takes {in_words(now)}, not {in_words(wanted)}"
-            self.fields[name].set_problem(words)
+            self.fields[name].refuse(words)
         if name in ("rate_hz", "trigger", "region"):
             self.reset.emit()
 
     def _refuse(self, name: str, error: CameraError | InputError) -> None:
         """Say beside each field what is wrong with its value, and what would be right."""
         if isinstance(error, CameraError):
-            self.fields[name].set_problem(str(error))
+            self.fields[name].refuse(str(error))
             return
         for problem in error.problems:
             words = f"{in_words(problem.value)} is refused; right is {problem.expected}"
-            self.fields.get(problem.field, self.fields[name]).set_problem(words)
+            self.fields.get(problem.field, self.fields[name]).refuse(words)
 
 
 def region_of(text: str) -> Region:
