@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QEvent, QPointF, QRectF, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QIcon, QPainter, QPalette, QPen, QPixmap, QPolygonF
 from PySide6.QtWidgets import (
     QFrame,
@@ -87,6 +87,7 @@ class StepList(QListWidget):
     chosen = Signal(str)
 
     def __init__(self, steps: Sequence[Step], parent: QWidget | None = None) -> None:
+        self._states: Mapping[str, State] = {}
         super().__init__(parent)
         self._steps = tuple(steps)
         self.setAccessibleName("Steps")
@@ -111,6 +112,7 @@ class StepList(QListWidget):
 
     def show_states(self, states: Mapping[str, State]) -> None:
         """Show how far every step is."""
+        self._states = states
         dark = is_dark(self.palette())
         selected = self.palette().color(QPalette.ColorRole.HighlightedText)
         for row, step in enumerate(self._steps):
@@ -119,6 +121,12 @@ class StepList(QListWidget):
             item.setToolTip(plain_tip(f"{state.mark.value.capitalize()}: {state.why}"))
             told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
             item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and self._states:
+            self.show_states(self._states)
 
     def show_step(self, key: str) -> None:
         """Mark the step in view; none for the welcome page."""
@@ -136,6 +144,7 @@ class SidePanel(QWidget):
     """What to do now, how far the step is, and the page's own panel, which scrolls."""
 
     def __init__(self, parent: QWidget | None = None) -> None:
+        self._shown: State | None = None
         super().__init__(parent)
         self.title = plain_label()
         font = self.title.font()
@@ -181,8 +190,15 @@ class SidePanel(QWidget):
 
     def show_state(self, state: State) -> None:
         """Show how far the step is, and why."""
+        self._shown = state
         self.state.setText(f"{SIGNS[state.mark]}  {state.why}")
         palette = self.state.palette()
         colour = COLOURS[state.mark][is_dark(self.palette())]
         palette.setColor(QPalette.ColorRole.WindowText, QColor(colour))
         self.state.setPalette(palette)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and self._shown is not None:
+            self.show_state(self._shown)

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pyqtgraph as pg
 import pytest
-from PySide6.QtWidgets import QGraphicsView, QWidget
+from PySide6.QtGui import QColor, QImage, QPalette
+from PySide6.QtWidgets import QApplication, QGraphicsView, QWidget
 from pytestqt.qtbot import QtBot
 
+from labapp.gui.pages.capture.live_figures import AlarmStrip, Figure, LiveFigures
+from labapp.gui.recent import Recent
+from labapp.gui.step_list import COLOURS
 from labapp.gui.steps import STEPS
+from labapp.gui.theme import RED, palette
 from labapp.gui.views.view3d import View3d
 from labapp.gui.window import MainWindow
+from labapp.session.alarms import Alarm
 from tests.gui.conftest import CopySample, let_draw
 
 
@@ -78,3 +86,60 @@ def test_the_scale_of_heights_keeps_its_numbers(opened: MainWindow, qtbot: QtBot
             assert bar.GetLookupTable().GetTableRange() == pytest.approx(view.scene.limits)
             assert np.isclose(float(bar.GetLabelFormat() % view.scene.limits[1]),
                               view.scene.limits[1], atol=0.01)  # fmt: skip
+
+
+def shades(image: QImage) -> set[str]:
+    """The colours of a picture's pixels that are wholly of one colour."""
+    image = image.convertToFormat(QImage.Format.Format_ARGB32)
+    levels = np.frombuffer(image.constBits(), np.uint32).reshape(image.height(), -1)
+    found = np.unique(levels[:, : image.width()]).tolist()
+    return {QColor(level).name() for level in found if level >> 24 == 255}
+
+
+def test_marks_and_words_take_the_colours_of_the_theme(opened: MainWindow) -> None:
+    opened.show_step("trends")
+    steps, panel, timeline = opened.step_list, opened.side_panel, opened.timeline
+    marks = {opened._states[step.key].mark for step in STEPS}
+    assert len(marks) > 1
+    for theme, dark in (("light", False), ("dark", True)):
+        opened.set_theme(theme)
+        let_draw()
+        icons = [steps.item(row).icon().pixmap(54).toImage() for row in range(steps.count())]
+        for icon, step in zip(icons, STEPS, strict=True):
+            pair = COLOURS[opened._states[step.key].mark]
+            assert pair[dark] in shades(icon)
+            assert pair[not dark] not in shades(icon)
+        state = opened._states["trends"]
+        colour = panel.state.palette().color(QPalette.ColorRole.WindowText)
+        assert colour == QColor(COLOURS[state.mark][dark])
+        play = timeline.play_button.icon().pixmap(timeline.play_button.iconSize()).toImage()
+        assert shades(play) == {palette(dark).color(QPalette.ColorRole.ButtonText).name()}
+        ticks = [tick for tick in timeline._ticks if tick.light]
+        assert any((t.dark if dark else t.light) in timeline.counts.text() for t in ticks)
+        assert not any((t.light if dark else t.dark) in timeline.counts.text() for t in ticks)
+
+
+def test_sessions_that_are_gone_stay_legible(tmp_path: Path, window: MainWindow) -> None:
+    welcome = window.welcome
+    path = tmp_path / "gone.labsession"
+    welcome._shown = (path,)
+    welcome.list.addItem("gone")
+    welcome._show(Recent(path, "gone", "is not there", there=False))
+    for theme, dark in (("dark", True), ("light", False)):
+        window.set_theme(theme)
+        let_draw()
+        pale = palette(dark).color(QPalette.ColorRole.PlaceholderText)
+        assert welcome.list.item(0).foreground().color() == pale
+
+
+def test_live_figures_and_alarms_take_the_colours_of_the_theme(qapp: QApplication) -> None:
+    figures, strip = LiveFigures(), AlarmStrip(lambda: None)
+    qapp.setPalette(palette(True))
+    figures.show_figures([Figure("Width", "6.6", "", "mm", "▲ above 6", "alarm")])
+    strip.show_alarms([Alarm("width-high", "Width is 6.6 mm", 0, 0.0)])
+    for dark in (True, False):
+        qapp.setPalette(palette(dark))
+        let_draw()
+        for label in (figures._labels[0, 1], strip.words):
+            assert label.palette().color(QPalette.ColorRole.WindowText) == RED[dark]
+    qapp.setPalette(palette(True))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from PySide6.QtCore import QSize, Qt, Signal
+from PySide6.QtCore import QEvent, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPixmap
 from PySide6.QtWidgets import (
     QFrame,
@@ -53,6 +53,7 @@ class Welcome(QWidget):
         self.setObjectName("page-welcome")
         self._workspace = workspace
         self._shown: tuple[Path, ...] = ()
+        self._gone: list[Path] = []
         self.buttons: dict[str, QPushButton] = {}
         inner = QWidget()
         inner.setMaximumWidth(WIDTH_PX)
@@ -107,7 +108,7 @@ class Welcome(QWidget):
 
     def show_recent(self, paths: Sequence[Path]) -> None:
         """List these sessions; what is in them is looked at in the background."""
-        self._shown = tuple(paths)
+        self._shown, self._gone = tuple(paths), []
         self.list.clear()
         blank = QPixmap(*THUMBNAIL_PX)
         blank.fill(QColor(0, 0, 0, 0))
@@ -144,12 +145,25 @@ class Welcome(QWidget):
         item.setText(f"{recent.title}\n{recent.about}\n{recent.path}")
         item.setData(Qt.ItemDataRole.AccessibleTextRole, f"{recent.title}, {recent.about}")
         if not recent.there:
-            item.setForeground(self.palette().placeholderText())
+            self._gone.append(recent.path)
+            self._show_gone()
         if recent.thumbnail is not None:
             rows, columns = recent.thumbnail.shape
             grey = QImage.Format.Format_Grayscale8
             image = QImage(recent.thumbnail.tobytes(), columns, rows, columns, grey).copy()
             item.setIcon(QIcon(QPixmap.fromImage(image)))
+
+    def _show_gone(self) -> None:
+        """Have sessions that are not there be paler."""
+        for path in self._gone:
+            item = self.list.item(self._shown.index(path))
+            item.setForeground(self.palette().placeholderText())
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange:
+            self._show_gone()
 
     def _open(self, item: QListWidgetItem) -> None:
         self.chosen.emit(item.data(Qt.ItemDataRole.UserRole))

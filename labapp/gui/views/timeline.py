@@ -11,6 +11,7 @@ from PySide6.QtCore import QEvent, QPointF, QRectF, QSignalBlocker, QSize, Qt, Q
 from PySide6.QtGui import (
     QColor,
     QHelpEvent,
+    QIcon,
     QImage,
     QKeyEvent,
     QMouseEvent,
@@ -295,6 +296,7 @@ class Timeline(QWidget):
     def __init__(self, ticks: Sequence[Tick], parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._ticks = tuple(ticks)
+        self._icons: dict[QToolButton, QStyle.StandardPixmap] = {}
         self._frames: npt.NDArray[np.int64] = np.zeros(0, np.int64)
         self._times_s: npt.NDArray[np.float64] = np.zeros(0)
         self.scrubber = Scrubber(ticks)
@@ -318,6 +320,14 @@ class Timeline(QWidget):
         self.counts.setMinimumWidth(self.fontMetrics().horizontalAdvance("■ 0000   ") * 3)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self._lay_out()
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "counts"):
+            self._show_counts()
+            for button, icon in list(self._icons.items()):
+                self._show_icon(button, icon)
 
     def _lay_out(self) -> None:
         style = QStyle.StandardPixmap
@@ -365,10 +375,21 @@ class Timeline(QWidget):
     ) -> QToolButton:
         button = QToolButton()
         if icon is not None:
-            button.setIcon(self.style().standardIcon(icon))
+            self._show_icon(button, icon)
         button.setAccessibleName(name)
         button.setToolTip(tip or name)
         return button
+
+    def _show_icon(self, button: QToolButton, icon: QStyle.StandardPixmap) -> None:
+        """Show an icon of the style in the colour of buttons' texts: the style's own are black."""
+        self._icons[button] = icon
+        ratio = self.devicePixelRatioF()
+        pixmap = self.style().standardIcon(icon).pixmap(button.iconSize(), ratio)
+        painter = QPainter(pixmap)
+        painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_SourceIn)
+        painter.fillRect(pixmap.rect(), self.palette().color(QPalette.ColorRole.ButtonText))
+        painter.end()
+        button.setIcon(QIcon(pixmap))
 
     # --- what it shows ----------------------------------------------------------------------
 
@@ -467,7 +488,7 @@ class Timeline(QWidget):
         self.play_button.setChecked(playing)
         style = QStyle.StandardPixmap
         icon = style.SP_MediaPause if playing else style.SP_MediaPlay
-        self.play_button.setIcon(self.style().standardIcon(icon))
+        self._show_icon(self.play_button, icon)
         self.play_button.setAccessibleName("Pause" if playing else "Play")
         self.play_button.setToolTip(
             "Stay at this frame (Space)" if playing else "Show one frame after another (Space)"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QAccessible, QAccessibleEvent, QPalette
 from PySide6.QtWidgets import QFrame, QGridLayout, QHBoxLayout, QLabel, QVBoxLayout, QWidget
 
@@ -191,6 +191,13 @@ class LiveFigures(QWidget):
             colours.setColor(QPalette.ColorRole.WindowText, pale)
         label.setPalette(colours)
 
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_looks"):
+            for label, (look, _) in list(self._looks.items()):
+                self._dress(label, look)
+
 
 class AlarmStrip(QFrame):
     """What the operator must see, above the picture, and the button that says it was seen.
@@ -218,7 +225,20 @@ class AlarmStrip(QFrame):
         row.addWidget(self.button)
         self._alarms: tuple[Alarm, ...] = ()
         self._kept: tuple[Alarm, ...] = ()
+        self._paint()
         self.hide()
+
+    def _paint(self) -> None:
+        colours = QPalette()
+        colours.setColor(QPalette.ColorRole.WindowText, RED[is_dark(colours)])
+        for widget in (self, self.words):
+            widget.setPalette(colours)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_kept"):
+            self._paint()
 
     def show_alarms(self, alarms: Sequence[Alarm]) -> None:
         """Show alarms, after those that are kept; none hides it."""
@@ -229,10 +249,6 @@ class AlarmStrip(QFrame):
             # A screen reader says it at once.
             alert = QAccessibleEvent(self.words, QAccessible.Event.Alert)
             QAccessible.updateAccessibility(alert)
-            colours = QPalette()
-            colours.setColor(QPalette.ColorRole.WindowText, RED[is_dark(colours)])
-            for widget in (self, self.words):
-                widget.setPalette(colours)
         self.button.setEnabled(not all(alarm.acknowledged for alarm in alarms))
         self.setVisible(bool(alarms))
         self._alarms = alarms
