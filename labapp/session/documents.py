@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import datetime
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Never
 
@@ -49,6 +49,8 @@ CLASSES: dict[str, type] = {
 }
 """What a document of each kind is."""
 
+Along = Callable[[Collection[Key]], object]
+
 KEPT_CHANGES = 500
 KEPT_BYTES = 64_000_000
 """The history is cut at the older end to stay within both."""
@@ -86,10 +88,14 @@ class Documents:
     ----------
     database
         The session file.
+    along
+        What else belongs to a change, an undo or a redo: called with the documents it set, in the
+        same transaction.
     """
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, along: Along = lambda _: None) -> None:
         self._database = database
+        self._along = along
         self._kept = Kept(database)
 
     def get(self, kind: Kind, frame: int = WHOLE) -> Any:
@@ -160,6 +166,7 @@ class Documents:
                 [(number, *part) for part in parts],
             )
             _cut(connection)
+            self._along([part[:2] for part in parts])
         self._kept.forget()
         return True
 
@@ -188,6 +195,7 @@ class Documents:
                     unpack_from(self._database.path, named, content, CLASSES.get(kind, Never))
                 _put(connection, kind, frame, content)
             connection.execute("UPDATE change SET undone = ? WHERE id = ?", (not undone, number))
+            self._along([part[:2] for part in parts])
         self._kept.forget()
         return next(change for change in self.history() if change.number == number)
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import datetime
 import functools
+import sqlite3
+from collections import OrderedDict
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +23,9 @@ from labapp.session.setup import Setup, parse_setup
 SETUP_CHANGED = "the rig or a calibration was changed"
 SETTINGS_CHANGED = "the settings were changed"
 CORRECTION_CHANGED = "the dots or rows were corrected"
+
+ASIDE_BYTES = 64_000_000
+"""So much of what frames gave with other dots and rows is kept in memory, for undo and redo."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,17 @@ class Overview:
         freeze(self)
 
 
+class _Row(NamedTuple):
+    """A result as it is kept: what it was measured from, when, and the measurement, packed."""
+
+    version: str
+    setup: bytes
+    settings: bytes
+    correction: str | None
+    measured: str
+    content: bytes
+
+
 class Results:
     """The results of a session.
 
@@ -123,11 +140,15 @@ class Results:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._aside: OrderedDict[tuple[int, str, str | None], _Row] = OrderedDict()
 
     def put(
         self, frame: int, measurement: Measurement, basis: Basis, correction: str | None
     ) -> None:
         """Keep what a frame gave; what the same scheme gave before is replaced.
+
+        What it gave with other dots and rows is put aside for `bring_back`. If that is what stands,
+        as the correction was taken back meanwhile, it stays, and the new is put aside.
 
         All of it but the surfaces one σ away (`Reconstruction.variants`): they are five times the
         rest, and what they are for, the ± of points and sizes, is kept.
@@ -153,32 +174,69 @@ class Results:
         key, made = (labapp.__version__, setup, settings), (correction, _now())
         seal = fingerprint((frame, basis.scheme, *key, *made))
         content = pack((replace(measurement, reconstruction=reconstruction), seal))
-        sizes = [getattr(measurement.measures, name, None) for name in MEASURES]
+        row = _Row(*key, *made, content)
         with self._database.transaction() as connection:
-            connection.execute(
-                "INSERT OR IGNORE INTO inputs (version, setup, settings) VALUES (?, ?, ?)", key
+            former = self._row(frame, basis.scheme)
+            if former is not None and self._differ_by_correction(former, row):
+                if former.correction == self._corrected(frame):
+                    self._put_aside(frame, basis.scheme, row)
+                    return
+                self._put_aside(frame, basis.scheme, former)
+            _replace(connection, frame, basis.scheme, row, measurement)
+
+    def bring_back(self, frame: int) -> None:
+        """Have a frame give what it gave with the dots and rows that it has now, if that is known.
+
+        It is if it was measured since the session was opened, and set-up and settings are the same.
+        """
+        present = self._corrected(frame)
+        for (scheme,) in self._database.rows("SELECT scheme FROM result WHERE frame = ?", frame):
+            former, row = self._row(frame, scheme), self._aside.get((frame, scheme, present))
+            if former is None or row is None or not self._differ_by_correction(former, row):
+                continue
+            try:
+                measurement = _unsealed(row.content, (frame, scheme, *row[:-1]))
+            except Damaged:
+                continue
+            self._put_aside(frame, scheme, former)
+            with self._database.transaction() as connection:
+                _replace(connection, frame, scheme, row, measurement)
+
+    def _row(self, frame: int, scheme: str) -> _Row | None:
+        found = self._database.rows(
+            "SELECT version, setup, settings, correction, measured, content "
+            "FROM result JOIN inputs ON inputs.id = result.inputs "
+            "JOIN detail ON detail.result = result.id WHERE frame = ? AND scheme = ?",
+            frame,
+            scheme,
+        )
+        return _Row(*found[0]) if found else None
+
+    def _corrected(self, frame: int) -> str | None:
+        """SHA-256 of a frame's correction; None without."""
+        found: str | None = self._database.value(
+            "SELECT sha256 FROM document WHERE kind = 'correction' AND frame = ?", frame
+        )
+        return found
+
+    def _differ_by_correction(self, one: _Row, other: _Row) -> bool:
+        """Whether two results were measured from the same, but for the correction."""
+        try:
+            one_inputs, other_inputs = (
+                self._inputs(row.setup, row.settings).fingerprints() for row in (one, other)
             )
-            (inputs,) = connection.execute(
-                "SELECT id FROM inputs WHERE version = ? AND setup = ? AND settings = ?", key
-            ).fetchone()
-            connection.execute(
-                "DELETE FROM result WHERE frame = ? AND scheme = ?", (frame, basis.scheme)
-            )
-            result = connection.execute(
-                "INSERT INTO result (frame, scheme, inputs, correction, measured, status, "
-                f"correspondence, {', '.join(MEASURES)}) "
-                f"VALUES ({', '.join('?' * (7 + len(MEASURES)))})",
-                (
-                    *(frame, basis.scheme, inputs, *made, measurement.status),
-                    None if measurement.match is None else measurement.match.orientation,
-                    *sizes,
-                ),
-            ).lastrowid
-            connection.execute("INSERT INTO detail VALUES (?, ?)", (result, content))
-            connection.execute(
-                "DELETE FROM inputs WHERE NOT EXISTS "
-                "(SELECT 1 FROM result WHERE result.inputs = inputs.id)"
-            )
+        except InputError:
+            return False
+        return one_inputs == other_inputs and one.correction != other.correction
+
+    def _put_aside(self, frame: int, scheme: str, row: _Row) -> None:
+        """Keep a result for `bring_back`; where there are many, the first goes."""
+        key = frame, scheme, row.correction
+        self._aside.pop(key, None)
+        self._aside[key] = row
+        size = sum(len(kept.content) for kept in self._aside.values())
+        while size > ASIDE_BYTES:
+            size -= len(self._aside.popitem(last=False)[1].content)
 
     def get(
         self, frame: int, scheme: str, basis: Basis | None, correction: str | None
@@ -197,32 +255,25 @@ class Results:
         InputError
             If it is damaged.
         """
-        found = self._database.rows(
-            "SELECT version, setup, settings, correction, measured, content "
-            "FROM result JOIN inputs ON inputs.id = result.inputs "
-            "JOIN detail ON detail.result = result.id WHERE frame = ? AND scheme = ?",
-            frame,
-            scheme,
-        )
-        if not found:
+        row = self._row(frame, scheme)
+        if row is None:
             return None
-        version, setup, settings, corrected, measured, content = found[0]
         path, named = self._database.path, f"result of frame {frame}"
         try:
-            measurement = _unsealed(content, (frame, scheme, *found[0][:-1]))
+            measurement = _unsealed(row.content, (frame, scheme, *row[:-1]))
         except Damaged as error:
             raise InputError(path, named, error, "what was written there") from error
-        inputs = self._inputs(setup, settings)
+        inputs = self._inputs(row.setup, row.settings)
         outdated = _differences(basis, inputs)
         return Result(
             frame=frame,
             measurement=measurement,
             scheme=scheme,
-            version=version,
-            measured=measured,
+            version=row.version,
+            measured=row.measured,
             setup=inputs.setup.text,
             settings=inputs.settings,
-            stale=(*outdated, *((CORRECTION_CHANGED,) if corrected != correction else ())),
+            stale=(*outdated, *((CORRECTION_CHANGED,) if row.correction != correction else ())),
         )
 
     def counts(self) -> dict[tuple[str, str], int]:
@@ -284,6 +335,34 @@ class Results:
             raise InputError(
                 self._database.path, "inputs", error, "what was written there"
             ) from error
+
+
+def _replace(
+    connection: sqlite3.Connection, frame: int, scheme: str, row: _Row, measurement: Measurement
+) -> None:
+    """Put a result in the place of the one that the frame has by the same scheme, if any."""
+    key = row.version, row.setup, row.settings
+    connection.execute(
+        "INSERT OR IGNORE INTO inputs (version, setup, settings) VALUES (?, ?, ?)", key
+    )
+    (inputs,) = connection.execute(
+        "SELECT id FROM inputs WHERE version = ? AND setup = ? AND settings = ?", key
+    ).fetchone()
+    connection.execute("DELETE FROM result WHERE frame = ? AND scheme = ?", (frame, scheme))
+    result = connection.execute(
+        "INSERT INTO result (frame, scheme, inputs, correction, measured, status, "
+        f"correspondence, {', '.join(MEASURES)}) "
+        f"VALUES ({', '.join('?' * (7 + len(MEASURES)))})",
+        (
+            *(frame, scheme, inputs, row.correction, row.measured, measurement.status),
+            None if measurement.match is None else measurement.match.orientation,
+            *(getattr(measurement.measures, name, None) for name in MEASURES),
+        ),
+    ).lastrowid
+    connection.execute("INSERT INTO detail VALUES (?, ?)", (result, row.content))
+    connection.execute(
+        "DELETE FROM inputs WHERE NOT EXISTS (SELECT 1 FROM result WHERE result.inputs = inputs.id)"
+    )
 
 
 def _unsealed(content: object, kept_with: tuple[object, ...]) -> Measurement:

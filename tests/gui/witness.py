@@ -33,7 +33,8 @@ class Kept:
 
     def __init__(self, path: Path) -> None:
         self.documents = dict(_documents(path))
-        self.results: dict[tuple[int, str], str] = {}
+        self.results: dict[tuple[int, str], set[str]] = {}
+        self.first_results = _results(path)
         self.recording: bytes | None = None
         self.done: list[tuple[Values, Values]] = []
         self.undone: list[tuple[Values, Values]] = []
@@ -115,8 +116,8 @@ class Witness:
                 if held.get(key) != kept.documents.get(key):
                     found.append(f"{path.name}: {key} is not as it was acknowledged")
             results = dict(_results(path))
-            for (frame, scheme), status in kept.results.items():
-                if results.get((frame, scheme)) != status:
+            for (frame, scheme), statuses in kept.results.items():
+                if results.get((frame, scheme)) not in statuses:
                     found.append(f"{path.name}: the {scheme} result of frame {frame} is lost")
             if kept.recording is not None and _recording(path) != kept.recording:
                 found.append(f"{path.name}: the recording is not the one that was imported")
@@ -151,7 +152,10 @@ class Witness:
     def _measured(
         self, kept: Kept, _: object, frame: int, measurement: Any, basis: Any, *__: Any
     ) -> None:
-        kept.results[frame, basis.scheme] = measurement.status
+        # Undo and redo bring back earlier ones.
+        key = frame, basis.scheme
+        first = {kept.first_results[key]} if key in kept.first_results else set()
+        kept.results.setdefault(key, first).add(measurement.status)
 
 
 def _rows(path: Path, sql: str) -> list[tuple[Any, ...]]:

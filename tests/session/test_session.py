@@ -187,8 +187,65 @@ def test_a_correction_makes_its_frame_stale(session: Session):
     ((number, measurement),) = session.measure([2])
     assert (number, measurement.status) == (2, "ok")
     assert session.overview().stale.tolist() == [False, False, False, False]
-    session.undo()  # the correction: what was measured with it no longer stands
-    assert session.overview().stale.tolist() == [False, True, False, False]
+
+
+def test_undo_and_redo_bring_back_what_was_measured(session: Session):
+    found = session.result(2)
+    assert found is not None
+    correction = Correction.of(found.measurement.dots, found.measurement.lattice)
+    session.correct({2: correction})
+    assert len(list(session.measure([2]))) == 1
+    by_hand = session.result(2)
+    for step, expected in ((session.undo, found), (session.redo, by_hand), (session.undo, found)):
+        step()
+        result = session.result(2)
+        assert result is not None
+        assert expected is not None
+        assert result.stale == ()
+        assert (result.version, result.measured) == (expected.version, expected.measured)
+        assert same(result.measurement, expected.measurement)
+        assert session.overview().stale.tolist() == [False] * 4
+        assert session.problems() == []
+    session.correct({2: correction})  # another way to the same dots and rows
+    result = session.result(2)
+    assert result is not None
+    assert result.stale == ()
+
+
+def test_a_fit_that_ends_after_its_edit_was_undone_takes_no_place(session: Session):
+    found = session.result(2)
+    assert found is not None
+    correction = Correction.of(found.measurement.dots, found.measurement.lattice)
+    session.correct({2: correction})
+    measuring = session._results.put
+    basis, used = session._basis(), session._documents.fingerprint("correction", 2)
+    assert basis is not None
+    session.undo()
+    measuring(2, replace(found.measurement, correction=correction), basis, used)
+    result = session.result(2)
+    assert result is not None
+    assert result.measurement.correction is None
+    assert result.stale == ()
+    session.redo()
+    result = session.result(2)
+    assert result is not None
+    assert result.measurement.correction is not None
+    assert result.stale == ()
+    assert session.problems() == []
+
+
+def test_what_was_measured_with_another_setup_is_not_brought_back(session: Session):
+    result = session.result(2)
+    assert result is not None
+    session.correct({2: Correction.of(result.measurement.dots, result.measurement.lattice)})
+    pretend(session, 2)
+    session.update_setup({"electrode": {"height_mm": 5.1}})
+    pretend(session, 2)
+    session.undo()
+    session.undo()
+    result = session.result(2)
+    assert result is not None
+    assert result.stale == (SETUP_CHANGED, CORRECTION_CHANGED)
 
 
 def test_a_correction_of_a_frame_that_is_not_there_is_refused(session: Session):

@@ -212,6 +212,60 @@ def test_a_newer_edit_ends_the_fit_of_the_one_before(
     assert began + 0.2 not in kept
 
 
+def test_undo_shows_the_measured_rows_at_once(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    """Not what the detector alone finds, which the next edit would make the frame's rows."""
+    session = show(page, qtbot, copy_sample("gtaw"), 0)
+    before = page.editor.correction
+    assert before is not None
+    page.editor.selection = np.array([12])
+    assert page.editor.put_in_doubt()
+    assert len(list(session.measure([0]))) == 1
+    page.workspace.changed.emit()
+    assert unfitted == [[0]]
+    page.workspace.undo()
+    assert origin(page) == "measured"
+    seen = page.editor.correction
+    assert seen is not None
+    np.testing.assert_array_equal(seen.lattice.row, before.lattice.row)
+    np.testing.assert_array_equal(seen.lattice.column, before.lattice.column)
+    page.editor.choose_rows([5])
+    assert page.editor.block()
+    kept = session.correction(0)
+    assert kept is not None
+    np.testing.assert_array_equal(kept.sited, before.sited)
+    page.workspace.undo()
+    assert origin(page) == "measured"
+    assert unfitted == [[0], [0]]  # after the edits, never after undo
+
+
+def test_what_the_detector_found_is_no_start_while_the_frame_is_measured(
+    page: DotsPage,
+    qtbot: QtBot,
+    copy_sample: CopySample,
+    unfitted: list[list[int]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = copy_sample("gtaw")
+    with Session.open(path) as session:
+        result = session.result(0)
+        assert result is not None
+        session.correct({0: start_correction(result.measurement)})
+        assert len(list(session.measure([0]))) == 1
+    session = show(page, qtbot, path, 0)
+    session.undo()  # what was measured before is not known in a session opened anew
+    page.workspace.changed.emit()
+    qtbot.waitUntil(lambda: origin(page) == "found")
+    assert unfitted == [[0]]
+    page.editor.choose_rows([5])
+    with monkeypatch.context() as patched:
+        patched.setattr(Refit, "pending", True)
+        assert not page.editor.block()
+    assert session.correction(0) is None
+    assert page.editor.block()
+
+
 def test_an_unmeasured_frame_shows_what_is_found_in_it(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:

@@ -24,6 +24,8 @@ from labapp.gui.workspace import Workspace
 
 NO_REFERENCE = "The reference is not known: can you tell it from other frames? Press Reference"
 
+NOT_YET = "The frame is being measured as it was found: edit it when its rows are there"
+
 REACH = 9.0
 """A dot is meant by a pointer this near, in points of the screen."""
 
@@ -194,6 +196,10 @@ class DotsPage(Page):
         if seen is None:
             return False
         stood = seen.result is not None and not seen.result.stale
+        if presenter.needs_fit(seen) and seen.origin == "found" and self.refit.pending:
+            self.workspace.said.emit(NOT_YET, True)
+            self.draw()
+            return False
         before, self._before = self._before, (seen.frame, presenter.figures(seen.result))
         if not stood and before is not None and before[0] == seen.frame:
             self._before = before  # edits before the fit is done are compared as one
