@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
 
-Needs = Literal["", "session", "frames", "undo", "redo", "work", "live"]
+Needs = Literal["", "session", "frames", "measuring", "undo", "redo", "work", "live"]
 """What must be there for an action to be of use; it is greyed out without."""
 
 

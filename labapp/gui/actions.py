@@ -134,7 +134,7 @@ FRAMES = (
         "F5",
         "Measure every frame that is not measured, or whose measures no longer stand",
         lambda window: window.measure_all(),
-        needs="frames",
+        needs="measuring",
     ),
     Action(
         "measure_frame",
@@ -143,7 +143,7 @@ FRAMES = (
         "Shift+F5",
         "Measure the frame in view",
         lambda window: window.measure_frame(),
-        needs="frames",
+        needs="measuring",
     ),
     Action(
         "cancel",

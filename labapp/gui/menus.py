@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QMenu
 from labapp.gui.action import MENUS, Action
 from labapp.gui.actions import ACTIONS
 from labapp.gui.filming import live_page
+from labapp.gui.steps import read_only
 from labapp.gui.views.labels import plain_tip
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ class Menus:
             "": True,
             "session": session is not None,
             "frames": len(window.standings) > 0,
+            "measuring": len(window.standings) > 0 and not read_only(session),
             "undo": bool(undo),
             "redo": bool(redo),
             "work": bool(window.workspace.tasks.active),

@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.gui.steps import Mark, State, Step
+from labapp.gui.steps import READ_ONLY, Mark, State, Step
 from labapp.gui.theme import is_dark
 from labapp.gui.views.labels import plain_label, plain_tip
 
@@ -153,14 +153,16 @@ class SidePanel(QWidget):
         self.title.setFont(font)
         self.hint = plain_label()
         self.state = plain_label()
-        for label in (self.hint, self.state):
+        self.read_only = plain_label(f"⚠ {READ_ONLY} until it is opened again for changes.")
+        self.read_only.hide()
+        for label in (self.hint, self.state, self.read_only):
             label.setWordWrap(True)
             label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.stack = QStackedWidget()
         self._areas: dict[QWidget, QScrollArea] = {}
         layout = QVBoxLayout(self)
         layout.setContentsMargins(10, 8, 6, 6)
-        for widget in (self.title, self.hint, self.state):
+        for widget in (self.title, self.hint, self.state, self.read_only):
             layout.addWidget(widget)
         line = QFrame()
         line.setFrameShape(QFrame.Shape.HLine)

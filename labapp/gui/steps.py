@@ -147,6 +147,14 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
     return words[:1].upper() + words[1:]
 
 
+READ_ONLY = "The session is open read-only: nothing can be changed"
+
+
+def read_only(session: Session | None) -> str:
+    """That a session is open read-only, and what that means; empty if it can be changed."""
+    return READ_ONLY if session is not None and session.read_only else ""
+
+
 def recording_gone(session: Session) -> str:
     """That the recording is not where it was, and what to do; empty if it is."""
     missing = session.missing_recording

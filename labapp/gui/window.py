@@ -253,6 +253,7 @@ class MainWindow(QMainWindow):
         self.timeline.set_playing(False)
         self.status_line.say("", False)  # what was said of another session
         self._leave()
+        self.side_panel.read_only.setVisible(session is not None and session.read_only)
         self._show_session()
         if session is None:
             self.stack.setCurrentWidget(self.welcome)

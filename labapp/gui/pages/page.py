@@ -7,7 +7,7 @@ from pathlib import Path
 from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
-from labapp.gui.steps import State
+from labapp.gui.steps import State, read_only
 from labapp.gui.views.fields import Field
 from labapp.gui.workspace import Workspace
 
@@ -42,13 +42,37 @@ class Page(QWidget):
         self.panel_layout = QVBoxLayout(self.panel)
         self.setObjectName(f"page-{self.key}")
         self.panel.setObjectName(f"panel-{self.key}")
+        self._changing: list[QWidget] = []
         workspace.opened.connect(self._take_session)
+
+    @property
+    def locked(self) -> str:
+        """Why nothing in the session can be changed; empty if it can."""
+        return read_only(self.workspace.session)
+
+    def lock_with_session(self, *widgets: QWidget) -> None:
+        """Have these, which change the session, be of no use while it is open read-only."""
+        self._changing += widgets
+        for widget in widgets:
+            if not isinstance(widget, Field):
+                widget.setProperty("usual tip", widget.toolTip())
+        self._lock()
+
+    def _lock(self) -> None:
+        why = self.locked
+        for widget in self._changing:
+            if isinstance(widget, Field):
+                widget.lock(why)
+            else:
+                widget.setEnabled(not why)
+                widget.setToolTip(why or widget.property("usual tip"))
 
     def _take_session(self) -> None:
         """What was refused in the former session is of no interest in another."""
         for side in (self, self.panel):
             for field in side.findChildren(Field):
                 field.refuse("")
+        self._lock()
 
     def refresh(self) -> None:
         """Show what the session holds now; ``workspace.session`` is not None."""

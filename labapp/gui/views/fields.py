@@ -15,6 +15,7 @@ from PySide6.QtGui import (
     QFocusEvent,
     QGuiApplication,
     QKeyEvent,
+    QPalette,
     QValidator,
     QWheelEvent,
 )
@@ -89,6 +90,15 @@ class Field(QWidget):
         """Say what is wrong with what the field holds; empty: nothing is."""
         self._fault = words
         self._show_problem()
+
+    def lock(self, why: str) -> None:
+        """Let nothing be entered, and say why; empty: let it."""
+        self._set_locked(bool(why))
+        self.editor.setToolTip(plain_tip(why or self._tooltip))
+        self.label.setToolTip(plain_tip(why or self._tooltip))
+
+    def _set_locked(self, locked: bool) -> None:
+        self.editor.setEnabled(not locked)
 
     def refuse(self, words: str) -> None:
         """Say why the last entry was refused, until this field takes or is shown another value."""
@@ -324,6 +334,15 @@ class TextField(Field):
         if self.value() != self._told:
             self._told = self.value()
             self._enter(self._told)
+
+    def _set_locked(self, locked: bool) -> None:
+        if isinstance(self._edit, QLineEdit):
+            super()._set_locked(locked)
+            return
+        # It can still be scrolled and copied from; its ground says that it takes nothing.
+        self._edit.setReadOnly(locked)
+        ground = QPalette.ColorRole.Window if locked else QPalette.ColorRole.Base
+        self._edit.viewport().setBackgroundRole(ground)
 
 
 class _Paragraphs(QPlainTextEdit):

@@ -426,7 +426,9 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
         self.blockSignals(blocked)
 
     def nudge(self, du: float, dv: float) -> None:
-        """Move it a little, as the arrow keys do."""
+        """Move it a little, as the arrow keys do; not where it cannot be dragged either."""
+        if not self.movable:
+            return
         u, v = self.place
         self.setPos(u + du, v + dv)
         self.dropped.emit(*self.place)

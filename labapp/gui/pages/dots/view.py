@@ -64,6 +64,7 @@ class DotsPage(Page):
         self.canvas_layout.addWidget(self.view)
         self.panel_layout.addWidget(self.dots_panel)
         self.setFocusProxy(self.view)
+        self.lock_with_session(self.dots_panel.method, *self.dots_panel.numbers)
         self._connect()
 
     def _connect(self) -> None:
@@ -395,7 +396,7 @@ class Hand(Tool):
         """Take hold of a dot, and of the others chosen with it; or begin a box."""
         editor = self._page.editor
         add = bool(modifiers & SHIFT)
-        on = editor.at(u, v, self._reach())
+        on = None if self._page.locked else editor.at(u, v, self._reach())
         self._start, self._adds, self._boxing = (u, v), add, on is None
         if on is not None and on not in editor.selection:
             editor.click(u, v, self._reach(), add)
@@ -425,7 +426,8 @@ class Hand(Tool):
 
     def takes(self, event: QKeyEvent) -> bool:
         """Arrow keys are for the chosen dots; without any they go through the frames."""
-        return bool(len(self._page.editor.selection)) and arrow_step(event) is not None
+        held = len(self._page.editor.selection) > 0 and not self._page.locked
+        return held and arrow_step(event) is not None
 
     def key(self, event: QKeyEvent) -> None:
         """Nudge; all of a held key is one step that can be undone."""

@@ -141,6 +141,7 @@ class LaserPage(Page):
         self.in_use = ResultTable("Laser in use")
         self.panel_layout.addWidget(self.in_use)
         self.panel_layout.addStretch(1)
+        self.lock_with_session(self.fan, self.table)
 
     def _picture_part(self) -> QWidget:
         self.picture_part = FieldForm()
@@ -223,9 +224,10 @@ class LaserPage(Page):
         warnings = [f"⚠ {words}" for words in result.warnings]
         refused = [f"⚠ {result.why_not}"] if result.why_not else []
         self.words.setText("\n".join(refused or warnings or ["✓ The three lengths agree."]))
-        self.use_button.setEnabled(result.found is not None)
+        why_not = result.why_not or self.locked
+        self.use_button.setEnabled(not why_not)
         tip = "Put angle and distance into the rig; undo brings the former back"
-        self.use_button.setToolTip(plain_tip(result.why_not or tip))
+        self.use_button.setToolTip(plain_tip(why_not or tip))
         means = [row.value for row in result.rows[:2]]
         l1, l2 = (value if isinstance(value, float) else 0.0 for value in means)
         explained = f"{EXPLAINED}\n\n{result.why_not}"
@@ -285,7 +287,7 @@ class LaserPage(Page):
         return lengths
 
     def _dragged(self) -> None:
-        self.add_button.setEnabled(self._cross() is not None)
+        self.add_button.setEnabled(self._cross() is not None and not self.locked)
 
 
 class _ReadingsTable(QTableWidget):

@@ -163,6 +163,7 @@ class PlanePage(Page):
         self.panel_layout.addWidget(help_text)
         self._make_results()
         self.panel_layout.addStretch(1)
+        self.lock_with_session(self.unit)
 
     def _make_results(self) -> None:
         self.result = ResultTable("What follows from the points and marks")
@@ -299,7 +300,8 @@ class PlanePage(Page):
         """Show what follows from the points."""
         result = presenter.result(self.found)
         self.model.set_choices(presenter.choices(self.found))
-        self.model.setEnabled(self.found is not None and bool(self.found.marks))
+        has_marks = self.found is not None and bool(self.found.marks)
+        self.model.setEnabled(has_marks and not self.locked)
         if self.found is not None:
             self.model.set_value(self.found.model)
         self._show_residuals()
@@ -308,12 +310,13 @@ class PlanePage(Page):
         why_not = (result.why_not,) if result.why_not else ()
         self.words.setText("\n".join(f"⚠ {words}" for words in (*why_not, *result.warnings)))
         self.words.setVisible(bool(self.words.text()))
-        usable = not result.why_not
-        self.use_button.setEnabled(usable)
-        self.use_button.setToolTip(
-            plain_tip(result.why_not or "Measure with this; undo brings the former back")
-        )
-        self.find_button.setEnabled(self.view.picture is not None)
+        unusable = result.why_not or self.locked
+        self.use_button.setEnabled(not unusable)
+        tip = "Measure with this; undo brings the former back"
+        self.use_button.setToolTip(plain_tip(unusable or tip))
+        self.find_button.setEnabled(self.view.picture is not None and not self.locked)
+        for point in self.points:
+            point.movable = not self.locked
         self._axes.setVisible(self.found is not None)
         self._marks.setVisible(self.found is not None)
         if self.found is not None:

@@ -58,6 +58,10 @@ class SetupPage(Page):
         self.tabs.currentChanged.connect(show_tab)
         show_tab(EXPERIMENT_TAB)
         self.panel_layout.addWidget(self.tabs)
+        self.lock_with_session(
+            *(*self.rig_fields.values(), *self.record_fields.values(), *self.ticks.values()),
+            *self._filling,
+        )
         self.panel_layout.setContentsMargins(0, 0, 0, 0)
 
     def refresh(self) -> None:
@@ -159,17 +163,17 @@ class SetupPage(Page):
 
     def _bench(self) -> QWidget:
         form = FieldForm()
-        form.add_wide(
-            _buttons(
-                ("Load…", "Take the whole set-up from a setup file (TOML)", self._choose_load),
-                ("Save…", "Write the set-up to a file, for another session", self._choose_save),
-                (
-                    "Usual values",
-                    "Put the usual values in where something is missing; check each of them",
-                    lambda: self.workspace.attempt(presenter.put_usual),
-                ),
-            )
+        row, (load, _, usual) = _buttons(
+            ("Load…", "Take the whole set-up from a setup file (TOML)", self._choose_load),
+            ("Save…", "Write the set-up to a file, for another session", self._choose_save),
+            (
+                "Usual values",
+                "Put the usual values in where something is missing; check each of them",
+                lambda: self.workspace.attempt(presenter.put_usual),
+            ),
         )
+        self._filling = load, usual
+        form.add_wide(row)
         self.others = plain_label()
         self.others.setWordWrap(True)
         form.add_wide(self.others)
@@ -180,15 +184,14 @@ class SetupPage(Page):
         form.add_heading("Expected pool")
         for entry in POOL:
             self._add_noted(form, entry)
-        form.add_wide(
-            _buttons(
-                (
-                    "Advise …",
-                    "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
-                    lambda: self.workspace.asked.emit("adviser"),
-                )
+        row, _ = _buttons(
+            (
+                "Advise …",
+                "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
+                lambda: self.workspace.asked.emit("adviser"),
             )
         )
+        form.add_wide(row)
         self.table = ResultTable("What the bench lets through")
         form.add_wide(self.table)
         return form
@@ -235,8 +238,11 @@ def _number(entry: Entry) -> NumberField:
     )
 
 
-def _buttons(*wanted: tuple[str, str, Callable[[], object]]) -> QWidget:
-    row = QWidget()
+def _buttons(
+    *wanted: tuple[str, str, Callable[[], object]],
+) -> tuple[QWidget, list[QPushButton]]:
+    """Buttons beside each other, and each of them."""
+    row, made = QWidget(), []
     layout = QHBoxLayout(row)
     layout.setContentsMargins(0, 0, 0, 0)
     for words, tooltip, work in wanted:
@@ -244,7 +250,8 @@ def _buttons(*wanted: tuple[str, str, Callable[[], object]]) -> QWidget:
         button.setToolTip(tooltip)
         button.clicked.connect(lambda _, work=work: work())
         layout.addWidget(button)
-    return row
+        made.append(button)
+    return row, made
 
 
 def _top(content: QWidget) -> QWidget:

@@ -16,7 +16,7 @@ from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
-from labapp.gui.steps import recording_gone, setup_to_do
+from labapp.gui.steps import READ_ONLY, recording_gone, setup_to_do
 from labapp.session.heights import Profile
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.scene import Scene, rays_of, scene_of
@@ -316,6 +316,8 @@ def reflected_dots(measurement: Measurement) -> tuple[FloatArray, FloatArray] | 
 
 def why_not(session: Session) -> str:
     """Why nothing can be measured now; empty if it can."""
+    if session.read_only:
+        return READ_ONLY
     if not len(session.frames):
         return "Import a recording first"
     if gone := recording_gone(session):

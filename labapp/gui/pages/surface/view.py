@@ -95,6 +95,7 @@ class SurfacePage(Page):
         self.plan.dragged.connect(self._set_section)
         self.compare = CompareView(workspace)
         self.side = SurfacePanel(workspace, self.panel_layout)
+        self.lock_with_session(self.side.scheme, self.side.correspondence)
         self._charts_due: Callable[[], None] | None = None
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)

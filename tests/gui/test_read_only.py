@@ -1,0 +1,85 @@
+"""A session that is open read-only looks so, on every page, and says why."""
+
+from __future__ import annotations
+
+from PySide6.QtWidgets import QCheckBox, QComboBox, QLineEdit
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.steps import READ_ONLY, STEPS
+from labapp.gui.views.fields import ChoiceField, Field, NumberField
+from labapp.gui.window import MainWindow
+from tests.gui.conftest import CopySample
+
+
+def enter_something(field: Field) -> None:
+    """Enter another value, as a hand would."""
+    editor = field.editor
+    if isinstance(field, NumberField):
+        field._step(1)
+        field.flush()
+    elif isinstance(field, ChoiceField) and isinstance(editor, QComboBox):
+        editor.setCurrentIndex((editor.currentIndex() + 1) % editor.count())
+        editor.activated.emit(editor.currentIndex())
+    elif isinstance(editor, QLineEdit):
+        editor.setText("x")
+        editor.editingFinished.emit()
+
+
+def test_what_can_be_entered_is_taken(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+) -> None:
+    assert window.workspace.open(copy_sample("gtaw"), read_only=True)
+    said: list[str] = []
+    window.workspace.said.connect(lambda words, problem: said.append(words))
+    entered = 0
+    for step in STEPS:
+        window.show_step(step.key)
+        qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+        assert window.side_panel.read_only.isVisible()
+        panel = window.page.panel
+        usable = [e for e in panel.findChildren(Field) if e.isVisible() and e.editor.isEnabled()]
+        for field in usable:
+            enter_something(field)
+        for box in panel.findChildren(QCheckBox):
+            if box.isEnabled() and box.isVisible():
+                box.click()
+        entered += len(usable)
+        assert [words for words in said if "read-only" in words] == []
+    assert entered > 0  # what only the page knows can be entered, as before
+
+
+def test_what_is_locked_says_why_and_is_free_in_the_next_session(
+    window: MainWindow, copy_sample: CopySample
+) -> None:
+    path = copy_sample("gtaw")
+    assert window.workspace.open(path)
+    window.show_step("setup")
+    page = window.page
+    height, notes = page.rig_fields["electrode.height_mm"], page.record_fields["notes"]
+    tick = next(iter(page.ticks.values()))
+    tips = [each.toolTip() for each in (height.editor, notes.editor, tick)]
+    assert window.menus.actions["measure"].isEnabled()
+    assert not window.side_panel.read_only.isVisible()
+
+    assert window.workspace.open(path, read_only=True)
+    window.show_step("setup")
+    for each in (height.editor, notes.editor, tick):
+        assert each.toolTip() == READ_ONLY
+    assert not height.editor.isEnabled()
+    assert not tick.isEnabled()
+    assert notes.editor.isReadOnly()  # and can be scrolled and copied from
+    assert not window.menus.actions["measure"].isEnabled()
+    for key, button in (("laser", "use_button"), ("plane", "use_button")):
+        window.show_step(key)
+        assert not getattr(window.page, button).isEnabled()
+    window.show_step("surface")
+    assert not window.page.side.one.isEnabled()
+    assert READ_ONLY in window.page.side.one.toolTip()
+
+    assert window.workspace.open(path)
+    window.show_step("setup")
+    assert height.editor.isEnabled()
+    assert tick.isEnabled()
+    assert not notes.editor.isReadOnly()
+    assert [each.toolTip() for each in (height.editor, notes.editor, tick)] == tips
+    assert window.menus.actions["measure"].isEnabled()
