@@ -284,6 +284,64 @@ def test_an_unmeasured_frame_shows_what_is_found_in_it(
     assert unfitted == []
 
 
+def test_buttons_are_of_use_when_what_they_need_is_chosen(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
+) -> None:
+    session = show(page, qtbot, copy_sample("gtaw"), 0)
+    panel, editor = page.dots_panel, page.editor
+    always = {"Add dot", "Reference", "No reference", "Carry on"}
+    dots, row = {"Delete", "Number", "In doubt"}, {"Row left", "Row right", "Blocked"}
+    one = {"Split up", "Split down"}
+
+    def enabled() -> set[str]:
+        return {words for words, button in panel.buttons.items() if button.isEnabled()}
+
+    assert enabled() == always
+    assert not panel.row.editor.isEnabled()
+    assert "Choose" in panel.buttons["Delete"].toolTip()
+    click(page, editor.dots_px[10])
+    assert enabled() == always | dots | row | one
+    assert panel.row.editor.isEnabled()
+    assert "Choose" not in panel.buttons["Split up"].toolTip()
+    page.choose(editor.choose_rows, [4])
+    assert enabled() == always | dots | row
+    page.choose(editor.choose_rows, [4, 5])
+    assert enabled() == always | dots | row | {"Merge"}
+    key(page, Qt.Key.Key_Escape)
+    assert enabled() == always
+
+    # The keys still answer, and say what is lacking.
+    said: list[str] = []
+    page.workspace.said.connect(lambda words, _: said.append(words))
+    key(page, Qt.Key.Key_Delete)
+    assert len(said) == 1
+    assert session.correction(0) is None
+
+    click(page, editor.dots_px[10])
+    panel.buttons["Delete"].setFocus()
+    panel.buttons["Delete"].click()
+    assert len(editor.selection) == 0
+    assert enabled() == always | {"Back to automatic"}
+    assert page.view.hasFocus()  # not another button
+
+
+def test_a_read_only_frame_is_looked_at_and_not_edited(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample
+) -> None:
+    path = copy_sample("gtaw")
+    assert page.workspace.open(path, read_only=True)
+    qtbot.waitUntil(lambda: page.editor.correction is not None)
+    page.refresh()
+    let_draw()
+    start = page.editor.dots_px.copy()
+    click(page, start[10])
+    assert page.editor.selection.tolist() == [10]
+    drag(page, start[10], start[10] + (6, -4))  # draws a box
+    np.testing.assert_array_equal(page.editor.dots_px, start)
+    assert not any(button.isEnabled() for button in page.dots_panel.buttons.values())
+    assert not page.dots_panel.method.editor.isEnabled()
+
+
 def test_clicks_boxes_drags_and_keys(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:

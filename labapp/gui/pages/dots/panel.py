@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt, Signal, SignalInstance
 from PySide6.QtGui import QAction
@@ -66,7 +66,8 @@ class DotsPanel(QWidget):
         layout.addWidget(heading("Put right"))
         layout.addWidget(self.chosen)
         layout.addLayout(self._sites())
-        layout.addLayout(_buttons(edits))
+        self.buttons: dict[str, QToolButton] = {}
+        layout.addLayout(self._buttons(edits))
         layout.addWidget(heading("Fit"))
         layout.addWidget(self.why)
         layout.addWidget(self.fit)
@@ -82,7 +83,7 @@ class DotsPanel(QWidget):
         form = FieldForm()
         form.add(self.most)
         layout.addWidget(form)
-        layout.addLayout(_buttons(frames))
+        layout.addLayout(self._buttons(frames))
         layout.addWidget(heading("Detector"))
         layout.addWidget(self._detector())
         layout.addStretch(1)
@@ -104,6 +105,32 @@ class DotsPanel(QWidget):
         self.rows.choose(rows)
         self.row.set_value(site[0] or None)
         self.column.set_value(site[1] or None)
+
+    def show_lacking(self, lacking: Mapping[str, str]) -> bool:
+        """Grey out the buttons of edits that lack something, and say what; by their words.
+
+        Returns
+        -------
+        bool
+            Whether the one with the focus is among them.
+        """
+        focused = False
+        for words, why in lacking.items():
+            button = self.buttons[words]
+            focused |= bool(why) and button.hasFocus()
+            button.setEnabled(not why)
+            tip = button.defaultAction().toolTip()
+            button.setToolTip(f"{why}. {tip}" if why else tip)
+        return focused
+
+    def lock_sites(self, dots: str, reference: str) -> None:
+        """Take no row and column of dots, or of the reference, and say why; empty: take them."""
+        for why, fields in (
+            (dots, (self.row, self.column)),
+            (reference, (self.reference_row, self.reference_column)),
+        ):
+            for field in fields:
+                field.lock(why)
 
     def show_reference(self, site: tuple[int, int] | None) -> None:
         """Show where the reference is."""
@@ -173,6 +200,18 @@ class DotsPanel(QWidget):
             form.add(field)
             self.numbers.append(field)
         return form
+
+    def _buttons(self, actions: Sequence[QAction]) -> QGridLayout:
+        grid = QGridLayout()
+        grid.setSpacing(3)
+        for k, action in enumerate(actions):
+            button = self.buttons[action.text()] = QToolButton()
+            button.setDefaultAction(action)
+            button.setAccessibleName(action.text())
+            button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+            button.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+            grid.addWidget(button, k // COLUMNS_OF_BUTTONS, k % COLUMNS_OF_BUTTONS)
+        return grid
 
 
 class _RowList(QTableWidget):
@@ -250,16 +289,3 @@ class _RowList(QTableWidget):
 def _told(signal: SignalInstance, value: float | None) -> None:
     if value is not None:
         signal.emit(int(value))
-
-
-def _buttons(actions: Sequence[QAction]) -> QGridLayout:
-    grid = QGridLayout()
-    grid.setSpacing(3)
-    for k, action in enumerate(actions):
-        button = QToolButton()
-        button.setDefaultAction(action)
-        button.setAccessibleName(action.text())
-        button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        button.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
-        grid.addWidget(button, k // COLUMNS_OF_BUTTONS, k % COLUMNS_OF_BUTTONS)
-    return grid

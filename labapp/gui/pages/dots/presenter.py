@@ -15,7 +15,7 @@ from labapp.core.dots import Dots, Image
 from labapp.core.lattice import Lattice
 from labapp.core.pipeline import Measurement, Settings, start_correction
 from labapp.core.tracking import carry_on
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow, plain
 from labapp.gui.steps import recording_gone
@@ -278,6 +278,49 @@ def chosen_words(correction: Correction | None, selection: Sequence[int]) -> str
     site = f"row {row or '–'}, column {column or '–'}"
     hand = ", by hand" if correction.manual[n] else ""
     return f"Dot at u {u:.1f}, v {v:.1f} px: {site}{hand}"
+
+
+Need = Literal["", "rows", "reference", "dots", "site", "row", "two rows", "corrected"]
+"""What an edit is of use for."""
+
+
+def lacking(need: Need, seen: Shown | None, selection: IntArray, rows: Sequence[int]) -> str:
+    """What an edit lacks that needs something, as what to do; empty if it is all there.
+
+    Parameters
+    ----------
+    need
+        What it needs.
+    seen
+        What the page shows.
+    selection, rows
+        Indices of the chosen dots, and the rows that they are in.
+    """
+    if seen is None or seen.correction is None:
+        return "The dots of this frame are not known yet"
+    lattice, sited = seen.correction.lattice, seen.correction.sited
+    there = {
+        "": True,
+        "rows": bool((lattice.row > 0).any()),
+        "reference": lattice.reference is not None,
+        "dots": len(selection) > 0,
+        "site": len(selection) == 1 and bool(sited[selection].all()),
+        "row": len(rows) > 0,
+        "two rows": len(rows) == 2,
+        "corrected": seen.origin == "corrected",
+    }
+    return "" if there[need] else LACKING[need]
+
+
+LACKING: dict[Need, str] = {
+    "rows": "There are no rows yet",
+    "reference": "No reference is known",
+    "dots": "Choose a dot first",
+    "site": "Choose one dot that has a row first",
+    "row": "Choose a row first, or a dot that has one",
+    "two rows": "Choose dots of two rows first",
+    "corrected": "This frame is as it was found: nothing was corrected",
+}
 
 
 def figures(result: Result | None) -> Figures | None:

@@ -17,7 +17,7 @@ from labapp.gui.pages.dots.editing import Editor
 from labapp.gui.pages.dots.fitting import Refit
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
-from labapp.gui.pages.dots.presenter import Figures, Shown
+from labapp.gui.pages.dots.presenter import Figures, Need, Shown
 from labapp.gui.pages.page import Page
 from labapp.gui.views.picture import SHIFT, PictureView, Tool, arrow_step
 from labapp.gui.workspace import Workspace
@@ -31,12 +31,16 @@ REACH = 9.0
 
 
 class Command(NamedTuple):
-    """One thing a key or button does: its words, its key, what it does in a sentence, and it."""
+    """One thing a key or button does: its words, its key, what it does in a sentence, and it.
+
+    A button is greyed out without what it needs; the key then says what that is.
+    """
 
     text: str
     key: str
     tip: str
     do: Callable[[], object]
+    needs: Need = ""
 
 
 class DotsPage(Page):
@@ -56,6 +60,8 @@ class DotsPage(Page):
         self._before: tuple[int, Figures | None] | None = None
         self._pointer: tuple[float, float] | None = None
         self._in_view = False
+        self._lacking: dict[str, str] = {}
+        self._needs = {c.text: c.needs for c in (*self._edits(), *self._frame_commands())}
         edits = [self._action(command) for command in self._edits()]
         frames = [self._action(command) for command in self._frame_commands()]
         for command in self._keys():
@@ -154,6 +160,21 @@ class DotsPage(Page):
         chosen = presenter.chosen_words(editor.correction, editor.selection.tolist())
         words = self.hand.asked or chosen
         self.dots_panel.show_chosen(words, editor.rows, site)
+        self._show_lacking()
+
+    def _show_lacking(self) -> None:
+        """Grey out what is of no use now."""
+        seen, editor = self.seen, self.editor
+
+        def lacking(need: Need) -> str:
+            return self.locked or presenter.lacking(need, seen, editor.selection, editor.rows)
+
+        found = {text: lacking(need) for text, need in self._needs.items()}
+        if found != self._lacking:  # a drag draws the marks all the time
+            self._lacking = found
+            self.dots_panel.lock_sites(lacking("dots"), lacking(""))
+            if self.dots_panel.show_lacking(found):
+                self.view.setFocus()  # or the focus would go on to another button
 
     def choose(self, way: Callable[..., None], *given: object) -> None:
         """Choose dots some way, and show it."""
@@ -264,7 +285,10 @@ class DotsPage(Page):
         self.draw()
 
     def _type_row(self) -> None:
-        self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
+        if why := self._lacking.get("Delete", ""):  # which needs as much
+            self.workspace.said.emit(why, True)
+        else:
+            self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
 
     # --- keys and buttons ---------------------------------------------------------------------
 
@@ -288,39 +312,41 @@ class DotsPage(Page):
                     "Add a dot: click where it is, or double click it; the key takes the "
                     "one under the pointer",
                     lambda: self._at_pointer(self.add_at, "Click where the dot is")),
-            Command("Delete", "Del", "Take the chosen dots out", lambda: self._then(editor.delete)),
+            Command("Delete", "Del", "Take the chosen dots out", lambda: self._then(editor.delete),
+                    "dots"),
             Command("Number", "N", "Give the chosen dots the row and column their neighbours tell",
-                    editor.number),
+                    editor.number, "dots"),
             Command("Row left", "Ctrl+Left", "Shift the chosen rows left by a column",
-                    lambda: editor.shift(-1)),
+                    lambda: editor.shift(-1), "row"),
             Command("Row right", "Ctrl+Right", "Shift the chosen rows right by a column",
-                    lambda: editor.shift(1)),
+                    lambda: editor.shift(1), "row"),
             Command("In doubt", "U", "Take row and column from the chosen dots",
-                    editor.put_in_doubt),
+                    editor.put_in_doubt, "dots"),
             Command("Split up", "S", "From the chosen dot on to the right, a row of its own above",
-                    editor.split),
+                    editor.split, "site"),
             Command("Split down", "Shift+S",
                     "From the chosen dot on to the right, a row of its own below",
-                    lambda: editor.split(above=False)),
+                    lambda: editor.split(above=False), "site"),
             Command("Merge", "M", "Make one row of the two that the chosen dots are in",
-                    editor.merge),
+                    editor.merge, "two rows"),
             Command("Blocked", "B", "Mark the chosen rows as hidden in part by the torch, or not",
-                    editor.block),
+                    editor.block, "row"),
             Command("Reference", "R",
                     "Click where the dark centre of the pattern is; the key takes the place "
                     "under the pointer",
                     lambda: self._at_pointer(editor.point_at_reference,
-                                             "Click where the dark centre of the pattern is")),
+                                             "Click where the dark centre of the pattern is"),
+                    "rows"),
             Command("No reference", "Shift+R", "Leave it to the program to find the reference",
-                    lambda: editor.set_reference(None)),
+                    lambda: editor.set_reference(None), "reference"),
         )  # fmt: skip
 
     def _frame_commands(self) -> tuple[Command, ...]:
         return (
             Command("Carry on", "Ctrl+Return", "Apply these dots and rows to the following frames "
-                    "by tracking, until they no longer fit", self._carry_on),
+                    "by tracking, until they no longer fit", self._carry_on, "rows"),
             Command("Back to automatic", "Ctrl+Backspace", "Forget the corrections of this frame",
-                    self._automatic),
+                    self._automatic, "corrected"),
         )  # fmt: skip
 
     def _keys(self) -> tuple[Command, ...]:
