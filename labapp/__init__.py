@@ -5,17 +5,12 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
+
+import labapp.pixels  # noqa: F401 (OpenCV is told before anything loads it)
 
 if TYPE_CHECKING:
     from labapp.session.session import Session
-
-MOST_PIXELS = 2**26
-"""No picture has more (8192×8192): a file of 0.4 MB can hold one that unpacks to gigabytes."""
-
-# OpenCV looks at it once, when it is loaded, and then before it decodes.
-os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = str(MOST_PIXELS)
 
 __all__ = ["Session", "__version__"]
 __version__ = "0.1.0"

@@ -9,11 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from labapp import MOST_PIXELS
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.stored import StoredFrames, finite, regular_size
 from labapp.media.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
+from labapp.pixels import MOST_PIXELS
 
 IMAGE_SUFFIXES = frozenset(
     ".png .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from labapp import MOST_PIXELS
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage, check_index, rate_in_words
+from labapp.pixels import MOST_PIXELS
 
 
 class StoredFrames(FrameSource):

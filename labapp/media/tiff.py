@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp import MOST_PIXELS
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
@@ -29,6 +28,7 @@ from labapp.media.stored import (
     too_large,
     unpack_bits,
 )
+from labapp.pixels import MOST_PIXELS
 
 if TYPE_CHECKING:
     import tifffile

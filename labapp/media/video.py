@@ -21,7 +21,6 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from labapp import MOST_PIXELS
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, check_index, rate_in_words
 from labapp.media.ffv1 import slices_whole
@@ -35,6 +34,7 @@ from labapp.media.packets import (
     number_by_order,
     number_by_stamp,
 )
+from labapp.pixels import MOST_PIXELS
 
 NEAR_PACKETS = 8
 """The next key frame is reached by decoding when it is no further than this, else by seeking."""
