@@ -9,3 +9,22 @@ SIGMA_OF = "noise and level only"
 def several(count: int, thing: str) -> str:
     """A number of things: "1 frame", "2 frames"."""
     return f"{count} {thing}{'s' * (count != 1)}"
+
+
+FORMULA = tuple("=+-@\t\r\n")
+"""A cell that begins so is a formula to a spreadsheet, which runs it; text may be anybody's."""
+
+
+def as_cell(value: object) -> object:
+    """A value as a cell of CSV: text that a spreadsheet would run gets ``'`` before it.
+
+    So does text in which only further ``'`` stand before such a beginning: one taken away from any
+    text that begins so gives it back. Numbers stay as they are.
+    """
+    if not isinstance(value, str) or not value.lstrip("'").startswith(FORMULA):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value

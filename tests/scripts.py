@@ -9,8 +9,9 @@ import textwrap
 from tests.waiting import PATIENCE_S
 
 SHOW_PEAK = """
-import resource
-print("peak", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+with open("/proc/self/status") as file:
+    peak = next(line for line in file if line.startswith("VmHWM:"))
+print("peak", int(peak.split()[1]) // 1024)
 """
 
 

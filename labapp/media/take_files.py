@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Say, Tally
 from labapp.media.nut import NutWriter
-from labapp.words import several
+from labapp.words import as_cell, several
 
 if TYPE_CHECKING:
     from labapp.media.recorder import Take
@@ -122,6 +122,7 @@ class TakeFiles:
         event = note.event
         later = len(self._times_s) - bisect_right(self._times_s, note.time_s)
         row = (f"{time_s:.6f}", self.take.frames - later, event.source, event.kind, event.words)
+        row = tuple(map(as_cell, row))
         text = io.StringIO(newline="")
         try:
             began = not self.take.notes.exists()

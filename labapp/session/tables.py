@@ -20,7 +20,7 @@ from labapp.core.coordinates import ImageCalibration
 from labapp.core.measures import Measures, surface_grid
 from labapp.core.pipeline import Measurement
 from labapp.core.reconstruction import Reconstruction
-from labapp.words import SIGMA_OF
+from labapp.words import SIGMA_OF, as_cell
 
 PX_DIGITS, MM_DIGITS = 4, 6
 
@@ -278,7 +278,14 @@ def number(value: float | None, digits: int = MM_DIGITS) -> str:
 
 
 def as_csv(rows: Iterable[Sequence[object]]) -> str:
-    """Rows as CSV text."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()
+    """Rows as CSV text; no text in it is run by a spreadsheet (`as_cell`)."""
+    lines = _Lines()
+    csv.writer(lines).writerows([as_cell(cell) for cell in row] for row in rows)
+    return "".join(lines)
+
+
+class _Lines(list[str]):
+    """Lines that end with \\n: told to end them so, csv would not quote a text with \\r in it."""
+
+    def write(self, line: str) -> None:
+        self.append(line.removesuffix("\r\n") + "\n")

@@ -227,6 +227,20 @@ def test_somebody_elses_file_is_not_replaced(out: Path, writer: Writer, run: str
     assert (out / "dots.csv").read_text() == "mine"
 
 
+@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r", "\n", "'=", "''-"])
+def test_text_is_no_formula_and_numbers_are_numbers(
+    out: Path, writer: Writer, unmeasured: Measurement, start: str
+) -> None:
+    """A spreadsheet runs what begins so; a recording's name may be in the reason."""
+    reason = f"{start}HYPERLINK(A1)"
+    with writer(out) as files:
+        files.write(0, -1.5, replace(unmeasured, reason=reason))
+        files.write(1, 0.5, replace(unmeasured, reason="'quoted' - said"))
+    first, second = table(out / "measures.csv")
+    assert first["reason"] == f"'{reason}"
+    assert (first["time_s"], second["reason"]) == ("-1.500000", "'quoted' - said")
+
+
 def test_a_link_is_not_followed(out: Path, writer: Writer) -> None:
     out.mkdir(parents=True)
     (out.parent / "mine.json").write_text("mine")
