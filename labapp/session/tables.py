@@ -285,7 +285,7 @@ def as_csv(rows: Iterable[Sequence[object]]) -> str:
 
 
 class _Lines(list[str]):
-    """Lines that end with \\n: told to end them so, csv would not quote a text with \\r in it."""
+    """Lines that end with a line feed alone; told so, csv would leave carriage returns unquoted."""
 
     def write(self, line: str) -> None:
         self.append(line.removesuffix("\r\n") + "\n")
