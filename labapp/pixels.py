@@ -9,3 +9,16 @@ MOST_PIXELS = 2**26
 
 # OpenCV looks at it once, when it is loaded, and then before it decodes.
 os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = str(MOST_PIXELS)
+
+
+MOST_BYTES = 2**30
+"""A video's decoder holds no more in frames than this."""
+
+HELD_FRAMES, HELD_REORDERED = 2, 17
+"""Frames that it may hold; of codecs that store them out of the order they are shown in."""
+
+
+def most_decoded(bits: int, reordered: bool) -> int:
+    """Pixels that a frame of a video may have, of so many bits each."""
+    held = HELD_REORDERED if reordered else HELD_FRAMES
+    return min(MOST_PIXELS, 8 * MOST_BYTES // (max(bits, 1) * held))

@@ -121,8 +121,8 @@ class TakeFiles:
         time_s = note.time_s - self._first_s
         event = note.event
         later = len(self._times_s) - bisect_right(self._times_s, note.time_s)
-        row = (f"{time_s:.6f}", self.take.frames - later, event.source, event.kind, event.words)
-        row = tuple(map(as_cell, row))
+        frame = self.take.frames - later
+        row = (f"{time_s:.6f}", frame, as_cell(event.source), event.kind, as_cell(event.words))
         text = io.StringIO(newline="")
         try:
             began = not self.take.notes.exists()

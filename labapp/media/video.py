@@ -17,7 +17,6 @@ import numpy as np
 from av.container import InputContainer
 from av.error import ExitError, FFmpegError
 from av.packet import Packet
-from av.video.codeccontext import VideoCodecContext
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
@@ -34,19 +33,13 @@ from labapp.media.packets import (
     number_by_order,
     number_by_stamp,
 )
-from labapp.pixels import MOST_PIXELS
+from labapp.pixels import most_decoded
 
 NEAR_PACKETS = 8
 """The next key frame is reached by decoding when it is no further than this, else by seeking."""
 
 DAMAGED_READS = 50
 """More failures than this to read a packet, one after the other, are the end."""
-
-MOST_BYTES = 2**30
-"""Decoders hold no more in frames than this."""
-
-HELD_FRAMES, HELD_REORDERED = 2, 17
-"""Frames that a decoder may hold; of codecs that store them out of the order they are shown in."""
 
 READ_S = 8.0
 """No one step of opening or reading takes longer, s: a damaged table can send FFmpeg astray."""
@@ -453,7 +446,8 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
         if not isinstance(stream, VideoStream) or stream.codec_context is None:
             raise InputError(path, "content", "no pictures", A_VIDEO)
         context = stream.codec_context
-        most = _most_pixels(context)
+        bits = 64 if context.format is None else context.format.padded_bits_per_pixel
+        most = most_decoded(bits, context.codec.reorder)
         if context.width * context.height > most:
             size = f"{context.width}×{context.height} px"
             raise InputError(path, "frame size", size, f"at most {most} px in a frame of its kind")
@@ -464,13 +458,6 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
         container.close()
         raise
     return container, stream
-
-
-def _most_pixels(context: VideoCodecContext) -> int:
-    """Pixels that a frame may have: a small file can claim many, of which decoders hold several."""
-    bits = 64 if context.format is None else context.format.padded_bits_per_pixel
-    held = HELD_REORDERED if context.codec.reorder else HELD_FRAMES
-    return min(MOST_PIXELS, 8 * MOST_BYTES // (max(bits, 1) * held))
 
 
 def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
