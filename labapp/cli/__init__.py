@@ -30,6 +30,7 @@ from labapp.cli.shared import (
     NOTHING,
     RECORDING_HELP,
     TERMINATED,
+    choose_frames,
     failure,
     measure_frames,
     note,
@@ -460,6 +461,7 @@ def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo_results"),
+    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
     window: Annotated[
         bool, typer.Option(help="Open the session in the app, where there is a display.")
     ] = True,
@@ -470,7 +472,7 @@ def demo(
 
     out = out.absolute()
     with open_demo(out) as session:
-        summary = measure_frames(session, session.frames.tolist())
+        summary = measure_frames(session, choose_frames(session, frames))
         typer.echo(summary.text())
         pictures = frozenset({"frames", "trends"})
         session.export(out / "results", ExportChoice(hdf5=True, pictures=pictures), report=True)

@@ -124,6 +124,7 @@ def answered(answers: list[Answer]) -> list[tuple[Answer, Match]]:
     return [(answer, answer.match) for answer in answers if answer.match is not None]
 
 
+@pytest.mark.slow
 def test_no_dot_is_ever_given_a_wrong_ray(answers: list[Answer]) -> None:
     assert len(answers) >= 24
     assert sum(int(answer.wrong.sum()) for answer, _ in answered(answers)) == 0
@@ -138,6 +139,7 @@ def test_most_scenes_are_answered_and_most_of_their_dots(answers: list[Answer]) 
         assert answer.status != "no reason"
 
 
+@pytest.mark.slow
 def test_a_row_that_growth_does_not_reach_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
     # A wave bends the pool so that no ray alone comes into question for the dots of an end row.
     rng = np.random.default_rng(7)

@@ -209,6 +209,7 @@ def test_rows_are_joined_in_the_middle_column_or_the_nearest_shared_one():
     assert parent[7] == 6  # no shared column: the nearest points, (6, 6) and (8, 9)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.sampled_from([0.1, 0.3, 0.6, 0.9]))
 def test_odd_sets_of_dots_are_measured_or_refused(seed, share):
     rng = np.random.default_rng(seed)

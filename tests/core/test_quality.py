@@ -137,6 +137,7 @@ def test_a_frame_that_cannot_be_measured_is_bad_and_says_why() -> None:
     assert found.words.endswith("(no-match).")
 
 
+@pytest.mark.slow
 def test_a_reference_that_is_not_seen_is_said(good: GreyImage, measured: Measurement) -> None:
     found = judged(without_middle(good, measured))
     assert not found.reference

@@ -95,6 +95,7 @@ def test_a_frame_of_another_size_is_refused() -> None:
             quick_dots(np.zeros((60, 40), kind), exposure, BandPassSettings(size_px=1.8))
 
 
+@pytest.mark.slow
 def test_threads_that_share_an_exposure_do_not_share_their_dots() -> None:
     rng = np.random.default_rng(11)
     frames = [frame(places(rng), rng) for _ in range(6)]

@@ -182,6 +182,7 @@ def test_a_dot_where_the_absent_one_should_be_dark_breaks_the_track() -> None:
     assert wrong_rays(result, frame) == 0
 
 
+@pytest.mark.slow
 def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() -> None:
     frame, follower = frames()[WARMED], chain()
     step = round(float(np.nanmedian(np.diff(frame.dot_px[9, 5:14, 0]))))
@@ -258,6 +259,7 @@ def test_the_track_goes_on_after_a_frame_without_dots() -> None:
     assert wrong_rays(result, frame) == 0
 
 
+@pytest.mark.slow
 def test_another_scheme_is_measured_by_the_cold_chain() -> None:
     follower = WarmChain(RIG, CALIBRATION, Settings(scheme="ers"))
     for frame in frames()[:2]:

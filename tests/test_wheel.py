@@ -1,0 +1,96 @@
+"""The wheel as a user has it: installed into an empty environment, away from the checkout."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import lacks
+from tests.screen import screen
+from tests.waiting import PATIENCE_S
+
+ROOT = Path(__file__).resolve().parents[1]
+
+pytestmark = pytest.mark.slow
+
+Start = Callable[..., str]
+
+
+def told(*command: object, cwd: Path, **given: str) -> str:
+    """Run a program that knows nothing of this checkout; what it writes."""
+    ours = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM", "PYTHONPATH", "VIRTUAL_ENV")
+    done = subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env={**{k: v for k, v in os.environ.items() if k not in ours}, **given},
+        capture_output=True,
+        text=True,
+        timeout=5 * PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def uv() -> Path:
+    found = shutil.which("uv", path=f"{ROOT / '.tools' / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    if found is None:
+        lacks("uv is not here")
+    return Path(str(found))
+
+
+@pytest.fixture(scope="module")
+def away(uv: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the wheel, and an environment with nothing but what is locked may come into."""
+    folder = tmp_path_factory.mktemp("away")
+    told(uv, "build", "--wheel", "--out-dir", folder, ROOT, cwd=folder)
+    told(
+        *(uv, "export", "--project", ROOT, "--locked", "--no-dev", "--all-extras"),
+        *("--no-emit-project", "--no-hashes", "--output-file", folder / "locked.txt"),
+        cwd=folder,
+    )
+    told(uv, "venv", "--no-project", "--python", sys.executable, folder / "env", cwd=folder)
+    return folder
+
+
+def install(uv: Path, away: Path, extra: str) -> Start:
+    """Install the wheel with an extra; returns what runs its labapp."""
+    (wheel,) = away.glob("*.whl")
+    told(
+        *(uv, "pip", "install", "--python", away / "env", "--constraint", away / "locked.txt"),
+        f"labapp{extra} @ {wheel.as_uri()}",
+        cwd=away,
+    )
+    own = {"XDG_CONFIG_HOME": str(away / "config"), "XDG_STATE_HOME": str(away / "state")}
+
+    def start(*arguments: object, **given: str) -> str:
+        return told(away / "env" / "bin" / "labapp", *arguments, cwd=away, **own, **given)
+
+    return start
+
+
+def test_without_windows_it_measures_and_simulates(uv: Path, away: Path) -> None:
+    labapp = install(uv, away, "")
+    assert "3-D" in labapp("demo", "--frames", "0:2", "--no-window", "--out", "demo")
+    assert {"measures.csv", "report.pdf"} <= {p.name for p in (away / "demo" / "results").iterdir()}
+    assert not list((away / "demo").glob("surface_*.png"))
+    labapp("simulate", "mode_11", "--out", "simulated", "--frames", 1)
+    assert (away / "simulated" / "recording.avi").stat().st_size > 10_000
+
+
+@pytest.mark.xvfb
+@pytest.mark.usefixtures("opengl")
+def test_with_windows_it_takes_the_whole_tour(uv: Path, away: Path) -> None:
+    labapp = install(uv, away, "[gui]")
+    labapp("demo", "--frames", "0:1", "--no-window", "--out", "demo in 3-D")
+    assert list((away / "demo in 3-D").glob("surface_*.png"))
+    with screen(1366, 768) as display:
+        labapp("tour", "--out", "tour", DISPLAY=display, QT_QPA_PLATFORM="xcb")
+    assert len(list((away / "tour").glob("*.png"))) > 30
