@@ -10,6 +10,8 @@ import pytest
 from labapp.session.setup import read_setup, update_setup
 from tests.conftest import Run
 
+pytestmark = pytest.mark.usefixtures("little_search")
+
 POOLS = """[pools]
 kind = "convex"
 width_mm = 6.5

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PySide6.QtCore import QCoreApplication, QEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
@@ -25,8 +26,8 @@ SAMPLES = Path(__file__).parents[2] / "sample_sessions"
 
 PATIENCE_MS = round(1000 * PATIENCE_S)
 
-KEPT: list[QWidget] = []
-"""Windows with pictures and 3-D views can crash when they are destroyed: these live to the end."""
+KEPT: list[object] = []
+"""What is to live until its test ends: Python would let go of it when it likes."""
 
 CopySample = Callable[[str], Path]
 
@@ -78,16 +79,20 @@ def nothing_left(qapp: QApplication, tmp_path: Path) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def hide_windows(nothing_left: None) -> Iterator[None]:
-    """Leave none in view: an app that is tested ends when the last one goes."""
+def no_windows(nothing_left: None) -> Iterator[None]:
+    """Take away the windows of each test; one holds ten megabytes and more."""
     yield
     for widget in QApplication.topLevelWidgets():
-        widget.hide()
+        if widget.parent() is None:
+            widget.hide()
+            widget.deleteLater()
+    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+    KEPT.clear()
 
 
 @pytest.fixture
 def window(qapp: QApplication, tmp_path: Path, state: Path) -> Iterator[MainWindow]:
-    """The window as it is at the first start; closed, and kept, after the test."""
+    """The window as it is at the first start; closed after the test."""
     made = MainWindow(Preferences(theme="dark"), tmp_path / "config" / "preferences.json")
     KEPT.append(made)
     made.resize(1280, 760)

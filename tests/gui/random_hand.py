@@ -28,11 +28,9 @@ from labapp.gui.pages.setup import SetupPage
 from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.views.fields import Field, NumberField, TextField
 from labapp.gui.window import MainWindow
+from tests.gui.conftest import KEPT
 from tests.gui.watching import Files
 from tests.gui.witness import Witness
-
-KEPT: list[MainWindow] = []
-"""Windows with pictures and 3-D views can crash when they are destroyed: these live to the end."""
 
 KEY, BUTTON = Qt.Key, Qt.MouseButton
 NONE, SHIFT, CONTROL, ALT = (

@@ -310,6 +310,7 @@ def test_the_help_by_keyboard(window: MainWindow, kind: str, qtbot: QtBot):
     assert not dialog.isVisible()
 
 
+@pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize("key", TOOLS)
 def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
     opened.menus.do(key)

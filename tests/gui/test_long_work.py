@@ -137,6 +137,7 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
     assert session.problems() == []
 
 
+@pytest.mark.soak
 def test_killed_at_work_it_loses_no_frame_that_was_done(tmp_path: Path):
     answer = subprocess.run(
         [sys.executable, KILL, tmp_path, "4", "20261121"],

@@ -10,10 +10,7 @@ from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.views.picture import DragPoint, PictureView, Tool, auto_levels, level_at
-from tests.gui.conftest import let_draw
-
-KEPT: list[PictureView] = []
-"""Windows with pyqtgraph live to the end of the process: some crash when they are destroyed."""
+from tests.gui.conftest import KEPT, let_draw
 
 GREY = (np.add.outer(np.arange(120), np.arange(160)) % 251).astype(np.uint8)
 

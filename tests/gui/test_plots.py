@@ -15,10 +15,7 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.curves import Axis, Curve, Mark, as_table, nearest, next_key, point_in_words
 from labapp.gui.theme import palette
 from labapp.gui.views.plots import MOST_POINTS, PlotStack
-from tests.gui.conftest import let_draw
-
-KEPT: list[PlotStack] = []
-"""Windows with pyqtgraph live to the end of the process: some crash when they are destroyed."""
+from tests.gui.conftest import KEPT, let_draw
 
 TIME = Axis("Time", "s")
 MARKS = (Mark("●", "measured"), Mark("○", "in doubt"))

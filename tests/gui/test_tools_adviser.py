@@ -19,6 +19,8 @@ from labapp.session.session import Session
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
 
+pytestmark = pytest.mark.usefixtures("little_search")
+
 SMALL = {
     "pools.width_mm": (6.5, 6.5),
     "pools.length_mm": (7.0, 7.0),

@@ -61,6 +61,7 @@ def named(taken: tuple[Path, str, Path], part: str) -> list[Path]:
     return sorted(taken[0].glob(f"[0-9][0-9]-{part}.png"))
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
     taken: tuple[Path, str, Path],
@@ -76,6 +77,7 @@ def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
         assert len(np.unique(picture)) > 20, name
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
     out, _, _ = taken
@@ -83,12 +85,14 @@ def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
     assert len(set(seen)) == len(seen)
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 @pytest.mark.parametrize("key", ["welcome", *PAGES])
 def test_every_page_has_a_picture(taken: tuple[Path, str, Path], key: str):
     assert named(taken, key) + named(taken, f"{key}-*")
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_menu_has_a_picture(taken: tuple[Path, str, Path]):
     for menu in MENUS:
@@ -135,6 +139,7 @@ def _titles_in(function: ast.FunctionDef, path: Path) -> Iterator[str]:
         )
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_question_for_a_file_and_every_other_question_has_a_picture(
     taken: tuple[Path, str, Path],
@@ -146,6 +151,7 @@ def test_every_question_for_a_file_and_every_other_question_has_a_picture(
     assert not [t for t in titles if not any(one.startswith(t) for one in shown)]
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
     """The app's own have pictures: each text of the help, each tool."""
@@ -161,6 +167,7 @@ def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
         assert named(taken, f"dialog-{kind}")
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 def test_the_3d_views_are_drawn(taken: tuple[Path, str, Path]):
     """Middle of the canvas, where the surface is: many levels, and not those of another look."""
@@ -175,6 +182,7 @@ def test_the_3d_views_are_drawn(taken: tuple[Path, str, Path]):
         assert np.abs(one.astype(int) - other).mean() > 1
 
 
+@pytest.mark.soak
 @pytest.mark.xvfb
 def test_nothing_is_left_in_the_home_folder_but_the_log(taken: tuple[Path, str, Path]):
     home = taken[2]
@@ -218,7 +226,10 @@ cli.main(["tour", "--out", sys.argv[1]])
 @pytest.mark.usefixtures("opengl")
 @pytest.mark.parametrize(
     ("page", "kind", "method"),
-    [("setup", "SetupPage", "refresh"), ("laser", "LaserPage", "_show_way")],
+    [
+        ("setup", "SetupPage", "refresh"),
+        pytest.param("laser", "LaserPage", "_show_way", marks=pytest.mark.soak),
+    ],
 )
 def test_a_page_that_throws_ends_it_and_is_named(tmp_path: Path, page: str, kind: str, method: str):
     code = BROKEN.format(page=page, kind=kind, method=method)

@@ -238,6 +238,7 @@ def compare(one: Path, other: Path) -> None:
     assert setup == of_command
 
 
+@pytest.mark.slow
 def test_a_session_by_hand_gives_the_files_that_the_command_line_gives(
     hand: Hand, labapp: Run, qtbot: QtBot, tmp_path: Path
 ) -> None:

@@ -13,7 +13,13 @@ PROGRAM = Path(__file__).parent / "crash.py"
 
 
 @pytest.mark.parametrize(
-    ("how", "times", "changes"), [("kill", 100, 500), ("disk", 25, 0)], ids=["killed", "disk full"]
+    ("how", "times", "changes"),
+    [
+        pytest.param("kill", 12, 60, id="killed"),
+        pytest.param("disk", 5, 0, id="disk full"),
+        pytest.param("kill", 200, 1000, id="killed, long", marks=pytest.mark.soak),
+        pytest.param("disk", 50, 0, id="disk full, long", marks=pytest.mark.soak),
+    ],
 )
 def test_nothing_acknowledged_is_lost(tmp_path: Path, how: str, times: int, changes: int):
     answer = subprocess.run(

@@ -24,8 +24,9 @@ from labapp.gui.views.sheet import Sheet
 from labapp.gui.views.tables import CellTable
 from labapp.session.advice import advice_files
 from labapp.session.advice_keys import parse_question
+from labapp.simulation import adviser
 from labapp.simulation.advice_report import cost_table
-from labapp.simulation.adviser import QUICK, Advice, Effort, advise
+from labapp.simulation.adviser import Advice, Effort, advise
 
 if TYPE_CHECKING:
     from labapp.gui.window import MainWindow
@@ -163,7 +164,7 @@ class AdviserWindow(ToolWindow):
         asked = self.workspace.tried(lambda: parse_question(self.values(), "the adviser"))
         if asked is None:
             return
-        effort = QUICK if self.effort.value() == "quick" else Effort()
+        effort = adviser.QUICK if self.effort.value() == "quick" else Effort()
 
         def work(control: Control) -> tuple[Advice, dict[str, bytes]]:
             advice = advise(*asked, effort, progress=told(control))

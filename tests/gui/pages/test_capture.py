@@ -6,7 +6,6 @@ import hashlib
 import re
 import shutil
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,11 +38,9 @@ from labapp.gui.workspace import Workspace
 from labapp.session.copies import next_session
 from labapp.session.record import Record
 from labapp.session.session import Session
-from tests.gui.conftest import CopySample
+from tests.gui.conftest import KEPT, CopySample
 from tests.gui.hand import Hand
 from tests.waiting import PATIENCE_S
-
-KEPT: list[object] = []
 
 
 @pytest.fixture
@@ -118,15 +115,6 @@ def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
         seen = look(session, 0)
         assert seen.image is None
         assert seen.words == "recording.avi is not where it was: say where it is now"
-
-
-@pytest.fixture(autouse=True)
-def hidden_at_the_end() -> Iterator[None]:
-    yield
-    for kept in KEPT:
-        if isinstance(kept, CapturePage):
-            kept.hide()
-            kept.panel.hide()
 
 
 def made(workspace: Workspace) -> CapturePage:

@@ -23,11 +23,10 @@ from labapp.gui.tasks import Control
 from labapp.gui.window import MainWindow
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from tests.gui.conftest import let_draw
+from tests.gui.conftest import KEPT, let_draw
 
 CopySample = Callable[[str], Path]
 SIZE = presenter.NUMBERS[0]
-KEPT: list[QWidget] = []
 CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftModifier
 
 

@@ -23,8 +23,7 @@ from labapp.gui.pages.export.presenter import (
 from labapp.gui.workspace import Workspace
 from labapp.session.export import ExportChoice, verify_export
 from labapp.session.session import Session
-
-KEPT: list[object] = []
+from tests.gui.conftest import KEPT
 
 
 @pytest.fixture

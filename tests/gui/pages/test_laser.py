@@ -17,8 +17,7 @@ from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
 from labapp.gui.steps import states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-
-KEPT: list[object] = []
+from tests.gui.conftest import KEPT
 
 CROSS = ((13.676,), (18.561,), (7.874,))
 

@@ -213,7 +213,7 @@ def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
         image = video.frame(0).image
     setup = read_setup(folder / "setup.toml")
     with_setup = Live("test", live._place, Plan(), CameraSettings(), Settings(), setup)
-    device = SimulatedDevice("test", lambda _: image, rate_hz=20)
+    device = SimulatedDevice("test", lambda _: image, rate_hz=4)
     try:
         with_setup.open(device.open)
         watch = with_setup.watch
@@ -363,7 +363,7 @@ def test_large_figures_where_the_set_up_is_complete(
     window.workspace.attempt(
         lambda session: session.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
     )
-    film = SimulatedDevice("pool", lambda _: image, rate_hz=20)
+    film = SimulatedDevice("pool", lambda _: image, rate_hz=4)
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
     start(page, qtbot)
     view = page.live_view

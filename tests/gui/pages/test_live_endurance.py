@@ -20,6 +20,8 @@ from labapp.media.nut import NutWriter
 from labapp.media.recorder import Recorder
 from tests.benchmarks.filming import Disk, FilmedDevice, compare, how_many, times_told
 
+pytestmark = pytest.mark.soak
+
 ROUNDS = 12
 STALLED = (3, 8)
 """Rounds in which the disk stalls, too, from before the camera is gone to after it is back."""

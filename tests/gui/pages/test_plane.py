@@ -22,8 +22,7 @@ from labapp.gui.steps import states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.simulation.target import Target, target_svg
-
-KEPT: list[object] = []
+from tests.gui.conftest import KEPT
 
 GTAW = Path(__file__).parents[3] / "sample_sessions" / "gtaw"
 

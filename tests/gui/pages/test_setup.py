@@ -16,8 +16,7 @@ from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from labapp.simulation.positioning import Fate
-
-KEPT: list[object] = []
+from tests.gui.conftest import KEPT
 
 SAMPLES = Path(__file__).parents[3] / "sample_sessions"
 

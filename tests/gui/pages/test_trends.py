@@ -16,9 +16,7 @@ from labapp.gui.pages.trends.presenter import CORRECTED, STALE, Wish, show
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.session.signals import Signals
-from tests.gui.conftest import let_draw
-
-KEPT: list[object] = []
+from tests.gui.conftest import KEPT, let_draw
 
 
 @pytest.fixture
