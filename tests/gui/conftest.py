@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pyqtgraph import GraphicsView
 from PySide6.QtCore import QCoreApplication, QEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
+from shiboken6 import isValid
 
 from labapp.gui.preferences import Preferences
 from labapp.gui.window import MainWindow
@@ -80,11 +82,14 @@ def nothing_left(qapp: QApplication, tmp_path: Path) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def no_windows(nothing_left: None) -> Iterator[None]:
-    """Take away the windows of each test; one holds ten megabytes and more."""
+    """Leave none in view: an app that is tested ends when the last one goes. And none in memory."""
     yield
     for widget in QApplication.topLevelWidgets():
-        if widget.parent() is None:
-            widget.hide()
+        widget.hide()
+    for widget in KEPT:
+        if isinstance(widget, QWidget) and isValid(widget) and widget.parent() is None:
+            for view in widget.findChildren(GraphicsView):
+                view.close()  # lets go of its items, which Python and Qt would both destroy
             widget.deleteLater()
     QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
     KEPT.clear()
