@@ -82,7 +82,7 @@ FILE = (
         "&Quit",
         "Ctrl+Q",
         "Stop all work and end the program; everything is saved",
-        lambda window: window.close(),
+        lambda window: window.files.quit(),
     ),
 )
 

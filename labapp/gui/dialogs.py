@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
@@ -68,6 +69,31 @@ def ask_read_only(parent: QWidget, path: Path) -> bool:
     box.setDefaultButton(look)
     box.exec()
     return box.clickedButton() is look
+
+
+def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", "go on"]:
+    """Ask what becomes of a recording that runs when its session is to be closed."""
+    box = QMessageBox(parent)
+    box.setObjectName("recording-runs")
+    box.setIcon(QMessageBox.Icon.Question)
+    box.setWindowTitle("A recording is running")
+    box.setText(f"{name} is still being recorded.")
+    box.setInformativeText(
+        "To close, the recording is ended. A finished one is kept beside the session and listed "
+        "in the step Recording."
+    )
+    keep = box.addButton("&Finish and keep", QMessageBox.ButtonRole.AcceptRole)
+    keep.setToolTip("End the recording, write all of it, and close")
+    discard = box.addButton("&Discard", QMessageBox.ButtonRole.DestructiveRole)
+    discard.setToolTip("End the recording, delete its file, and close")
+    go_on = box.addButton("&Go on recording", QMessageBox.ButtonRole.RejectRole)
+    go_on.setToolTip("Close nothing (Esc)")
+    box.setDefaultButton(keep)
+    box.setEscapeButton(go_on)
+    box.exec()
+    if box.clickedButton() is keep:
+        return "keep"
+    return "discard" if box.clickedButton() is discard else "go on"
 
 
 def new_path(folder: Path, stem: str) -> Path:

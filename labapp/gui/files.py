@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from labapp.gui import dialogs
+from labapp.gui import dialogs, filming
 from labapp.session.database import SUFFIX, SessionInUse
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ class Files:
         present = self._window.workspace.session
         if present is not None and path.absolute() == present.path:
             return True
+        if not filming.may_close(self._window):
+            return False
         session = self._window.workspace.tried(lambda: self._opened(path))
         if session is None:
             return False
@@ -100,7 +102,7 @@ class Files:
         title = "New session from this recording"
         proposed = dialogs.new_path(present.path.parent, recording.stem)
         path = dialogs.ask_new_session(self._window, proposed, title)
-        if path is None:
+        if path is None or not filming.may_close(self._window):
             return
         session = self._window.workspace.tried(lambda: next_session(present, path))
         if session is not None:
@@ -120,7 +122,13 @@ class Files:
 
     def close(self) -> None:
         """Close the session and go back to the welcome page."""
-        self._window.workspace.show(None)
+        if filming.may_close(self._window):
+            self._window.workspace.show(None)
+
+    def quit(self) -> None:
+        """Close the window."""
+        if filming.may_close(self._window):
+            self._window.close()
 
     def forget(self, path: Path) -> None:
         """Take a session off the list of recent ones; the file stays."""
@@ -131,9 +139,9 @@ class Files:
         from labapp.session.session import Session
 
         path = dialogs.ask_new_session(self._window, proposed)
-        session = (
-            None if path is None else self._window.workspace.tried(lambda: Session.create(path))
-        )
+        if path is None or not filming.may_close(self._window):
+            return False
+        session = self._window.workspace.tried(lambda: Session.create(path))
         if session is None:
             return False
         self._show(session)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from labapp.gui import dialogs
+
 if TYPE_CHECKING:
     from labapp.gui.pages.page import Page
     from labapp.gui.window import MainWindow
@@ -23,6 +25,18 @@ def trigger(window: MainWindow) -> None:
         window.say(NONE_LIVE, True)
     else:
         page.trigger()
+
+
+def may_close(window: MainWindow) -> bool:
+    """Ask what becomes of a recording that runs; False if it is to go on, and nothing closed."""
+    page = live_page(window)
+    take = None if page is None else page.recording
+    if page is None or take is None:
+        return True
+    answer = dialogs.ask_recording_end(window, take.path.name)
+    if answer == "discard":
+        page.discard(take)
+    return answer != "go on"
 
 
 def mark(window: MainWindow) -> None:

@@ -25,6 +25,7 @@ from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.gui.actions import ACTIONS
 from labapp.gui.files import Files, title
+from labapp.gui.filming import may_close
 from labapp.gui.focus import finish_edit
 from labapp.gui.help import HelpDialog
 from labapp.gui.menus import Menus
@@ -479,7 +480,13 @@ class MainWindow(QMainWindow):
             QTimer.singleShot(0, self, lambda: self.files.open_path(paths[0]))
 
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Stop all work, remember the layout and close the session."""
+        """Stop all work, remember the layout and close the session.
+
+        The operator is asked about a recording that runs; the program closes without a question.
+        """
+        if event.spontaneous() and not may_close(self):
+            event.ignore()
+            return
         for beside in self.findChildren(QDialog):
             beside.close()
         self.timeline.set_playing(False)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import re
 import sys
 import threading
 import time
@@ -426,3 +427,15 @@ def recording_path(folder: Path, stem: str) -> Path:
         count += 1
         path = folder / f"{stem}-{begun}-{count}.nut"
     return path
+
+
+def recordings_beside(folder: Path, stem: str) -> list[Path]:
+    """The files in a folder that `recording_path` has named with this stem, the oldest first.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be read.
+    """
+    named = re.compile(rf"{re.escape(stem)}-\d{{4}}-\d\d-\d\d-\d{{6}}(-\d{{1,3}}){{0,2}}\.nut")
+    return sorted(path for path in folder.iterdir() if named.fullmatch(path.name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
@@ -10,6 +11,9 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 from labapp.gui.steps import State, read_only
 from labapp.gui.views.fields import Field
 from labapp.gui.workspace import Workspace
+
+if TYPE_CHECKING:
+    from labapp.media.recorder import Take
 
 
 class Page(QWidget):
@@ -97,6 +101,14 @@ class Page(QWidget):
 
     def trigger(self) -> None:
         """Begin a recording, or end the one that runs; while `live`."""
+
+    @property
+    def recording(self) -> Take | None:
+        """The recording that runs; None if none does."""
+        return None
+
+    def discard(self, take: Take) -> None:
+        """Delete a recording that runs as soon as the camera is let go."""
 
     def mark(self) -> bool:
         """Note the present moment beside the recording that runs; False if none does."""

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QCloseEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QAbstractButton, QApplication, QLabel
+from PySide6.QtWidgets import QAbstractButton, QApplication, QLabel, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from labapp.core.pipeline import Settings
@@ -455,6 +456,103 @@ def test_closing_the_window_finishes_the_recording(
         numbers = [number_in(frame.image) for frame in video]
     assert len(numbers) == take.frames > 10
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def answer(words: str) -> None:
+    """Press a button of the next question."""
+
+    def press() -> None:
+        box = QApplication.activeModalWidget()
+        if not isinstance(box, QMessageBox):
+            QTimer.singleShot(20, press)
+            return
+        found = [each for each in box.buttons() if each.text().replace("&", "") == words]
+        assert len(found) == 1, [each.text() for each in box.buttons()]
+        found[0].click()
+
+    QTimer.singleShot(0, press)
+
+
+class ByHand(QCloseEvent):
+    """As the button in the window's frame sends it."""
+
+    def spontaneous(self) -> bool:
+        return True
+
+
+def close_by_hand(window: MainWindow) -> None:
+    event = ByHand()
+    window.closeEvent(event)
+    if event.isAccepted():
+        window.hide()
+
+
+@pytest.mark.parametrize("way", ["the frame", "quit", "close", "another"])
+def test_while_it_records_closing_asks_and_a_no_closes_nothing(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, copy_sample, way: str
+):
+    close = {
+        "the frame": lambda: close_by_hand(window),
+        "quit": lambda: window.menus.do("quit"),
+        "close": lambda: window.menus.do("close"),
+        "another": lambda: window.files.open(other),
+    }[way]
+    other, session = copy_sample("thumb_tack"), window.workspace.session
+    start(page, qtbot)
+    page.live_view.trigger()
+    take = page.live_view.live.running
+    answer("Go on recording")
+    close()
+    assert window.isVisible()
+    assert window.workspace.session is session
+    assert page.live_view.live.running is take
+    frames = take.frames
+    qtbot.waitUntil(lambda: take.frames > frames + 5)
+    answer("Finish and keep")
+    close()
+    assert window.workspace.session is not session
+    assert take.finished.is_set()
+    with open_source(take.path) as video:
+        assert len(video) == take.frames
+
+
+def test_a_recording_that_is_discarded_is_gone(window: MainWindow, page: CapturePage, qtbot: QtBot):
+    start(page, qtbot)
+    live = page.live_view.live
+    page.live_view.trigger()
+    qtbot.waitUntil(lambda: live.takes[0].frames > 10)
+    folder = window.workspace.session.path.parent
+    answer("Discard")
+    close_by_hand(window)
+    assert not window.isVisible()
+    assert [path.name for path in folder.glob("new*")] == ["new.labsession"]
+
+
+def test_recordings_made_besides_are_listed_when_the_session_is_opened_again(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    path = window.workspace.session.path
+    path.with_name("new-notes.nut").write_bytes(b"")  # not one of the session's
+    start(page, qtbot)
+    live = page.live_view.live
+    page.live_view.trigger()
+    qtbot.waitUntil(lambda: live.takes[0].frames > 10)
+    assert not page.kept_group.isVisible()
+    answer("Finish and keep")
+    window.menus.do("close")
+    window.files.open(path)
+    window.show_step("capture")
+    hand = Hand(window)
+    assert page.kept_group.isVisible()
+    assert page.kept.editor.count() == 1
+    assert page.kept.value() == str(live.takes[0].path)
+    hand.button("Look at it")
+    qtbot.waitUntil(lambda: page.preview is not None)
+    hand.button("Import")
+    session = window.workspace.session
+    qtbot.waitUntil(lambda: session.recording is not None)
+    assert len(session.frames) == live.takes[0].frames
+    qtbot.waitUntil(lambda: not page.kept_group.isVisible())
 
 
 def test_a_camera_that_cannot_be_opened_is_told(

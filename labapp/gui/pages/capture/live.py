@@ -163,6 +163,7 @@ class Live:
         self._judged: deque[Looked] = deque(maxlen=1)
         self._recorders: list[Recorder] = []
         self._told: set[Path] = set()
+        self._discarded: list[Take] = []
         self._counted: deque[tuple[float, int]] = deque()
         self._frame_byte = 0
         self._is_stale = False
@@ -206,6 +207,17 @@ class Live:
                 worker.join()
         for recorder in self._recorders:
             recorder.close()
+        self._delete_discarded()
+
+    def _delete_discarded(self) -> None:
+        while self._discarded:
+            take = self._discarded.pop()
+            for path in (take.path, take.notes):
+                try:
+                    path.unlink(missing_ok=True)
+                except OSError as error:
+                    words = f"cannot be deleted: {error.strerror}"
+                    self._events.put(Event(path.name, "warning", words))
 
     @property
     def is_open(self) -> bool:
@@ -415,6 +427,16 @@ class Live:
         if self.watch is not None:
             for event, time_s in self.watch.standing():
                 recorder.note(event, time_s)
+
+    def discard(self, take: Take) -> bool:
+        """End a recording and have `close` delete it; False if it had ended before: it is kept."""
+        with self._turn:
+            if self.running is not take:
+                return False
+            self._recorders[-1].stop()
+        self._told.add(take.path)
+        self._discarded.append(take)
+        return True
 
     def mark(self) -> None:
         """Note the present frame beside the recording that runs."""

@@ -40,7 +40,7 @@ from labapp.media.cameras import (
     open_camera,
 )
 from labapp.media.events import Event
-from labapp.media.recorder import recording_path
+from labapp.media.recorder import Take, recording_path
 from labapp.session.live_watch import Followed, LiveWatch
 from labapp.session.session import Session
 from labapp.session.simulated_pool import pool_camera, simulated_pool
@@ -260,6 +260,11 @@ class LiveView(QObject):
             self.workspace.tried(live.trigger)
             self._tell_figures(live)
             self._show_state()
+
+    def discard(self, take: Take) -> None:
+        """Delete a recording that runs as soon as the camera is let go."""
+        if self.live is not None and not self.live.discard(take):
+            self.workspace.said.emit(f"{take.path.name} had ended and is kept", False)
 
     def mark(self) -> bool:
         """Note the present frame beside the recording that runs; False if none does."""

@@ -32,11 +32,14 @@ from labapp.gui.pages.capture.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
+from labapp.gui.views.fields import ChoiceField, FieldForm
 from labapp.gui.views.labels import headed, plain_label
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
-from labapp.media.recorder import Take
+from labapp.media.recorder import Take, recordings_beside
+from labapp.session.database import SUFFIX
 from labapp.session.record import Recording
+from labapp.session.session import Session
 from labapp.words import several
 
 REST_MS = 120
@@ -69,8 +72,8 @@ class CapturePage(Page):
         self._rest.setInterval(REST_MS)
         self._rest.timeout.connect(self._judge)
         self._last_folder = Path()
-        self._kept: Path | None = None
-        """The last recording that was kept beside the session; of this session."""
+        self._listed: Session | None = None
+        """The session that recordings beside it are listed of."""
         self.title = plain_label()
         self.title.setContentsMargins(8, 4, 8, 0)
         self.title.setWordWrap(True)
@@ -139,6 +142,15 @@ class CapturePage(Page):
         """Begin a recording, or end the one that runs."""
         self.live_view.trigger()
 
+    @property
+    def recording(self) -> Take | None:
+        """The recording that runs; None if none does."""
+        return None if self.live_view.live is None else self.live_view.live.running
+
+    def discard(self, take: Take) -> None:
+        """Delete a recording that runs as soon as the camera is let go."""
+        self.live_view.discard(take)
+
     def mark(self) -> bool:
         """Note the present moment beside the recording that runs; False if none does."""
         return self.live_view.mark()
@@ -174,9 +186,9 @@ class CapturePage(Page):
         elif session.recording is not None or self._importing in self.workspace.tasks.active:
             why_kept = "the session has a recording already"
         if why_kept:
-            self._kept = take.path
-            self.workspace.said.emit(told_of(take, why_kept), False)
+            self._listed = None
             self._show_import()
+            self.workspace.said.emit(told_of(take, why_kept), False)
         else:
             self._import(take.path, ":", None, False)
 
@@ -212,9 +224,23 @@ class CapturePage(Page):
         measured = seen is not None and (any(seen.status) or bool(seen.corrected.any()))
         self.chosen.show_choice(session, self.preview, working, measured)
         self.slider.setVisible(self.preview is not None and self.preview.frames > 1)
-        self.kept_group.setVisible(self._kept is not None)
-        if self._kept is not None:
-            self.kept_words.setText(f"{self._kept.name} is kept beside the session.")
+        if session is not None and session is not self._listed and not working:
+            self._list_kept(session)
+
+    def _list_kept(self, session: Session) -> None:
+        """List the recordings made beside the session that are not its own, the newest first."""
+        self._listed, folder = session, session.path.parent
+        others = [] if session.recording is None else [folder / session.recording.path]
+        others += [] if self.recording is None else [self.recording.path]
+        try:
+            found = recordings_beside(folder, session.path.stem)
+        except OSError:
+            found = []  # what is wrong with the folder is said where something is written in it
+        kept = [path for path in reversed(found) if path not in others]
+        self.kept.set_choices([(str(path), _kept_in_words(path)) for path in kept])
+        if kept:
+            self.kept.set_value(str(kept[0]))
+        self.kept_group.setVisible(bool(kept))
 
     def _show_seen(self, seen: Seen) -> None:
         self.title.setText(seen.title)
@@ -342,8 +368,7 @@ class CapturePage(Page):
             self._import_next(preview.path, choice.frames, choice.rate_hz, choice.embed)
 
     def _import_kept(self) -> None:
-        if self._kept is not None:
-            self._import_next(self._kept, ":", None, False)
+        self._import_next(Path(self.kept.value()), ":", None, False)
 
     def _import_next(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
         former = self.workspace.session
@@ -375,6 +400,7 @@ class CapturePage(Page):
             self.workspace.changed.emit()
 
         self._importing = self.workspace.tasks.start(f"Importing {path.name}", work, done)
+        self._listed = None  # one of them may be the session's own then
         self._show_import()
 
     def _drop_preview(self) -> None:
@@ -389,7 +415,7 @@ class CapturePage(Page):
 
     def _forget(self) -> None:
         """Forget what was to be imported into the session before."""
-        self._kept = None
+        self._listed = None
         self._drop_preview()
 
     def cancel_choice(self) -> None:
@@ -461,8 +487,23 @@ class CapturePage(Page):
 
     def _make_kept(self) -> None:
         self.kept_group, layout = headed("Recorded besides")
-        self.kept_words = wrapped()
-        layout.addWidget(self.kept_words)
+        form = FieldForm()
+        self.kept = ChoiceField("Beside the session", tooltip="Recordings not in the session")
+        form.add(self.kept)
+        layout.addWidget(form)
+        layout.addWidget(
+            button(
+                "Look at it",
+                "Show its frames, and choose which of them to import",
+                lambda: self.choose(Path(self.kept.value())),
+            )
+        )
         layout.addWidget(button(NEXT, NEXT_TIP, self._import_kept))
         self.kept_group.hide()
         self.panel_layout.addWidget(self.kept_group)
+
+
+def _kept_in_words(path: Path) -> str:
+    """Name of a recording beside the session, and whether a session was begun with it."""
+    used = path.with_suffix(SUFFIX).exists()
+    return f"{path.name}, has a session of its own" if used else path.name
