@@ -19,9 +19,13 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.steps import READ_ONLY, Mark, State, Step
 from labapp.gui.theme import is_dark
-from labapp.gui.views.labels import plain_label, plain_tip
+from labapp.gui.views.labels import Message, plain_label, plain_tip
 
 ICON_PX = 18
+
+STATE_LINES = 2
+"""Room for how far a step is: the panel below stays where it is, whatever there is to say."""
+
 COLOURS = {
     Mark.TODO: ("#6b7480", "#929ba6"),
     Mark.READY: ("#0a6fc2", "#6db8f2"),
@@ -152,10 +156,10 @@ class SidePanel(QWidget):
         font.setBold(True)
         self.title.setFont(font)
         self.hint = plain_label()
-        self.state = plain_label()
+        self.state = Message(STATE_LINES)
         self.read_only = plain_label(f"⚠ {READ_ONLY} until it is opened again for changes.")
         self.read_only.hide()
-        for label in (self.hint, self.state, self.read_only):
+        for label in (self.hint, self.read_only):
             label.setWordWrap(True)
             label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.stack = QStackedWidget()

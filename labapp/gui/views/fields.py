@@ -37,6 +37,9 @@ from labapp.gui.digits import ResultRow, as_csv, as_text, entered, parsed
 from labapp.gui.views.labels import heading, plain_label, plain_tip
 from labapp.gui.views.tables import ReadTable
 
+MOUSE_MS = 20
+"""How often it is asked whether the mouse is let go."""
+
 STEP_PAUSE_MS = 300
 """Steps that follow each other faster than this are one edit."""
 
@@ -112,10 +115,19 @@ class Field(QWidget):
 
     def _show_problem(self) -> None:
         words = self._refusal or self._fault
-        self.problem.setText(f"⚠ {words}" if words else "")
-        self.problem.setVisible(bool(words))
         described = f"{words}. {self._tooltip}" if words else self._tooltip
         self.editor.setAccessibleDescription(described)
+        self._tell_problem()
+
+    def _tell_problem(self) -> None:
+        """Make or take its room; not while a button of the mouse is down, or a click is lost."""
+        words = self._refusal or self._fault
+        told = f"⚠ {words}" if words else ""
+        if told != self.problem.text() and QGuiApplication.mouseButtons():
+            QTimer.singleShot(MOUSE_MS, self, self._tell_problem)
+            return
+        self.problem.setText(told)
+        self.problem.setVisible(bool(told))
 
 
 class NumberField(Field):

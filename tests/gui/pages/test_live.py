@@ -473,18 +473,11 @@ def answer(words: str) -> None:
     QTimer.singleShot(0, press)
 
 
-class ByHand(QCloseEvent):
-    """As the button in the window's frame sends it."""
-
-    def spontaneous(self) -> bool:
-        return True
-
-
 def close_by_hand(window: MainWindow) -> None:
-    event = ByHand()
-    window.closeEvent(event)
-    if event.isAccepted():
-        window.hide()
+    """As the button in the window's frame does."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(QCloseEvent, "spontaneous", lambda _: True)
+        window.close()
 
 
 @pytest.mark.parametrize("way", ["the frame", "quit", "close", "another"])

@@ -64,7 +64,7 @@ class FootSwitchPanel(QWidget):
         )
         row.addWidget(self.learn_button)
         row.addWidget(self.look_button)
-        self._layout.addLayout(row)
+        self._layout.insertLayout(1, row)  # above the words, which need more or less room
         self.learned_words = wrapped()
         self._layout.addWidget(self.learned_words)
         self.learned = QWidget()

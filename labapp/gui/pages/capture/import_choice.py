@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QVBoxLayout, QWidget
 from labapp.gui.pages.capture.parts import button, whole, wrapped
 from labapp.gui.pages.capture.presenter import Choice, Preview, choice_in_words, refusal
 from labapp.gui.views.fields import FieldForm, NumberField
-from labapp.gui.views.labels import headed, plain_tip
+from labapp.gui.views.labels import Message, headed, plain_tip
 from labapp.session.session import Session
 
 MOST_HZ = 1e7
@@ -64,7 +64,7 @@ class ImportChoice(QWidget):
         )
         self.embed.toggled.connect(lambda _: self.edited.emit())
         layout.addWidget(self.embed)
-        self.choice_words = wrapped()
+        self.choice_words = Message(2)
         layout.addWidget(self.choice_words)
         row = QHBoxLayout()
         self.import_button = button("Import", "", do_import)
@@ -72,10 +72,10 @@ class ImportChoice(QWidget):
         row.addWidget(self.import_button)
         row.addWidget(button("Not this one", "Leave it, and see the session's frames", leave))
         layout.addLayout(row)
-        self.replace_words = wrapped()
-        layout.addWidget(self.replace_words)
         self.next_button = button(NEXT, NEXT_TIP, begin_next)
         layout.addWidget(self.next_button)
+        self.replace_words = wrapped()
+        layout.addWidget(self.replace_words)
         self.hide()
 
     def _form(self) -> FieldForm:

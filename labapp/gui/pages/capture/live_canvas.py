@@ -64,9 +64,9 @@ class LiveCanvas(QWidget):
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.setSpacing(2)
-        for widget in (self.alarms, self.tabs):
-            layout.addWidget(widget)
+        layout.addWidget(self.tabs)
         layout.addWidget(self.stack, 1)
+        layout.addWidget(self.alarms)  # below: what is above stays under the hand
         self.set_live(False)
 
     @property

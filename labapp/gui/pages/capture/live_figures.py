@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QFrame, QGridLayout, QHBoxLayout, QLabel, QVBoxLay
 from labapp.gui.digits import NOTHING, plain
 from labapp.gui.pages.capture.parts import button, wrapped
 from labapp.gui.theme import RED, is_dark
-from labapp.gui.views.labels import plain_label
+from labapp.gui.views.labels import Message, plain_label
 from labapp.session.alarms import Alarm
 from labapp.session.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.session.live_watch import Followed, Pace
@@ -139,7 +139,7 @@ class LiveFigures(QWidget):
         self._grid = QGridLayout()
         self._grid.setColumnStretch(1, 1)
         column.addLayout(self._grid)
-        self.words = wrapped()
+        self.words = Message(3)
         column.addWidget(self.words)
         self._labels: dict[tuple[int, int], QLabel] = {}
         self._looks: dict[QLabel, tuple[Look, bool]] = {}
@@ -158,11 +158,7 @@ class LiveFigures(QWidget):
 
     def show_words(self, words: str) -> None:
         """Say how measuring keeps up."""
-        if words != self.words.text():
-            self.words.setText(words)
-            # It grows where a line wraps, and does not shrink: what is below must not jump.
-            height = self.words.heightForWidth(self.words.width())
-            self.words.setMinimumHeight(max(self.words.minimumHeight(), height))
+        self.words.setText(words)
 
     def _label(self, row: int, column: int) -> QLabel:
         if (row, column) not in self._labels:
@@ -200,7 +196,7 @@ class LiveFigures(QWidget):
 
 
 class AlarmStrip(QFrame):
-    """What the operator must see, above the picture, and the button that says it was seen.
+    """What the operator must see, below the picture, and the button that says it was seen.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from labapp.errors import InputError
 from labapp.gui.pages.capture.parts import wrapped
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import NumberField
-from labapp.gui.views.labels import headed
+from labapp.gui.views.labels import Message, headed
 from labapp.gui.workspace import Workspace
 from labapp.session.live_watch import LiveWatch
 from labapp.session.streams import Stream, open_stream
@@ -59,7 +59,7 @@ class LiveStreams(QWidget):
         self._workspace, self._watch = workspace, watch
         self.boxes: dict[str, QCheckBox] = {}
         self.ports: dict[str, NumberField] = {}
-        self.words = {kind: wrapped() for kind in KINDS}
+        self.words = {kind: Message(2) for kind in KINDS}
         self._problems: dict[str, str] = {}
         self._tasks: dict[str, Task] = {}
         outer = QVBoxLayout(self)

@@ -22,12 +22,12 @@ from labapp.gui.pages.capture.live_figures import (
     figures,
     pace_in_words,
 )
-from labapp.gui.pages.capture.parts import ExposureBars, button, show_recording, wrapped
+from labapp.gui.pages.capture.parts import ExposureBars, button, show_recording
 from labapp.gui.pages.capture.plan_fields import PlanFields
 from labapp.gui.pages.capture.presenter import calibrated_px
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import headed, plain_label
+from labapp.gui.views.labels import Message, headed, plain_label
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
@@ -440,7 +440,7 @@ class LiveView(QObject):
         inner = QVBoxLayout(self.settings)
         inner.setContentsMargins(0, 0, 0, 0)
         self.figures = LiveFigures()
-        self.counts = wrapped()
+        self.counts = Message(2)
         inner.addWidget(self.figures)
         inner.addWidget(self.counts)
         fields = FieldForm()
@@ -457,7 +457,7 @@ class LiveView(QObject):
         self.bar = QWidget()
         layout = QVBoxLayout(self.bar)
         layout.setContentsMargins(8, 2, 8, 4)
-        self.state = wrapped()
+        self.state = Message(1)
         self.ring = QProgressBar()
         self.ring.setRange(0, 100)
         self.ring.setFixedWidth(RING_BAR_PX)
@@ -467,7 +467,7 @@ class LiveView(QObject):
         line.addWidget(plain_label("Before the trigger:"))
         line.addWidget(self.ring)
         layout.addLayout(line)
-        self.recording = wrapped()
+        self.recording = Message(2)
         layout.addWidget(self.recording)
         row = QHBoxLayout()
         self.record_button = button(

@@ -33,7 +33,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import headed, plain_label
+from labapp.gui.views.labels import headed, keep_room, plain_label
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media.recorder import Take, recordings_beside
@@ -465,11 +465,12 @@ class CapturePage(Page):
         self.chosen = ImportChoice(self.import_chosen, self.begin_next, self.cancel_choice)
         self.chosen.edited.connect(self._show_import)
         self.panel_layout.addWidget(self.chosen)
-        self._make_kept()
         self.exposure.hide()
+        keep_room(self.exposure)
         self.panel_layout.addWidget(self.exposure)
         self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
         self.panel_layout.addWidget(self.foot_switch)
+        self._make_kept()  # below the other buttons: it comes when a recording ends
         self.told_group, layout = headed("What was read")
         self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
         self.told.setColumnStretch(1, 1)

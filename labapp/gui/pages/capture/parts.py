@@ -19,7 +19,7 @@ from labapp.core.exposure import Exposure
 from labapp.gui.pages.capture.presenter import bars
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.fields import NumberField
-from labapp.gui.views.labels import headed, plain_label, plain_tip
+from labapp.gui.views.labels import Message, headed, plain_label, plain_tip
 
 
 class ExposureBars(QWidget):
@@ -39,7 +39,7 @@ class ExposureBars(QWidget):
             self.bars.append(bar)
             form.addRow(f"{name}:", bar)
         layout.addLayout(form)
-        self.verdict = wrapped()
+        self.verdict = Message(3)
         layout.addWidget(self.verdict)
 
     def show_exposure(self, exposure: Exposure, verdict: str, good: bool) -> None:

@@ -22,7 +22,7 @@ from labapp.core.pipeline import Settings
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
-from labapp.gui.views.labels import heading, plain_label, plain_tip, plain_words
+from labapp.gui.views.labels import Message, heading, plain_label, plain_tip, plain_words
 
 MOST_ROWS = 60
 COLUMNS_OF_BUTTONS = 3
@@ -56,25 +56,15 @@ class DotsPanel(QWidget):
         super().__init__()
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
-        self.seen, self.why, self.chosen = plain_words(), plain_words(), plain_words()
+        # The buttons stay under the hand, whatever there is to say.
+        self.seen, self.chosen, self.why = Message(3), Message(2), plain_words()
         self.fit = ResultTable("Fit before the last edit and after it")
-        for words in (self.seen, self.chosen):
-            # The buttons stay under the hand, whatever there is to say.
-            words.setMinimumHeight(2 * words.fontMetrics().lineSpacing())
-            words.setAlignment(Qt.AlignmentFlag.AlignTop)
         layout.addWidget(self.seen)
         layout.addWidget(heading("Put right"))
         layout.addWidget(self.chosen)
         layout.addLayout(self._sites())
         self.buttons: dict[str, QToolButton] = {}
         layout.addLayout(self._buttons(edits))
-        layout.addWidget(heading("Fit"))
-        layout.addWidget(self.why)
-        layout.addWidget(self.fit)
-        layout.addWidget(heading("Rows"))
-        self.rows = _RowList()
-        self.rows.itemSelectionChanged.connect(lambda: self.rows_chosen.emit(self.rows.chosen()))
-        layout.addWidget(self.rows)
         layout.addWidget(heading("Following frames"))
         self.most = NumberField(
             "At most", "frames", lowest=1, highest=1_000_000, decimals=0, optional=True,
@@ -84,6 +74,13 @@ class DotsPanel(QWidget):
         form.add(self.most)
         layout.addWidget(form)
         layout.addLayout(self._buttons(frames))
+        layout.addWidget(heading("Fit"))
+        layout.addWidget(self.why)
+        layout.addWidget(self.fit)
+        layout.addWidget(heading("Rows"))
+        self.rows = _RowList()
+        self.rows.itemSelectionChanged.connect(lambda: self.rows_chosen.emit(self.rows.chosen()))
+        layout.addWidget(self.rows)
         layout.addWidget(heading("Detector"))
         layout.addWidget(self._detector())
         layout.addStretch(1)

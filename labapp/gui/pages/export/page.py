@@ -37,7 +37,7 @@ from labapp.gui.pages.export.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.views.labels import heading, plain_tip, plain_words
+from labapp.gui.views.labels import heading, keep_room, plain_tip, plain_words
 from labapp.gui.views.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.meshes import SMALLEST_SPACING_MM
@@ -100,16 +100,18 @@ class ExportPage(Page):
         self.plan = made = plan(session, self.wish, self.workspace.frame)
         self.files.setText("\n".join(made.files) or "Nothing.")
         self.notes.setText("\n".join(made.notes))
-        self.notes.setVisible(bool(made.notes))
         self._boxes["solid"].setEnabled(self.wish.has_mesh)
-        for field in (self.first, self.last, self.every):
-            for widget in (field, field.label):
-                widget.setVisible(self.wish.which == "part")
+        part, drawn = self.wish.which == "part", self.wish.has_view
         film = "film" in self.wish.some("pictures")
-        drawn = self.wish.has_view
-        for one, shown in ((self.view, drawn), (self.picture_size, drawn), (self.rate, film)):
-            one.setVisible(shown)
-            one.label.setVisible(shown)
+        # Greyed, not hidden: what is below stays where it is.
+        for fields, used in (
+            ((self.first, self.last, self.every), part),
+            ((self.view, self.picture_size), drawn),
+            ((self.rate,), film),
+        ):
+            for one in fields:
+                one.setEnabled(used)
+                one.label.setEnabled(used)
         self._show_state()
 
     def _show_state(self) -> None:
@@ -295,8 +297,10 @@ class ExportPage(Page):
             "Measure the chosen frames that are not measured, or no longer stand",
             self.measure_again,
         )
+        keep_room(self.again_button)
         self.export_button = _button("Export", "", self.export)
-        for widget in (self.notes, self.why_not, self.again_button, self.export_button):
+        # The buttons stand above the words, which need more or less room.
+        for widget in (self.export_button, self.again_button, self.why_not, self.notes):
             self.panel_layout.addWidget(widget)
         self.panel_layout.addStretch(1)
 

@@ -21,7 +21,7 @@ from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place
 from labapp.gui.pages.page import Page
 from labapp.gui.views.cross_hair import CrossHairView
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
-from labapp.gui.views.labels import plain_label, plain_tip
+from labapp.gui.views.labels import Message, plain_label, plain_tip
 from labapp.gui.views.picture import DragPoint, PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -129,14 +129,14 @@ class LaserPage(Page):
         readings.setWordWrap(True)
         self.panel_layout.addWidget(readings)
         self.panel_layout.addWidget(self.table)
-        self.result = ResultTable("The laser that follows")
-        self.panel_layout.addWidget(self.result)
-        self.words = plain_label()
-        self.words.setWordWrap(True)
-        self.panel_layout.addWidget(self.words)
         self.use_button = QPushButton("Use these")
         self.use_button.clicked.connect(self.use)
         self.panel_layout.addWidget(self.use_button)
+        self.words = plain_label()
+        self.words.setWordWrap(True)
+        self.panel_layout.addWidget(self.words)
+        self.result = ResultTable("The laser that follows")
+        self.panel_layout.addWidget(self.result)
         self.panel_layout.addWidget(plain_label("In the rig now"))
         self.in_use = ResultTable("Laser in use")
         self.panel_layout.addWidget(self.in_use)
@@ -161,8 +161,7 @@ class LaserPage(Page):
         self.scale.set_value(10.0)
         self.scale.edited.connect(lambda _: self._dragged())
         self.picture_part.add(self.scale)
-        self.lengths = plain_label()
-        self.lengths.setWordWrap(True)
+        self.lengths = Message(2)
         self.picture_part.add_wide(self.lengths)
         self.add_button = QPushButton("Add as a reading")
         self.add_button.setToolTip("Put these lengths into the table, as one more reading")

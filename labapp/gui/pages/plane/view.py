@@ -154,6 +154,13 @@ class PlanePage(Page):
             self.find_axes,
         )
         form.add_wide(self.find_button)
+        form.add_wide(
+            self._button(
+                "Save the target for printing…",
+                "The target at true size (SVG): print it at 100 % and measure its unit",
+                self._choose_target,
+            )
+        )
         self.panel_layout.addWidget(form)
         help_text = plain_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
@@ -166,8 +173,6 @@ class PlanePage(Page):
         self.lock_with_session(self.unit)
 
     def _make_results(self) -> None:
-        self.result = ResultTable("What follows from the points and marks")
-        self.panel_layout.addWidget(self.result)
         model = FieldForm()
         self.model = ChoiceField(
             "Use",
@@ -177,24 +182,19 @@ class PlanePage(Page):
         self.model.edited.connect(self.choose_model)
         model.add(self.model)
         self.panel_layout.addWidget(model)
-        self.why = plain_label()
-        self.why.setWordWrap(True)
-        self.panel_layout.addWidget(self.why)
+        self.use_button = self._button("Use", "", self.use)
+        self.panel_layout.addWidget(self.use_button)
         self.words = plain_label()
         self.words.setWordWrap(True)
         self.panel_layout.addWidget(self.words)
-        self.use_button = self._button("Use", "", self.use)
-        self.panel_layout.addWidget(self.use_button)
+        self.result = ResultTable("What follows from the points and marks")
+        self.panel_layout.addWidget(self.result)
+        self.why = plain_label()
+        self.why.setWordWrap(True)
+        self.panel_layout.addWidget(self.why)
         self.panel_layout.addWidget(plain_label("In use now"))
         self.in_use = ResultTable("Image calibration in use")
         self.panel_layout.addWidget(self.in_use)
-        self.panel_layout.addWidget(
-            self._button(
-                "Save the target for printing…",
-                "The target at true size (SVG): print it at 100 % and measure its unit",
-                self._choose_target,
-            )
-        )
 
     def _button(self, words: str, tooltip: str, work: object) -> QPushButton:
         button = QPushButton(words)

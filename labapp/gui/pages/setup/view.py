@@ -22,7 +22,7 @@ from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
 from labapp.gui.views.bench import BenchView
 from labapp.gui.views.fields import FieldForm, NumberField, ResultTable, TextField
-from labapp.gui.views.labels import plain_label
+from labapp.gui.views.labels import Message, plain_label
 from labapp.gui.workspace import Workspace
 
 SETUP_FILES = "Set-up files (*.toml)"
@@ -79,7 +79,6 @@ class SetupPage(Page):
         for item, box in self.ticks.items():
             box.setChecked(item in ticked)
             self._times[item].setText(f"ticked {_clock(ticked[item])}" if item in ticked else "")
-            self._times[item].setVisible(item in ticked)
         self.tabs.setTabText(SAFETY_TAB, f"Safety {len(ticked.keys() & self.ticks)}/{len(SAFETY)}")
         self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems else "Bench")
         self.others.setText("\n".join(shown.others))
@@ -147,9 +146,9 @@ class SetupPage(Page):
             box.setAccessibleDescription(meaning)
             box.clicked.connect(lambda on, item=item: self._tick(item, on))
             layout.addWidget(box)
-            time = plain_label()
-            for label in (plain_label(meaning), time):
-                label.setWordWrap(True)
+            time, means = Message(1), plain_label(meaning)
+            means.setWordWrap(True)
+            for label in (means, time):
                 label.setIndent(24)
                 layout.addWidget(label)
             layout.addSpacing(4)
@@ -174,9 +173,6 @@ class SetupPage(Page):
         )
         self._filling = load, usual
         form.add_wide(row)
-        self.others = plain_label()
-        self.others.setWordWrap(True)
-        form.add_wide(self.others)
         for heading, entries in RIG:
             form.add_heading(heading)
             for entry in entries:
@@ -194,6 +190,9 @@ class SetupPage(Page):
         form.add_wide(row)
         self.table = ResultTable("What the bench lets through")
         form.add_wide(self.table)
+        self.others = plain_label()
+        self.others.setWordWrap(True)
+        form.add_wide(self.others)
         return form
 
     def _add_rig(self, form: FieldForm, entry: Entry) -> None:

@@ -16,7 +16,7 @@ from labapp.gui.pages.surface.presenter import (
 )
 from labapp.gui.tasks import Task
 from labapp.gui.views.fields import ChoiceField, FieldForm, ResultTable
-from labapp.gui.views.labels import heading, plain_label, plain_tip
+from labapp.gui.views.labels import heading, keep_room, plain_label, plain_tip
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
 
@@ -61,7 +61,8 @@ class SurfacePanel:
         self.trials = ResultTable("Errors of the correspondences tried")
         layout.addWidget(form)
         layout.addLayout(self._measuring())
-        for widget in (self.status, self.again, self.sizes, self.errors, self.provenance):
+        keep_room(self.progress, self.cancel, self.again)
+        for widget in (self.again, self.status, self.sizes, self.errors, self.provenance):
             layout.addWidget(widget)
         for widget in (self.verdict, self.trials):
             layout.addWidget(widget)

@@ -22,7 +22,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
 from labapp.gui.tasks import Control
 from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
-from labapp.gui.views.labels import heading, plain_label, plain_words
+from labapp.gui.views.labels import Message, heading, keep_room, plain_label, plain_words
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.workspace import Workspace
 from labapp.session.signals import Signals, read_signals
@@ -81,7 +81,6 @@ class TrendsPage(Page):
         self.spectrum.setVisible(bool(shown.spectrum))
         self.spectrum.show_curves(shown.spectrum, shown.spectrum_axis)
         self.spectrum_words.setText(shown.spectrum_words)
-        self.spectrum_words.setVisible(bool(shown.spectrum_words))
         self.signals_words.setText(shown.signals_words)
         self._show_signals(session.signals, session.read_only)
 
@@ -177,7 +176,7 @@ class TrendsPage(Page):
         layout.addWidget(heading("Mean ± standard deviation, range"))
         self.table = ResultTable("Statistics of the measures")
         layout.addWidget(self.table)
-        self.counted = plain_words()
+        self.counted = Message(3)
         layout.addWidget(self.counted)
         self.without = QCheckBox("Leave out frames that stand out")
         self.without.setToolTip(
@@ -220,14 +219,12 @@ class TrendsPage(Page):
         self.of = ChoiceField("Spectrum of", choices, tooltip="Shows oscillations of a measure")
         self.of.edited.connect(lambda key: self._wish(spectrum_of=key))
         self.panel_layout.addLayout(_labelled(self.of))
-        self.spectrum_words = plain_words()
-        self.spectrum_words.hide()
+        self.spectrum_words = Message(2)
         self.panel_layout.addWidget(self.spectrum_words)
 
     def _make_signals(self) -> None:
         self.panel_layout.addWidget(heading("Current and voltage"))
         self.signals_words = plain_words()
-        self.panel_layout.addWidget(self.signals_words)
         self.start = NumberField(
             "Starts at",
             "s",
@@ -252,7 +249,9 @@ class TrendsPage(Page):
         )
         row.addWidget(self.read_button)
         row.addWidget(self.forget_button)
+        keep_room(self.start, self.start.label, self.forget_button)
         self.panel_layout.addLayout(row)
+        self.panel_layout.addWidget(self.signals_words)
 
 
 def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
