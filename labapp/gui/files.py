@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from labapp.gui import dialogs, filming
+from labapp.gui.workspace import MISSING
 from labapp.session.database import SUFFIX, SessionInUse
 
 if TYPE_CHECKING:
@@ -162,7 +163,8 @@ class Files:
         self._window.workspace.show(session)
         missing = self._window.workspace.tried(lambda: session.missing_recording)
         if missing is not None:
-            self._window.say(f"The recording is not where it was: {missing}", True)
+            words = f"The recording is not where it was: {missing}"
+            self._window.workspace.say_wrong(MISSING, words)
 
     def list_recent(self) -> None:
         """List the sessions opened before, in the menu and on the welcome page."""

@@ -124,7 +124,7 @@ class LogPanel(QListWidget):
 class StatusLine(QWidget):
     """The last message, and how far the work under way is.
 
-    A problem stays until it was read, whatever is said after it.
+    A problem stays until it was read, or is over, whatever is said after it.
 
     Signals
     -------
@@ -173,6 +173,12 @@ class StatusLine(QWidget):
         elif self.unread:
             return
         self._show_message(text)
+
+    def settle(self, text: str) -> None:
+        """Take a problem off the line that is over, read or not; the log still has it."""
+        if text in self.unread:
+            self.unread.remove(text)
+            self._show_message(self.unread[-1] if self.unread else "")
 
     def mark_read(self) -> None:
         """Take the problems off the line."""

@@ -185,6 +185,8 @@ class SidePanel(QWidget):
             area = QScrollArea()
             area.setWidgetResizable(True)
             area.setFrameShape(QFrame.Shape.NoFrame)
+            # Where it came and went, words would wrap otherwise, and what is below them move.
+            area.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOn)
             area.setAccessibleName(f"{step.title}: parameters and results")
             area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
             area.setWidget(panel)

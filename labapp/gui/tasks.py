@@ -86,8 +86,10 @@ class Task:
         Its side of the talk.
     thread
         Where it runs.
-    on_part, on_done
-        Called on the GUI thread with parts and with the result.
+    on_part, on_done, on_failed
+        Called on the GUI thread with parts, with the result, and with why it failed.
+    kind
+        What work fails and goes well together: "Exporting", wherever to.
     """
 
     title: str
@@ -95,6 +97,8 @@ class Task:
     thread: threading.Thread
     on_part: Callable[[Any], None] | None
     on_done: Callable[[Any], None] | None
+    on_failed: Callable[[str], None] | None
+    kind: str
 
     @property
     def done(self) -> int:
@@ -121,12 +125,15 @@ class Tasks(QObject):
     progressed
         Tasks have gone on.
     failed
-        A task failed: its title and what to tell the operator.
+        A task failed: its title, what to tell the operator, and its kind.
+    settled
+        Work of a kind begins again: that it failed before no longer holds.
     """
 
     changed = Signal()
     progressed = Signal()
-    failed = Signal(str, str)
+    failed = Signal(str, str, str)
+    settled = Signal(str)
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -142,6 +149,8 @@ class Tasks(QObject):
         work: Work,
         on_done: Callable[[Any], None] | None = None,
         on_part: Callable[[Any], None] | None = None,
+        on_failed: Callable[[str], None] | None = None,
+        kind: str = "",
     ) -> Task:
         """Begin work in a thread of its own.
 
@@ -154,11 +163,16 @@ class Tasks(QObject):
         on_done, on_part
             Called on the GUI thread with what ``work`` returns, and with each part it hands over.
             Not called after a cancel or a failure.
+        on_failed
+            Called on the GUI thread with why it failed, to be shown beside what was pressed.
+        kind
+            A failure is forgotten when work of its kind begins again; empty: its title.
         """
         control = Control()
         thread = threading.Thread(target=_run, args=(work, control), name=title, daemon=True)
-        task = Task(title, control, thread, on_part, on_done)
+        task = Task(title, control, thread, on_part, on_done, on_failed, kind or title)
         self.active.append(task)
+        self.settled.emit(task.kind)
         thread.start()
         self._timer.start()
         self.changed.emit()
@@ -197,7 +211,9 @@ class Tasks(QObject):
             return
         self.active.remove(task)
         if kind == "failed":
-            self.failed.emit(task.title, value)
+            self.failed.emit(task.title, value, task.kind)
+            if task.on_failed is not None:
+                task.on_failed(value)
         elif kind == "done" and task.on_done is not None:
             task.on_done(value)
         self.changed.emit()

@@ -40,7 +40,7 @@ from labapp.gui.steps import STEPS, first_step, states
 from labapp.gui.theme import apply_theme
 from labapp.gui.views.tables import table_text
 from labapp.gui.views.timeline import Tick, Timeline
-from labapp.gui.workspace import Workspace
+from labapp.gui.workspace import MEASURING, Workspace
 from labapp.session.log import log_file
 
 if TYPE_CHECKING:
@@ -164,6 +164,7 @@ class MainWindow(QMainWindow):
         space.measured.connect(self._show_measured)
         space.frame_changed.connect(self._frame_changed)
         space.said.connect(self.say)
+        space.settled.connect(self.status_line.settle)
         space.asked.connect(self.menus.do)
         space.next_wanted.connect(self.files.begin_next)
         space.pedals_kept.connect(
@@ -339,13 +340,13 @@ class MainWindow(QMainWindow):
         session = self.workspace.session
         if session is None:
             return
-        if any(task.title == "Measuring" for task in self.workspace.tasks.active):
+        if any(task.title == MEASURING for task in self.workspace.tasks.active):
             self.say("Frames are being measured already")
             return
         try:
             _ = session.setup
         except InputError as error:
-            self.say(f"The set-up is not complete: {error}", True)
+            self.workspace.say_wrong(MEASURING, f"The set-up is not complete: {error}")
             return
         self.workspace.measure(frames)
 

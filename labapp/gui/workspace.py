@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+MEASURING, MISSING = "Measuring", "Recording"
+"""Causes of problems: see `Workspace.say_wrong`."""
+
 MEASURED_S = 0.25
 """What is measured behind the operator's back is shown no more often."""
 
@@ -47,6 +50,8 @@ class Workspace(QObject):
         Another frame is in view.
     said
         Something for the operator to read: a sentence, and whether it is a problem.
+    settled
+        What was said to be wrong no longer is: its words.
     asked
         An action of the window's menus is wanted, by its name.
     next_wanted
@@ -61,6 +66,7 @@ class Workspace(QObject):
     measured = Signal()
     frame_changed = Signal(int)
     said = Signal(str, bool)
+    settled = Signal(str)
     asked = Signal(str)
     next_wanted = Signal(object)
     pedals_kept = Signal(object)
@@ -77,7 +83,9 @@ class Workspace(QObject):
         self.changed.connect(self._forget)
         self.tasks = Tasks(self)
         self.tasks.changed.connect(self._show_end)
-        self.tasks.failed.connect(lambda title, why: self.said.emit(f"{title}: {why}", True))
+        self._problems: dict[str, str] = {}
+        self.tasks.failed.connect(lambda title, why, kind: self.say_wrong(kind, f"{title}: {why}"))
+        self.tasks.settled.connect(self.settle)
 
     @cached_property
     def foot_switches(self) -> FootSwitches:
@@ -92,6 +100,8 @@ class Workspace(QObject):
 
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""
+        for cause in list(self._problems):
+            self.settle(cause)
         if self.session is not None:
             self.closing.emit()
         if self.tasks.active:
@@ -139,23 +149,65 @@ class Workspace(QObject):
         if pool is not None:
             parallel.end_processes(pool)
 
-    def tried(self, work: Callable[[], T]) -> T | None:
-        """Do something short; a refusal is said in words and gives None."""
-        try:
-            return work()
-        except Exception as error:
-            self.said.emit(in_words(error), True)
-            return None
+    def say_wrong(self, cause: str, words: str) -> None:
+        """Tell of a problem that lasts until its cause is settled, or another session is open."""
+        self.settle(cause)
+        self._problems[cause] = words
+        self.said.emit(words, True)
 
-    def attempt(self, change: Callable[[Session], object]) -> bool:
-        """Change the session and tell everybody; False if it was refused, which is said."""
-        session = self.session
-        if session is None:
-            return False
+    def settle(self, cause: str) -> None:
+        """Take it that a problem is over, if there was one."""
+        words = self._problems.pop(cause, "")
+        if words:
+            self.settled.emit(words)
+
+    def tried(
+        self, work: Callable[[], T], cause: str = "", beside: Callable[[str], object] | None = None
+    ) -> T | None:
+        """Do something short; a refusal is said in words and gives None.
+
+        Parameters
+        ----------
+        work
+            What is done.
+        cause
+            What a refusal lasts as long as, see `say_wrong`; empty: until it was read.
+        beside
+            Shows a refusal beside what was pressed, too; called with nothing where all went well.
+        """
         try:
-            change(session)
+            done = work()
         except Exception as error:
-            self.said.emit(in_words(error), True)
+            words = in_words(error)
+            if cause:
+                self.say_wrong(cause, words)
+            else:
+                self.said.emit(words, True)
+            if beside is not None:
+                beside(f"▲ {words}")
+            return None
+        self.settle(cause)
+        if beside is not None:
+            beside("")
+        return done
+
+    def attempt(
+        self,
+        change: Callable[[Session], object],
+        cause: str = "",
+        beside: Callable[[str], object] | None = None,
+    ) -> bool:
+        """Change the session and tell everybody; False if it was refused, which is said.
+
+        Parameters
+        ----------
+        change
+            What is done to it.
+        cause, beside
+            As of `tried`.
+        """
+        session = self.session
+        if session is None or self.tried(lambda: (change(session),), cause, beside) is None:
             return False
         self.changed.emit()
         return True
@@ -245,7 +297,7 @@ class Workspace(QObject):
                 self._overview = seen
                 self.measured.emit()
 
-        task = self.tasks.start("Measuring", work, finished, kept)
+        task = self.tasks.start(MEASURING, work, finished, kept)
         self._measuring.append(task)
         return task
 

@@ -171,8 +171,13 @@ class LiveView(QObject):
                 raise ValueError(str(error)) from error
 
         self._opening = self.workspace.tasks.start(
-            f"Opening {name}", work, lambda _: self._opened(live)
+            f"Opening {name}",
+            work,
+            lambda _: self._opened(live),
+            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+            kind="Opening the camera",
         )
+        self.refused.setText("")
         self.live = live
         self._show_state()
         self.changed.emit()
@@ -239,6 +244,7 @@ class LiveView(QObject):
             for take in live.ended_takes():
                 self.workspace.said.emit(f"Recorded beside the session: {take.path.name}", False)
         self._ending.clear()
+        self.refused.setText("")
         self.live = None
         self.canvas.set_live(False)
         self.canvas.alarms.let_go()
@@ -436,6 +442,8 @@ class LiveView(QObject):
         row.addWidget(self.start_button)
         row.addWidget(self.find_button)
         layout.addLayout(row)
+        self.refused = Message(2)
+        layout.addWidget(self.refused)
         self.settings = QWidget()
         inner = QVBoxLayout(self.settings)
         inner.setContentsMargins(0, 0, 0, 0)

@@ -33,9 +33,9 @@ from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import headed, keep_room, plain_label
+from labapp.gui.views.labels import Message, headed, keep_room, plain_label
 from labapp.gui.views.picture import PictureView
-from labapp.gui.workspace import Workspace
+from labapp.gui.workspace import MISSING, Workspace
 from labapp.media.recorder import Take, recordings_beside
 from labapp.session.database import SUFFIX
 from labapp.session.record import Recording
@@ -328,6 +328,7 @@ class CapturePage(Page):
     def choose(self, path: Path) -> None:
         """Look at a recording, to import it."""
         self._last_folder = path.parent
+        self.refused.setText("")
         self.live_view.stop()
         if self._opening in self.workspace.tasks.active and self._opening is not None:
             self._opening.cancel()
@@ -346,7 +347,11 @@ class CapturePage(Page):
             self.workspace.changed.emit()
 
         self._opening = self.workspace.tasks.start(
-            f"Opening {path.name}", lambda _: Preview(path), opened
+            f"Opening {path.name}",
+            lambda _: Preview(path),
+            opened,
+            on_failed=lambda why: self.refused.setText(f"▲ {path.name}: {why}"),
+            kind="Opening a recording",
         )
 
     def choice(self) -> Choice | None:
@@ -399,7 +404,14 @@ class CapturePage(Page):
             self.workspace.said.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
             self.workspace.changed.emit()
 
-        self._importing = self.workspace.tasks.start(f"Importing {path.name}", work, done)
+        def failed(why: str) -> None:
+            if self.workspace.session is session:
+                self.refused.setText(f"▲ {path.name} is not imported: {why}")
+
+        self.refused.setText("")
+        self._importing = self.workspace.tasks.start(
+            f"Importing {path.name}", work, done, on_failed=failed, kind="Importing"
+        )
         self._listed = None  # one of them may be the session's own then
         self._show_import()
 
@@ -416,6 +428,7 @@ class CapturePage(Page):
     def _forget(self) -> None:
         """Forget what was to be imported into the session before."""
         self._listed = None
+        self.refused.setText("")
         self._drop_preview()
 
     def cancel_choice(self) -> None:
@@ -446,10 +459,22 @@ class CapturePage(Page):
         def done(_: object) -> None:
             if self.workspace.session is session:
                 self._seen = None
+                self.workspace.settle(MISSING)
                 self.workspace.said.emit(f"The recording is found at {path}", False)
                 self.workspace.changed.emit()
 
-        self.workspace.tasks.start(f"Comparing {path.name}", lambda _: session.relink(path), done)
+        def failed(why: str) -> None:
+            if self.workspace.session is session:
+                self.refused.setText(f"▲ {why}")
+
+        self.refused.setText("")
+        self.workspace.tasks.start(
+            f"Comparing {path.name}",
+            lambda _: session.relink(path),
+            done,
+            on_failed=failed,
+            kind="Comparing",
+        )
 
     # --- the panel ----------------------------------------------------------------------------
 
@@ -460,6 +485,8 @@ class CapturePage(Page):
             button("Choose a folder …", "A folder of images in order", self.choose_folder)
         )
         self.panel_layout.addLayout(row)
+        self.refused = Message(2)
+        self.panel_layout.addWidget(self.refused)
         self.panel_layout.addWidget(self.live_view.group)
         self._make_missing()
         self.chosen = ImportChoice(self.import_chosen, self.begin_next, self.cancel_choice)

@@ -185,6 +185,7 @@ class DotsPage(Page):
         """Let go of what is under the hand; a fit under way goes on."""
         self._in_view = False
         self.hand.release()
+        self.hand.give_up()  # a click that is asked for is not to follow into another session
         self.looking.stop()
 
     def picture(self) -> QPixmap:

@@ -61,6 +61,7 @@ class ExportPage(Page):
         self.plan: Plan | None = None
         self.written: Written | None = None
         self._writing: Task | None = None
+        self._failed = ""
         self._in_view: int | None = None
         self._boxes: dict[str, QCheckBox] = {}
         self._make_canvas()
@@ -128,7 +129,8 @@ class ExportPage(Page):
         )
         count = len(made.frames)
         ready = f"{count} frame{'s' * (count != 1)} will be written."
-        self.why_not.setText(f"▲ {why_not}" if why_not and not writing else why_not or ready)
+        wrong = "" if writing else why_not or self._failed
+        self.why_not.setText(f"▲ {wrong}" if wrong else why_not or ready)
         again = len(made.again) > 0 and not self.workspace.session.read_only
         self.again_button.setVisible(again)
         self.again_button.setEnabled(again and not measuring)
@@ -140,6 +142,7 @@ class ExportPage(Page):
 
     def _session_opened(self) -> None:
         self.written = self.plan = self._in_view = None
+        self._failed = ""
         self.folder.set_value("")
         self.wish = replace(self.wish, scheme="", first=0, last=0)
 
@@ -187,8 +190,15 @@ class ExportPage(Page):
                 self.workspace.said.emit(written.words, bool(written.problems))
                 self._show_state()
 
-        self.written = None
-        self._writing = self.workspace.tasks.start(f"Exporting to {folder.name}", work, done)
+        def failed(why: str) -> None:
+            if self.workspace.session is session:
+                self._failed = f"Not exported: {why}"
+                self._show_state()
+
+        self.written, self._failed = None, ""
+        self._writing = self.workspace.tasks.start(
+            f"Exporting to {folder.name}", work, done, on_failed=failed, kind="Exporting"
+        )
         self._show_state()
 
     def open_folder(self) -> None:

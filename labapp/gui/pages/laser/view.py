@@ -80,8 +80,12 @@ class LaserPage(Page):
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross, with the points to drag."""
+        self.refused.setText("")
         self.workspace.tasks.start(
-            "Loading the picture", lambda _: presenter.read_picture(path), self._show_picture
+            "Loading the picture",
+            lambda _: presenter.read_picture(path),
+            self._show_picture,
+            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
         )
 
     def add_reading(self) -> None:
@@ -149,6 +153,9 @@ class LaserPage(Page):
         load.setToolTip("A picture of the cross hair beside a scale")
         load.clicked.connect(self._choose_picture)
         self.picture_part.add_wide(load)
+        self.refused = Message(2)
+        self.workspace.opened.connect(lambda: self.refused.setText(""))
+        self.picture_part.add_wide(self.refused)
         self.scale = NumberField(
             "Scale length",
             "mm",

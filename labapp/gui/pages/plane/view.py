@@ -15,7 +15,7 @@ from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
 from labapp.gui.tasks import Control
 from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, ResultTable
-from labapp.gui.views.labels import plain_label, plain_tip
+from labapp.gui.views.labels import Message, plain_label, plain_tip
 from labapp.gui.views.picture import DragPoint, PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -72,7 +72,13 @@ class PlanePage(Page):
             self._show(image, None)
             self.find_axes()
 
-        self.workspace.tasks.start("Loading the picture", lambda _: read_picture(path), loaded)
+        self.refused.setText("")
+        self.workspace.tasks.start(
+            "Loading the picture",
+            lambda _: read_picture(path),
+            loaded,
+            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+        )
 
     def take_kept(self) -> None:
         """Show the picture that the session keeps, and the points in use."""
@@ -105,7 +111,13 @@ class PlanePage(Page):
             if self.view.picture is image:
                 self._place(presenter.with_unit(calibration, self._unit()))
 
-        self.workspace.tasks.start("Looking for O′ and the axes", work, found)
+        self.refused.setText("")
+        self.workspace.tasks.start(
+            "Looking for O′ and the axes",
+            work,
+            found,
+            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+        )
 
     def use(self) -> None:
         """Use what is shown."""
@@ -154,6 +166,9 @@ class PlanePage(Page):
             self.find_axes,
         )
         form.add_wide(self.find_button)
+        self.refused = Message(2)
+        self.workspace.opened.connect(lambda: self.refused.setText(""))
+        form.add_wide(self.refused)
         form.add_wide(
             self._button(
                 "Save the target for printing…",

@@ -57,6 +57,7 @@ class SetupPage(Page):
 
         self.tabs.currentChanged.connect(show_tab)
         show_tab(EXPERIMENT_TAB)
+        workspace.opened.connect(lambda: self.refused.setText(""))
         self.panel_layout.addWidget(self.tabs)
         self.lock_with_session(
             *(*self.rig_fields.values(), *self.record_fields.values(), *self.ticks.values()),
@@ -98,7 +99,9 @@ class SetupPage(Page):
 
     def load(self, path: Path) -> None:
         """Take the setup from a file."""
-        if self.workspace.attempt(lambda session: presenter.load_setup(session, path)):
+        if self.workspace.attempt(
+            lambda session: presenter.load_setup(session, path), "Loading", self.refused.setText
+        ):
             self.workspace.said.emit(f"Set-up loaded from {path.name}", False)
 
     def save(self, path: Path) -> None:
@@ -111,7 +114,7 @@ class SetupPage(Page):
             presenter.save_setup(session, path)
             return True
 
-        if self.workspace.tried(saved):
+        if self.workspace.tried(saved, "Saving", self.refused.setText):
             self.workspace.said.emit(f"Set-up saved as {path.name}", False)
 
     # --- within -----------------------------------------------------------------------------
@@ -173,6 +176,8 @@ class SetupPage(Page):
         )
         self._filling = load, usual
         form.add_wide(row)
+        self.refused = Message(2)
+        form.add_wide(self.refused)
         for heading, entries in RIG:
             form.add_heading(heading)
             for entry in entries:

@@ -159,7 +159,13 @@ class TrendsPage(Page):
             if self.workspace.session is session:
                 self.workspace.changed.emit()
 
-        self.workspace.tasks.start(title, work, done)
+        def failed(why: str) -> None:
+            if self.workspace.session is session:
+                self.signals_words.setText(f"▲ {why}")
+
+        self.workspace.tasks.start(
+            title, work, done, on_failed=failed, kind="Reading current and voltage"
+        )
 
     # --- the panel ----------------------------------------------------------------------------
 

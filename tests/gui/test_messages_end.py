@@ -1,0 +1,145 @@
+"""A message goes when its cause does, and a failure stands beside the button that was pressed."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import QPoint, QRect
+from PySide6.QtWidgets import QAbstractButton, QLabel
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.export import page as export_page
+from labapp.gui.pages.setup.view import BENCH_TAB
+from labapp.gui.window import MainWindow
+from tests.gui.conftest import CopySample, let_draw
+from tests.gui.hand import Hand
+
+BESIDE_PX = 90
+"""A message beside a button is no farther from it."""
+
+
+@pytest.fixture
+def opened(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> MainWindow:
+    assert window.files.open(copy_sample("thumb_tack"))
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    return window
+
+
+def stands_beside(label: QLabel, button: QAbstractButton) -> bool:
+    """Whether a message is in view, and close to a button."""
+    let_draw()
+    if not (label.isVisible() and button.isVisible()):
+        return False
+    one, other = (
+        QRect(each.mapTo(each.window(), QPoint()), each.size()) for each in (label, button)
+    )
+    return other.adjusted(0, -BESIDE_PX, 0, BESIDE_PX).intersects(one)
+
+
+def test_a_full_disk_is_forgotten_when_the_export_goes_well(
+    opened: MainWindow, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+):
+    opened.show_step("export")
+    page, write = opened.page, export_page.write
+    for box in page._boxes.values():
+        box.setChecked(False)
+    page._boxes["tables:measures"].setChecked(True)
+    page.folder.set_value(str(tmp_path / "first"))
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(export_page, "write", full)
+    page.export()
+    qtbot.waitUntil(lambda: "No space left" in opened.status_line.message.text())
+    assert "No space left" in page.why_not.text()
+    assert stands_beside(page.why_not, page.export_button)
+    assert page.export_button.isEnabled()
+    monkeypatch.setattr(export_page, "write", write)
+    page.folder.set_value(str(tmp_path / "second"))
+    page.export()
+    qtbot.waitUntil(lambda: page.written is not None)
+    assert opened.status_line.unread == []
+    assert "No space left" not in opened.status_line.message.text()
+    assert "No space left" not in page.why_not.text()
+    assert any("No space left" in line for line in opened.log_panel.texts())
+
+
+def test_what_was_wrong_with_one_session_is_not_said_of_the_next(
+    opened: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
+):
+    missing = opened.workspace.session.path.parent / "recording.tif"
+    moved = missing.rename(tmp_path / "moved.tif")
+    path = opened.workspace.session.path
+    opened.files.close()
+    opened.files.open(path)
+    assert "not where it was" in opened.status_line.message.text()
+    opened.files.open(copy_sample("gtaw"))
+    assert opened.status_line.unread == []
+    # Where it is found again it is not missed any more.
+    opened.files.open(path)
+    opened.show_step("capture")
+    assert "not where it was" in opened.status_line.message.text()
+    opened.page.relink(moved)
+    qtbot.waitUntil(lambda: opened.workspace.session.missing_recording is None)
+    qtbot.waitUntil(lambda: opened.status_line.unread == [])
+
+
+def test_a_click_that_was_asked_for_is_not_awaited_in_another_session(
+    opened: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    opened.show_step("dots")
+    page = opened.page
+    qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
+    page._at_pointer(page.add_at, "Click where the dot is")
+    assert "Click where" in page.dots_panel.chosen.text()
+    opened.files.open(copy_sample("gtaw"))
+    opened.show_step("dots")
+    qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
+    assert "Click where" not in page.dots_panel.chosen.text()
+    assert not page.hand.busy
+
+
+def test_an_incomplete_set_up_is_forgotten_when_frames_are_measured(
+    opened: MainWindow, tmp_path: Path
+):
+    sample = opened.workspace.session
+    whole, recording = sample.setup_text, sample.path.parent / "recording.tif"
+    assert opened.workspace.create(tmp_path / "new.labsession")
+    assert opened.workspace.attempt(lambda session: session.import_recording(recording))
+    opened.measure_frame()
+    assert "not complete" in opened.status_line.message.text()
+    assert opened.workspace.attempt(lambda session: session.set_setup(whole))
+    opened.measure_frame()
+    assert opened.status_line.unread == []
+    opened.files.close()  # it is not what this is about how long measuring takes
+
+
+def test_refused_files_are_told_beside_their_buttons(
+    opened: MainWindow, tmp_path: Path, qtbot: QtBot
+):
+    hand, wrong = Hand(opened), tmp_path / "wrong.toml"
+    wrong.write_text("nonsense")
+    opened.show_step("setup")
+    page = opened.page
+    page.tabs.setCurrentIndex(BENCH_TAB)
+    page.load(wrong)
+    assert "wrong.toml" in page.refused.text()
+    assert stands_beside(page.refused, hand.find("Load…"))
+    page.save(tmp_path / "right.toml")
+    assert page.refused.text() == ""
+    page.load(tmp_path / "right.toml")
+    assert opened.status_line.unread == []
+    opened.show_step("capture")
+    page = opened.page
+    page.choose(wrong)
+    qtbot.waitUntil(lambda: "wrong.toml" in page.refused.text())
+    assert stands_beside(page.refused, hand.find("Choose a file …"))
+    opened.show_step("plane")
+    page = opened.page
+    page.load(wrong)
+    qtbot.waitUntil(lambda: bool(page.refused.text()))
+    assert stands_beside(page.refused, hand.find("Find O′ and the axes"))
