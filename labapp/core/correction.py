@@ -16,7 +16,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from labapp.core.dots import BandPassSettings, Dots, Image, dot_at
+from labapp.core.band_pass import dot_at
+from labapp.core.dots import BandPassSettings, Dots, Image
 from labapp.core.lattice import Lattice, Site, find_holes
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 

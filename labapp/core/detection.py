@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from labapp.core.dots import BandPassSettings, Dots, Image, band_pass_dots
+from labapp.core.band_pass import band_pass_dots
+from labapp.core.dots import BandPassSettings, Dots, Image
 from labapp.core.lattice import GrowSettings, Lattice, grow_lattice
 from labapp.core.row_search import MaskRowsSettings, RowSearchSettings, mask_rows, search_rows
 from labapp.core.threshold_dots import (

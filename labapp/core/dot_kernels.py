@@ -88,16 +88,44 @@ def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
     return True
 
 
-@_compiled(_grey, _mask, _ints)
-def peaks(band: Grey, disc: BoolArray, pixels: IntArray) -> IntArray:
-    """Columns and rows, shape (2, n), of those of some pixels that none of a disc is over."""
-    found, count = np.empty((2, len(pixels)), np.int64), 0
-    for at in pixels:
-        v, u = at // band.shape[1], at % band.shape[1]
-        if _tops(band, disc, v, u):
+@_compiled(_grey, _grey, _mask)
+def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
+    """Columns and rows, shape (2, n), of pixels over the floor that none of a disc is over.
+
+    A floor of shape (1, 1) holds everywhere.
+    """
+    height, width = band.shape
+    found, count, level = np.empty((2, 256), np.int64), 0, floor[0, 0]
+    everywhere = floor.size == 1
+    for v in range(height):
+        for u in range(width):
+            if not band[v, u] > (level if everywhere else floor[v, u]):
+                continue
+            if not _tops(band, disc, v, u):
+                continue
+            if count == found.shape[1]:
+                more = np.empty((2, 2 * count), np.int64)
+                more[:, :count] = found
+                found = more
             found[0, count], found[1, count] = u, v
             count += 1
     return found[:, :count].copy()
+
+
+@_compiled(_grey, _ints, _ints, _f)
+def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
+    """Whether peaks are so many times more curved one way than the other; edges are mirrors."""
+    (height, width), made = band.shape, np.empty(len(u), np.bool_)
+    for k in range(len(u)):
+        above, below = abs(v[k] - 1), height - 1 - abs(height - 2 - v[k])
+        left, right = abs(u[k] - 1), width - 1 - abs(width - 2 - u[k])
+        own = 2.0 * band[v[k], u[k]]
+        across = own - band[v[k], left] - band[v[k], right]
+        along = own - band[above, u[k]] - band[below, u[k]]
+        skew = band[above, left] + band[below, right] - band[above, right] - band[below, left]
+        both = across * along - skew * skew / 16.0
+        made[k] = slender * (across + along) ** 2 > (1.0 + slender) ** 2 * both
+    return made
 
 
 @_inner
@@ -155,7 +183,7 @@ def centroids(
     width: FloatArray,
     reach: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Centroids and second moments of light round pixels: see `dots.centroids`.
+    """Centroids and second moments of light round pixels: see `band_pass.described`.
 
     Light is the image, blurred by a filter, over what is around it, another picture.
     """
@@ -204,9 +232,76 @@ def centroids(
     return offset, moment
 
 
+@_inner
+def _beside(image: Picture, v: int, u: int, away: int) -> float:
+    """Mean of the two pixels so far above and below one, or left and right, whichever is less.
+
+    Beyond an edge the picture is mirrored at its last pixel.
+    """
+    height, width = image.shape
+    above, below, left, right = v - away, v + away, u - away, u + away
+    if above < 0 or below >= height or left < 0 or right >= width:
+        above, below = abs(above), height - 1 - abs(height - 1 - below)
+        left, right = abs(left), width - 1 - abs(width - 1 - right)
+    along = float(image[above, u]) + float(image[below, u])
+    across = float(image[v, left]) + float(image[v, right])
+    return 0.5 * min(along, across)
+
+
+@_compiled_for(*((own, _f, _f, _f, _i) for own in (_grey, _byte)))
+def spikes(
+    image: Picture, over: float, size: float, sharper: float, reach: int
+) -> tuple[IntArray, FloatArray]:
+    """Pixels that no dot has: columns and rows, shape (2, n).
+
+    Light of dots that are Gaussians of this size or larger, however many, falls from a pixel to the
+    mean of two on both sides of it at most as one Gaussian does from its top. Spikes fall so many
+    times deeper, towards the darkest pixel of a square of half side ``reach``, and ``over`` grey
+    levels besides. Asked for are the pixels next to it and next to those, as some spikes are of two
+    by two pixels. The second array, shape (2, n), is how many times deeper each falls and what is
+    beside it, grey levels.
+    """
+    height, width = image.shape
+    found, told, count = np.empty((2, 64), np.int64), np.empty((2, 64)), 0
+    near, far = np.exp(0.5 / size**2), np.exp(2.0 / size**2)
+    far = far if far < 4.0 else np.inf  # dots so small have no light so far off
+    darkest = np.empty(height)
+    for v in range(height):
+        darkest[v] = float(image[v].min())
+    for v in range(height):
+        floor = darkest[max(v - 2, 0) : v + 3].min() + over  # of all that is beside this row
+        for u in range(width):
+            own = float(image[v, u])
+            if not own > floor:
+                continue
+            one, two = _beside(image, v, u, 1), _beside(image, v, u, 2)
+            if not own - min(one, two) > over:
+                continue
+            ground = own
+            for y in range(max(v - reach, 0), min(v + reach + 1, height)):
+                for x in range(max(u - reach, 0), min(u + reach + 1, width)):
+                    ground = min(ground, float(image[y, x]))
+            height_over, fit = own - ground - over, one
+            times = height_over / max(near * (one - ground), 1e-3 * height_over)
+            if times <= sharper:
+                times, fit = height_over / max(far * (two - ground), 1e-3 * height_over), two
+            elif far < np.inf:  # the pixel next to it may be a spike as well
+                fit = min(one, ground + far / near * (two - ground))
+            if not (height_over > 0.0 and times > sharper):
+                continue
+            if count == found.shape[1]:
+                more, further = np.empty((2, 2 * count), np.int64), np.empty((2, 2 * count))
+                more[:, :count], further[:, :count] = found, told
+                found, told = more, further
+            found[0, count], found[1, count] = u, v
+            told[0, count], told[1, count] = times, fit
+            count += 1
+    return found[:, :count].copy(), told[:, :count].copy()
+
+
 @_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))
 def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
-    """Largest difference of two filters among nine pixels round each (`quick_dots._nine`)."""
+    """Largest difference of two filters among nine pixels round each (`band_pass._nine`)."""
     side, made = narrow.shape[1], np.empty(len(u))
     patch, across = np.empty((side, side)), np.empty((2, side, 3))
     for k in range(len(u)):
@@ -231,9 +326,73 @@ def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -
     return made
 
 
+@_compiled_for(*((own, _i, _i) for own in (_grey, _byte)))
+def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
+    """Noise of a picture's tiles, shape (rows, columns): see `dot_size.local_noise`.
+
+    Every second pixel of every second row stands for the others.
+    """
+    height, width = image.shape
+    made = np.empty((rows, columns), np.float32)
+    for i in range(rows):
+        top, bottom = max(i * height // rows, 1), min((i + 1) * height // rows, height - 1)
+        for j in range(columns):
+            left, right = max(j * width // columns, 1), min((j + 1) * width // columns, width - 1)
+            some = np.empty(((bottom - top + 1) // 2) * ((right - left + 1) // 2), np.float32)
+            count = 0
+            for v in range(top, bottom, 2):
+                for u in range(left, right, 2):
+                    sides = float(image[v - 1, u]) + float(image[v + 1, u])
+                    sides += float(image[v, u - 1]) + float(image[v, u + 1])
+                    ends = float(image[v - 1, u - 1]) + float(image[v + 1, u + 1])
+                    ends += float(image[v - 1, u + 1]) + float(image[v + 1, u - 1])
+                    some[count] = abs(4.0 * float(image[v, u]) - 2.0 * sides + ends) / 6.0
+                    count += 1
+            made[i, j] = np.median(some)
+    return made
+
+
+@_compiled(_grey, _ints, _ints, _f)
+def answers(band: Grey, u: IntArray, v: IntArray, step: float) -> FloatArray:
+    """Largest value of a picture, made smaller ``step``-fold, about each pixel of the large one."""
+    height, width = band.shape
+    made = np.empty(len(u))
+    for k in range(len(u)):
+        x, y = round((u[k] + 0.5) / step - 0.5), round((v[k] + 0.5) / step - 0.5)
+        most = -np.inf
+        for at_y in range(max(y - 1, 0), min(y + 2, height)):
+            for at_x in range(max(x - 1, 0), min(x + 2, width)):
+                most = max(most, band[at_y, at_x])
+        made[k] = most
+    return made
+
+
+@_compiled(_f2, _f1, _f2, _f1, _f, _f)
+def parts(
+    places: FloatArray,
+    strength: FloatArray,
+    wholes: FloatArray,
+    of_whole: FloatArray,
+    within: float,
+    share: float,
+) -> BoolArray:
+    """Whether a whole lies within some distance of each place that has this share of its strength.
+
+    Places and wholes have shapes (n, 2) and (m, 2).
+    """
+    made = np.zeros(len(places), np.bool_)
+    for k in range(len(places)):
+        for m in range(len(wholes)):
+            x, y = places[k, 0] - wholes[m, 0], places[k, 1] - wholes[m, 1]
+            if x * x + y * y <= within * within and of_whole[m] >= share * strength[k]:
+                made[k] = True
+                break
+    return made
+
+
 @_compiled(_ints, _ints, _f)
 def first_of_each(u: IntArray, v: IntArray, within: float) -> IntArray:
-    """Numbers of the pixels that none before them is near that stays: `dots.first_of_each`."""
+    """Numbers of the pixels that none before them is near that stays."""
     kept = np.empty(len(u), np.int64)
     count = 0
     for k in range(len(u)):

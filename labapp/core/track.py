@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import types
 
+from labapp.core.band_pass import Exposure
 from labapp.core.boundary import Boundary
 from labapp.core.compiled import compiled
 from labapp.core.correspondence import Match
@@ -19,7 +20,6 @@ from labapp.core.dots import Image
 from labapp.core.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.pool_fit import Level, find_level
-from labapp.core.quick_dots import Exposure
 from labapp.core.ray_growth import UNLABELLED, Scene
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig

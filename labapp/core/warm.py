@@ -18,16 +18,17 @@ from dataclasses import replace
 import numpy as np
 
 from labapp.core import kernels, measures
+from labapp.core.band_pass import quick_dots
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.correspondence import Match, Trial
-from labapp.core.dots import Image, estimate_size
+from labapp.core.dot_size import estimate_size
+from labapp.core.dots import Image
 from labapp.core.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.lattice import Lattice
 from labapp.core.measures import scaled_errors
 from labapp.core.orientation import ways
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.pool_fit import Level, place_level
-from labapp.core.quick_dots import quick_dots
 from labapp.core.ray_growth import UNLABELLED, Scene
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
@@ -136,7 +137,7 @@ def _with_size(settings: Settings, image: Image) -> Settings:
     dots = settings.dots
     if dots.method != "band-pass" or dots.band_pass.size_px:
         return settings
-    size = estimate_size(np.asarray(image, np.float32))
+    size = estimate_size(image)
     band_pass = replace(dots.band_pass, size_px=size)
     return replace(settings, dots=replace(dots, band_pass=band_pass))
 

@@ -18,9 +18,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from threadpoolctl import ThreadpoolController
 
-from labapp.core.dots import Dots, Image, band_pass_dots
+from labapp.core.band_pass import Exposure, band_pass_dots, quick_dots
+from labapp.core.dots import Dots, Image
 from labapp.core.pipeline import Settings, measure
-from labapp.core.quick_dots import Exposure, quick_dots
 from labapp.core.values import FloatArray, IntArray
 from labapp.core.warm import WarmChain
 from labapp.media import open_source

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from labapp.core.band_pass import band_pass_dots
 from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
-from labapp.core.dots import band_pass_dots
 from labapp.core.lattice import grow_lattice
 from labapp.core.row_search import mask_rows, search_rows
 from labapp.core.threshold_dots import block_threshold_dots, wavelet_dots

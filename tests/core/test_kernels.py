@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core import dot_kernels, dots, kernels, level_kernels, quadric_kernels, ray_growth
+from labapp.core import (
+    dot_kernels,
+    dot_size,
+    dots,
+    kernels,
+    level_kernels,
+    quadric_kernels,
+    ray_growth,
+)
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.optics import (
     bisecting_gradient,
@@ -205,38 +213,110 @@ def picture() -> tuple[FloatArray, dots.Grey]:
     return place, image.astype(np.float32)
 
 
+def band_of(image: dots.Grey) -> dots.Grey:
+    return dot_size.blur(image, 1.5) - dot_size.blur(image, 3.0)
+
+
 def test_peaks_are_the_local_maxima() -> None:
-    band = dots.band_pass(picture()[1], 1.9)
-    v, u = dots.local_maxima(band, 3.0, 1.9)
-    found = dot_kernels.peaks(band, dots.peak_disc(1.9).astype(bool), np.flatnonzero(band > 3.0))
-    np.testing.assert_array_equal(found, [u, v])
-    doubled = np.concatenate([found, found + np.array([[1], [0]])], axis=1)
-    first = dot_kernels.first_of_each(*doubled, 2.0)
-    np.testing.assert_array_equal(first, np.flatnonzero(dots.first_of_each(*doubled, 2.0)))
+    band, disc = band_of(picture()[1]), dot_size.peak_disc(1.9)
+    highest = cv2.dilate(band, disc.astype(np.uint8))
+    for floor in (np.full((1, 1), 3.0, "f4"), np.full(band.shape, 3.0, "f4")):
+        found = dot_kernels.peaks(band, floor, disc)
+        np.testing.assert_array_equal(found[::-1], np.nonzero((band >= highest) & (band > 3.0)))
+    noise = random().normal(0, 1, (90, 700)).astype(np.float32)  # more peaks than room at first
+    found = dot_kernels.peaks(noise, np.full((1, 1), -9.0, "f4"), np.ones((3, 3), bool))
+    assert found.shape[1] == (noise >= cv2.dilate(noise, np.ones((3, 3)))).sum() > 256
 
 
-def test_centroids_are_those_of_the_whole_search() -> None:
+def test_pixels_that_share_a_peak_are_one() -> None:
+    u, v = np.array([5, 6, 30, 5, 31, 60]), np.array([5, 5, 9, 7, 11, 9])
+    np.testing.assert_array_equal(dot_kernels.first_of_each(u, v, 2.0), [0, 2, 4, 5])
+
+
+def test_ridges_are_long_at_any_angle_and_at_the_edge() -> None:
+    v, u = np.mgrid[:60, :80].astype(float)
+    for angle in np.linspace(0, np.pi, 9):
+        along = (u - 40) * np.cos(angle) + (v - 30) * np.sin(angle)
+        across = (v - 30) * np.cos(angle) - (u - 40) * np.sin(angle)
+        for times, long in ((2.0, False), (6.0, True)):
+            band = np.exp(-(across**2 + (along / times) ** 2) / 18).astype(np.float32)
+            assert dot_kernels.ridges(band, np.array([40]), np.array([30]), 10.0) == [long]
+    for at, times, long in ((0, 6.0, True), (79, 6.0, True), (0, 1.0, False)):
+        band = np.exp(-((u - at) ** 2 + ((v - 30) / times) ** 2) / 18).astype(np.float32)
+        assert dot_kernels.ridges(band, np.array([at]), np.array([30]), 10.0) == [long]
+
+
+def centroids_by_hand(
+    light: FloatArray, u: int, v: int, margin: int, width: float
+) -> tuple[float, float, float]:
+    """A window moved on to the light until it stays, in NumPy: column, row, second moment."""
+    wide = np.pad(np.maximum(light, 0.0), margin)
+    patch = wide[v : v + 2 * margin + 1, u : u + 2 * margin + 1].astype(float)
+    y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
+    at_u = at_v = 0.0
+    for _ in range(4):
+        weight = patch * np.exp(-((x - at_u) ** 2 + (y - at_v) ** 2) / (2 * width**2))
+        weight /= weight.sum() + 1e-12
+        mean_u, mean_v = (weight * x).sum(), (weight * y).sum()
+        square = (weight * (x**2 + y**2)).sum() - mean_u**2 - mean_v**2
+        at_u, at_v = at_u + 1.5 * (mean_u - at_u), at_v + 1.5 * (mean_v - at_v)
+        at_u, at_v = np.clip(at_u, -2, 2), np.clip(at_v, -2, 2)
+    return at_u, at_v, square
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1.1])
+def test_centroids_are_those_of_the_blurred_picture_over_what_is_around_it(sigma: float) -> None:
     place, image = picture()
     u, v = np.rint(place).astype(np.int64).T
     width = random().uniform(1.0, 2.2, len(u))
-    nothing, as_it_is = np.zeros_like(image), np.ones(1, np.float32)
-    made = dot_kernels.centroids(image, nothing, as_it_is, u, v, 6, width, 2.0)
-    wanted = dots.centroids(image, u, v, 6, width, 2.0)
-    for one, other in zip(made, wanted, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-9)
-
-
-def test_light_is_the_blurred_picture_over_what_is_around_it() -> None:
-    place, image = picture()
-    u, v = np.rint(place).astype(np.int64).T
-    width = random().uniform(1.0, 2.2, len(u))
-    around = cv2.GaussianBlur(image, (0, 0), 4.0, borderType=cv2.BORDER_REFLECT)
-    taps = cv2.getGaussianKernel(9, 1.1, cv2.CV_32F).ravel()
+    around = dot_size.blur(image, 4.0) if sigma else np.zeros_like(image)
+    taps = dot_size.kernel(sigma)
     light = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT) - around
-    made = dot_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
-    wanted = dots.centroids(light, u, v, 6, width, 2.0)
-    for one, other in zip(made, wanted, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-5)  # of single precision
+    offset, moment = dot_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
+    for k in range(len(u)):
+        wanted = centroids_by_hand(light, u[k], v[k], 6, width[k])
+        np.testing.assert_allclose([*offset[:, k], moment[k]], wanted, atol=1e-5)
+
+
+def test_noise_is_that_of_each_tile() -> None:
+    rng = random()
+    image = 50 + np.concatenate(
+        [rng.normal(0, 1.0, (200, 240)), rng.normal(0, 3.0, (200, 240))], axis=1
+    )
+    made = 1.4826 * dot_kernels.tile_noise(image.astype(np.float32), 2, 4)
+    np.testing.assert_allclose(made, [[1, 1, 3, 3]] * 2, rtol=0.08)
+    ramp = np.add.outer(np.arange(40.0), 3 * np.arange(50.0)).astype(np.float32)
+    np.testing.assert_allclose(dot_kernels.tile_noise(ramp, 2, 2), 0.0, atol=1e-4)
+    assert dot_kernels.tile_noise(ramp[:8, :8].copy(), 1, 1).shape == (1, 1)
+
+
+def test_spikes_are_pixels_that_no_dot_has() -> None:
+    image = picture()[1] + 20
+    hot = {(75, 49): 500.0, (0, 40): 90.0, (100, 88): 70.0, (101, 88): 70.0, (101, 89): 70.0}
+    for (u, v), height in hot.items():
+        image[v, u] += height
+    found, (times, beside) = dot_kernels.spikes(image, 6.0, 1.9, 1.5, 5)
+    assert set(zip(*found.tolist(), strict=True)) == set(hot)
+    assert (times > 1.5).all()
+    clean = picture()[1] + 20
+    for u, v, fit in zip(*found, beside, strict=True):
+        assert fit == pytest.approx(clean[v, u], abs=0.35 * max(float(clean[v, u]) - 20, 15))
+
+
+def test_answers_are_the_largest_about_the_same_place_in_smaller_pictures() -> None:
+    image = random().normal(0, 1, (60, 80)).astype(np.float32)
+    for step in (1, 2, 4):
+        small = cv2.resize(image, (80 // step, 60 // step), interpolation=cv2.INTER_AREA)
+        u, v = np.array([0, 33, 79]), np.array([0, 21, 59])
+        most = cv2.dilate(small, np.ones((3, 3)))
+        x, y = (np.rint((at + 0.5) / step - 0.5).astype(int) for at in (u, v))
+        np.testing.assert_array_equal(dot_kernels.answers(small, u, v, float(step)), most[y, x])
+
+
+def test_parts_have_a_whole_near_them() -> None:
+    places, wholes = np.array([[0.0, 0], [3, 0], [9, 0], [0, 4]]), np.array([[1.0, 0], [9, 3]])
+    made = dot_kernels.parts(places, np.array([1.0, 2, 1, 1]), wholes, np.array([1.0, 0.5]), 3, 0.6)
+    np.testing.assert_array_equal(made, [True, False, False, False])
 
 
 def test_the_finer_band_is_that_of_the_whole_picture() -> None:
@@ -264,6 +344,8 @@ def test_bytes_are_read_as_they_are() -> None:
     for made in (
         lambda own: dot_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
         lambda own: dot_kernels.finest(own, u, v, narrow, wide),
+        lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
+        lambda own: dot_kernels.tile_noise(own, 2, 3),
     ):
         for one, other in zip(made(coarse), made(coarse.astype(np.float32)), strict=True):
             np.testing.assert_array_equal(one, other)

@@ -1,16 +1,15 @@
-"""Quick dots are those of the default detector, and better placed where there is speckle."""
+"""Dots of a frame like the one before, whose exposure is known, are those of the whole search."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core.dots import BandPassSettings, band_pass_dots
-from labapp.core.quick_dots import Exposure, quick_dots
+from labapp.core.band_pass import Exposure, band_pass_dots, quick_dots
+from labapp.core.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
 
 SIZE_PX = 2.0
@@ -57,26 +56,19 @@ def test_light_is_the_same_round_the_dots_alone_and_over_the_whole_picture(
     exposure = Exposure.of(image, BandPassSettings())
     made = []
     for much in (np.inf, 0.0):
-        monkeypatch.setattr("labapp.core.quick_dots.MUCH", much)
+        monkeypatch.setattr("labapp.core.band_pass.MUCH", much)
         made.append(quick_dots(image, exposure, BandPassSettings()))
     np.testing.assert_allclose(made[0].image_px, made[1].image_px, atol=1e-4)
     np.testing.assert_allclose(made[0].size_px, made[1].size_px, atol=1e-3)
 
 
-def test_speckle_moves_them_less() -> None:
+def test_a_frame_with_its_own_exposure_has_the_same_dots() -> None:
     rng = np.random.default_rng(9)
-    exposure, off = None, []
-    for _ in range(2):
-        true = places(rng)
-        clean = frame(true, rng).astype(float) - 20.0
-        grain = cv2.GaussianBlur(rng.normal(0.0, 1.0, SHAPE), (0, 0), 0.9)
-        image = 20.0 + clean * (1 + 0.35 * grain / grain.std())
-        exposure = exposure or Exposure.of(image, BandPassSettings())
-        slow = band_pass_dots(image, BandPassSettings(size_px=exposure.size_px))
-        quick = quick_dots(image, exposure, BandPassSettings())
-        off.append([cKDTree(true).query(dots.image_px)[0].mean() for dots in (quick, slow)])
-    mine, its = np.mean(off, axis=0)
-    assert mine < 0.9 * its
+    image = frame(places(rng), rng, hot=6)
+    cold = band_pass_dots(image, BandPassSettings())
+    quick = quick_dots(image, Exposure.of(image, BandPassSettings()), BandPassSettings())
+    for one, other in zip(vars(cold).values(), vars(quick).values(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_frame_without_dots_has_none() -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from labapp.core.dots import BandPassSettings, band_pass_dots
+from labapp.core.band_pass import band_pass_dots
+from labapp.core.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
 
 SHAPE = (240, 320)
@@ -78,6 +80,58 @@ def test_hot_pixels_and_a_glow_are_not_dots() -> None:
     dots = band_pass_dots(frame, BandPassSettings())
     assert np.abs(offsets(dots.image_px, grid())).max() < 0.5
     assert len(dots) == len(grid())
+
+
+@pytest.mark.parametrize("size", [2.5, 5.5])
+@pytest.mark.parametrize("grain", [0.0, 0.3])
+def test_lobes_and_grains_of_a_dot_are_not_dots(size: float, grain: float) -> None:
+    rng = np.random.default_rng(8)
+    places = grid(5.0 * size)
+    round_it = np.linspace(0.0, 2 * np.pi, 5)[:4] + 0.3
+    lobes = np.stack([np.cos(round_it), np.sin(round_it)], axis=-1) * 1.15 * size
+    frame = 0.7 * draw(places, 0.45 * size, 130.0)
+    for lobe in lobes:
+        frame += draw(places + lobe, 0.45 * size, 130.0)
+    speckle = cv2.GaussianBlur(rng.normal(size=SHAPE), (0, 0), 0.8)
+    frame = np.maximum(frame * (1 + grain * speckle / speckle.std()), 0.0)
+    dots = band_pass_dots(frame + rng.normal(20.0, 1.5, SHAPE), BandPassSettings())
+    assert np.abs(offsets(places, dots.image_px)).max() < size  # none is false
+    away = np.abs(offsets(dots.image_px, places)).max(axis=1)
+    assert np.mean(away < size) > 0.98
+    assert np.median(away) < 0.2 * size
+    assert len(dots) <= len(places)
+
+
+@pytest.mark.parametrize("wide", [1, 2])
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom", "amid"])
+def test_a_bright_line_of_pixels_is_not_dots(side: str, wide: int) -> None:
+    rng = np.random.default_rng(7)
+    frame = draw(grid(), 1.6, 60.0) + rng.normal(10.0, 3.0, SHAPE)
+    line = {
+        "left": np.s_[:, :wide],
+        "right": np.s_[:, -wide:],
+        "top": np.s_[:wide],
+        "bottom": np.s_[-wide:],
+        "amid": np.s_[:, 140 : 140 + wide],
+    }[side]
+    frame[line] = rng.normal(80.0, 4.0, frame[line].shape)
+    dots = band_pass_dots(np.clip(frame, 0, 255).astype(np.uint8), BandPassSettings())
+    assert len(dots) == len(grid())
+    assert np.abs(offsets(dots.image_px, grid())).max() < 0.6
+
+
+@pytest.mark.parametrize("height", [60.0, 150.0, 230.0])
+@pytest.mark.parametrize("size", [1.4, 2.4])
+def test_a_hot_pixel_on_a_dot_does_not_delete_it(size: float, height: float) -> None:
+    rng = np.random.default_rng(12)
+    frame = draw(grid(), size, 50.0) + rng.normal(15.0, 1.5, SHAPE)
+    for u, v in grid()[::3]:
+        du, dv = rng.integers(-2, 3, 2)
+        frame[round(v) + dv, round(u) + du] += height
+    frame = np.clip(frame, 0, 255).astype(np.uint8)
+    dots = band_pass_dots(frame, BandPassSettings())
+    assert len(dots) == len(grid())
+    assert np.abs(offsets(dots.image_px, grid())).max() < 0.6
 
 
 def test_dots_close_together_do_not_pull_at_each_other() -> None:
