@@ -23,7 +23,6 @@ import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from labapp.errors import InputError
-from labapp.media.stored import regular_size
 from labapp.session.files import made_whole
 from labapp.session.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 
@@ -272,6 +271,8 @@ def new_session_path(path: str | os.PathLike[str]) -> Path:
 
 def _check_header(path: Path) -> int:
     """Version of a session file, told without SQLite, which would not say what is wrong."""
+    from labapp.media.stored import regular_size  # late: it loads what reads every recording
+
     try:
         regular_size(path)
         with path.open("rb") as file:
