@@ -66,8 +66,9 @@ def measure(
     if settings.scheme == "ers":
         return replace(found, status="no-match", reason="for the test")
     sizes = dict.fromkeys(Measures.__dataclass_fields__, 1.0)
-    height = float(len(dots) + 100 * len(lattice.blocked_rows))
-    return replace(found, measures=Measures(**{**sizes, "height_mm": height}))
+    sizes["height_mm"] = float(len(dots) + 100 * len(lattice.blocked_rows))
+    sizes["own_are_mm"] = np.nan
+    return replace(found, measures=Measures(**sizes))
 
 
 @pytest.fixture(autouse=True)

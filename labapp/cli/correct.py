@@ -323,6 +323,8 @@ def _compared(before: Measures | None, after: Measures | None) -> str:
     lines = []
     for label, name in TOLD.items():
         values = [getattr(measures, name, math.nan) for measures in (before, after)]
+        if name == "own_are_mm" and not any(map(math.isfinite, values)):
+            continue  # the scheme has none
         told = [f"{value:z8.4f}" if math.isfinite(value) else f"{'–':>8}" for value in values]
         lines.append(f"  {label:7}{told[0]} → {told[1]} mm")
     return "\n".join(lines)
