@@ -316,10 +316,7 @@ def test_a_write_that_takes_a_part_is_carried_on() -> None:
 FULL_DISK = """
     import resource, sys
     from labapp.core.coordinates import ImageCalibration
-    from labapp.core.measures import measure
-from labapp.core.pipeline import Measurement, Settings, reconstruct
-from labapp.core.reconstruction import Scheme
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+    from labapp.core.pipeline import Measurement
     from labapp.core.dots import Dots
     from labapp.errors import InputError
     from labapp.session.results import ResultsWriter
