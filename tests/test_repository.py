@@ -35,7 +35,7 @@ def relative(path: Path) -> str:
 def repository_files() -> Iterator[Path]:
     """Everything git would keep, told without git: a bare machine may have none."""
     for top in ROOT.iterdir():
-        if top.is_file():
+        if top.is_file() and top.name != ".git":  # a work tree has a file of that name
             yield top
     for folder in (".ci", "docs", "labapp", "resources", "sample_sessions", "tests"):
         for path in (ROOT / folder).rglob("*"):
