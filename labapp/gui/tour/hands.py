@@ -44,7 +44,7 @@ from labapp.gui.views.picture import PictureView
 from labapp.gui.views.view3d import InteractiveView, View3d
 from labapp.gui.window import MainWindow
 
-LONGEST_MS = 60_000
+LONGEST_MS = 300_000
 """What takes longer than this has gone wrong."""
 
 LOOK_MS = 5
