@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from labapp.core.values import BoolArray, IntArray
+from labapp.gui.views.scrubber import Tick
 
 if TYPE_CHECKING:
     from labapp.session.measured import Overview
@@ -35,6 +36,15 @@ WORDS = {
     Standing.DOUBTFUL: "in doubt: stands out, or changed since it was measured",
     Standing.NOT_MEASURABLE: "could not be measured",
 }
+
+TICKS = (
+    Tick(Standing.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
+    Tick(Standing.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
+    Tick(Standing.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
+    Tick(Standing.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
+    Tick(Standing.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
+)
+"""By `Standing`."""
 
 DOUBTFUL = (Standing.DOUBTFUL, Standing.NOT_MEASURABLE)
 """What an operator has to look at."""

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QByteArray, QEvent, QSize, Qt, QTimer, QUrl
@@ -34,31 +33,19 @@ from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.welcome import Welcome
 from labapp.gui.preferences import Preferences, change_preferences, recall_preferences
-from labapp.gui.standing import DOUBTFUL, Standing, next_frame, standings
+from labapp.gui.standing import DOUBTFUL, TICKS, next_frame, standings
 from labapp.gui.step_list import SidePanel, StepList
 from labapp.gui.steps import STEPS, first_step, states
 from labapp.gui.theme import apply_theme
 from labapp.gui.views.tables import table_text
-from labapp.gui.views.timeline import Tick, Timeline
+from labapp.gui.views.timeline import Timeline
 from labapp.gui.workspace import MEASURING, Workspace
 from labapp.session.log import log_file
-
-if TYPE_CHECKING:
-    pass
 
 REST = 4
 """After showing a change the window rests so many times as long as that took, for the hands."""
 
 LONGEST_REST_MS = 1000
-
-TICKS = (
-    Tick(Standing.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
-    Tick(Standing.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
-    Tick(Standing.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
-    Tick(Standing.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
-    Tick(Standing.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
-)
-"""By `Standing`."""
 
 LAYOUT_VERSION = 1
 

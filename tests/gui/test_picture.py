@@ -9,7 +9,8 @@ from PySide6.QtCore import QPoint, QPointF, QRectF, Qt
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.views.picture import DragPoint, PictureView, Tool, auto_levels, level_at
+from labapp.gui.views.drag_point import DragPoint
+from labapp.gui.views.picture import PictureView, Tool, auto_levels, level_at
 from tests.gui.conftest import KEPT, let_draw
 
 GREY = (np.add.outer(np.arange(120), np.arange(160)) % 251).astype(np.uint8)

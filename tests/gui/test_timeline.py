@@ -7,7 +7,8 @@ from PySide6.QtGui import QImage
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.standing import Standing, next_frame, standings
-from labapp.gui.views.timeline import Timeline, aggregated
+from labapp.gui.views.scrubber import aggregated
+from labapp.gui.views.timeline import Timeline
 from labapp.gui.window import TICKS
 from labapp.session.measured import Overview
 from labapp.session.schema import MEASURES

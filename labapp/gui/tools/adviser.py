@@ -17,9 +17,10 @@ from PySide6.QtWidgets import (
 from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
 from labapp.gui.tools.tool import ToolWindow, told
-from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.fields import ChoiceField, NumberField
 from labapp.gui.views.labels import headed, plain_label
 from labapp.gui.views.ranges import RangeField
+from labapp.gui.views.result_table import ResultTable
 from labapp.gui.views.sheet import Sheet
 from labapp.gui.views.tables import CellTable
 from labapp.session.advice import advice_files

@@ -16,10 +16,11 @@ from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import simulating
 from labapp.gui.tools.simulating import Preview
 from labapp.gui.tools.tool import ToolWindow, told
-from labapp.gui.views.fields import ChoiceField, NumberField, ResultTable
+from labapp.gui.views.fields import ChoiceField, NumberField
 from labapp.gui.views.labels import plain_label
 from labapp.gui.views.path_field import PathField
 from labapp.gui.views.picture import PictureView
+from labapp.gui.views.result_table import ResultTable
 from labapp.session.scenario import Scenario, read_scenario
 from labapp.session.simulate import begin_session, simulate
 from labapp.words import several

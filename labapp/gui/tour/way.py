@@ -157,7 +157,7 @@ def _film(hands: Hands) -> None:
     hands.press("Start")
     view = page.live_view
     hands.wait(lambda: view.updates > 20 and page.exposure.isVisible(), "live frames")
-    hands.wait(lambda: view.ring.value() == 100, "the seconds before a trigger")
+    hands.wait(lambda: view.bar.ring.value() == 100, "the seconds before a trigger")
     hands.wait(lambda: view.measured_s, "a live frame to be measured")
     hands.picture("live")
     _look_on(hands, page)

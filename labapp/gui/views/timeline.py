@@ -1,279 +1,28 @@
-"""The timeline: one tick a frame, the frame in view, playing and jumping. Quick for any length."""
+"""The timeline: one tick a frame, the frame in view, playing and jumping."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, QPointF, QRectF, QSignalBlocker, QSize, Qt, QTimer, Signal
-from PySide6.QtGui import (
-    QColor,
-    QHelpEvent,
-    QIcon,
-    QImage,
-    QKeyEvent,
-    QMouseEvent,
-    QPainter,
-    QPaintEvent,
-    QPalette,
-    QPen,
-    QPolygonF,
-    QResizeEvent,
-    QWheelEvent,
-)
+from PySide6.QtCore import QEvent, Qt, QTimer, Signal
+from PySide6.QtGui import QIcon, QPainter, QPalette, QResizeEvent
 from PySide6.QtWidgets import (
-    QAbstractSlider,
     QHBoxLayout,
     QSizePolicy,
     QSpinBox,
     QStyle,
-    QStyleOptionFocusRect,
     QToolButton,
-    QToolTip,
     QVBoxLayout,
     QWidget,
 )
 
 from labapp.gui.views.labels import plain_label
+from labapp.gui.views.scrubber import Scrubber, Tick
 
 PLAY_HZ = 30.0
 """Most frames a second while playing; every frame is shown."""
-
-GAP_FROM_PX = 4
-"""Ticks at least this wide stand apart."""
-
-RAIL_PX = 9
-"""Room above the ticks for the marker of the frame in view."""
-
-KEYS = "← → step through the frames, Page Up and Down go a tenth, Home End to the first and last"
-
-Shape = Sequence[tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class Tick:
-    """How ticks of one kind look.
-
-    Parameters
-    ----------
-    words
-        What it means.
-    short
-        The same in a word, where there is little room.
-    light, dark
-        Colour on a light and on a dark ground; empty for the palette's.
-    parts
-        (from, to) up the height, 0 at the foot and 1 at the top: shape tells as much as colour.
-    """
-
-    words: str
-    short: str
-    light: str
-    dark: str
-    parts: Shape
-
-
-def aggregated(kinds: npt.NDArray[np.int64], columns: int) -> npt.NDArray[np.int64]:
-    """The kind that each column of pixels shows: the greatest of its frames, shape (columns,).
-
-    Parameters
-    ----------
-    kinds
-        Of the frames, at least one, shape (n,).
-    columns
-        How many there are.
-    """
-    count = len(kinds)
-    first = np.arange(columns, dtype=np.int64) * count // columns
-    if count <= columns:
-        return np.asarray(kinds[first])
-    return np.asarray(np.maximum.reduceat(kinds, first))
-
-
-class Scrubber(QAbstractSlider):
-    """The ticks, and the frame in view on them; it knows positions, not what a frame is.
-
-    To a screen reader it is a slider, whose value is the position.
-
-    Signals
-    -------
-    moved
-        The operator went to a position, counted from 0.
-    """
-
-    moved = Signal(int)
-
-    def __init__(self, ticks: Sequence[Tick], parent: QWidget | None = None) -> None:
-        super().__init__(parent)
-        self._ticks = tuple(ticks)
-        self._kinds: npt.NDArray[np.int64] = np.zeros(0, np.int64)
-        self._picture: QImage | None = None
-        self.describe: Callable[[int], str] = lambda position: f"{position + 1}"
-        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
-        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-        self.setAccessibleName("Frames")
-        self.valueChanged.connect(self.moved)  # by a screen reader
-
-    def sizeHint(self) -> QSize:
-        """As wide as there is room, and high enough for the shapes to be told apart."""
-        return QSize(400, self.fontMetrics().height() * 2 + RAIL_PX)
-
-    def set_kinds(self, kinds: npt.NDArray[np.int64]) -> None:
-        """Show frames of these kinds, indices into the ticks, shape (n,)."""
-        if not np.array_equal(kinds, self._kinds):
-            self._kinds = np.asarray(kinds, np.int64)
-            self._picture = None
-            with QSignalBlocker(self):
-                self.setRange(0, max(0, len(kinds) - 1))
-            self._tell()
-            self.update()
-
-    def set_position(self, position: int) -> None:
-        """Mark the frame in view."""
-        with QSignalBlocker(self):
-            self.setValue(position)
-        self._tell()
-
-    def _tell(self) -> None:
-        seen = self.in_words(self.value()) if len(self._kinds) else "There are no frames"
-        self.setAccessibleDescription(f"{seen}. {KEYS}")
-
-    def in_words(self, position: int) -> str:
-        """A frame and how it stands."""
-        return f"{self.describe(position)}: {self._ticks[int(self._kinds[position])].words}"
-
-    @property
-    def kinds(self) -> npt.NDArray[np.int64]:
-        """Of the frames, indices into the ticks, shape (n,)."""
-        return self._kinds
-
-    @property
-    def position(self) -> int:
-        """Of the frame in view."""
-        return self.value()
-
-    def position_at(self, x: float) -> int:
-        """Position of the frame under a place across the widget, px."""
-        return max(0, min(len(self._kinds) - 1, int(x * len(self._kinds) / max(1, self.width()))))
-
-    def go_to(self, position: int) -> None:
-        """Go to the nearest position there is, as if the operator had."""
-        if len(self._kinds):
-            position = max(0, min(len(self._kinds) - 1, position))
-            if position != self.value():
-                self.moved.emit(position)
-
-    # --- drawing ----------------------------------------------------------------------------
-
-    def paintEvent(self, _event: QPaintEvent) -> None:
-        """Draw the ticks, made once for a width and kinds, and the marker over them."""
-        painter = QPainter(self)
-        if not len(self._kinds):
-            return
-        if self._picture is None:
-            self._picture = self._drawn()
-        painter.drawImage(QPointF(0, RAIL_PX), self._picture)
-        width = self.width() / len(self._kinds)
-        left = self.value() * width
-        middle = left + width / 2
-        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        ink = self.palette().color(QPalette.ColorRole.WindowText)
-        if width >= GAP_FROM_PX:
-            painter.setPen(QPen(ink, 1.5))
-            painter.drawRect(QRectF(left + 0.5, RAIL_PX, width - 1, self.height() - RAIL_PX - 1))
-        else:
-            painter.setPen(QPen(ink, 1.5))
-            painter.drawLine(QPointF(middle, RAIL_PX), QPointF(middle, self.height()))
-        painter.setPen(Qt.PenStyle.NoPen)
-        painter.setBrush(ink)
-        half = RAIL_PX * 0.6
-        corners = [(middle - half, 0.0), (middle + half, 0.0), (middle, RAIL_PX - 1.0)]
-        painter.drawPolygon(QPolygonF([QPointF(*corner) for corner in corners]))
-        if self.hasFocus():
-            option = QStyleOptionFocusRect()
-            option.initFrom(self)
-            self.style().drawPrimitive(
-                QStyle.PrimitiveElement.PE_FrameFocusRect, option, painter, self
-            )
-
-    def _drawn(self) -> QImage:
-        scale = self.devicePixelRatioF()
-        columns = max(1, round(self.width() * scale))
-        rows = max(8, round((self.height() - RAIL_PX) * scale))
-        kinds = aggregated(self._kinds, columns)
-        colours, masks = self._looks(rows)
-        pixels = np.where(masks[kinds].T, colours[kinds][None, :], np.uint32(0))
-        if columns / len(self._kinds) >= GAP_FROM_PX * scale:
-            frame = np.arange(columns) * len(self._kinds) // columns
-            pixels[:, 1:][:, frame[1:] != frame[:-1]] = 0
-        pixels = np.ascontiguousarray(pixels, np.uint32)
-        picture = QImage(
-            pixels.tobytes(), columns, rows, 4 * columns, QImage.Format.Format_ARGB32
-        ).copy()
-        picture.setDevicePixelRatio(scale)
-        return picture
-
-    def _looks(self, rows: int) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.bool_]]:
-        """Colour of each kind, shape (kinds,), and which rows of pixels it fills, (kinds, rows)."""
-        palette = self.palette()
-        dark = palette.color(QPalette.ColorRole.Window).lightness() < 128
-        plain = palette.color(QPalette.ColorRole.Shadow if not dark else QPalette.ColorRole.Mid)
-        colours, masks = [], []
-        up = 1 - (np.arange(rows) + 0.5) / rows
-        for tick in self._ticks:
-            name = tick.dark if dark else tick.light
-            colours.append((QColor(name) if name else plain).rgba())
-            fills = [(up >= foot) & (up <= top) for foot, top in tick.parts]
-            masks.append(np.any(fills, axis=0))
-        return np.array(colours, np.uint32), np.array(masks, bool)
-
-    def resizeEvent(self, event: QResizeEvent) -> None:
-        """Draw the ticks anew for another width."""
-        self._picture = None
-        super().resizeEvent(event)
-
-    def changeEvent(self, event: QEvent) -> None:
-        """Draw the ticks anew for another palette."""
-        if event.type() in (QEvent.Type.PaletteChange, QEvent.Type.StyleChange):
-            self._picture = None
-        super().changeEvent(event)
-
-    # --- going ------------------------------------------------------------------------------
-
-    def mousePressEvent(self, event: QMouseEvent) -> None:
-        """Go to the frame under the pointer."""
-        if event.button() == Qt.MouseButton.LeftButton:
-            self.go_to(self.position_at(event.position().x()))
-
-    def mouseMoveEvent(self, event: QMouseEvent) -> None:
-        """Scrub."""
-        if event.buttons() & Qt.MouseButton.LeftButton:
-            self.go_to(self.position_at(event.position().x()))
-
-    def wheelEvent(self, event: QWheelEvent) -> None:
-        """Step through the frames."""
-        steps = event.angleDelta().y() or event.angleDelta().x()
-        self.go_to(self.value() - (steps > 0) + (steps < 0))
-
-    def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Go a tenth of all frames with Page Up and Down; the other keys are the window's."""
-        page = max(1, len(self._kinds) // 10)
-        if event.key() == Qt.Key.Key_PageUp:
-            self.go_to(self.value() - page)
-        elif event.key() == Qt.Key.Key_PageDown:
-            self.go_to(self.value() + page)
-        else:
-            event.ignore()
-
-    def event(self, event: QEvent) -> bool:
-        """Tell of the frame under the pointer."""
-        if isinstance(event, QHelpEvent) and len(self._kinds):
-            position = self.position_at(event.pos().x())
-            QToolTip.showText(event.globalPos(), self.in_words(position), self)
-            return True
-        return super().event(event)
 
 
 class Timeline(QWidget):

@@ -189,7 +189,9 @@ def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, dev
     hand.choose(fields.trigger, "when told: Take a frame")
     qtbot.waitUntil(lambda: device.settings.trigger == "software" and not fields.waiting)
     qtbot.waitUntil(fields.shoot_button.isVisible)
-    qtbot.waitUntil(lambda: view.state.text().startswith("● Live, takes a frame when it is told"))
+    qtbot.waitUntil(
+        lambda: view.bar.state.text().startswith("● Live, takes a frame when it is told")
+    )
     taken = device.taken
     for count in (1, 2, 3):
         hand.click(fields.shoot_button)

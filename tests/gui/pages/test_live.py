@@ -312,12 +312,12 @@ def test_start_record_and_import_by_mouse_and_keys(
     assert page.title.text() == "Live: Simulated camera"
     assert page.picture_view.picture.shape == SHAPE
     assert window.menus.actions["record"].isEnabled()
-    qtbot.waitUntil(lambda: view.state.text().startswith("● Live"))
+    qtbot.waitUntil(lambda: view.bar.state.text().startswith("● Live"))
     qtbot.waitUntil(page.exposure.isVisible)
     page.setFocus()
     hand.press(Qt.Key.Key_Space)
     assert view.live.running is not None
-    assert view.record_button.text() == "■ End the recording"
+    assert view.bar.record_button.text() == "■ End the recording"
     assert not view.plan_fields.before.isEnabled()
     hand.press(Qt.Key.Key_M)
     qtbot.waitUntil(lambda: view.live.running.frames > 20)
@@ -350,7 +350,7 @@ def test_start_record_and_import_by_mouse_and_keys(
     qtbot.waitUntil(lambda: window.workspace.session.path == second)
     qtbot.waitUntil(lambda: window.workspace.session.recording is not None)
     assert len(window.workspace.session.frames) > 5
-    assert not page.kept_group.isVisible()
+    assert not page.kept.isVisible()
     with Session.open(session.path) as former:
         assert len(former.frames) == take.frames
         assert former.problems() == []
@@ -406,10 +406,10 @@ def test_faults_are_told_in_words(window: MainWindow, page: CapturePage, device,
     start(page, qtbot)
     view.trigger()
     device.unplug()
-    qtbot.waitUntil(lambda: view.state.text().startswith("▲ Not connected"))
+    qtbot.waitUntil(lambda: view.bar.state.text().startswith("▲ Not connected"))
     assert "unplugged. Trying to get it back" in said_in(window)
     device.plug()
-    qtbot.waitUntil(lambda: view.state.text().startswith("● Live"))
+    qtbot.waitUntil(lambda: view.bar.state.text().startswith("● Live"))
     assert "it is back after" in said_in(window)
     device.faults = Faults(garbage=1.0)
     qtbot.waitUntil(lambda: "not whole, left out" in said_in(window))
@@ -530,22 +530,22 @@ def test_recordings_made_besides_are_listed_when_the_session_is_opened_again(
     live = page.live_view.live
     page.live_view.trigger()
     qtbot.waitUntil(lambda: live.takes[0].frames > 10)
-    assert not page.kept_group.isVisible()
+    assert not page.kept.isVisible()
     answer("Finish and keep")
     window.menus.do("close")
     window.files.open(path)
     window.show_step("capture")
     hand = Hand(window)
-    assert page.kept_group.isVisible()
-    assert page.kept.editor.count() == 1
-    assert page.kept.value() == str(live.takes[0].path)
+    assert page.kept.isVisible()
+    assert page.kept.choice.editor.count() == 1
+    assert page.kept.choice.value() == str(live.takes[0].path)
     hand.button("Look at it")
     qtbot.waitUntil(lambda: page.preview is not None)
     hand.button("Import")
     session = window.workspace.session
     qtbot.waitUntil(lambda: session.recording is not None)
     assert len(session.frames) == live.takes[0].frames
-    qtbot.waitUntil(lambda: not page.kept_group.isVisible())
+    qtbot.waitUntil(lambda: not page.kept.isVisible())
 
 
 def test_a_camera_that_cannot_be_opened_is_told(
@@ -606,18 +606,18 @@ def test_a_file_that_is_chosen_takes_the_place_of_the_camera(
 def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePage, qtbot: QtBot):
     start(page, qtbot)
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
-    assert QApplication.focusWidget() is page.live_view.record_button
+    assert QApplication.focusWidget() is page.live_view.bar.record_button
     reached = check_round(window)
-    assert page.live_view.record_button in reached
+    assert page.live_view.bar.record_button in reached
     assert page.live_view.camera_fields.fields["rate_hz"].editor in reached
     window.resize(911, 512)  # 1366 × 768 at 150 %
     let_draw()
     for button in window.findChildren(QAbstractButton):
         if button.isVisible() and button.text():
             assert button.width() >= button.sizeHint().width() - 1, button.text()
-    assert window.page.live_view.record_button.isVisible()
+    assert window.page.live_view.bar.record_button.isVisible()
     # Whatever is to be said of the camera, the window does not grow beyond the screen.
     for words in (*(words for _, words in STATES.values()), *WAITS.values()):
-        page.live_view.state.setText(f"▲ {words}, 1000.0 frames/s")
+        page.live_view.bar.state.setText(f"▲ {words}, 1000.0 frames/s")
         let_draw()
         assert (window.width(), window.height()) == (911, 512), words

@@ -457,4 +457,4 @@ def test_every_part_by_keyboard_and_on_a_small_screen(
     for button in window.findChildren(QAbstractButton):
         if button.isVisible() and button.text():
             assert button.width() >= button.sizeHint().width() - 1, button.text()
-    assert page.live_view.record_button.isVisible()
+    assert page.live_view.bar.record_button.isVisible()

@@ -473,14 +473,6 @@ def _places_px(dots: Dots | None) -> FloatArray:
     return np.zeros((0, 2)) if dots is None else dots.image_px
 
 
-def told_of(take: Take, why_kept: str) -> str:
-    """What became of a recording that is not imported."""
-    return (
-        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, press New "
-        "session from this recording"
-    )
-
-
 def rays_of(setup: Setup | None) -> int | None:
     """How many rays the lens makes; None where the set-up is not complete."""
     return None if setup is None else setup.rig.pattern.rows * setup.rig.pattern.columns

@@ -8,7 +8,7 @@ from functools import partial
 
 import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
-from PySide6.QtWidgets import QHBoxLayout, QProgressBar, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout, QWidget
 
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
@@ -22,12 +22,13 @@ from labapp.gui.pages.capture.live_figures import (
     figures,
     pace_in_words,
 )
-from labapp.gui.pages.capture.parts import ExposureBars, button, show_recording
+from labapp.gui.pages.capture.parts import ExposureBars, button
 from labapp.gui.pages.capture.plan_fields import PlanFields
 from labapp.gui.pages.capture.presenter import calibrated_px
+from labapp.gui.pages.capture.record_bar import RecordBar
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import Message, headed, plain_label
+from labapp.gui.views.labels import Message, headed
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
@@ -57,9 +58,6 @@ TELL_S = 0.2
 
 RING, RING_PX = "#2fd39b", 15
 """Round the dots that are found: a colour of the dots page; points of the screen."""
-
-BUTTON_PX, RING_BAR_PX = 44, 130
-"""Least height of the buttons that are pressed in gloves; width of the bar beside them."""
 
 
 class LiveView(QObject):
@@ -122,7 +120,7 @@ class LiveView(QObject):
         picture.add(self._rings)
         self.canvas = LiveCanvas(workspace, picture, self._watch, self.acknowledge)
         self._make_group()
-        self._make_bar()
+        self.bar = RecordBar(self.trigger, self.mark, self.stop)
         workspace.changed.connect(self._set_limits)
         workspace.closing.connect(self._session_closes)
         workspace.tasks.changed.connect(self._show_state)
@@ -212,7 +210,7 @@ class LiveView(QObject):
         self._timer.start(TICK_MS)
         self._show_state()
         # Where Space records even as the key of what has the focus.
-        self.record_button.setFocus()
+        self.bar.record_button.setFocus()
 
     def stop(self) -> None:
         """Let go of the camera; what is being recorded is written to its end first."""
@@ -381,13 +379,8 @@ class LiveView(QObject):
 
     def _tell_figures(self, live: Live) -> None:
         self._told_s = time.monotonic()
-        self.state.setText(live.state_in_words())
+        self.bar.tell(live, self._room_byte)
         self.counts.setText(live.counts_in_words())
-        part, told = live.ring()
-        self.ring.setValue(round(100 * part))
-        self.ring.setFormat(told)
-        self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
-        self.recording.setText(live.recording_in_words(self._room_byte))
         if live.watch is not None:
             pace, came_hz = live.watch.pace(), live.rate_hz()
             self._show_figures(live.watch)
@@ -418,10 +411,9 @@ class LiveView(QObject):
         self.start_button.setEnabled(self.workspace.session is not None and not self._ending)
         self.settings.setVisible(runs)
         self.bar.setVisible(runs)
-        self.mark_button.setEnabled(recording)
         self.plan_fields.set_enabled(not recording)
         self.camera_fields.set_recording(recording)
-        show_recording(self.record_button, recording)
+        self.bar.show_recording(recording)
 
     def _make_group(self) -> None:
         self.group, layout = headed("Capture")
@@ -460,39 +452,6 @@ class LiveView(QObject):
         self.plan_fields.edited.connect(self._replan)
         inner.addWidget(fields)
         layout.addWidget(self.settings)
-
-    def _make_bar(self) -> None:
-        self.bar = QWidget()
-        layout = QVBoxLayout(self.bar)
-        layout.setContentsMargins(8, 2, 8, 4)
-        self.state = Message(1)
-        self.ring = QProgressBar()
-        self.ring.setRange(0, 100)
-        self.ring.setFixedWidth(RING_BAR_PX)
-        self.ring.setToolTip("How much from before the trigger is in memory")
-        line = QHBoxLayout()
-        line.addWidget(self.state, 1)
-        line.addWidget(plain_label("Before the trigger:"))
-        line.addWidget(self.ring)
-        layout.addLayout(line)
-        self.recording = Message(2)
-        layout.addWidget(self.recording)
-        row = QHBoxLayout()
-        self.record_button = button(
-            "● Record",
-            "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
-            self.trigger,
-        )
-        self.mark_button = button(
-            "Mark", "Note this moment beside the recording that runs (M)", self.mark
-        )
-        self.stop_button = button(
-            "Stop the camera", "Let go of the camera; a recording is written first", self.stop
-        )
-        for each, wide in ((self.record_button, 3), (self.mark_button, 1), (self.stop_button, 2)):
-            each.setMinimumHeight(BUTTON_PX)
-            row.addWidget(each, wide)
-        layout.addLayout(row)
 
     def take_key(self, key: Qt.Key) -> bool:
         """Do what a plain key means while live; whether it means anything."""

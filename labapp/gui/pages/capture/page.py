@@ -15,8 +15,8 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.dialogs import EVERYTHING, recordings
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
-from labapp.gui.pages.capture.import_choice import NEXT, NEXT_TIP, ImportChoice
-from labapp.gui.pages.capture.live import told_of
+from labapp.gui.pages.capture.import_choice import ImportChoice
+from labapp.gui.pages.capture.kept_recordings import KeptRecordings, told_of
 from labapp.gui.pages.capture.live_view import LiveView
 from labapp.gui.pages.capture.parts import ExposureBars, button, wrapped
 from labapp.gui.pages.capture.presenter import (
@@ -32,12 +32,10 @@ from labapp.gui.pages.capture.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.steps import Mark, State
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import ChoiceField, FieldForm
 from labapp.gui.views.labels import Message, headed, keep_room, plain_label
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import MISSING, Workspace
-from labapp.media.recorder import Take, recordings_beside
-from labapp.session.database import SUFFIX
+from labapp.media.recorder import Take
 from labapp.session.record import Recording
 from labapp.session.session import Session
 from labapp.words import several
@@ -225,22 +223,8 @@ class CapturePage(Page):
         self.chosen.show_choice(session, self.preview, working, measured)
         self.slider.setVisible(self.preview is not None and self.preview.frames > 1)
         if session is not None and session is not self._listed and not working:
-            self._list_kept(session)
-
-    def _list_kept(self, session: Session) -> None:
-        """List the recordings made beside the session that are not its own, the newest first."""
-        self._listed, folder = session, session.path.parent
-        others = [] if session.recording is None else [folder / session.recording.path]
-        others += [] if self.recording is None else [self.recording.path]
-        try:
-            found = recordings_beside(folder, session.path.stem)
-        except OSError:
-            found = []  # what is wrong with the folder is said where something is written in it
-        kept = [path for path in reversed(found) if path not in others]
-        self.kept.set_choices([(str(path), _kept_in_words(path)) for path in kept])
-        if kept:
-            self.kept.set_value(str(kept[0]))
-        self.kept_group.setVisible(bool(kept))
+            self._listed = session
+            self.kept.list_beside(session, self.recording)
 
     def _show_seen(self, seen: Seen) -> None:
         self.title.setText(seen.title)
@@ -372,9 +356,6 @@ class CapturePage(Page):
         if preview is not None and choice is not None and choice.count:
             self._import_next(preview.path, choice.frames, choice.rate_hz, choice.embed)
 
-    def _import_kept(self) -> None:
-        self._import_next(Path(self.kept.value()), ":", None, False)
-
     def _import_next(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
         former = self.workspace.session
         self.workspace.next_wanted.emit(path)
@@ -497,7 +478,11 @@ class CapturePage(Page):
         self.panel_layout.addWidget(self.exposure)
         self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
         self.panel_layout.addWidget(self.foot_switch)
-        self._make_kept()  # below the other buttons: it comes when a recording ends
+        # Below the other buttons: it comes when a recording ends.
+        self.kept = KeptRecordings(
+            self.choose, lambda path: self._import_next(path, ":", None, False)
+        )
+        self.panel_layout.addWidget(self.kept)
         self.told_group, layout = headed("What was read")
         self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
         self.told.setColumnStretch(1, 1)
@@ -512,26 +497,3 @@ class CapturePage(Page):
         )
         self.panel_layout.addWidget(self.missing)
         self.panel_layout.addWidget(self.find_button)
-
-    def _make_kept(self) -> None:
-        self.kept_group, layout = headed("Recorded besides")
-        form = FieldForm()
-        self.kept = ChoiceField("Beside the session", tooltip="Recordings not in the session")
-        form.add(self.kept)
-        layout.addWidget(form)
-        layout.addWidget(
-            button(
-                "Look at it",
-                "Show its frames, and choose which of them to import",
-                lambda: self.choose(Path(self.kept.value())),
-            )
-        )
-        layout.addWidget(button(NEXT, NEXT_TIP, self._import_kept))
-        self.kept_group.hide()
-        self.panel_layout.addWidget(self.kept_group)
-
-
-def _kept_in_words(path: Path) -> str:
-    """Name of a recording beside the session, and whether a session was begun with it."""
-    used = path.with_suffix(SUFFIX).exists()
-    return f"{path.name}, has a session of its own" if used else path.name

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import (
     QFormLayout,
     QLabel,
@@ -17,7 +16,6 @@ from PySide6.QtWidgets import (
 
 from labapp.core.exposure import Exposure
 from labapp.gui.pages.capture.presenter import bars
-from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.fields import NumberField
 from labapp.gui.views.labels import Message, headed, plain_label, plain_tip
 
@@ -79,14 +77,3 @@ def button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
     button.setToolTip(tip)
     button.clicked.connect(lambda _: work())
     return button
-
-
-def show_recording(pressed: QPushButton, recording: bool) -> None:
-    """Let the button that records say whether it does: by its words, its sign, and in red."""
-    pressed.setText("■ End the recording" if recording else "● Record")
-    palette, font = QPalette(), pressed.font()
-    if recording:
-        palette.setColor(QPalette.ColorRole.ButtonText, RED[is_dark(palette)])
-    font.setBold(True)
-    pressed.setPalette(palette)
-    pressed.setFont(font)

@@ -19,7 +19,8 @@ from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
 from labapp.gui.pages.dots.presenter import Figures, Need, Shown
 from labapp.gui.pages.page import Page
-from labapp.gui.views.picture import SHIFT, PictureView, Tool, arrow_step
+from labapp.gui.views.drag_point import SHIFT, arrow_step
+from labapp.gui.views.picture import PictureView, Tool
 from labapp.gui.workspace import Workspace
 
 NO_REFERENCE = "The reference is not known: can you tell it from other frames? Press Reference"

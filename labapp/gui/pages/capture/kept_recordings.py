@@ -1,0 +1,79 @@
+"""Recordings made beside a session that are not its own: to look at, or to begin a session with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from PySide6.QtWidgets import QVBoxLayout, QWidget
+
+from labapp.gui.pages.capture.import_choice import NEXT, NEXT_TIP
+from labapp.gui.pages.capture.parts import button
+from labapp.gui.views.fields import ChoiceField, FieldForm
+from labapp.gui.views.labels import headed
+from labapp.media.recorder import Take, recordings_beside
+from labapp.session.database import SUFFIX
+from labapp.session.session import Session
+
+
+class KeptRecordings(QWidget):
+    """Their list, seen where there are any.
+
+    Parameters
+    ----------
+    look
+        Shows the frames of one.
+    begin_next
+        Begins a session with one.
+    """
+
+    def __init__(
+        self, look: Callable[[Path], object], begin_next: Callable[[Path], object]
+    ) -> None:
+        super().__init__()
+        outer = QVBoxLayout(self)
+        outer.setContentsMargins(0, 0, 0, 0)
+        group, layout = headed("Recorded besides")
+        outer.addWidget(group)
+        form = FieldForm()
+        self.choice = ChoiceField("Beside the session", tooltip="Recordings not in the session")
+        form.add(self.choice)
+        layout.addWidget(form)
+        layout.addWidget(
+            button(
+                "Look at it",
+                "Show its frames, and choose which of them to import",
+                lambda: look(Path(self.choice.value())),
+            )
+        )
+        layout.addWidget(button(NEXT, NEXT_TIP, lambda: begin_next(Path(self.choice.value()))))
+        self.hide()
+
+    def list_beside(self, session: Session, running: Take | None) -> None:
+        """List those of a session, the newest first, without the one that runs."""
+        folder = session.path.parent
+        others = [] if session.recording is None else [folder / session.recording.path]
+        others += [] if running is None else [running.path]
+        try:
+            found = recordings_beside(folder, session.path.stem)
+        except OSError:
+            found = []  # what is wrong with the folder is said where something is written in it
+        kept = [path for path in reversed(found) if path not in others]
+        self.choice.set_choices([(str(path), _in_words(path)) for path in kept])
+        if kept:
+            self.choice.set_value(str(kept[0]))
+        self.setVisible(bool(kept))
+
+
+def told_of(take: Take, why_kept: str) -> str:
+    """What became of a recording that is not imported."""
+    return (
+        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, press New "
+        "session from this recording"
+    )
+
+
+def _in_words(path: Path) -> str:
+    """Name of a recording beside the session, and whether a session was begun with it."""
+    used = path.with_suffix(SUFFIX).exists()
+    return f"{path.name}, has a session of its own" if used else path.name
