@@ -6,6 +6,7 @@ import datetime
 import functools
 import sqlite3
 from collections import OrderedDict
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -184,7 +185,19 @@ class Results:
                 self._put_aside(frame, basis.scheme, former)
             _replace(connection, frame, basis.scheme, row, measurement)
 
-    def bring_back(self, frame: int) -> None:
+    def bring_back(self, changed: Collection[tuple[str, int]]) -> None:
+        """Have frames whose correction was changed give what they gave before with the same.
+
+        Parameters
+        ----------
+        changed
+            Kind and frame of the documents that were set.
+        """
+        for kind, frame in changed:
+            if kind == "correction":
+                self._bring_back(frame)
+
+    def _bring_back(self, frame: int) -> None:
         """Have a frame give what it gave with the dots and rows that it has now, if that is known.
 
         It is if it was measured since the session was opened, and set-up and settings are the same.

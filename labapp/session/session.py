@@ -7,7 +7,7 @@ and whatever happens before it returns leaves the session as it was.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -61,7 +61,7 @@ class Session:
         self._frames = Frames(database)
         self._pictures = KeptPictures(database)
         self._results = Results(database)
-        self._documents = Documents(database, self._bring_back)
+        self._documents = Documents(database, self._results.bring_back)
         self._overviews = Overviews(database, self._results)
         self._signals = KeptSignals(self._documents)
 
@@ -491,12 +491,6 @@ class Session:
 
     def _change(self, label: str, values: Mapping[Key, Any]) -> None:
         self._documents.change(label, values)
-
-    def _bring_back(self, keys: Collection[Key]) -> None:
-        """Have frames that are corrected as they were before give what they gave then."""
-        for kind, frame in keys:
-            if kind == "correction":
-                self._results.bring_back(frame)
 
     def _basis(self) -> Basis | None:
         try:
