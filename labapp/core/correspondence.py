@@ -238,7 +238,9 @@ def match_corrected(
                 "ambiguous-orientation",
                 f"{best.orientation} and {other.orientation} explain the dots alike",
             )
-    return _as_match(best.scene, best.hypothesis, best.orientation, reference)
+    # Which rays came back is told by the surface that is fitted to frames without a correction.
+    told = weigh(best.scene, best.hypothesis.labels) or best.hypothesis
+    return _as_match(best.scene, told, best.orientation, reference)
 
 
 def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:

@@ -13,6 +13,7 @@ from labapp.core.lattice import Lattice, Site
 from labapp.core.orientation import Orientation, ways
 from labapp.core.pool_fit import FitSettings, FittedPool
 from labapp.core.ray_growth import (
+    AS_LIKELY_FALSE,
     NEAR,
     UNLABELLED,
     Prediction,
@@ -286,11 +287,12 @@ def _rows_begun(scene: Scene, hypothesis: Hypothesis, most: int = 8) -> list[Hyp
     rays = predict(scene, hypothesis.pool, beyond)
     if len(stray) == 0 or len(rays.at) == 0:
         return found
-    distance, _ = surprises(scene, hypothesis.pool, rays, stray)
-    for pair in np.argsort(distance, axis=None)[:most]:
-        dot, ray = (int(k) for k in np.unravel_index(pair, distance.shape))
+    distance, surprise = surprises(scene, hypothesis.pool, rays, stray)
+    for pair in np.argsort(surprise, axis=None)[:most]:
+        dot, ray = (int(k) for k in np.unravel_index(pair, surprise.shape))
         at = tuple(rays.at[ray])
-        if distance[dot, ray] > NEAR or any(one.labels[at] == stray[dot] for one in found):
+        vague = surprise[dot, ray] > AS_LIKELY_FALSE
+        if vague or distance[dot, ray] > NEAR or any(one.labels[at] == stray[dot] for one in found):
             continue
         more = labels.copy()
         more[at] = stray[dot]

@@ -48,6 +48,9 @@ FALSE_PER_MM2 = 5e-4
 """False dots to be expected on the imaging plane: a few in a frame. Where a prediction is vague,
 one of them is as likely a cause of a dot as the ray."""
 
+AS_LIKELY_FALSE = -2 * np.log(2 * np.pi * FALSE_PER_MM2)
+"""−2 log likelihood, less the same constant as `surprises`, of a false dot."""
+
 MODEL_MM = 0.06
 """How far the right surface's dots may be off for no fault of theirs, mm."""
 
@@ -358,7 +361,7 @@ def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
     dot = np.arange(len(ray))
     least = surprise[dot, ray]
     taken = (np.argmin(surprise, axis=0)[ray] == dot) & (distance[dot, ray] < NEAR)
-    taken &= least + CLEAR < -2 * np.log(2 * np.pi * FALSE_PER_MM2)
+    taken &= least + CLEAR < AS_LIKELY_FALSE
     for axis, rivals in ((1, surprise), (0, surprise[:, ray])):
         if surprise.shape[axis] > 1:
             taken &= np.partition(rivals, 1, axis=axis).take(1, axis=axis) > least + CLEAR

@@ -188,19 +188,19 @@ a dot next to the absent centre dot: no hole in the rows is the reference any mo
 
 {{files}}
 
-`labapp reconstruct recording.mkv --setup setup.toml --out DIR` measures frames 0 and 1 (height
-within 3 %) and refuses frames 2 to 5. Who sees the whole run can put them right, for the rows
-stay where they are on the picture. Rows are counted from the bottom up, columns from left to
+`labapp reconstruct recording.mkv --setup setup.toml --out DIR` measures frames 0 to 4 (height
+within 3 %, from frame 2 on within 5 %) and refuses frame 5. Who sees the whole run can put it right,
+for the rows stay where they are on the picture. Rows are counted from the bottom up, columns from left to
 right, both from 1, as the program finds them here.
 
 | frame | status | reference (row, column) | on the picture (u, v) | rows to mark as blocked |
 | --- | --- | --- | --- | --- |
 | 0 | `ok` | (6, 8) is found | (278, 282) px | none |
 | 1 | `ok` | (6, 8) is found | (278, 281) px | none |
-| 2 | `no-match` | (6, 8) | (278, 281) px | 1, 2, 6, 7, 8 |
-| 3 | `no-match` | (6, 8) | (278, 281) px | 1, 2, 6, 7, 8 |
-| 4 | `no-match` | (6, 8) | (278, 281) px | 1, 2, 6, 7, 8 |
-| 5 | `no-match` | (6, 8) | (278, 282) px | 1, 2, 6, 7 |
+| 2 | `ok` | (6, 8) is found | (278, 281) px | 1, 2, 6, 7, 8 |
+| 3 | `ok` | (6, 8) is found | (278, 281) px | 1, 2, 6, 7, 8 |
+| 4 | `ok` | (6, 8) is found | (278, 281) px | 1, 2, 6, 7, 8 |
+| 5 | `ambiguous-rows` | (6, 8) | (278, 282) px | 1, 2, 6, 7 |
 
 The reference alone is what it takes; with the rows marked, a ray that the torch hid is not taken
 for one that missed the pool, and the measures come out closer: height within 2 % in every frame.
