@@ -16,7 +16,7 @@ from labapp.core.quality import Quality, judge_quality
 from labapp.media import GreyImage
 from labapp.session.scene import Scene, scene_of
 from labapp.session.setup import Setup
-from labapp.simulation.parallel import NICE, begin_worker, end_processes
+from labapp.simulation.parallel import begin_worker, end_processes
 
 JUDGED_S = 0.2
 """So long the verdict on a frame stands for those that are followed from it."""
@@ -67,9 +67,9 @@ class LiveMeasuring:
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
         spawn = multiprocessing.get_context("spawn")
-        given = _Chain(setup, settings, bit_depth)
+        given, nice = _Chain(setup, settings, bit_depth), 0  # its figures are looked at now
         self._pool = ProcessPoolExecutor(
-            1, spawn, initializer=begin_worker, initargs=(NICE, _begin, given)
+            1, spawn, initializer=begin_worker, initargs=(nice, _begin, given)
         )
 
     def measure(self, image: GreyImage, drawn: bool = False) -> LiveMeasurement:

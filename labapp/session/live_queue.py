@@ -15,7 +15,8 @@ from labapp.media.cameras import CameraFrame
 
 MOST = 32
 """So many frames wait at most; and so many right after one that was measured by itself are measured
-in their order, however old: the present one would be too far from it."""
+in their order, however old: the present one would be too far from it. Where one of those has to be
+measured by itself, too, the newest is next, or figures would become older and older."""
 
 SWING_S = 0.0125
 """Until twice as many have followed each other steps are no smaller: what they tell is then a whole
@@ -40,7 +41,7 @@ class FrameQueue:
         self._given_s = 0.0
         self._interval_s = self._took_s = 0.0
         self._in_order = self._followed = 0
-        self._is_behind = False
+        self._is_behind = self._is_old = False
 
     @property
     def every(self) -> int:
@@ -69,7 +70,8 @@ class FrameQueue:
             if not self._waiting:
                 self._in_order, self._is_behind = 0, False
                 return None
-            if self._in_order or not self._is_behind:
+            self._is_old = self._in_order > 0
+            if self._is_old or not self._is_behind:
                 self._in_order = max(self._in_order - 1, 0)
                 frame = self._waiting.popleft()
             else:
@@ -84,8 +86,10 @@ class FrameQueue:
         with self._turn:
             if not followed:
                 self._followed = 0
-                if self._waiting and self._waiting[0].arrived_s - self._given_s > FAR_S:
-                    # None that waits can be measured from this one; those after the next can be.
+                far = self._waiting and self._waiting[0].arrived_s - self._given_s > FAR_S
+                if far or self._is_old:
+                    # None that waits can be measured from this one, or all are older still than
+                    # this one was; those after the next can be.
                     self._waiting.clear()
                     self._every, self._due, self._took_s = self._steps(SWING_S), 0, 0.0
                 self._in_order = len(self._waiting)

@@ -90,6 +90,15 @@ def test_after_a_frame_measured_by_itself_come_those_right_after_it_and_then_the
     assert set(np.diff([one.number for one in done if one.number > jumped.number + 700])) == {2}
 
 
+@pytest.mark.parametrize("lost", [1, 4, 20])
+def test_figures_never_grow_older_than_one_search_makes_them(lost: int) -> None:
+    """Frames that come after one that was searched for have to be searched for, too."""
+    cold = frozenset(range(101, 102 + lost))
+    done = measure(FrameQueue(), range(10_000), 0.006, cold=cold)
+    assert max(one.age_s for one in done) < COLD_S + 0.05
+    assert max(one.age_s for one in done[-1000:]) < 0.05
+
+
 def test_where_measuring_becomes_slow_it_is_never_behind_for_long() -> None:
     queue = FrameQueue()
     measure(queue, range(1000), 0.005)

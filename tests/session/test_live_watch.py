@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.session import live_watch
 from labapp.session.limits import Limits, Size, standing
-from labapp.session.live_measuring import LiveMeasurement
+from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring
 from labapp.session.live_watch import LiveWatch
 from labapp.session.scene import Scene, empty_scene
 from labapp.session.setup import Setup, read_setup
@@ -271,3 +273,10 @@ def test_a_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, told: Tol
         assert told[-1][0].words.startswith("ALARM: 2 frames in a row could not be measured: ")
     finally:
         watch.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "nice"), reason="the system knows no niceness")
+def test_what_measures_gives_way_to_nothing(setup: Setup):
+    """Behind other programs its figures would be a minute old; they are looked at now."""
+    with closing(LiveMeasuring(setup, Settings(), 8)) as measuring:
+        assert measuring._pool.submit(os.nice, 0).result() == os.nice(0)
