@@ -189,9 +189,9 @@ a dot next to the absent centre dot: no hole in the rows is the reference any mo
 {{files}}
 
 `labapp reconstruct recording.mkv --setup setup.toml --out DIR` measures frames 0 to 4 (height
-within 3 %, from frame 2 on within 5 %) and refuses frame 5. Who sees the whole run can put it right,
-for the rows stay where they are on the picture. Rows are counted from the bottom up, columns from left to
-right, both from 1, as the program finds them here.
+within 3 %, from frame 2 on within 5 %) and refuses frame 5. Who sees the whole run can put it
+right, for the rows stay where they are on the picture. Rows are counted from the bottom up, columns
+from left to right, both from 1, as the program finds them here.
 
 | frame | status | reference (row, column) | on the picture (u, v) | rows to mark as blocked |
 | --- | --- | --- | --- | --- |
