@@ -239,8 +239,9 @@ def match_corrected(
                 f"{best.orientation} and {other.orientation} explain the dots alike",
             )
     # Which rays came back is told by the surface that is fitted to frames without a correction.
-    told = weigh(best.scene, best.hypothesis.labels) or best.hypothesis
-    return _as_match(best.scene, told, best.orientation, reference)
+    told = weigh(best.scene, best.hypothesis.labels)
+    final = best.hypothesis if told is None else replace(best.hypothesis, witness=told.witness)
+    return _as_match(best.scene, final, best.orientation, reference)
 
 
 def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
