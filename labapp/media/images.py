@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
@@ -18,6 +20,7 @@ from labapp.pixels import MOST_PIXELS
 IMAGE_SUFFIXES = frozenset(
     ".png .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()
 ) | set(TIFF_SUFFIXES)
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 AN_IMAGE = f"a whole image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PGM"
 
 
@@ -98,25 +101,43 @@ def read_image(path: Path) -> GreyImage:
     # Read here rather than by OpenCV: it says why a file cannot be opened.
     try:
         regular_size(path)
-        content = np.fromfile(path, np.uint8)
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(path, "file", error.strerror, "a file that may be read") from error
-    if not content.size:
+    if not content:
         raise InputError(path, "size", "0 bytes", AN_IMAGE)
-    if content[:4].tobytes() in TIFF_MAGICS:
+    if content[:4] in TIFF_MAGICS:
         with TiffStack(path) as stack:
             if len(stack) > 1:
                 raise InputError(
                     path, "pages", len(stack), "one picture a file, or open the stack itself"
                 )
             return stack.frame(0).image
-    try:
-        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None or image.size == 0:
+    image = decoded(content)
+    if image is None:
         raise InputError(path, "content", "cannot be decoded", AN_IMAGE)
     return finite(path, to_grey(image))
+
+
+def decoded(content: bytes) -> npt.NDArray[Any] | None:
+    """The picture that an encoded one holds; None if it is damaged, or too large."""
+    if not content or _is_cut_off(content):
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError):
+        return None
+    return image if image is not None and image.size else None
+
+
+def _is_cut_off(content: bytes) -> bool:
+    """Whether a chunk of a PNG is longer than what is there; OpenCV makes room for all of it."""
+    at = len(PNG_MAGIC)
+    if content[:at] != PNG_MAGIC:
+        return False
+    while content[at + 4 : at + 8] not in (b"", b"IEND"):
+        at += 12 + int.from_bytes(content[at : at + 4], "big")
+    return at >= len(content)
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

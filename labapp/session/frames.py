@@ -22,6 +22,7 @@ import numpy.typing as npt
 from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource, GreyImage, open_source
+from labapp.media.images import decoded
 from labapp.media.stored import regular_size
 from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.session.blobs import MAGIC, pack, unpack_from
@@ -411,7 +412,7 @@ class Frames:
         if isinstance(content, bytes) and content.startswith(MAGIC):
             image = unpack_from(self._database.path, named, content, np.ndarray)
         else:
-            image = decoded(content)
+            image = decoded(content) if isinstance(content, bytes) else None
         if image is None or image.ndim != 2:
             raise InputError(self._database.path, named, "damaged", "what was written there")
         return np.asarray(image)
@@ -451,16 +452,6 @@ def _files(path: Path) -> list[Path]:
             p for p in path.parent.iterdir() if p.stem == path.stem and p.suffix.lower() in PAIRED
         )
     return [path]
-
-
-def decoded(content: object) -> npt.NDArray[Any] | None:
-    """The picture that an encoded one holds; None if it is damaged."""
-    if not isinstance(content, bytes) or not content:
-        return None
-    try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except (cv2.error, MemoryError):
-        return None
 
 
 def _encoded(image: npt.NDArray[Any]) -> bytes:

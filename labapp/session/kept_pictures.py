@@ -9,8 +9,8 @@ import numpy as np
 
 from labapp.errors import InputError
 from labapp.media import GreyImage
+from labapp.media.images import decoded
 from labapp.session.database import Database
-from labapp.session.frames import decoded
 
 
 class KeptPictures:
@@ -40,7 +40,7 @@ class KeptPictures:
         """A kept picture; see `Session.picture`."""
         content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)
         image = decoded(content) if _is_whole(content, sha256) else None
-        if image is None:
+        if image is None or image.ndim != 2:
             value = "missing" if content is None else "damaged"
             path = self._database.path
             raise InputError(path, "calibration picture", value, "what was kept there")

@@ -232,6 +232,26 @@ def tiff(path: Path, side: int) -> Path:
     return path
 
 
+@pytest.mark.parametrize("kind", [b"tEXt", b"IDAT"])
+def test_a_chunk_longer_than_its_picture_is_refused(tmp_path: Path, kind: bytes) -> None:
+    """OpenCV would make room for all that it says to be."""
+    path = tmp_path / "large.png"
+    content = cv2.imencode(".png", GREY)[1].tobytes()
+    end = content.index(b"IDAT") - 4
+    path.write_bytes(content[:end] + b"\x7f\0\0\0" + kind + content[end:])
+    script = """
+        import sys
+        from labapp.errors import InputError
+        from labapp.media import open_source
+        try:
+            open_source(sys.argv[1])
+            sys.exit("it was opened")
+        except InputError:
+            pass
+    """
+    assert peak_mb(script, path) < 400
+
+
 @pytest.mark.parametrize("write", [png, tiff])
 def test_a_picture_that_would_fill_the_memory_is_refused(
     tmp_path: Path, write: Callable[[Path, int], Path]
