@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import lzma
 import math
 import xml.etree.ElementTree as ET
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
@@ -43,6 +45,16 @@ MOST_BITS = 64 * MOST_PIXELS
 
 MAX_RATIO = 2000
 """No compression that is read makes a picture more times smaller than this."""
+
+UNPACKERS: dict[int, Callable[[], Any]] = {
+    8: zlib.decompressobj,
+    32946: zlib.decompressobj,
+    34925: lzma.LZMADecompressor,
+}
+"""By compression: Deflate and LZMA, of which tifffile unpacks all there is."""
+
+BY_TIFFFILE = {1, *UNPACKERS}
+"""Compressions left to tifffile. It may know others, without bounds: OpenCV has them."""
 
 MIN_IS_WHITE, MIN_IS_BLACK, RGB, COLOUR_FILTER = 0, 1, 2, 32803
 """Photometric interpretations whose levels are read as they are; others go through OpenCV."""
@@ -239,6 +251,7 @@ def _read_page(
         raise InputError(
             path, "samples a pixel", page.samplesperpixel, "1, or 3 and 4 with a colour space"
         )
+    _check_unpacked(path, page)
     image = _samples(path, page, offset)
     if image is None:
         return None
@@ -265,9 +278,19 @@ def _check_room(path: Path, page: tifffile.TiffPage, size: int) -> None:
         raise InputError(path, "content", f"{stored} bytes for {bits} bits", A_TIFF)
 
 
+def _check_unpacked(path: Path, page: tifffile.TiffPage) -> None:
+    """Refuse strips and tiles that unpack to more than they should hold."""
+    if (unpacker := UNPACKERS.get(page.compression)) is None:
+        return
+    most = math.prod(page.chunks) * -(-page.bitspersample // 8)
+    for at, count in zip(page.dataoffsets, page.databytecounts, strict=False):
+        if len(unpacker().decompress(read_bytes(path, at, count), most + 1)) > most:
+            raise InputError(path, "content", "more than its pages hold", A_TIFF)
+
+
 def _samples(path: Path, page: tifffile.TiffPage, offset: int | None) -> npt.NDArray[Any] | None:
     """Samples as tifffile orders them: (planes, depth, rows, columns, samples)."""
-    if page.dtype is None:
+    if page.dtype is None or page.compression not in BY_TIFFFILE:
         return None
     if offset is not None:
         kind = page.dtype.newbyteorder(page.parent.byteorder)

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import lzma
 import struct
 import subprocess
+import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import imageio_ffmpeg
@@ -14,6 +18,7 @@ from labapp.errors import InputError
 from labapp.media import open_source
 from tests.media.cine_writer import pack
 from tests.media.mutate import survives_damage
+from tests.scripts import peak_mb
 
 RNG = np.random.default_rng(14)
 GREY_8 = RNG.integers(0, 256, (5, 12, 17), np.uint8)
@@ -226,6 +231,30 @@ def test_what_cannot_be_is_named(tmp_path: Path, other: dict[str, int], said: st
     path.write_bytes(one_page(12, 17, 8, GREY_8[0].tobytes(), **other))
     with pytest.raises(InputError, match=said):
         open_source(path)
+
+
+@pytest.mark.parametrize(
+    ("compression", "packer"), [(8, zlib.compressobj), (34925, lzma.LZMACompressor)]
+)
+def test_a_strip_that_would_fill_the_memory_is_refused(
+    tmp_path: Path, compression: int, packer: Callable[[], Any]
+) -> None:
+    """The page is small; its one strip unpacks to 600 MB."""
+    path, zeros, packing = tmp_path / "run.tif", bytes(10**7), packer()
+    content = b"".join([packing.compress(zeros) for _ in range(60)]) + packing.flush()
+    path.write_bytes(one_page(12, 17, 8, content, t259=compression))
+    assert path.stat().st_size < 1e6
+    script = """
+        import sys
+        from labapp.errors import InputError
+        from labapp.media import open_source
+        try:
+            open_source(sys.argv[1])
+            sys.exit("it was opened")
+        except InputError as error:
+            assert "more than its pages hold" in str(error)
+    """
+    assert peak_mb(script, path) < 300
 
 
 def test_the_times_of_ome(tmp_path: Path) -> None:
