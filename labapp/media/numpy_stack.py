@@ -49,7 +49,12 @@ MOST_HELD = 2**30
 
 NOT_HELD = f"at most {MOST_HELD} bytes, or an array saved as it is (numpy.savez)"
 
+A_DEFLATED = "an array as numpy.savez or numpy.savez_compressed writes it"
+
 READ_BYTES = 2**20
+
+AS_NUMPY_DOES = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""How arrays are kept. Of other kinds zipfile unpacks all it has read at once, without bounds."""
 
 DEFLATE_RATIO = 1032
 """Deflate makes data at most so many times smaller."""
@@ -174,6 +179,9 @@ def _from_archive(
             for entry in archive.infolist()
             if entry.filename.endswith(".npy")
         }
+        for entry in members.values():
+            if entry.compress_type not in AS_NUMPY_DOES:
+                raise InputError(path, entry.filename, "packed by another program", A_DEFLATED)
         frames = _archived_frames(path, file, archive, members)
         time_s = rate = None
         if "time_s" in members:

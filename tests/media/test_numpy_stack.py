@@ -150,6 +150,18 @@ def test_a_compressed_array_that_would_fill_the_memory_is_refused(tmp_path: Path
     assert peak_mb(script, path) < 1000
 
 
+@pytest.mark.parametrize("packed", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_what_unpacks_without_bounds_is_refused(tmp_path: Path, packed: int) -> None:
+    """Of a few kilobytes zipfile makes gigabytes, however small it says that the array is."""
+    path = tmp_path / "run.npz"
+    array = io.BytesIO()
+    np.save(array, GREY)
+    with zipfile.ZipFile(path, "w", packed) as archive:
+        archive.writestr("frames.npy", array.getvalue())
+    with pytest.raises(InputError, match="packed by another program"):
+        open_source(path)
+
+
 @pytest.mark.parametrize(
     ("array", "said"),
     [
