@@ -145,10 +145,10 @@ def empty_lists() -> bytes:
     return blob_of(b'{"list":[' + b",".join([b'{"list":[]}'] * 8_000_000) + b"]}")
 
 
-def empty_of_a_long_type() -> bytes:
+def of_a_long_type() -> bytes:
     return blob_of(
-        b'{"list":[' + b",".join([b'{"array":["|V100000000",[1],0]}'] * 30) + b"]}",
-        bytes(99_000_000),
+        b'{"list":[' + b",".join([b'{"array":["|V60000000",[1],0]}'] * 50) + b"]}",
+        bytes(60_000_000),
     )
 
 
@@ -160,7 +160,7 @@ def surface(kind: str) -> bytes:
 
 @pytest.mark.parametrize(
     "forge",
-    [many_times, bytes_many_times, empty_lists, empty_of_a_long_type]
+    [many_times, bytes_many_times, empty_lists, of_a_long_type]
     + [functools.partial(surface, kind) for kind in ("ThinPlateSurface", "CloughTocherSurface")],
     ids=["arrays", "bytes", "lists", "type", "thin plate", "triangles"],
 )
