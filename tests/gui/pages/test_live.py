@@ -104,11 +104,12 @@ def test_the_newest_frame_is_given_once_and_judged(live: Live):
 
     live.open(SimulatedDevice("test", picture).open)
     wait_until(lambda: live.feed.counts.frames == 20)
-    shown = []
-    wait_until(lambda: bool(shown.append(live.newest()) or shown[-1]))
-    wait_until(lambda: not live._to_show)
-    shown += [last] if (last := live.newest()) else []
-    assert number_in(shown[-1].frame.image) == 19
+
+    def is_last() -> bool:
+        shown = live.newest()
+        return shown is not None and number_in(shown.frame.image) == 19
+
+    wait_until(is_last)
     assert live.newest() is None
     found = []
     wait_until(lambda: bool(found.append(live.looked()) or found[-1]))
