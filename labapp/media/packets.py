@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,12 @@ MOST_HEADERS_BYTE = 256
 
 MOST_AHEAD = 16
 """No codec stores a frame before more than these that are shown before it."""
+
+MOST_BYTES = 2**28
+"""An index unpacks to no more: six million frames."""
+
+ARRAYS = {"place": "i8", "key": "?", "seek": "i8", "number": "i8", "time_s": "f8"}
+"""What is kept of a `PacketTable` as arrays, and their types."""
 
 UNKNOWN = np.iinfo(np.int64).min
 """Stamp of a packet that has none."""
@@ -310,14 +317,22 @@ class PacketTable:
 
     @classmethod
     def from_bytes(cls, content: bytes, fingerprint: tuple[int, int]) -> Self | None:
-        """What `to_bytes` gave; None if it is damaged or made for another file."""
+        """What `to_bytes` gave; None if it is damaged, forged or made for another file."""
         head = len(MAGIC)
         body = content[head + 4 :]
         if content[:head] != MAGIC or content[head : head + 4] != zlib.crc32(body).to_bytes(
             4, "big"
         ):
             return None
-        content = zlib.decompress(body)
+        try:
+            table = cls._read(body, fingerprint)
+            return table if table is not None and _is_as_built(table) else None
+        except Exception:
+            return None  # of what was forged NumPy, zipfile and json say the most different things
+
+    @classmethod
+    def _read(cls, body: bytes, fingerprint: tuple[int, int]) -> Self | None:
+        content = zlib.decompressobj().decompress(body, MOST_BYTES)
         end = 4 + int.from_bytes(content[:4], "big")
         others = json.loads(content[4:end])
         if tuple(others.pop("fingerprint")) != fingerprint:
@@ -325,7 +340,30 @@ class PacketTable:
         others["shape"] = tuple(others["shape"])
         others["warnings"] = tuple(others["warnings"])
         with np.load(io.BytesIO(content[end:]), allow_pickle=False) as arrays:
-            return cls(**others, **{name: arrays[name] for name in arrays.files})
+            # What is stored as it is cannot be more than there is.
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in arrays.zip.infolist()):
+                return None
+            return cls(**others, **{name: arrays[name] for name in ARRAYS})
+
+
+def _is_as_built(table: Any) -> bool:
+    """Whether all is as `build` makes it: the index of a session may be anybody's."""
+    packets, frames = table.place.shape, table.time_s.shape
+    shapes = (packets, packets, (np.count_nonzero(table.key), 2), packets, frames)
+    arrays = [getattr(table, name) for name in ARRAYS]
+    size, rate = table.shape, table.frame_rate_hz
+    return (
+        [array.dtype for array in arrays] == list(ARRAYS.values())
+        and all(array.shape == shape for array, shape in zip(arrays, shapes, strict=True))
+        and len(packets) == len(frames) == 1
+        and -1 <= table.number.min() <= table.number.max() < frames[0]
+        and table.placed_by in ("pos", "pts", "dts")
+        and (rate is None or (isinstance(rate, float) and 0 < rate < np.inf))
+        and len(size) == 2
+        and all(type(each) is int for each in (*size, table.bit_depth))
+        and all(isinstance(each, str) for each in (table.description, *table.warnings))
+        and all(isinstance(each, bool) for each in (table.seekable, table.slice_crc))
+    )
 
 
 def _places(elapsed_s: FloatArray, timing: Timing, packets: Packets) -> IntArray:
