@@ -74,7 +74,7 @@ LARGEST_TREE = 8_000_000
 """Of these, bytes of JSON: every two of them may become a list of sixty bytes."""
 
 MOST_SURFACE_POINTS = 4000
-"""A surface is made from so many: the system of a thin plate grows with their square."""
+"""The surfaces of a value are made from so many: a thin plate's system grows with their square."""
 
 UNREADABLE = (
     *(zlib.error, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError),
@@ -232,6 +232,7 @@ class _Reader:
     def __init__(self, content: memoryview) -> None:
         self._content = content
         self._left = LARGEST
+        self._points_left = MOST_SURFACE_POINTS
 
     def read(self, tree: Any) -> Any:
         if not isinstance(tree, dict):
@@ -275,6 +276,7 @@ class _Reader:
         surface, _, hint, shape = SURFACES[kind]
         if not is_a(from_what, hint) or (shape and np.shape(from_what)[1:] != shape):
             raise TypeError(f"a {kind} of a {type(from_what).__name__}")
-        if shape and len(from_what) > MOST_SURFACE_POINTS:
-            raise ValueError(f"a {kind} through {len(from_what)} points")
+        self._points_left -= len(from_what) if shape else 0
+        if self._points_left < 0:
+            raise ValueError(f"its surfaces are made from more than {MOST_SURFACE_POINTS} points")
         return surface(from_what)

@@ -158,6 +158,15 @@ def surface(kind: str) -> bytes:
     return blob_of(tree, points.tobytes())
 
 
+def test_many_surfaces_are_made_from_no_more_points_than_one():
+    """Each of these takes seconds and hundreds of megabytes; a value may name one array often."""
+    points = np.random.default_rng(7).uniform(-3, 3, (1500, 3))
+    one = b'{"ThinPlateSurface":{"array":["<f8",[1500,3],0]}}'
+    assert len(unpack(blob_of(b'{"list":[%s]}' % b",".join([one] * 2), points.tobytes()))) == 2
+    with pytest.raises(Damaged, match="4000 points"):
+        unpack(blob_of(b'{"list":[%s]}' % b",".join([one] * 3), points.tobytes()))
+
+
 @pytest.mark.parametrize(
     "forge",
     [many_times, bytes_many_times, empty_lists, of_a_long_type]
