@@ -28,7 +28,7 @@ from labapp.session.drawing import VIEWS, Direction
 from labapp.session.files import as_bytes, beside
 from labapp.session.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.session.hdf5 import Hdf5Writer
-from labapp.session.meshes import FORMATS, SMALLEST_SPACING_MM, SPACING_MM
+from labapp.session.meshes import FORMATS, SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
 from labapp.session.pictures import (
     write_frame_picture,
     write_surface_picture,
@@ -311,6 +311,8 @@ def _write_results(
             process = stack.enter_context(drawing_process(choice.size_px, choice.view))
         for frame, time_s, measurement in measured:
             reconstruction = measurement.reconstruction
+            if reconstruction is not None and (choice.surfaces or choice.hdf5):
+                refuse_too_large(reconstruction, choice.spacing_mm)
             tables = frame_tables(frame, time_s, measurement, calibration)
             for name in choice.tables:
                 rows = csv_rows(name, tables[name])

@@ -17,12 +17,19 @@ import numpy.typing as npt
 from labapp.core.measures import surface_mesh
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.errors import InputError
 
 SPACING_MM = 0.1
 """Distance between the rings of a mesh, and between the nodes of a surface as CSV, mm."""
 
 SMALLEST_SPACING_MM = 0.05
 """STL's 32-bit numbers cannot tell apart the vertices of smaller rings."""
+
+MOST_NODES = 10_000_000
+"""A surface that is written has no more nodes: one in a stranger's session may be any size."""
+
+MOST_DRAWN = 300_000
+"""Nodes of a mesh that is only looked at."""
 
 BLOCK_MM = 1.0
 """How far the bottom of a block lies below the lowest point of the pool, mm."""
@@ -49,6 +56,34 @@ class Mesh:
 
     def __post_init__(self) -> None:
         freeze(self)
+
+
+def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:
+    """Refuse a surface that has more nodes than `MOST_NODES`, as a grid or as a mesh.
+
+    Raises
+    ------
+    InputError
+        If it has, or its size is not known.
+    """
+    count = len(reconstruction.boundary.points_mm)
+    width, length = np.ptp(reconstruction.boundary.points_mm[:, :2], axis=0)
+    mesh = _radius_mm(reconstruction) / spacing_mm * count
+    if not max(mesh, width / spacing_mm * length / spacing_mm) <= MOST_NODES:
+        size = f"{width:.6g} × {length:.6g} mm, {count} boundary points"
+        expected = f"a surface of at most {MOST_NODES} nodes, {spacing_mm:g} mm apart"
+        raise InputError("export", "surface", size, expected)
+
+
+def drawn_spacing(reconstruction: Reconstruction, spacing_mm: float) -> float:
+    """Distance of a mesh's rings for a picture, mm: wider where there would be `MOST_DRAWN`."""
+    rings = max(MOST_DRAWN // len(reconstruction.boundary.points_mm), 1)
+    return max(spacing_mm, _radius_mm(reconstruction) / rings)
+
+
+def _radius_mm(reconstruction: Reconstruction) -> float:
+    boundary = reconstruction.boundary
+    return float(np.hypot(*(boundary.points_mm[:, :2] - boundary.center_mm).T).max())
 
 
 def surface(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:

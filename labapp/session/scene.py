@@ -13,6 +13,7 @@ from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
 from labapp.core.values import FloatArray, IntArray, freeze
 from labapp.session.heights import difference_at, sigma_at
+from labapp.session.meshes import drawn_spacing
 
 EXAGGERATION = 3.0
 """Height over width by default: pools are flat."""
@@ -170,7 +171,8 @@ def _mesh(reconstruction: Reconstruction) -> tuple[FloatArray, IntArray]:
     thinned = replace(
         boundary, theta_deg=boundary.theta_deg[some], points_mm=boundary.points_mm[some]
     )
-    return surface_mesh(replace(reconstruction, boundary=thinned), SPACING_MM)
+    spacing_mm = drawn_spacing(reconstruction, SPACING_MM)
+    return surface_mesh(replace(reconstruction, boundary=thinned), spacing_mm)
 
 
 def _known(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:

@@ -321,6 +321,39 @@ def other_manifest(out: Path) -> None:
     (out / "manifest.json").write_text('{"program": "other", "files": []}')
 
 
+def huge(measured: Measurement, change: str) -> Measurement:
+    """A measurement as a stranger's session may have it; what is built of it has no end."""
+    found = measured.reconstruction
+    assert found is not None
+    boundary, count = found.boundary, len(found.boundary.points_mm)
+    changed = {
+        "wide": replace(boundary, points_mm=boundary.points_mm * 1e6),
+        "far": replace(boundary, center_mm=boundary.center_mm + 1e9),
+        "fine": replace(
+            boundary,
+            theta_deg=np.resize(boundary.theta_deg, 10**6),
+            points_mm=boundary.points_mm[np.arange(10**6) % count],
+        ),
+        "unknown": replace(boundary, points_mm=boundary.points_mm * np.nan),
+    }[change]
+    return replace(measured, reconstruction=replace(found, boundary=changed))
+
+
+@pytest.mark.parametrize("change", ["wide", "far", "fine", "unknown"])
+def test_a_surface_too_large_to_be_written_is_refused(
+    run: Run, tmp_path: Path, measured: Measurement, change: str
+) -> None:
+    frames = [(0, None, huge(measured, change))]
+    for choice in (
+        ExportChoice(frozenset(), frozenset({"csv"})),
+        ExportChoice(frozenset(), frozenset({"stl"})),
+        ExportChoice(frozenset(), frozenset(), hdf5=True),
+    ):
+        with pytest.raises(InputError, match="a surface of at most"):
+            run(tmp_path / "out", choice, frames)
+    assert list(tmp_path.iterdir()) == []
+
+
 CHANGES = {
     mine: "notes.txt is not in the manifest",
     changed: "measures.csv has ",

@@ -55,6 +55,14 @@ def test_surfaces_differ_only_where_both_are(pool: Reconstruction) -> None:
     np.testing.assert_allclose(difference, [0.2, 0.3 * (1 - 1 / 9) - 0.1, np.nan])
 
 
+@pytest.mark.parametrize("scale", [1, 1e3, 1e6])
+def test_a_huge_surface_is_drawn_with_no_more_nodes(pool: Reconstruction, scale: float) -> None:
+    """It is told in a stranger's session; what is built of it has bounds."""
+    boundary = replace(pool.boundary, points_mm=pool.boundary.points_mm * scale)
+    vertices, _ = scenes._mesh(replace(pool, boundary=boundary))
+    assert 1000 < len(vertices) < 1_000_000
+
+
 @pytest.mark.parametrize("angle_deg", [0.0, 37.0, 90.0, 180.0, -60.0])
 def test_a_section_ends_at_the_boundary(pool: Reconstruction, angle_deg: float) -> None:
     cut = profile(pool, angle_deg, 1.5)

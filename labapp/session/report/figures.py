@@ -17,6 +17,7 @@ from labapp.core.plane_calibration import PlaneCalibration
 from labapp.core.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.media import GreyImage
+from labapp.session.meshes import drawn_spacing
 from labapp.session.report.layout import DPI
 from labapp.simulation.plotting import INCHES, STYLE, as_bytes, new_figure, row_colour
 
@@ -248,7 +249,7 @@ def height_map(measurement: Measurement) -> bytes:
     found, size = measurement.reconstruction, measurement.measures
     assert found is not None
     assert size is not None
-    vertices, triangles = surface_mesh(found, 0.1)
+    vertices, triangles = surface_mesh(found, drawn_spacing(found, 0.1))
     # A surface that interpolates need not reach the boundary everywhere.
     triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
     x, y, z = np.nan_to_num(vertices).T
