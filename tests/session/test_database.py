@@ -295,6 +295,15 @@ def test_an_older_version_is_copied_and_brought_up_to_date(path: Path):
     assert kinds(Database.open(path)) == ["ONE"]  # and only once
 
 
+def test_a_link_in_the_place_of_the_lock_is_refused(path: Path, tmp_path: Path):
+    (tmp_path / "mine.txt").write_text("mine")
+    path.with_name(f".{path.name}.lock").unlink(missing_ok=True)
+    path.with_name(f".{path.name}.lock").symlink_to("mine.txt")
+    with pytest.raises(InputError):
+        Database.open(path)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
 @pytest.mark.usefixtures("next_version")
 def test_the_copy_of_an_older_version_follows_no_link(path: Path, tmp_path: Path):
     (tmp_path / "mine.txt").write_text("mine")
