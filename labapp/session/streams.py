@@ -256,6 +256,7 @@ class OpcuaStream:
 
     async def _start(self, server: Any) -> Any:
         await server.init()
+        server.iserver.max_connections = MOST_LISTENERS
         server.set_endpoint(self.address)
         server.set_server_name("labapp")
         server.set_security_policy([self._ua.SecurityPolicyType.NoSecurity])

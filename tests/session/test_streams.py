@@ -111,6 +111,38 @@ def test_too_many_listeners_are_refused_and_harm_nobody() -> None:
         assert connected[-1].recv(1) == b""
 
 
+def test_too_many_clients_of_opc_ua_are_refused_and_harm_nobody(port: int) -> None:
+    pytest.importorskip("asyncua")
+    script = f"""
+        import resource, sys
+        resource.setrlimit(resource.RLIMIT_NOFILE, (200, 200))
+        from labapp.session.streams import OpcuaStream
+        stream = OpcuaStream(port={port})
+        print("begun", flush=True)
+        sys.stdin.readline()
+        for frame in range(100):
+            with open(sys.executable, "rb"):
+                stream.publish({{"frame": frame}})
+        print(stream.listeners)
+        stream.close()
+    """
+    measuring = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={"PYTHONPATH": ":".join(sys.path)},
+    )
+    assert measuring.stdout is not None
+    with ExitStack() as stack:
+        assert measuring.stdout.readline() == b"begun\n"
+        connected = [stack.enter_context(connect(port)) for _ in range(300)]
+        assert connected[-1].recv(1) == b""  # refused, after all before it were answered
+        listeners, complained = measuring.communicate(b"go\n", PATIENCE_S)
+        assert (measuring.returncode, complained) == (0, b"")
+        assert int(listeners) <= 32  # who says nothing for half a minute is let go
+
+
 def test_who_does_not_read_is_told_what_it_missed_and_holds_nobody_up(lines: LineStream) -> None:
     idle, eager = listener(lines), listener(lines)
     padding = "x" * 10_000
