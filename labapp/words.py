@@ -11,8 +11,11 @@ def several(count: int, thing: str) -> str:
     return f"{count} {thing}{'s' * (count != 1)}"
 
 
-FORMULA = tuple("=+-@\t\r\n")
-"""A cell that begins so is a formula to a spreadsheet, which runs it; text may be anybody's."""
+FORMULA = tuple("=+-@＝＋－＠\t\r\n")
+"""A cell that begins so is a formula to a spreadsheet, which runs it; text may be anybody's.
+
+Signs of full width are the same to some.
+"""
 
 
 def as_cell(value: object) -> object:

@@ -227,7 +227,9 @@ def test_somebody_elses_file_is_not_replaced(out: Path, writer: Writer, run: str
     assert (out / "dots.csv").read_text() == "mine"
 
 
-@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t", "\r", "\n", "'=", "''-"])
+@pytest.mark.parametrize(
+    "start", ["=", "+", "-", "@", "\t", "\r", "\n", "'=", "''-", "＝", "＋", "－", "＠"]
+)
 def test_text_is_no_formula_and_numbers_are_numbers(
     out: Path, writer: Writer, unmeasured: Measurement, start: str
 ) -> None:
