@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 import re
 import sys
 import threading
@@ -337,7 +338,7 @@ class Recorder:
                 break
             path = wanted.with_stem(f"{wanted.stem}-{number}")
         for there in (path, notes_of(path)):
-            if there.exists():
+            if os.path.lexists(there):
                 raise InputError(there, "recording", "is there already", "another name")
         return path
 
@@ -423,7 +424,7 @@ def recording_path(folder: Path, stem: str) -> Path:
     """A file, not there yet, for a recording that begins now: its name ends in date and time."""
     begun = time.strftime("%Y-%m-%d-%H%M%S")
     path, count = folder / f"{stem}-{begun}.nut", 1
-    while path.exists() or notes_of(path).exists():
+    while os.path.lexists(path) or os.path.lexists(notes_of(path)):
         count += 1
         path = folder / f"{stem}-{begun}-{count}.nut"
     return path

@@ -125,9 +125,9 @@ class TakeFiles:
         row = (f"{time_s:.6f}", frame, as_cell(event.source), event.kind, as_cell(event.words))
         text = io.StringIO(newline="")
         try:
-            began = not self.take.notes.exists()
+            began = not self.take.notes.exists()  # or a link to nowhere, which `x` does not follow
             csv.writer(text, lineterminator="\n").writerows([NOTES, row] if began else [row])
-            with self.take.notes.open("a", encoding="utf-8", newline="") as file:
+            with self.take.notes.open("x" if began else "a", encoding="utf-8", newline="") as file:
                 file.write(text.getvalue())
         except OSError as error:
             if self._has_notes:

@@ -346,6 +346,29 @@ def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mine.nut", "mine-notes.csv"])
+def test_a_link_to_nowhere_is_not_followed(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).symlink_to("elsewhere")
+    with (
+        Recorder(lambda: tmp_path / "mine.nut", Plan(), 8, RATE_HZ) as recorder,
+        pytest.raises(InputError, match=f"{name}: recording: is there already"),
+    ):
+        recorder.trigger()
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_notes_follow_no_link_that_is_made_meanwhile(start: Start, tmp_path: Path) -> None:
+    heard = Heard()
+    with start(heard.append) as recorder:
+        take = recorder.trigger()
+        take.notes.symlink_to(tmp_path / "elsewhere")
+        for number in range(5):
+            recorder.take(frame(number))
+    assert take.frames == 5
+    assert any("not all notes can be written" in words for words in heard.words())
+    assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize("name", ["mine.nut", "mine-notes.csv"])
 def test_a_file_that_is_there_is_not_written_over(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("mine")
     with Recorder(lambda: tmp_path / "mine.nut", Plan(), 8, RATE_HZ) as recorder:
