@@ -22,6 +22,7 @@ from av.video.stream import VideoStream
 
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, check_index, rate_in_words
+from labapp.media.boxes import mp4_formats
 from labapp.media.ffv1 import slices_whole
 from labapp.media.luminance import bit_depth_of, grey_of
 from labapp.media.packets import (
@@ -47,7 +48,6 @@ READ_S = 8.0
 CONTAINERS = {
     "avi": "AVI",
     "matroska": "MKV",
-    "mov": "MP4",
     "mpegts": "MPEG-TS",
     "mpeg": "MPEG",
     "asf": "WMV",
@@ -61,7 +61,7 @@ CONTAINERS = {
     "ivf": "IVF",
     "yuv4mpegpipe": "Y4M",
 }
-"""What is opened, by FFmpeg's names. No playlists, which name other files, and no text."""
+"""What is opened besides MP4, by FFmpeg's names. No playlists (they name other files), no text."""
 
 CODECS = {
     "mjpeg": "MJPG",
@@ -403,7 +403,7 @@ class VideoSource(FrameSource):
         rate = self._rate()
         return ", ".join(
             [
-                CONTAINERS.get(container, container.upper()),
+                CONTAINERS.get(container, "MP4" if container == "mov" else container.upper()),
                 CODECS.get(codec, codec.upper()),
                 f"{columns}×{rows} px",
                 f"{bit_depth_of(frame)} bit {colour}",
@@ -433,7 +433,7 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
             options={
                 "fflags": "discardcorrupt",
                 "protocol_whitelist": "file",
-                "format_whitelist": ",".join((*CONTAINERS, "webm", "mp4")),
+                "format_whitelist": ",".join((*CONTAINERS, "webm", *mp4_formats(path))),
             },
             timeout=(READ_S, READ_S),
         )

@@ -1,0 +1,96 @@
+"""MP4s that promise more than they hold."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from labapp.errors import InputError
+from labapp.media import open_source
+from tests.scripts import peak_mb
+
+H264 = Path(__file__).parent / "data" / "h264.mp4"
+
+MANY = 30_000_000
+
+
+def box(kind: bytes, *content: bytes) -> bytes:
+    body = b"".join(content)
+    return struct.pack(">I", 8 + len(body)) + kind + body
+
+
+def changed(content: bytes, kind: bytes, at: int, *values: int) -> bytes:
+    """A file with other numbers behind the type of its first box of a kind."""
+    place = content.index(kind) + 4 + at
+    new = struct.pack(f">{len(values)}I", *values)
+    return content[:place] + new + content[place + len(new) :]
+
+
+def many_samples() -> bytes:
+    """One chunk of frames of a byte each, as long as each other."""
+    content = changed(H264.read_bytes(), b"stsz", 4, 1, MANY)
+    content = changed(content, b"stts", 4, 1, MANY, 512)
+    content = changed(content, b"stsc", 4, 1, 1, MANY, 1)
+    return content.replace(b"ctts", b"free")
+
+
+def many_in_a_fragment() -> bytes:
+    head = struct.pack(">II", 0x20000, 1)
+    run = box(b"traf", box(b"tfhd", head), box(b"trun", struct.pack(">II", 0, MANY)))
+    return H264.read_bytes() + box(b"moof", box(b"mfhd", bytes(8)), run)
+
+
+def many_edits() -> bytes:
+    return H264.read_bytes() + box(b"free", box(b"elst", struct.pack(">II", 0, MANY)))
+
+
+def packed() -> bytes:
+    return H264.read_bytes() + box(b"moov", box(b"cmov", bytes(8)))
+
+
+@pytest.mark.parametrize("forge", [many_samples, many_in_a_fragment, many_edits, packed])
+def test_samples_that_cannot_be_in_the_file_are_refused(tmp_path: Path, forge: object) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(forge())
+    with pytest.raises(InputError, match=r"samples and edits: .*no more frames"):
+        open_source(path)
+
+
+def test_what_would_fill_the_memory_is_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(many_samples())
+    script = """
+        import sys
+        from labapp.errors import InputError
+        from labapp.media import open_source
+        try:
+            open_source(sys.argv[1])
+        except InputError:
+            pass
+    """
+    assert peak_mb(script, path) < 300
+
+
+def test_a_long_box_and_frames_are_no_promise(tmp_path: Path) -> None:
+    """Of the frames themselves any bytes are right; a box may have a length of eight bytes."""
+    inside = box(b"stsz", bytes(8), b"\xff" * 4)
+    longer = struct.pack(">I4sQ", 1, b"free", 32) + bytes(16)
+    path = tmp_path / "v.mp4"
+    path.write_bytes(H264.read_bytes() + longer + box(b"mdat", inside))
+    with open_source(path) as source, open_source(H264) as whole:
+        assert len(source) == len(whole)
+    path.write_bytes(
+        H264.read_bytes() + box(b"free", struct.pack(">I4sQ3I", 1, b"stsz", 28, 0, 0, MANY))
+    )
+    with pytest.raises(InputError, match="samples and edits"):
+        open_source(path)
+
+
+def test_what_does_not_begin_as_one_is_none(tmp_path: Path) -> None:
+    """FFmpeg would take it for one by what follows, and by its name."""
+    path = tmp_path / "v.mp4"
+    path.write_bytes(box(b"test") + many_samples())
+    with pytest.raises(InputError, match="not a video"):
+        open_source(path)
