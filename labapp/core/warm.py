@@ -108,8 +108,11 @@ class WarmChain:
         self.broke: str | None = None
         self._track: Track | None = None
 
-    def measure(self, image: Image) -> Measurement:
-        """Measure the next frame; see `pipeline.measure`."""
+    def follow(self, image: Image) -> Measurement | None:
+        """Measure the next frame from those before; None where they do not lead to it.
+
+        That takes no longer, and a frame after it may be followed again.
+        """
         try:
             if self._track is None:
                 raise Broken("no frame before it was measured")
@@ -120,6 +123,13 @@ class WarmChain:
             return measurement
         except (Broken, CannotMeasure, np.linalg.LinAlgError) as reason:
             self.broke = str(reason)
+            return None
+
+    def measure(self, image: Image) -> Measurement:
+        """Measure the next frame; see `pipeline.measure`."""
+        found = self.follow(image)
+        if found is not None:
+            return found
         settings = _with_size(self.settings, image)
         measurement = measure(image, self.rig, self.calibration, settings)
         if measurement.status == "ok":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import time
 from collections.abc import Callable
@@ -20,6 +21,11 @@ from labapp.simulation.parallel import begin_worker, end_processes
 
 JUDGED_S = 0.2
 """So long the verdict on a frame stands for those that are followed from it."""
+
+
+SOUGHT_S = 1.0
+"""So long after a frame that was measured those that are not followed are left out: the pool may
+swing back to where it was, and a frame that is measured by itself takes seconds."""
 
 
 class LiveMeasuringEnded(Exception):
@@ -72,8 +78,8 @@ class LiveMeasuring:
             1, spawn, initializer=begin_worker, initargs=(nice, _begin, given)
         )
 
-    def measure(self, image: GreyImage, drawn: bool = False) -> LiveMeasurement:
-        """Measure the next frame.
+    def measure(self, image: GreyImage, drawn: bool = False) -> LiveMeasurement | None:
+        """Measure the next frame; None where it is left out, for one after it may be followed.
 
         Parameters
         ----------
@@ -105,7 +111,7 @@ class _Chain(NamedTuple):
     bit_depth: int
 
 
-_measure: list[Callable[[GreyImage, bool], LiveMeasurement]] = []
+_measure: list[Callable[[GreyImage, bool], LiveMeasurement | None]] = []
 """In the process: what measures."""
 
 
@@ -116,10 +122,17 @@ def _begin(given: _Chain) -> None:
     chain = WarmChain(setup.rig, setup.calibration, settings)
     rays = setup.rig.pattern.rows * setup.rig.pattern.columns
     verdict: list[tuple[float, Quality]] = []
+    measured_s = -math.inf
 
-    def measure(image: GreyImage, drawn: bool) -> LiveMeasurement:
-        found, now_s = chain.measure(image), time.monotonic()
-        followed, ok = chain.broke is None, found.status == "ok"
+    def measure(image: GreyImage, drawn: bool) -> LiveMeasurement | None:
+        nonlocal measured_s
+        found = chain.follow(image)
+        if found is None and time.monotonic() < measured_s + SOUGHT_S:
+            return None
+        found = found or chain.measure(image)
+        followed, ok, now_s = chain.broke is None, found.status == "ok", time.monotonic()
+        if ok:
+            measured_s = now_s
         if not (verdict and followed and ok and now_s < verdict[0][0] + JUDGED_S):
             # It takes nearly half as long as measuring.
             verdict[:] = [(now_s, judge_quality(image, found, depth, rays))]
@@ -136,5 +149,5 @@ def _begin(given: _Chain) -> None:
     _measure[:] = [measure]
 
 
-def _measured(image: GreyImage, drawn: bool) -> LiveMeasurement:
+def _measured(image: GreyImage, drawn: bool) -> LiveMeasurement | None:
     return _measure[0](image, drawn)

@@ -191,7 +191,7 @@ class LiveWatch:
         return frame
 
     def measure(self, frame: CameraFrame) -> None:
-        """Measure a frame, watch its sizes, and tell them.
+        """Measure a frame, watch its sizes, and tell them; or leave it out (`LiveMeasuring`).
 
         Raises
         ------
@@ -205,6 +205,9 @@ class LiveWatch:
             if not self._is_closed:
                 self._fall_silent(f"Nothing is measured any more: {error}")
             raise
+        if found is None:
+            self._queue.done(False, time.monotonic() - began_s)
+            return
         if found.scene is not None:
             self._is_drawn.clear()
             self._scene.append(found.scene)

@@ -128,6 +128,8 @@ class Measured:
 
         def counting(measuring: LiveMeasuring, image: Any, *given: Any) -> Any:
             found = measure(measuring, image, *given)
+            if found is None:  # it was left out
+                return found
             cls.frames += 1
             cls.good += found.status == "ok"
             cls.cold += not found.followed

@@ -248,6 +248,17 @@ def test_a_pool_that_jumps_is_measured_anew() -> None:
         assert abs(off) < 4 * result.measures.height_sigma_mm
 
 
+def test_a_frame_that_is_not_followed_is_left_out_and_the_next_one_is_followed() -> None:
+    follower = chain()
+    dark = np.full_like(frames()[0].image, 20)
+    assert follower.follow(dark) is None
+    assert follower.broke is not None
+    found = follower.follow(frames()[WARMED].image)
+    assert found is not None
+    assert follower.broke is None
+    assert wrong_rays(found, frames()[WARMED]) == 0
+
+
 def test_the_track_goes_on_after_a_frame_without_dots() -> None:
     follower = chain()
     dark = np.full_like(frames()[0].image, 18)

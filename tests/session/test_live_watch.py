@@ -9,25 +9,27 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from labapp.core import warm
 from labapp.core.measures import Measures
-from labapp.core.pipeline import Settings
+from labapp.core.pipeline import Measurement, Settings
 from labapp.media import open_source
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
-from labapp.session import live_watch
+from labapp.session import live_measuring, live_watch
 from labapp.session.limits import Limits, Size, standing
-from labapp.session.live_measuring import LiveMeasurement, LiveMeasuring
+from labapp.session.live_measuring import SOUGHT_S, LiveMeasurement, LiveMeasuring
 from labapp.session.live_watch import LiveWatch
 from labapp.session.scene import Scene, empty_scene
 from labapp.session.setup import Setup, read_setup
 from labapp.session.streams import LineStream
-from tests.waiting import connect
+from tests.waiting import PATIENCE_S, connect
 
 SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
 
@@ -267,8 +269,12 @@ def test_a_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, told: Tol
         watch.measure(frame(1, image))
         assert watch.alarms.shown == ()
         dark = np.random.default_rng(3).integers(0, 4, image.shape).astype(np.uint8)
-        for number in (2, 3):
+        began_s = time.monotonic()
+        for number in count(2):  # the first are left out
             watch.measure(frame(number, dark))
+            if watch.alarms.shown:
+                break
+            assert time.monotonic() < began_s + PATIENCE_S
         assert [alarm.code for alarm in watch.alarms.shown] == ["not-measured"]
         assert told[-1][0].words.startswith("ALARM: 2 frames in a row could not be measured: ")
     finally:
@@ -280,3 +286,62 @@ def test_what_measures_gives_way_to_nothing(setup: Setup):
     """Behind other programs its figures would be a minute old; they are looked at now."""
     with closing(LiveMeasuring(setup, Settings(), 8)) as measuring:
         assert measuring._pool.submit(os.nice, 0).result() == os.nice(0)
+
+
+def test_a_frame_that_is_left_out_is_none_that_failed(watch: LiveWatch, told: Told):
+    prepared = prepare(watch, {})
+    watch.measure(frame(1))
+    measure = prepared.measure
+    prepared.measure = lambda *_: None  # type: ignore[method-assign, assignment]
+    for number in range(2, 9):
+        watch.measure(frame(number))
+    prepared.measure = measure  # type: ignore[method-assign]
+    watch.measure(frame(9))
+    assert watch.trend(60).number.tolist() == [1, 9]
+    assert watch.pace().failed == 0
+    assert told == []
+
+
+def test_a_frame_is_searched_for_only_when_none_was_followed_for_long(
+    setup: Setup, monkeypatch: pytest.MonkeyPatch
+):
+    now_s, found = [100.0], Measurement("ok", "", "fit", measures=MEASURES)
+    is_lost, searched = [True], []
+
+    class Chain:
+        broke: str | None = None
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def follow(self, _: np.ndarray) -> Measurement | None:
+            self.broke = "it jumped" if is_lost[0] else None
+            return None if is_lost[0] else found
+
+        def measure(self, _: np.ndarray) -> Measurement:
+            searched.append(now_s[0])
+            return found
+
+    monkeypatch.setattr(warm, "WarmChain", Chain)
+    monkeypatch.setattr(live_measuring, "judge_quality", lambda *_: None)
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(live_measuring, "_measure", [])
+    live_measuring._begin(live_measuring._Chain(setup, Settings(), 8))
+    (measure,) = live_measuring._measure
+    image = np.zeros((2, 2), np.uint8)
+    assert measure(image, False) is not None  # the first
+    assert searched == [100.0]
+    now_s[0] += 0.9 * SOUGHT_S
+    assert measure(image, False) is None
+    is_lost[0] = False
+    followed = measure(image, False)
+    assert followed is not None
+    assert followed.followed
+    is_lost[0] = True
+    now_s[0] += 0.9 * SOUGHT_S
+    assert measure(image, False) is None
+    now_s[0] += 0.2 * SOUGHT_S
+    again = measure(image, False)
+    assert again is not None
+    assert not again.followed
+    assert searched == [100.0, now_s[0]]
