@@ -492,7 +492,7 @@ def two_sizes(tmp_path: Path) -> Path:
     frame = np.random.default_rng(1).normal(20, 1, u.shape)
     for at_v, at_u in np.ndindex(5, 8):
         square = (u - 37 - 44 * at_u) ** 2 + (v - 33 - 44 * at_v) ** 2
-        frame += 80 * np.exp(-square / 50) + 60 * np.exp(-square / 2)
+        frame += 80 * np.exp(-square / 50) + 120 * np.exp(-square / 2)
     path = tmp_path / "two_sizes.png"
     cv2.imwrite(str(path), np.clip(frame, 0, 255).astype(np.uint8))
     return path

@@ -27,6 +27,7 @@ from labapp.session.frames import Frames
 from labapp.session.measured import Results
 from labapp.session.session import Session
 from tests.conftest import Run
+from tests.same import assert_same
 
 SAMPLE = Path(package.__file__).parents[1] / "sample_sessions" / "gtaw"
 SETUP = SAMPLE / "setup.toml"
@@ -239,7 +240,7 @@ def test_a_frame_that_was_damaged_since_keeps_its_result(
             result = session.result(frame)
             assert result is not None
             assert kept is not None
-            assert result.measurement.measures == kept.measurement.measures
+            assert_same(result.measurement.measures, kept.measurement.measures)
             assert not result.stale
         assert session.problems() != []
     code, _, _ = labapp("session", "verify", measured)

@@ -7,13 +7,12 @@ from typing import Literal
 
 from labapp.core import ers, fit, irs, measures
 from labapp.core.coordinates import ImageCalibration
+from labapp.core.corrected_rows import confirmed_lattice, match_corrected
 from labapp.core.correction import Correction
 from labapp.core.correspondence import (
     Match,
     MatchSettings,
-    confirmed_lattice,
     indexed_lattice,
-    match_corrected,
     match_rays,
 )
 from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice

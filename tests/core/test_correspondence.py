@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from labapp.core import correspondence
+from labapp.core.corrected_rows import confirmed_lattice, match_corrected
 from labapp.core.correction import (
     Correction,
     assign,
@@ -21,9 +22,7 @@ from labapp.core.correction import (
 from labapp.core.correspondence import (
     Match,
     MatchSettings,
-    confirmed_lattice,
     indexed_lattice,
-    match_corrected,
     match_rays,
 )
 from labapp.core.dots import Dots

@@ -19,6 +19,7 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Wave, egg
 from labapp.simulation.recording import RecordedFrame, Recording
 from labapp.simulation.render import Look
+from tests.same import assert_same
 
 RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0))
 VIEW = CameraView((44.0, 590.0), (242.02, 590.0), 34.925, (44.0, 499.99), 15.875)
@@ -156,7 +157,7 @@ def test_the_same_frames_give_the_same_answers() -> None:
     one, other = chain(), chain()
     for frame in frames()[WARMED:]:
         first, second = one.measure(frame.image), other.measure(frame.image)
-        assert first.measures == second.measures
+        assert_same(first.measures, second.measures)
 
 
 def test_missing_and_false_dots_are_told_apart_from_the_others() -> None:

@@ -27,6 +27,7 @@ from labapp.session.sequence import Job, Told, followers, measure_sequence
 from labapp.session.session import Session
 from labapp.session.setup import read_setup
 from labapp.session.simulate import simulate
+from tests.same import assert_same
 
 FRAMES = 9
 
@@ -157,7 +158,7 @@ def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
         first = dict(session.measure([0, 1, 2], warm=True))
         assert [one.status for one in first.values()] == ["ok"] * 3
         bare = told_here(job)[1].measurement
-        assert first[1].measures == bare.measures
+        assert_same(first[1].measures, bare.measures)
         assert (bare.dots, bare.lattice, bare.match, bare.reconstruction) == (None,) * 4
         session.correct({1: start_correction(first[1])}, "as it is")
         again = dict(session.measure([0, 1, 2], warm=True))
