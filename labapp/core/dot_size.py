@@ -37,6 +37,11 @@ COARSE = 2
 OVER_NOISE = 8.0
 """A blob's answer stands so many times over that of the frame's noise."""
 
+MOST_BLOBS = 3000
+"""So many of a scale's blobs are looked at, those that answer most: more than a pattern has dots.
+
+Where part of a picture is blank the noise of the rest has a blob every few pixels."""
+
 WHOLE = 0.6
 """A blob with this share of the answer of smaller ones within it has them as its parts."""
 
@@ -192,6 +197,9 @@ def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blo
     x, y = dot_kernels.peaks(band, np.full((1, 1), floor, np.float32), disc)
     good = ~dot_kernels.ridges(band, x, y, SLENDER)
     x, y = x[good], y[good]
+    if len(x) > MOST_BLOBS:
+        most = np.argpartition(-band[y, x], MOST_BLOBS)[:MOST_BLOBS]
+        x, y = x[most], y[most]
     place = (pairs(x, y) + 0.5) * step - 0.5
     u, v = np.rint(place.T).astype(np.int64)
     answer = {k: dot_kernels.answers(other, u, v, float(by)) for k, (by, other) in bands.items()}
