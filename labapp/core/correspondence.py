@@ -26,6 +26,7 @@ from labapp.core.hypothesis import (
     pursue,
     turned,
     weigh,
+    with_repaired,
     with_rows_beyond,
     without_false_ends,
 )
@@ -160,11 +161,11 @@ def match_rays(
         )
     scene = Scene.of(dots, rig, calibration, frame_shape)
     orientations = settings.orientations
-    found = _by_grid(scene, lattice, orientations)
-    if not _any_explains(scene, found):
-        found += _by_placement(scene, lattice, orientations)
-    if not _any_explains(scene, found):
-        found += _by_optics(scene, lattice, orientations)
+    found: list[Hypothesis] = []
+    for way in (_by_grid, _by_placement, _by_optics):
+        found = with_repaired(scene, found + way(scene, lattice, orientations))
+        if _any_explains(scene, found):
+            break
     found = with_rows_beyond(scene, found)
     # Followed to its end, a hypothesis may have come round to a correspondence not asked for.
     found = [hypothesis for hypothesis in found if hypothesis.orientation(scene) in orientations]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from labapp.core.lattice import Lattice, Site
@@ -51,6 +52,9 @@ or nothing where nothing need be seen."""
 
 CONTESTED = 0.5
 """A label is in doubt where a rival is nearer than this, in spacings of the dots."""
+
+REPAIRED = 2
+"""So many rings of labels round what is unexplained are told anew."""
 
 LEAST_ROW, MOST_BEYOND = 3, 0.6
 """A dot or two beyond the last row may be false; so many where one surface has them are not. If a
@@ -250,6 +254,38 @@ def moved(scene: Scene, labels: IntArray) -> Iterator[IntArray]:
         shifted = _labelled(at + 1 + step, dot, labels.shape)
         shifted[scene.absent] = UNLABELLED
         yield shifted
+
+
+def with_repaired(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
+    """Add what the cheapest leads to without its labels round what it leaves unexplained.
+
+    Where rows cross in a dip, growth may swap them; the swapped labels then bend the surface and
+    hold each other up. The surface through the labels round about knows better.
+    """
+    best = min(found, key=lambda hypothesis: hypothesis.cost, default=None)
+    while best is not None:
+        labels = np.where(_about_unexplained(scene, best), UNLABELLED, best.labels)
+        wider = pursue(scene, labels) if (labels != best.labels).any() else None
+        best = wider if wider is not None and wider.cost < best.cost else None
+        found = found if best is None else [*found, best]
+    return found
+
+
+def _about_unexplained(scene: Scene, hypothesis: Hypothesis) -> BoolArray:
+    """Rays within `REPAIRED` rings of those that lack a dot, or are nearest to a dot without a ray.
+
+    Shape (rows, columns).
+    """
+    unseen, stray = _unexplained(scene, hypothesis.labels, hypothesis.pool)
+    about = np.zeros(hypothesis.labels.shape, bool)
+    about[unseen.at[:, 0], unseen.at[:, 1]] = True
+    rays = predict(scene, hypothesis.pool, within_rings(hypothesis.labels, 1))
+    if len(stray) and len(rays.at):
+        nearest = rays.at[cKDTree(rays.plane_mm).query(scene.plane_mm[stray])[1]]
+        about[nearest[:, 0], nearest[:, 1]] = True
+    if not about.any():
+        return about
+    return np.asarray(binary_dilation(about, np.ones((3, 3), bool), iterations=REPAIRED))
 
 
 def with_rows_beyond(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:

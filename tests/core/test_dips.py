@@ -14,6 +14,9 @@ from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots
 SHIFTED = 37
 """A pool that was once answered with every ray a row off."""
 
+CROSSED = (7004, 7008, 7148)
+"""Pools in whose dip rows cross: growth swaps some dots of two rows."""
+
 
 def scene_of(seen: SeenDots) -> tuple[Scene, IntArray]:
     """The scene, and the true labels."""
@@ -29,7 +32,7 @@ def weighed(scene: Scene, labels: IntArray) -> Hypothesis:
     return hypothesis
 
 
-@pytest.mark.parametrize("seed", [SHIFTED, 1, 2, 3])
+@pytest.mark.parametrize("seed", [SHIFTED, 2, *CROSSED])
 def test_a_pool_with_a_dip_has_its_rows_told_right(seed: int) -> None:
     got = answer(*draw(seed))
     assert (got.status, got.wrong) == ("ok", 0)
