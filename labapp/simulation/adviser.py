@@ -31,7 +31,7 @@ from labapp.simulation.height_error import (
     predicted_errors,
     simulated_errors,
 )
-from labapp.simulation.parallel import Progress, in_parallel
+from labapp.simulation.parallel import Progress, in_parallel, shared_processes
 
 MOVED: dict[str, str] = {
     "projection_angle_deg": "angle_deg",
@@ -185,6 +185,12 @@ def advise(
         See `in_parallel`. What ``progress`` raises ends the search.
     """
     search = _Search(expected, limits, effort or Effort(), seed, progress, workers)
+    with shared_processes(workers):
+        return _found(search)
+
+
+def _found(search: _Search) -> Advice:
+    expected, limits = search.expected, search.limits
     grid = search.grid()
     possible = [one for one in grid if one.possible]
     if not possible:

@@ -9,7 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import TypeVar
 
@@ -28,6 +28,9 @@ NICE = 10
 
 _behind = ContextVar("behind", default=False)
 """Whether what begins processes now works behind a window."""
+
+_shared: ContextVar[ProcessPoolExecutor | None] = ContextVar("shared", default=None)
+"""The processes of `shared_processes`."""
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """The matrices are small: more threads than one get in each other's way."""
@@ -72,13 +75,35 @@ def in_parallel(
                 results.append(function(task))
                 tell(what, len(results), len(tasks))
         return results
-    with processes(min(workers, len(tasks))) as pool:
+    shared = _shared.get()
+    with nullcontext(shared) if shared else processes(min(workers, len(tasks))) as pool:
         with deaf():
             futures = [pool.submit(function, task) for task in tasks]
         for future in futures:
             results.append(awaited(future, lambda: tell(what, len(results), len(tasks))))
             tell(what, len(results), len(tasks))
     return results
+
+
+@contextmanager
+def shared_processes(workers: int | None = None) -> Iterator[None]:
+    """Let every `in_parallel` within this use the same processes: each takes seconds to begin.
+
+    Parameters
+    ----------
+    workers
+        See `in_parallel`.
+    """
+    workers = workers or os.cpu_count() or 1
+    if workers <= 1:
+        yield
+        return
+    with processes(workers) as pool:
+        former = _shared.set(pool)
+        try:
+            yield
+        finally:
+            _shared.reset(former)
 
 
 def awaited(future: Future[R], tell: Callable[[], None]) -> R:

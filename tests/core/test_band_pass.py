@@ -82,6 +82,7 @@ def test_hot_pixels_and_a_glow_are_not_dots() -> None:
     assert len(dots) == len(grid())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [2.5, 5.5])
 @pytest.mark.parametrize("grain", [0.0, 0.3])
 def test_lobes_and_grains_of_a_dot_are_not_dots(size: float, grain: float) -> None:

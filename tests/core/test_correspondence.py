@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -107,8 +108,8 @@ def matched(
     return match, "ok"
 
 
-@pytest.fixture(scope="module")
-def answers() -> list[Answer]:
+@cache
+def computed() -> list[Answer]:
     made = []
     for seed, (kind, rig) in enumerate(SCENES):
         rng = np.random.default_rng(seed)
@@ -117,6 +118,12 @@ def answers() -> list[Answer]:
         seen = see(pool, rng, missing=missing, false=false, rig=rig)
         made.append(Answer(pool, rig, trace(pool, rig), seen, *matched(seen.dots, rig)))
     return made
+
+
+@pytest.fixture
+def answers() -> list[Answer]:
+    """Computed once a process: tests that are slow are run apart from the others."""
+    return computed()
 
 
 def answered(answers: list[Answer]) -> list[tuple[Answer, Match]]:
@@ -129,6 +136,7 @@ def test_no_dot_is_ever_given_a_wrong_ray(answers: list[Answer]) -> None:
     assert sum(int(answer.wrong.sum()) for answer, _ in answered(answers)) == 0
 
 
+@pytest.mark.slow
 def test_most_scenes_are_answered_and_most_of_their_dots(answers: list[Answer]) -> None:
     assert len(answered(answers)) >= len(answers) - 2
     own = sum(int((answer.seen.ray[:, 0] > 0).sum()) for answer, _ in answered(answers))
@@ -197,6 +205,7 @@ def test_rays_that_are_said_to_have_stayed_away_did(answers: list[Answer]) -> No
     assert came_back <= 0.005 * dark
 
 
+@pytest.mark.slow
 def test_indexed_dots_are_those_with_a_ray(answers: list[Answer]) -> None:
     for answer, match in answered(answers):
         lattice = indexed_lattice(match, answer.rig, len(answer.seen.dots))
@@ -224,6 +233,7 @@ def exact(pool: Pool, with_reference: bool = False) -> SeenDots:
     return SeenDots(as_dots(image + noise), ray)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pool", [CONVEX, CONCAVE])
 def test_where_the_centre_is_lit_no_ray_is_wrong(pool: Pool) -> None:
     # It may pass for a false dot where the rim tells the rows; it never gets a ray itself.
@@ -319,6 +329,7 @@ NARROW = spherical_cap(4.7, 0.211)
 BEHIND_THE_TORCH = [(i, j) for i in (10, 11, 12) for j in (9, 10, 11)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pool", "hidden", "refusal"),
     [
@@ -339,6 +350,7 @@ def test_a_reference_that_cannot_be_told_is_set_by_hand(
     assert match.margin > 5
 
 
+@pytest.mark.slow
 def test_a_dot_that_hides_the_reference_is_deleted_by_hand() -> None:
     seen = exact(NARROW, with_reference=True)
     assert matched(seen.dots) == (None, "ambiguous-rows")
@@ -405,6 +417,7 @@ def test_without_any_rows_the_optics_decide() -> None:
     assert len(match.dot) == len(seen.ray)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pool", [CONVEX, CONCAVE])
 @pytest.mark.parametrize("columns", [1, -1])
 def test_a_row_that_was_shifted_by_mistake_is_refused_and_named(pool: Pool, columns: int) -> None:

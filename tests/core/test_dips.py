@@ -32,6 +32,7 @@ def weighed(scene: Scene, labels: IntArray) -> Hypothesis:
     return hypothesis
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [SHIFTED, 2, *CROSSED])
 def test_a_pool_with_a_dip_has_its_rows_told_right(seed: int) -> None:
     got = answer(*draw(seed))

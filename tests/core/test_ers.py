@@ -125,6 +125,7 @@ def test_the_boundary_lies_on_the_extrapolated_surface():
     assert np.isnan(made.sigma_mm).all()
 
 
+@pytest.mark.slow
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3))
 def test_a_tilted_mirror_is_followed_exactly(slope_x, slope_y, level):
     # Constant slopes: the mean of two is exact, and so is every step, whatever the path.

@@ -162,6 +162,7 @@ def volume(pool: Pool) -> float:
     return float(np.nansum(z)) * (2 * reach / 240) ** 2
 
 
+@pytest.mark.slow
 def test_uncertainties_are_honest() -> None:
     # 240 such pools: 97.5 % of heights within ±1.96 σ; RMS of error/σ 0.75 … 0.80 for width,
     # length, height and area.

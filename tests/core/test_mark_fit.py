@@ -117,6 +117,7 @@ def test_a_camera_far_off_and_square_wants_the_affine(seed: int) -> None:
     assert root_mean_square(used - PLATE_MM) < 0.12
 
 
+@pytest.mark.slow
 def test_the_marks_are_not_biased() -> None:
     matrix = pinhole(1e6)
     offsets = [
@@ -156,6 +157,7 @@ def test_marks_without_noise_give_the_map_back() -> None:
     )
 
 
+@pytest.mark.slow
 def test_noise_alone_is_never_taken_for_perspective() -> None:
     rng = np.random.default_rng(5)
     matrix = pinhole(1e7)
@@ -163,6 +165,7 @@ def test_noise_alone_is_never_taken_for_perspective() -> None:
     assert chosen.count("homography") <= 3
 
 
+@pytest.mark.slow
 def test_the_uncertainty_is_what_repeating_gives() -> None:
     rng = np.random.default_rng(6)
     matrix = pinhole(700, 0, 15)

@@ -54,6 +54,7 @@ def truth(pool: Pool, residual=None):
     return reconstruction, match
 
 
+@pytest.mark.slow
 @given(
     st.floats(5.0, 8.0),
     st.sampled_from([-0.1, -0.05, 0.05, 0.1]),

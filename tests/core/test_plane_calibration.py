@@ -119,6 +119,7 @@ def test_the_points_of_eq_5_6_in_a_dim_picture() -> None:
     assert plane == pytest.approx(np.array([[0, 0], [69.85, 0], [0, 31.75]]), abs=0.15)
 
 
+@pytest.mark.slow
 def test_random_pictures_are_right_to_half_a_pixel() -> None:
     errors, ratios = [], []
     for seed in range(15):
@@ -173,6 +174,7 @@ def test_a_flag_that_is_hidden_is_no_mark() -> None:
     assert np.abs(points(found) - scene.truth).max() < 0.3
 
 
+@pytest.mark.slow
 def test_the_marks_make_the_points_more_certain() -> None:
     scenes = [random_scene(seed) for seed in range(20, 32)]
     errors, sigma = [], []
@@ -240,6 +242,7 @@ def test_a_turned_picture_is_refused(turn: str) -> None:
         calibrate_plane(turned)
 
 
+@pytest.mark.slow
 def test_a_bar_partly_covered_is_never_measured_wrong() -> None:
     scene = Scene(noise=0.5)
     along = scene.axes[0] / scene.unit_px

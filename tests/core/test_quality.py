@@ -49,6 +49,7 @@ def measured(good: GreyImage) -> Measurement:
     return seen(good, "gtaw")
 
 
+@pytest.mark.slow
 def test_a_good_frame_is_good_and_its_height_known_to_what_is_predicted(
     good: GreyImage, measured: Measurement
 ) -> None:
@@ -131,6 +132,7 @@ def test_a_row_that_the_torch_hides_is_said() -> None:
     assert "The torch hides dots in a row" in found.words
 
 
+@pytest.mark.slow
 def test_a_frame_that_cannot_be_measured_is_bad_and_says_why() -> None:
     # By its README the torch leaves too little of frame 5 to tell its rays.
     found = judged(frame("blocked_rows", "recording.mkv", 5), "blocked_rows")

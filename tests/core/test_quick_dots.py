@@ -31,6 +31,7 @@ def places(rng: np.random.Generator) -> FloatArray:
     return np.stack([u.ravel(), v.ravel()], axis=-1) + rng.uniform(-3, 3, (u.size, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_dots_of_the_next_frame_are_those_of_the_default_detector(seed: int) -> None:
     rng = np.random.default_rng(seed)

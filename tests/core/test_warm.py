@@ -174,6 +174,7 @@ def test_missing_and_false_dots_are_told_apart_from_the_others() -> None:
     assert len(rays) >= frame.shown.sum() - 6
 
 
+@pytest.mark.slow
 def test_a_dot_where_the_absent_one_should_be_dark_breaks_the_track() -> None:
     frame, follower = frames()[WARMED], chain()
     hole = frame.dot_px[9, 8:11:2].mean(axis=0)

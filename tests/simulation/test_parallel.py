@@ -12,7 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from labapp.simulation.parallel import NICE, behind_a_window, in_parallel
+from labapp.simulation.parallel import (
+    NICE,
+    behind_a_window,
+    in_parallel,
+    shared_processes,
+)
 from tests.waiting import PATIENCE_S, wait_until
 
 BUSY = """
@@ -41,6 +46,30 @@ def test_they_give_way_to_a_window_and_use_one_thread() -> None:
         assert in_parallel(os.nice, [0, 0, 0], workers=2) == [min(own + NICE, 19)] * 3
     assert in_parallel(os.nice, [0, 0], workers=2) == [own] * 2
     assert in_parallel(os.getenv, ["OMP_NUM_THREADS"] * 2, workers=2) == ["1", "1"]
+
+
+def process(_: int) -> int:
+    time.sleep(0.01)
+    return os.getpid()
+
+
+def test_processes_are_shared_and_end() -> None:
+    with shared_processes(2):
+        first, second = (set(in_parallel(process, range(20), workers=2)) for _ in range(2))
+        assert len(first | second) <= 2
+        assert os.getpid() not in first
+    assert not multiprocessing.active_children()
+    assert first.isdisjoint(in_parallel(process, range(20), workers=2))
+
+
+def test_what_progress_raises_ends_shared_ones() -> None:
+    def stop(_what: str, done: int, _total: int) -> None:
+        if multiprocessing.active_children():
+            raise InterruptedError(done)
+
+    with pytest.raises(InterruptedError), shared_processes(2):
+        in_parallel(time.sleep, [600, 600], "asleep", stop, workers=2)
+    assert not multiprocessing.active_children()
 
 
 def test_what_progress_raises_ends_them() -> None:
