@@ -156,7 +156,8 @@ def test_a_row_that_growth_does_not_reach_is_begun(monkeypatch: pytest.MonkeyPat
     assert match is not None
     np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
     assert len(match.dot) == len(seen.dots)
-    monkeypatch.setattr(correspondence, "with_rows_beyond", lambda _scene, found: found)
+    for way in ("with_rows_beyond", "with_repaired"):  # either tells them
+        monkeypatch.setattr(correspondence, way, lambda _scene, found: found)
     assert matched(seen.dots) == (None, "no-match")
 
 

@@ -6,9 +6,7 @@ import os
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 
-import ctypes
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -47,12 +45,6 @@ class PatientBot(QtBot):
 
     def waitExposed(self, widget: QWidget, **given: Any) -> Any:  # noqa: N802
         return super().waitExposed(widget, **{"timeout": PATIENCE_MS, **given})
-
-
-def give_memory_back() -> None:
-    """Let the system have what was freed: glibc keeps some hundred megabytes in pieces."""
-    if sys.platform == "linux":
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def let_draw() -> None:
@@ -101,7 +93,6 @@ def no_windows(nothing_left: None) -> Iterator[None]:
             widget.deleteLater()
     QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
     KEPT.clear()
-    give_memory_back()
 
 
 @pytest.fixture
