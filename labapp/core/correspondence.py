@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from labapp.core.cap_search import search_caps
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.dots import Dots
 from labapp.core.hypothesis import (
@@ -162,7 +163,7 @@ def match_rays(
     scene = Scene.of(dots, rig, calibration, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
-    for way in (_by_grid, _by_placement, _by_optics):
+    for way in (_by_grid, _by_placement, _by_caps, _by_optics):
         found = with_repaired(scene, found + way(scene, lattice, orientations))
         if _any_explains(scene, found):
             break
@@ -233,6 +234,17 @@ def _by_placement(
     rough.sort(key=lambda one: one[0])
     pursued = (pursue(scene, labels) for _, labels in rough[:MOST_PLACES])
     return [hypothesis for hypothesis in pursued if hypothesis is not None]
+
+
+def _by_caps(
+    scene: Scene, _lattice: Lattice | None, _orientations: tuple[Orientation, ...]
+) -> list[Hypothesis]:
+    """Follow the caps that the dots lie on best, and mend what each leaves unexplained."""
+    found: list[Hypothesis] = []
+    for labels in search_caps(scene):
+        hypothesis = pursue(scene, labels)
+        found += with_repaired(scene, [hypothesis]) if hypothesis is not None else []
+    return found
 
 
 def _by_optics(
