@@ -163,19 +163,32 @@ def match_rays(
     scene = Scene.of(dots, rig, calibration, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
-    for way in (_by_grid, _by_placement, _by_caps, _by_optics):
+    for way in (_by_grid, _by_placement, _by_optics):
         found = with_repaired(scene, found + way(scene, lattice, orientations))
         if _any_explains(scene, found):
             break
+    try:
+        best = _answer(scene, found, lattice, settings)
+    except CannotMeasure as reason:
+        if reason.status != "no-match":
+            raise
+        best = _answer(scene, found + _by_caps(scene), lattice, settings)
+    return as_match(scene, best, best.orientation(scene))
+
+
+def _answer(
+    scene: Scene, found: list[Hypothesis], lattice: Lattice | None, settings: MatchSettings
+) -> Hypothesis:
+    """Settle on one of the hypotheses, or what one leads to; `CannotMeasure` as `match_rays`."""
     found = with_rows_beyond(scene, found)
     # Followed to its end, a hypothesis may have come round to a correspondence not asked for.
-    found = [hypothesis for hypothesis in found if hypothesis.orientation(scene) in orientations]
+    asked = settings.orientations
+    found = [hypothesis for hypothesis in found if hypothesis.orientation(scene) in asked]
     if not found:
-        if rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
+        if scene.rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
         raise CannotMeasure("no-match", "no surface explains the reflected dots")
-    best = _settled(scene, found, settings)
-    return as_match(scene, best, best.orientation(scene))
+    return _settled(scene, found, settings)
 
 
 def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
@@ -236,9 +249,7 @@ def _by_placement(
     return [hypothesis for hypothesis in pursued if hypothesis is not None]
 
 
-def _by_caps(
-    scene: Scene, _lattice: Lattice | None, _orientations: tuple[Orientation, ...]
-) -> list[Hypothesis]:
+def _by_caps(scene: Scene) -> list[Hypothesis]:
     """Follow the caps that the dots lie on best, and mend what each leaves unexplained."""
     found: list[Hypothesis] = []
     for labels in search_caps(scene):
