@@ -352,7 +352,8 @@ def place_level(
     count = round(120 * reach) + 1
     first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
     lit = y[witness > 0]
-    start, end = (lit.max() + lit.min()) / 2, lit.min()
+    start = (lit.max() + lit.min()) / 2
+    end = min(lit.min(), start - 1e-6)  # a single row has no rear
     # Only a pool that stands above the work piece is seen to sink at its rear.
     seen = sign > 0 and bool(np.any(near & (witness < 0) & (y < end)))
     drops = (_DROPS if seen else _DROPS[:1]) if drop_mm is None else np.array([drop_mm])

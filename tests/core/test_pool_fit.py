@@ -20,6 +20,7 @@ from labapp.core.pool_fit import (
     find_level,
     fit_pool,
     meet_surface,
+    place_level,
     predict_dots,
     slope_of_dot,
 )
@@ -278,3 +279,11 @@ def test_garbage_is_answered_with_a_surface_or_a_reason(seed: int, noise_mm: flo
 def test_dots_with_the_wrong_rays_make_no_surface(match: Match, seed: int) -> None:
     shuffled = np.random.default_rng(seed).permutation(len(match.ray))
     assert refused(replace(match, plane_mm=match.plane_mm[shuffled])) in STATUSES
+
+
+def test_a_single_row_of_rays_that_came_back_has_a_level() -> None:
+    height, slope = np.array([0.1, 0.2, 0.1, -0.1, -0.1]), np.full((5, 2), 0.1)
+    y, witness = np.array([1.0, 1.0, 1.0, 2.0, 0.0]), np.array([1, 1, 1, -1, -1])
+    level = place_level(height, slope, y, witness, np.array([0.4, 0.8]))
+    assert np.isfinite([level.shift_mm, level.sigma_mm]).all()
+    assert level.rear.drop_mm == 0.0
