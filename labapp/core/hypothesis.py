@@ -54,7 +54,7 @@ CONTESTED = 0.5
 """A label is in doubt where a rival is nearer than this, in spacings of the dots."""
 
 REPAIRED = 2
-"""So many rings of labels round what is unexplained are told anew."""
+"""So many rings of labels round what is unexplained are discarded and assigned again."""
 
 LEAST_ROW, MOST_BEYOND = 3, 0.6
 """A dot or two beyond the last row may be false; so many where one surface has them are not. If a

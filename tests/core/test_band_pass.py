@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from labapp.core import dot_size
 from labapp.core.band_pass import band_pass_dots
 from labapp.core.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
@@ -167,3 +168,12 @@ def test_nothing_to_be_seen_is_said(frame: FloatArray) -> None:
     with pytest.raises(CannotMeasure) as answer:
         band_pass_dots(frame, BandPassSettings())
     assert answer.value.status == "no-dots"
+
+
+def test_noise_beside_a_blank_part_has_no_more_blobs_than_are_looked_at() -> None:
+    """The noise of most of the frame is nothing, and every grain of the rest is over it."""
+    frame = np.full((640, 480), 20.0, np.float32)
+    frame[:300] += np.random.default_rng(2).normal(0.0, 3.0, (300, 480)).astype(np.float32)
+    bands = dict(dot_size._bands(frame))
+    counts = [len(dot_size._blobs(bands, scale, 0.0).own) for scale in sorted(bands)[:-1]]
+    assert max(counts) == dot_size.MOST_BLOBS

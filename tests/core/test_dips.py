@@ -45,6 +45,12 @@ def test_a_pool_with_a_dip_has_its_rows_told_right(seed: int) -> None:
     assert abs(got.height) < 0.03
 
 
+def test_a_cap_takes_no_answer_s_place() -> None:
+    """Begun with caps beside all else, this pool had five wrong labels at its rim."""
+    got = answer(*draw(7306))
+    assert (got.status, got.wrong) == ("ok", 0)
+
+
 def test_the_true_rows_cost_less_than_those_that_put_a_dot_on_the_absent_ray() -> None:
     scene, labels = scene_of(draw(SHIFTED)[1])
     true = weighed(scene, labels)
