@@ -24,7 +24,9 @@ TEXTS = sorted(
 )
 
 # Files over 500 lines and functions over 60, each with its reason.
-LONG_FILES: dict[str, str] = {}
+LONG_FILES: dict[str, str] = {
+    "labapp/core/kernels.py": "what is kept compiled must not call what another file compiles",
+}
 LONG_FUNCTIONS: dict[str, str] = {}
 
 

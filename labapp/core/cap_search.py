@@ -85,7 +85,7 @@ def _caps(scene: Scene) -> Iterator[_Cap]:
 
 def _judged(scene: Scene, tree: cKDTree, cap: _Cap) -> tuple[float, IntArray] | None:
     """How well the dots lie where the cap has them, and the labels of those that do."""
-    from labapp.core import quadric_kernels
+    from labapp.core import kernels
 
     down = np.array([0.0, 0.0, cap.height])  # the quadric has its top at 0
     rays, plane = scene.rays.reshape(-1, 3), scene.rig.imaging_plane.pose_mm
@@ -94,7 +94,7 @@ def _judged(scene: Scene, tree: cKDTree, cap: _Cap) -> tuple[float, IntArray] | 
     curvature = -2 * cap.height / cap.axes**2
     quadric = np.array([[0.0, 0.0, curvature[0], 0.0, curvature[1]]])
     points, dots = (
-        part[0] for part in quadric_kernels.meet(cap.middle, quadric, rays, laser, plane)
+        part[0] for part in kernels.meet_quadrics(cap.middle, quadric, rays, laser, plane)
     )
     from_middle = np.sum(((points[:, :2] - cap.middle) / cap.axes) ** 2, axis=-1)
     there = (from_middle < 1) & np.isfinite(dots).all(axis=-1)

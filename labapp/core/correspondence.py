@@ -295,7 +295,8 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     """
     best = min(found, key=lambda hypothesis: hypothesis.cost)
     while True:  # each round is cheaper than the one before
-        neighbours = [h for labels in moved(scene, best.labels) if (h := weigh(scene, labels))]
+        one_on = moved(scene, best.labels)
+        neighbours = [h for labels in one_on if (h := weigh(scene, labels, near=best.pool))]
         nearest = min(neighbours, key=lambda h: h.cost, default=best)
         better = pursue(scene, nearest.labels) if nearest.cost < best.cost else None
         if better is None or better.cost >= best.cost:
@@ -338,7 +339,7 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     if doubtful:
         certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
         witness = np.where(certain == best.labels, best.witness, 0)
-        best = replace(weigh(scene, certain) or best, witness=witness)
+        best = replace(weigh(scene, certain, near=best.pool) or best, witness=witness)
     return best
 
 

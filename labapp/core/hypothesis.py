@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from labapp.core.lattice import Lattice, Site
@@ -20,11 +19,11 @@ from labapp.core.ray_growth import (
     Prediction,
     Scene,
     amid,
-    blocked,
     grow_labels,
     predict,
     surprises,
     try_fit,
+    widened,
     within_rings,
 )
 from labapp.core.values import BoolArray, CannotMeasure, IntArray, median
@@ -33,7 +32,8 @@ MODEL_MM = 0.045
 """How far the right surface's dots may be off for no fault of theirs, mm: what the knots of the fit
 leave of a dent."""
 
-FOLLOWING, STANDING_OUT = FitSettings(), FitSettings(knot_mm=1.0)
+FOLLOWING = FitSettings(settled_mm=1e-3)
+STANDING_OUT = replace(FOLLOWING, knot_mm=1.0)
 """Of the surface that a hypothesis is weighed with: fine enough for a dip under the torch; or so
 wide that a row which somebody shifted stands out."""
 
@@ -73,8 +73,8 @@ class Hypothesis:
         The surface.
     witness
         See `Match.witness`.
-    stray, missed
-        How many dots have no ray; how many rays amid the others have no dot.
+    unseen, strays
+        Rays amid the others that have no dot; indices of the dots that have no ray.
     marker
         What shows at the marker's absent ray; None if the pattern has no marker.
     cost
@@ -84,10 +84,20 @@ class Hypothesis:
     labels: IntArray
     pool: FittedPool
     witness: IntArray
-    stray: int
-    missed: int
+    unseen: Prediction
+    strays: IntArray
     marker: Marker | None
     cost: float
+
+    @property
+    def stray(self) -> int:
+        """How many dots have no ray."""
+        return len(self.strays)
+
+    @property
+    def missed(self) -> int:
+        """How many rays amid the others have no dot."""
+        return len(self.unseen.at)
 
     @property
     def count(self) -> int:
@@ -135,13 +145,21 @@ def _outside(scene: Scene, hypothesis: Hypothesis) -> IntArray:
     return np.asarray(at[level.sign * over < -BEYOND * rise])
 
 
-def weigh(scene: Scene, labels: IntArray, settings: FitSettings = FOLLOWING) -> Hypothesis | None:
-    """Fit the surface to labels as they are and count what speaks against them."""
-    pool = try_fit(scene, labels)
+def weigh(
+    scene: Scene,
+    labels: IntArray,
+    settings: FitSettings = FOLLOWING,
+    near: FittedPool | None = None,
+) -> Hypothesis | None:
+    """Fit the surface to labels as they are and count what speaks against them.
+
+    A surface that is near saves rounds of the fit.
+    """
+    pool = try_fit(scene, labels, near=near)
     if pool is None:
         return None
     try:
-        pool = scene.fit(labels, _witness(scene, labels, pool), settings)
+        pool = scene.fit(labels, _witness(scene, labels, pool), settings, pool)
     except CannotMeasure:
         return None
     lit = labels != UNLABELLED
@@ -152,7 +170,7 @@ def weigh(scene: Scene, labels: IntArray, settings: FitSettings = FOLLOWING) -> 
     cost = float(surprise.sum()) + STRAY * len(stray) + MISSED * len(unseen.at)
     cost += LIT_MARKER * (marker == "lit")
     witness = _witness(scene, labels, pool)
-    return Hypothesis(labels, pool, witness, len(stray), len(unseen.at), marker, cost)
+    return Hypothesis(labels, pool, witness, unseen, stray, marker, cost)
 
 
 def _marker(scene: Scene, lit: BoolArray, pool: FittedPool) -> Marker | None:
@@ -179,9 +197,8 @@ def contested(scene: Scene, hypothesis: Hypothesis) -> IntArray:
     Either may be the right pair there. Indices of dots.
     """
     labels = hypothesis.labels
-    unseen, stray = _unexplained(scene, labels, hypothesis.pool)
     dots = labels[labels != UNLABELLED]
-    rivals = np.concatenate([unseen.plane_mm, scene.plane_mm[stray]])
+    rivals = np.concatenate([hypothesis.unseen.plane_mm, scene.plane_mm[hypothesis.strays]])
     if len(rivals) == 0 or len(dots) < 2:
         return np.zeros(0, np.int64)
     spacing = median(cKDTree(scene.plane_mm[dots]).query(scene.plane_mm[dots], k=2)[0][:, 1])
@@ -194,13 +211,12 @@ def without_false_ends(scene: Scene, hypothesis: Hypothesis) -> Hypothesis:
 
     Beyond the last row a false dot may lie where a ray's should.
     """
-    unseen, _ = _unexplained(scene, hypothesis.labels, hypothesis.pool)
     lit = hypothesis.labels != UNLABELLED
     fewer = []
-    for at in {at for ray in unseen.at.tolist() for at in _alone_around(lit, ray)}:
+    for at in {at for ray in hypothesis.unseen.at.tolist() for at in _alone_around(lit, ray)}:
         labels = hypothesis.labels.copy()
         labels[at] = UNLABELLED
-        fewer.append(weigh(scene, labels))
+        fewer.append(weigh(scene, labels, near=hypothesis.pool))
     best = min((h for h in fewer if h), key=lambda h: h.cost, default=hypothesis)
     return without_false_ends(scene, best) if best.cost < hypothesis.cost else hypothesis
 
@@ -276,7 +292,7 @@ def _about_unexplained(scene: Scene, hypothesis: Hypothesis) -> BoolArray:
 
     Shape (rows, columns).
     """
-    unseen, stray = _unexplained(scene, hypothesis.labels, hypothesis.pool)
+    unseen, stray = hypothesis.unseen, hypothesis.strays
     about = np.zeros(hypothesis.labels.shape, bool)
     about[unseen.at[:, 0], unseen.at[:, 1]] = True
     rays = predict(scene, hypothesis.pool, within_rings(hypothesis.labels, 1))
@@ -285,7 +301,7 @@ def _about_unexplained(scene: Scene, hypothesis: Hypothesis) -> BoolArray:
         about[nearest[:, 0], nearest[:, 1]] = True
     if not about.any():
         return about
-    return np.asarray(binary_dilation(about, np.ones((3, 3), bool), iterations=REPAIRED))
+    return widened(about, REPAIRED)
 
 
 def with_rows_beyond(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
@@ -361,9 +377,7 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[Pred
     lit = labels != UNLABELLED
     among = predict(scene, pool, amid(lit) & ~scene.absent & ~scene.hidden)
     merged = among.spacing_mm < scene.resolution_mm
-    rays = scene.rays[among.at[:, 0], among.at[:, 1]]
-    hidden = blocked(among.points_mm, rays, scene.rig, pool)
-    silent = ~lit[among.at[:, 0], among.at[:, 1]] & ~merged & ~hidden
+    silent = ~lit[tuple(among.at.T)] & ~merged & ~among.blocked(scene)
     unseen = among.part(silent & scene.in_view(among.plane_mm))
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
     if merged.any() and len(stray):
@@ -377,10 +391,8 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     lit = labels != UNLABELLED
     witness = np.zeros(lit.shape, np.int64)
     around = predict(scene, pool, np.ones_like(lit))
-    rays = scene.rays[around.at[:, 0], around.at[:, 1]]
-    hidden = blocked(around.points_mm, rays, scene.rig, pool)
     merged = around.spacing_mm < scene.resolution_mm
-    seen = scene.in_view(around.plane_mm) & ~hidden & ~merged
+    seen = scene.in_view(around.plane_mm) & ~around.blocked(scene) & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
     witness[amid(lit) | scene.absent | scene.hidden] = 0
     witness[lit] = 1

@@ -1,6 +1,6 @@
-"""Inner loops of the warm chain, compiled for the processor (docs/adr/0018).
+"""Inner loops of the fit, compiled for the processor (docs/adr/0018).
 
-A followed frame has a hundred dots: NumPy's overhead per call would take longer than the sums. Here
+A frame has a hundred dots: NumPy's overhead per call would take longer than the sums. Here
 are only loops over rays and splines; what they mean is told where they are called. Those that call
 each other are in one file because a compiled function is kept on disk as long as its own file does
 not change, whatever became of those it calls.
@@ -16,10 +16,11 @@ from numba import types
 
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import part as _inner
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _f, _i = types.float64, types.int64
-_f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
+_f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
+_mask = types.Array(types.boolean, 2, "A", readonly=True)
 
 
 # --- splines ------------------------------------------------------------------------------------
@@ -136,6 +137,30 @@ def _meet(
     return step, slope_x, slope_y
 
 
+@_inner
+def _dot(
+    ray: FloatArray, point: FloatArray, slope_x: float, slope_y: float, plane: FloatArray
+) -> tuple[float, float]:
+    """Dot that a ray makes, reflected at a point of a surface of some slopes; NaN if none."""
+    # Twice the ray's part along the normal (−f_x, −f_y, 1) is taken off (Eq. 4-4).
+    twice = 2.0 * (ray[2] - slope_x * ray[0] - slope_y * ray[1])
+    twice /= slope_x * slope_x + slope_y * slope_y + 1.0
+    away = ray[0] + twice * slope_x, ray[1] + twice * slope_y, ray[2] - twice
+    gap, along = 0.0, 0.0
+    for axis in range(3):
+        gap += (plane[0, axis] - point[axis]) * plane[3, axis]
+        along += away[axis] * plane[3, axis]
+    distance = gap / along if along != 0.0 else np.nan
+    if not 0.0 < distance < np.inf:
+        return np.nan, np.nan
+    x, z = 0.0, 0.0
+    for axis in range(3):
+        at = point[axis] + distance * away[axis] - plane[0, axis]
+        x += at * plane[1, axis]
+        z += at * plane[2, axis]
+    return x, z
+
+
 @_compiled(_f2, _f1, _f2, _f2, _i, _f2)
 def meet(
     grid: FloatArray,
@@ -158,23 +183,9 @@ def meet(
         for _ in range(steps):
             _, slope_x, slope_y = _meet(grid, coefficients, ray, point, work)
         slopes[k, 0], slopes[k, 1] = slope_x, slope_y
-        # Twice the ray's part along the normal (−f_x, −f_y, 1) is taken off (Eq. 4-4).
-        twice = 2.0 * (ray[2] - slope_x * ray[0] - slope_y * ray[1])
-        twice /= slope_x * slope_x + slope_y * slope_y + 1.0
-        away = ray[0] + twice * slope_x, ray[1] + twice * slope_y, ray[2] - twice
-        gap, along = 0.0, 0.0
-        for axis in range(3):
-            gap += (plane[0, axis] - point[axis]) * plane[3, axis]
-            along += away[axis] * plane[3, axis]
-        distance = gap / along if along != 0.0 else np.nan
-        on_grid = grid[0, 0] <= point[0] <= grid[0, 1] and grid[1, 0] <= point[1] <= grid[1, 1]
         dots[k, 0] = dots[k, 1] = np.nan
-        if on_grid and 0.0 < distance < np.inf:
-            dots[k, 0] = dots[k, 1] = 0.0
-            for axis in range(3):
-                at = point[axis] + distance * away[axis] - plane[0, axis]
-                dots[k, 0] += at * plane[1, axis]
-                dots[k, 1] += at * plane[2, axis]
+        if grid[0, 0] <= point[0] <= grid[0, 1] and grid[1, 0] <= point[1] <= grid[1, 1]:
+            dots[k, 0], dots[k, 1] = _dot(ray, point, slope_x, slope_y, plane)
     return met, slopes, dots
 
 
@@ -191,23 +202,101 @@ def _bisecting(
     return -(on_x / on - to_x / to) / normal_z, -(on_y / on - to_y / to) / normal_z
 
 
-@_compiled(_f1, _f2, _f2, _f2)
-def slopes_of_dots(
-    laser: FloatArray, axes: FloatArray, points: FloatArray, dots: FloatArray
+@_inner
+def _slopes_of_dot(
+    laser: FloatArray, axes: FloatArray, point: FloatArray, dot: FloatArray
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Rows of ∂(slopes at a point)/∂(its dot along either axis of the plane), mm⁻¹."""
+    step = 1e-3
+    base_x, base_y = _bisecting(laser, point, dot[0], dot[1], dot[2])
+    by = axes[0]
+    x, y = _bisecting(
+        laser, point, dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
+    )
+    by = axes[1]
+    u, v = _bisecting(
+        laser, point, dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
+    )
+    return (
+        ((x - base_x) / step, (u - base_x) / step),
+        ((y - base_y) / step, (v - base_y) / step),
+    )
+
+
+@_compiled(_f1, _f2, _f2, _f2, _f3, _f)
+def slope_weights(
+    laser: FloatArray,
+    axes: FloatArray,
+    points: FloatArray,
+    dots: FloatArray,
+    covariance: FloatArray,
+    floor: float,
 ) -> FloatArray:
-    """What `pool_fit.slope_of_dot` gives for dots in the UCS, shape (n, 3), and a plane's axes."""
-    made, step = np.empty((len(points), 2, 2)), 1e-3
+    """Inverse covariance of the slopes at points that follow from dots, shape (n, 2, 2).
+
+    Points and dots are in the UCS, shape (n, 3), mm; the covariance of the dots along the axes of
+    the imaging plane has shape (n, 2, 2), mm². ``floor`` is the least uncertainty of a dot, mm.
+    """
+    made = np.empty(covariance.shape)
     for k in range(len(points)):
-        dot, point = dots[k], points[k]
-        base_x, base_y = _bisecting(laser, point, dot[0], dot[1], dot[2])
-        for axis in range(2):
-            by = step * axes[axis, 0], step * axes[axis, 1], step * axes[axis, 2]
-            x, y = _bisecting(laser, point, dot[0] + by[0], dot[1] + by[1], dot[2] + by[2])
-            made[k, 0, axis], made[k, 1, axis] = (x - base_x) / step, (y - base_y) / step
+        (a, b), (c, d) = _slopes_of_dot(laser, axes, points[k], dots[k])
+        xx, xy, yy = covariance[k, 0, 0] + floor**2, covariance[k, 0, 1], covariance[k, 1, 1]
+        yy += floor**2
+        one = a * a * xx + 2.0 * a * b * xy + b * b * yy
+        other = c * c * xx + 2.0 * c * d * xy + d * d * yy
+        both = a * c * xx + (a * d + b * c) * xy + b * d * yy
+        area = one * other - both * both
+        made[k, 0, 0], made[k, 1, 1] = other / area, one / area
+        made[k, 0, 1] = made[k, 1, 0] = -both / area
     return made
 
 
+@_compiled(_f2, _f2, _f2, _f)
+def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: float) -> BoolArray:
+    """Whether rays pass above the torch's tip, or nearly (§4.2.1), shape (n,).
+
+    The incident ray for points behind the electrode (y < 0), the reflected one before it. Points
+    and unit directions, shape (n, 3), slopes of the surface there, shape (n, 2); mm.
+    """
+    hidden = np.empty(len(rays), np.bool_)
+    for k in range(len(rays)):
+        x, y, z = -rays[k, 0], -rays[k, 1], -rays[k, 2]
+        if points[k, 1] >= 0.0:  # Eq. 4-4
+            a, b = slopes[k, 0], slopes[k, 1]
+            twice = 2.0 * (a * x + b * y - z) / (a * a + b * b + 1.0)
+            y, z = twice * b - y, -twice - z
+        y = y if y != 0.0 else 1e-12
+        # Both ways lead towards y = 0 and up.
+        hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - 0.3
+    return hidden
+
+
 # --- the fit ------------------------------------------------------------------------------------
+
+
+@_compiled(_f3, _f3, _f1)
+def roughness(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> FloatArray:
+    """Band of `SplineBasis.roughness` from the products along x and along y in cells of size 1.
+
+    Those of each spline with itself and the next three, for orders 0 … 3, shapes (4, nx, 4) and
+    (4, ny, 4) (`spline._products`); the size of a cell has shape (2,), mm.
+    """
+    nx, ny = along_x.shape[1], along_y.shape[1]
+    columns = np.zeros((nx * ny, 3 * (ny + 1) + 1))
+    scale = np.empty(4)
+    for order in range(4):
+        scale[order] = 3.0 if 0 < order < 3 else 1.0
+        scale[order] *= step[0] ** (2 * order - 5) * step[1] ** (1 - 2 * order)
+    for i in range(nx):
+        for j in range(ny):
+            for a in range(min(4, nx - i)):
+                for b in range(-min(3, j) if a else 0, min(4, ny - j)):
+                    first, on = (j, b) if b >= 0 else (j + b, -b)
+                    total = 0.0
+                    for order in range(4):
+                        total += scale[order] * along_x[3 - order, i, a] * along_y[order, first, on]
+                    columns[i * ny + j, a * ny + b] = total
+    return columns.T
 
 
 @_compiled(_f2, _f2, _f3, types.Array(_f, 1, "C"), _i)
@@ -238,16 +327,36 @@ def add_gram(
                 normal[row + column] += along_x * by_x[other] + along_y * by_y[other]
 
 
-@_compiled(_f2, types.Array(types.int64, 2, "A", readonly=True), _f3)
-def covariance_of(lower: FloatArray, splines: IntArray, parts: FloatArray) -> FloatArray:
-    """`SlopeFit.covariance_of`: with L the factor and R the parts, (L⁻¹R)ᵀ L⁻¹R of each pair."""
-    width, count, pairs = lower.shape[0] - 1, lower.shape[1], len(splines)
+@_compiled(_f2, _f2, _f1, _f2, _f2, _f2)
+def covariance_of_dots(
+    grid: FloatArray,
+    lower: FloatArray,
+    laser: FloatArray,
+    axes: FloatArray,
+    points: FloatArray,
+    dots: FloatArray,
+) -> FloatArray:
+    """Covariance of the dots that a fitted surface makes of rays, shape (n, 2, 2), mm².
+
+    With L the factor of the normal matrix, shape (width + 1, p), and R what each coefficient moves
+    either coordinate of a dot by, (L⁻¹R)ᵀ L⁻¹R. Points are where the rays meet the surface, shape
+    (n, 3), dots are in the UCS, shape (n, 3), axes those of the imaging plane.
+    """
+    width, count, pairs = lower.shape[0] - 1, lower.shape[1], len(points)
     right, first = np.zeros((count, 2 * pairs)), count
+    work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
     for k in range(pairs):
-        for s in range(splines.shape[1]):
-            first = min(first, splines[k, s])
-            right[splines[k, s], 2 * k] += parts[k, 0, s]
-            right[splines[k, s], 2 * k + 1] += parts[k, 1, s]
+        (a, b), (c, d) = _slopes_of_dot(laser, axes, points[k], dots[k])
+        area = a * d - b * c
+        first_x = _along(grid[0], points[k, 0], work[0], work[1])
+        first_y = _along(grid[1], points[k, 1], work[2], work[3])
+        first = min(first, first_x * many + first_y)
+        for m in range(4):
+            for n in range(4):
+                at = (first_x + m) * many + first_y + n
+                by_x, by_y = work[1, m] * work[2, n], work[0, m] * work[3, n]
+                right[at, 2 * k] = (d * by_x - b * by_y) / area
+                right[at, 2 * k + 1] = (a * by_y - c * by_x) / area
     made = np.zeros((pairs, 2, 2))
     for i in range(first, count):
         row = right[i]
@@ -434,4 +543,176 @@ def size_gradients(
         _add(grid, outline[k, 0], outline[k, 1], moved * outline[k, 2], work, made[3])
     for k in range(len(samples)):
         _add(grid, samples[k, 0], samples[k, 1], share[k], work, made[3])
+    return made
+
+
+# --- quadrics -----------------------------------------------------------------------------------
+
+
+@_inner
+def _quadric_at(quadric: FloatArray, x: float, y: float) -> tuple[float, float, float]:
+    """Height and slopes of a quadric at a place from its centre: g_x, g_y, κ_x, κ_xy, κ_y."""
+    along_x = quadric[0] + quadric[2] * x + quadric[3] * y
+    along_y = quadric[1] + quadric[3] * x + quadric[4] * y
+    return ((quadric[0] + along_x) * x + (quadric[1] + along_y) * y) / 2.0, along_x, along_y
+
+
+@_compiled(_f1, _f2, _f2, _f1, _f2)
+def meet_quadrics(
+    center: FloatArray, quadrics: FloatArray, rays: FloatArray, laser: FloatArray, plane: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where rays meet quadrics, and the dots that these make of them on a plane.
+
+    Parameters
+    ----------
+    center, quadrics
+        Shape (2,), mm; slopes and curvatures of each (`_quadric_at`), shape (m, 5).
+    rays, laser
+        Shapes (n, 3) and (3,), mm.
+    plane
+        Its origin, its axes along X′ and Z′ and its normal, shape (4, 3).
+
+    Returns
+    -------
+    points, dots
+        Shape (m, n, 3), mm, and IPCS, shape (m, n, 2), mm; NaN where a ray runs away.
+    """
+    points = np.empty((len(quadrics), len(rays), 3))
+    dots = np.empty((len(quadrics), len(rays), 2))
+    for q in range(len(quadrics)):
+        for k in range(len(rays)):
+            ray, point = rays[k], points[q, k]
+            for axis in range(3):
+                point[axis] = laser[axis] - laser[2] / ray[2] * ray[axis]
+            for _ in range(3):
+                z, slope_x, slope_y = _quadric_at(
+                    quadrics[q], point[0] - center[0], point[1] - center[1]
+                )
+                descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
+                step = min(max((point[2] - z) / max(descent, 0.05), -1.0), 1.0)
+                for axis in range(3):
+                    point[axis] += step * ray[axis]
+            _, slope_x, slope_y = _quadric_at(
+                quadrics[q], point[0] - center[0], point[1] - center[1]
+            )
+            dots[q, k, 0], dots[q, k, 1] = _dot(ray, point, slope_x, slope_y, plane)
+    return points, dots
+
+
+@_inner
+def _apart(one: FloatArray, other: FloatArray) -> float:
+    """Distance of two dots; infinite where there is none."""
+    distance = np.hypot(one[0] - other[0], one[1] - other[1])
+    return distance if np.isfinite(distance) else np.inf
+
+
+@_compiled(_f4, _f2, _mask, _f)
+def hits(
+    pattern: FloatArray, places: FloatArray, absent: BoolArray, gate: float
+) -> tuple[BoolArray, IntArray, FloatArray]:
+    """Which predicted dots fall on which of some places: see `quadric_search._Window.hits`."""
+    count, rows, columns = pattern.shape[:3]
+    hit = np.zeros((count, rows, columns), np.bool_)
+    dot = np.zeros((count, rows, columns), np.int64)
+    off = np.full((count, rows, columns), np.inf)
+    for p in range(count):
+        for i in range(rows):
+            for j in range(columns):
+                own = pattern[p, i, j]
+                if not (np.isfinite(own[0]) and np.isfinite(own[1])):
+                    continue
+                spacing = np.inf
+                if i > 0:
+                    spacing = min(spacing, _apart(own, pattern[p, i - 1, j]))
+                if i < rows - 1:
+                    spacing = min(spacing, _apart(own, pattern[p, i + 1, j]))
+                if j > 0:
+                    spacing = min(spacing, _apart(own, pattern[p, i, j - 1]))
+                if j < columns - 1:
+                    spacing = min(spacing, _apart(own, pattern[p, i, j + 1]))
+                least = np.inf
+                for k in range(len(places)):
+                    x, y = own[0] - places[k, 0], own[1] - places[k, 1]
+                    if x * x + y * y < least:
+                        least = x * x + y * y
+                        dot[p, i, j] = k
+                off[p, i, j] = np.sqrt(least) / max(gate * spacing, 1e-9)
+                hit[p, i, j] = off[p, i, j] < 1.0 and not absent[i, j]
+    return hit, dot, off
+
+
+@_inner
+def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve normal equations by elimination; what they leave open is 0."""
+    count, most = len(right), normal.max()
+    for k in range(count):
+        if not normal[k, k] > 1e-10 * most:
+            normal[k, :], normal[:, k], right[k] = 0.0, 0.0, 0.0
+            normal[k, k] = 1.0
+        for i in range(k + 1, count):
+            factor = normal[i, k] / normal[k, k]
+            right[i] -= factor * right[k]
+            for j in range(k, count):
+                normal[i, j] -= factor * normal[k, j]
+    for k in range(count - 1, -1, -1):
+        for j in range(k + 1, count):
+            right[k] -= normal[k, j] * right[j]
+        right[k] /= normal[k, k]
+    return right
+
+
+@_compiled(_f1, _f2, _f3, _f1, _f2, _f2, _mask, _f)
+def fit_quadrics(
+    center: FloatArray,
+    quadrics: FloatArray,
+    rays: FloatArray,
+    laser: FloatArray,
+    plane: FloatArray,
+    places: FloatArray,
+    absent: BoolArray,
+    gate: float,
+) -> FloatArray:
+    """Fit quadrics, shape (m, 5), to the places that their rays next to the middle one fall near.
+
+    Least squares of slopes: every ray that falls on a place asks for the slopes that turn it
+    there (`_bisecting`). One on which fewer than four fall stays as it is.
+
+    Parameters
+    ----------
+    center, laser, plane
+        See `meet_quadrics`.
+    rays
+        Shape (rows, columns, 3), rows and columns odd.
+    places, absent, gate
+        See `hits`.
+    """
+    rows, columns = rays.shape[:2]
+    flat, made = rays.copy().reshape(rows * columns, 3), quadrics.copy()
+    normal, right, by, dot = np.empty((5, 5)), np.empty(5), np.zeros((2, 5)), np.empty(3)
+    for q in range(len(made)):
+        for _ in range(2):  # they land elsewhere then
+            points, dots = meet_quadrics(center, made[q : q + 1], flat, laser, plane)
+            hit, number, _ = hits(dots.reshape(1, rows, columns, 2), places, absent, gate)
+            normal[:], right[:], count = 0.0, 0.0, 0
+            for i in range(rows // 2 - 1, rows // 2 + 2):
+                for j in range(columns // 2 - 1, columns // 2 + 2):
+                    if not hit[0, i, j]:
+                        continue
+                    count += 1
+                    point, place = points[0, i * columns + j], places[number[0, i, j]]
+                    for axis in range(3):
+                        dot[axis] = plane[0, axis] + place[0] * plane[1, axis]
+                        dot[axis] += place[1] * plane[2, axis]
+                    asked = _bisecting(laser, point, dot[0], dot[1], dot[2])
+                    x, y = point[0] - center[0], point[1] - center[1]
+                    by[0, 0], by[0, 2], by[0, 3] = 1.0, x, y
+                    by[1, 1], by[1, 3], by[1, 4] = 1.0, x, y
+                    for axis in range(2):
+                        for m in range(5):
+                            right[m] += by[axis, m] * asked[axis]
+                            for n in range(5):
+                                normal[m, n] += by[axis, m] * by[axis, n]
+            if count < 4:
+                break
+            made[q] = _solved(normal, right)
     return made

@@ -15,16 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.optics import (
-    bisecting_gradient,
-    meet_level,
-    meet_plane,
-    ray_directions,
-    reflect,
-    surface_normal,
-)
+from labapp.core.optics import meet_level, ray_directions
 from labapp.core.rig import Rig
-from labapp.core.spline import SlopeFit, SplineBasis, SplineSurface, fit_slopes
+from labapp.core.solver import NormalEquations, covariance_of
+from labapp.core.spline import SplineBasis, SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze, median
 
 REACH = 2.5
@@ -123,8 +117,8 @@ class FittedPool:
     ----------
     surface
         The surface, z = 0 at the boundary.
-    slopes
-        What the slopes gave in the last round, up to the level.
+    factor
+        Cholesky factor of the normal matrix (`solver.normal_factor`).
     level
         The level and its uncertainty.
     points_mm
@@ -136,7 +130,7 @@ class FittedPool:
     """
 
     surface: SplineSurface
-    slopes: SlopeFit
+    factor: FloatArray
     level: Level
     points_mm: FloatArray
     residual_mm: FloatArray
@@ -148,7 +142,11 @@ class FittedPool:
     @property
     def covariance(self) -> FloatArray:
         """Of the spline coefficients, the level left out, shape (splines, splines), mm²."""
-        return self.slopes.covariance
+        from labapp.core import kernels
+
+        x_y, share = self.points_mm[:, :2], np.full(len(self.points_mm), 1 / len(self.points_mm))
+        mean = kernels.gradient_of_sum(self.surface.basis.grid, self.factor.shape[1], x_y, share)
+        return covariance_of(self.factor, mean)
 
 
 def fit_pool(
@@ -158,59 +156,68 @@ def fit_pool(
     witness: IntArray,
     rig: Rig,
     settings: FitSettings,
+    near: SplineSurface | None = None,
 ) -> FittedPool:
     """Solve for the surface that turns each ray (i, j), shape (n, 2), to its dot.
 
-    Parameters are those of `Match`.
+    Parameters are those of `Match`, and a surface that is near: fewer rounds are needed then.
 
     Raises
     ------
     CannotMeasure
         ``no-surface`` if no surface can be fitted or it sends rays away from the plane.
     """
-    laser = rig.laser.position_mm
+    from labapp.core import kernels
+
+    laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
     pattern = ray_directions(rig.laser, rig.pattern)
-    rays = pattern[ray[:, 0] - 1, ray[:, 1] - 1]
-    dots = rig.imaging_plane.to_universal(plane_mm)
-    points = meet_level(laser, rays)
-    ground = meet_level(laser, pattern)[..., :2]
+    ground = meet_level(laser, pattern)
+    rays, points = pattern[tuple(ray.T - 1)], ground[tuple(ray.T - 1)]
     spacing = landing_spacing(ground)
     margin = REACH * spacing.max()
     basis = SplineBasis.over(
         points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
     )
+    grid, covariance = basis.grid, plane_covariance_mm2
     told = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
-    jacobian = slope_of_dot(points, plane_mm, rig)
-    weights = slope_weights(jacobian, plane_covariance_mm2, settings.floor_mm)
+    stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
+    dots = rig.imaging_plane.to_universal(plane_mm)
+    weights = kernels.slope_weights(laser, plane[1:3], points, dots, covariance, settings.floor_mm)
+    serves = settings.floor_mm / 50
+    equations = NormalEquations(basis, stiffness, laser, dots, weights, serves_mm=serves)
     out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
-    rim = out > np.median(out)
-    stiffness = CORRELATED_MM2 / settings.jerk**2
+    rim = out > median(out)
+    coefficients, moved = np.zeros(basis.count), np.inf
+    if near is not None:
+        points, _ = kernels.advance(near.basis.grid, near.coefficients, rays, points, 4)
     level = Level(0.0, np.inf, 1, Rear(), np.inf)
     for count in range(settings.rounds):
-        slopes = bisecting_gradient(points - laser, dots - points)
-        fitted = fit_slopes(basis, points[:, :2], slopes, weights, stiffness)
+        coefficients = equations.improve(coefficients, points, moved)
         if not (witness[told] < 0).any():
-            level = _rim_level(fitted.surface, points, rim)
-        elif 2 * count <= settings.rounds:
-            level = find_level(fitted.surface, ground[told], witness[told], spacing)
+            level = _rim_level(kernels.surface_at(grid, coefficients, points)[0], rim)
         else:
-            # Whether the rear sinks is settled half-way, or the rounds might go to and fro; how
-            # far it leaves the level open stays as it was.
-            drop, sigma = level.rear.drop_mm, level.sigma_mm
-            level = find_level(fitted.surface, ground[told], witness[told], spacing, drop)
-            level = replace(level, sigma_mm=max(level.sigma_mm, sigma))
-        surface = fitted.surface.raised(level.shift_mm)
-        if not np.isfinite(surface.coefficients).all():
+            # Whether the rear sinks is settled half-way, or the rounds might go to and fro.
+            drop = None if 2 * count <= settings.rounds else level.rear.drop_mm
+            height, *slope = kernels.surface_at(grid, coefficients, ground[told])
+            about = (0.0, level.sign) if count else None
+            before, at = level, (np.array(slope).T, ground[told, 1], witness[told], spacing)
+            level = place_level(height, *at, drop, about)
+            if drop is not None:  # how far the rear leaves the level open stays as it was
+                level = replace(level, sigma_mm=max(level.sigma_mm, before.sigma_mm))
+        coefficients += level.shift_mm  # the splines add up to 1
+        if not np.isfinite(coefficients).all():
             raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
-        met = meet_surface(surface, rays, points)
-        moved = float(np.max(np.abs(met - points)))
-        points = met
+        met, _ = kernels.advance(grid, coefficients, rays, points, 4)
+        moved, points = float(np.max(np.abs(met - points))), met
         if moved < settings.settled_mm:
             break
-    residual = predict_dots(surface, points, rays, rig) - plane_mm
+    points, _, made = kernels.meet(grid, coefficients, rays, points, 1, plane)
+    residual = made - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
-    return FittedPool(surface, fitted, level, points, residual, moved)
+    surface = SplineSurface(basis, coefficients)
+    assert equations.factor is not None
+    return FittedPool(surface, equations.factor, level, points, residual, moved)
 
 
 def landing_spacing(landing_mm: FloatArray) -> FloatArray:
@@ -220,63 +227,16 @@ def landing_spacing(landing_mm: FloatArray) -> FloatArray:
     return np.asarray(np.abs([across, along]), float)
 
 
-def slope_weights(jacobian: FloatArray, covariance: FloatArray, floor: float) -> FloatArray:
-    """Inverse covariance of slopes that follow dots (`slope_of_dot`) of some covariance, (n, 2, 2).
-
-    Parameters
-    ----------
-    jacobian, covariance
-        Of the slopes by the dots, mm⁻¹, and of the dots, mm², shapes (n, 2, 2).
-    floor
-        Least uncertainty of a dot, mm.
-    """
-    floored = covariance + floor**2 * np.eye(2)
-    return np.asarray(np.linalg.inv(jacobian @ floored @ np.swapaxes(jacobian, -1, -2)))
-
-
-def slope_of_dot(points_mm: FloatArray, plane_mm: FloatArray, rig: Rig) -> FloatArray:
-    """∂(slopes at a reflection point)/∂(its dot on the plane, X′ and Z′), shape (n, 2, 2), mm⁻¹."""
-    laser, plane, step = rig.laser.position_mm, rig.imaging_plane, 1e-3
-    dots = plane.to_universal(plane_mm)
-    incident = points_mm - laser
-    base = bisecting_gradient(incident, dots - points_mm)
-    moved = [
-        bisecting_gradient(incident, dots + step * axis - points_mm)
-        for axis in (plane.x_axis, plane.z_axis)
-    ]
-    return np.asarray(np.stack([(slope - base) / step for slope in moved], axis=-1))
-
-
-def meet_surface(surface: SplineSurface, rays: FloatArray, points: FloatArray) -> FloatArray:
-    """Where rays meet the surface, by bounded Newton steps from points on them; shapes (n, 3).
-
-    Beyond the surface's rectangle it goes on as it is at its edge.
-    """
-    from labapp.core import kernels
-
-    return kernels.advance(surface.basis.grid, surface.coefficients, rays, points, 4)[0]
-
-
-def predict_dots(
-    surface: SplineSurface, points: FloatArray, rays: FloatArray, rig: Rig
-) -> FloatArray:
-    """Dots that the surface makes of rays meeting it at points, IPCS, shape (n, 2), mm."""
-    x, y = np.clip(points[:, :2], surface.basis.low_mm, surface.basis.high_mm).T
-    normal = surface_normal(surface.gradient(x, y))
-    return meet_plane(points, reflect(rays, normal), rig.imaging_plane)
-
-
-def _rim_level(surface: SplineSurface, points: FloatArray, rim: BoolArray) -> Level:
+def _rim_level(height: FloatArray, rim: BoolArray) -> Level:
     """Guess the level where nobody says where the pool ends: the outermost points lie at 0."""
-    height = surface.height(points[:, 0], points[:, 1])
     shift = -float(np.mean(height[rim]))
     sign = 1 if height[~rim].mean() + shift > 0 else -1
     return Level(shift, float(np.std(height)), sign, Rear(), np.inf)
 
 
-WINDOW, OFF_WINDOW = 0.4, 1e-6
-"""Where the level is known nearly, it is looked for within this share of what is searched else; if
-so much of its probability is at the ends of that, everywhere."""
+AT_END, AT_FAR_END = 1e-6, 0.02
+"""If so much of the level's probability is at the ends of what was searched, near a level that is
+known or farther from it, more is searched."""
 
 # Width of the step from inside to outside, in dot spacings: from a boundary that is known as
 # sharply as the surface is to one that half the neighbouring rays contradict.
@@ -328,6 +288,7 @@ def place_level(
     spacing_mm: FloatArray,
     drop_mm: float | None = None,
     about: tuple[float, int] | None = None,
+    reach: float = 1.0,
 ) -> Level:
     """Do what `find_level` does, with the surface known where the witnesses would land.
 
@@ -339,6 +300,9 @@ def place_level(
         See `find_level`.
     about
         A level that is near, as its shift, mm, and its sign; None: it is looked for.
+    reach
+        How far from there the level may be, in heights by which the surface changes from one ray
+        to the next. If it is found at the end of that, it is looked for farther off.
     """
     from labapp.core import level_kernels
 
@@ -348,7 +312,6 @@ def place_level(
     rise = np.maximum(rise, usual / 4)
     shift, sign = about or _rough_level(height, rise, witness)
     near = np.abs(height + shift) < 3.0 * rise
-    reach = 1.0 if about is None else WINDOW
     count = round(120 * reach) + 1
     first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
     lit = y[witness > 0]
@@ -362,8 +325,9 @@ def place_level(
     nats = level_kernels.doubts(over, side, first, step, count, _BLURS)
     asked = _BLUR_COST, _SUNK, drops, first, step
     drop, mean, sigma, off_window = level_kernels.weigh(nats, *asked)
-    if about is not None and off_window > OFF_WINDOW:
-        return place_level(height, slope, y, witness, spacing_mm, drop_mm)
+    if about is not None and off_window > (AT_END if reach < 1.0 else AT_FAR_END):
+        farther = about if reach < 1.0 else None
+        return place_level(height, slope, y, witness, spacing_mm, drop_mm, farther)
     surprise = nats.min() / np.log(2) / max(int(near.sum()), 1)
     return Level(mean, sigma, sign, Rear(drop, start, end), float(surprise))
 

@@ -36,25 +36,6 @@ _FLATTEST, _STEEPEST = 0.004, 0.6
 
 
 @dataclass(frozen=True)
-class Quadric:
-    """z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), x and y from a centre on the work piece.
-
-    Parameters
-    ----------
-    center
-        The centre, shape (2,), mm.
-    slope
-        g, shape (2,).
-    curvature
-        (κ_x, κ_xy, κ_y), shape (3,), mm⁻¹.
-    """
-
-    center: FloatArray
-    slope: FloatArray
-    curvature: FloatArray
-
-
-@dataclass(frozen=True)
 class QuadricGuess:
     """The dots that a quadric's rays fall on.
 
@@ -86,10 +67,7 @@ def search_quadrics(scene: Scene, most: int = 8) -> list[QuadricGuess]:
     window = _Window(scene, marker)
     found: dict[bytes, QuadricGuess] = {}
     for hole, half_width in _holes(scene, window.tree):
-        for quadric in _quadrics(window, hole, half_width):
-            guess = window.judge(window.fitted(quadric))
-            if guess is None:
-                continue
+        for guess in window.judged(window.fitted(_quadrics(window, hole, half_width))):
             key = guess.labels.tobytes()
             if key not in found or found[key].hits < guess.hits:
                 found[key] = guess
@@ -114,34 +92,33 @@ def _holes(scene: Scene, tree: cKDTree) -> Iterator[tuple[FloatArray, float]]:
                     yield hole, step[0] / 2
 
 
-def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> list[Quadric]:
+def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArray:
     """Quadrics that put the reference into the hole, and loosely the dots round it in place.
 
-    Every curvature along is tried, and both signs of the curvature across that put the
-    neighbouring dots where they are.
+    z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), x and y from where the reference would land on the
+    work piece: (g_x, g_y, κ_x, κ_xy, κ_y) of each, shape (m, 5), mm⁻¹. Every curvature along is
+    tried, and both signs of the curvature across that put the neighbouring dots where they are.
     """
     scene = window.scene
     laser, plane = scene.rig.laser.position_mm, scene.rig.imaging_plane
     slope = bisecting_gradient(
         window.landing_mm - laser, plane.to_universal(hole) - window.landing_mm
     )
-    center = window.landing_mm[:2]
     middle = window.middle
     beside = window.rays[middle[0], middle[1] + 1][None]
     # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.
     trial = np.array([[*slope, -0.02, 0.0, -0.02], [*slope, 0.02, 0.0, 0.02]])
-    moved = window.met(center, trial, beside)[1][:, 0, 0] - hole[0]
+    moved = window.met(trial, beside)[1][:, 0, 0] - hole[0]
     across = (np.array([1, -1]) * half_width - moved.mean()) / ((moved[1] - moved[0]) / 0.04)
     across = across[(np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST)]
     quadrics = np.zeros((len(across) * len(_RATIOS), 5))
     quadrics[:, :2] = slope
     quadrics[:, 2] = np.repeat(across, len(_RATIOS))
     quadrics[:, 4] = np.outer(across, _RATIOS).ravel()
-    patterns = window.met(center, quadrics, window.rays.reshape(-1, 3))[1]
+    patterns = window.met(quadrics, window.rays.reshape(-1, 3))[1]
     patterns = patterns.reshape(-1, *window.rays.shape[:2], 2)
     hit = window.hits(patterns, LOOSE)[0][(slice(None), *window.core)]
-    likely = quadrics[hit.sum(axis=(1, 2)) >= 5]
-    return [Quadric(center, each[:2], each[2:]) for each in likely]
+    return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= 5])
 
 
 class _Window:
@@ -160,17 +137,15 @@ class _Window:
         self.middle = (reach, reach)
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
 
-    def met(
-        self, center: FloatArray, quadrics: FloatArray, rays: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Where rays, shape (n, 3), meet quadrics of (g, κ), shape (m, 5), and their dots.
+    def met(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where rays, shape (n, 3), meet quadrics, shape (m, 5), and their dots.
 
         Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm.
         """
-        from labapp.core import quadric_kernels
+        from labapp.core import kernels
 
         laser = self.scene.rig.laser.position_mm
-        return quadric_kernels.meet(center, quadrics, rays, laser, self.plane)
+        return kernels.meet_quadrics(self.landing_mm[:2], quadrics, rays, laser, self.plane)
 
     def hits(self, pattern: FloatArray, gate: float) -> tuple[BoolArray, IntArray, FloatArray]:
         """Which predicted dots, shape (m, rows, columns, 2), fall on a dot, on which, how far off.
@@ -178,42 +153,30 @@ class _Window:
         The last is in units of the gate: a share of the way to the next predicted dot in the row
         or the column.
         """
-        from labapp.core import quadric_kernels
+        from labapp.core import kernels
 
-        return quadric_kernels.hits(pattern, self.scene.plane_mm, self.absent, gate)
+        return kernels.hits(pattern, self.scene.plane_mm, self.absent, gate)
 
-    def fitted(self, quadric: Quadric) -> Quadric:
-        """Fit the quadric to the dots that its rays next to the reference fall near."""
-        for _ in range(2):
-            points, pattern = self._pattern(quadric)
-            hit, dot, _ = self.hits(pattern[None], LOOSE)
-            hit, dot = hit[0][self.core], dot[0][self.core]
-            if hit.sum() < 4:
-                return quadric
-            points = points[self.core][hit]
-            laser, plane = self.scene.rig.laser.position_mm, self.scene.rig.imaging_plane
-            dots = plane.to_universal(self.scene.plane_mm[dot[hit]])
-            slopes = bisecting_gradient(points - laser, dots - points)
-            x, y = (points[:, :2] - quadric.center).T
-            zero, one = np.zeros(len(points)), np.ones(len(points))
-            rows = [np.stack([one, zero, x, y, zero], -1), np.stack([zero, one, zero, x, y], -1)]
-            values = np.linalg.lstsq(np.concatenate(rows), slopes.T.ravel(), rcond=None)[0]
-            quadric = Quadric(quadric.center, values[:2], values[2:])
-        return quadric
+    def fitted(self, quadrics: FloatArray) -> FloatArray:
+        """Fit quadrics to the dots that their rays next to the reference fall near."""
+        from labapp.core import kernels
 
-    def _pattern(self, quadric: Quadric) -> tuple[FloatArray, FloatArray]:
-        """Where all rays of the window meet a quadric, and their dots, (rows, columns, 3 and 2)."""
-        own = np.concatenate([quadric.slope, quadric.curvature])[None]
-        points, dots = self.met(quadric.center, own, self.rays.reshape(-1, 3))
-        shape = self.rays.shape[:2]
-        return points.reshape(*shape, 3), dots.reshape(*shape, 2)
+        laser, places = self.scene.rig.laser.position_mm, self.scene.plane_mm
+        center, plane = self.landing_mm[:2], self.plane
+        bench = self.rays, laser, plane, places, self.absent
+        return kernels.fit_quadrics(center, quadrics, *bench, LOOSE)
 
-    def judge(self, quadric: Quadric) -> QuadricGuess | None:
-        """Hold a quadric against the dots; None if it does not explain those round the hole."""
-        pattern = self._pattern(quadric)[1]
-        hit, dot, off = (part[0] for part in self.hits(pattern[None], TIGHT))
-        if hit[self.core].sum() < 6:
-            return None
+    def judged(self, quadrics: FloatArray) -> Iterator[QuadricGuess]:
+        """Hold quadrics against the dots; yield those that explain the dots round the hole."""
+        patterns = self.met(quadrics, self.rays.reshape(-1, 3))[1]
+        patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
+        for pattern, *found in zip(patterns, *self.hits(patterns, TIGHT), strict=True):
+            if found[0][self.core].sum() >= 6:
+                yield self._guess(pattern, *found)
+
+    def _guess(
+        self, pattern: FloatArray, hit: BoolArray, dot: IntArray, off: FloatArray
+    ) -> QuadricGuess:
         own = np.where(hit, dot, UNLABELLED)
         chosen, count = np.unique(own[hit], return_counts=True)
         own[np.isin(own, chosen[count > 1])] = UNLABELLED

@@ -9,22 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
-from scipy.ndimage import binary_dilation, convolve
+from scipy.ndimage import convolve
 from scipy.spatial import cKDTree
 
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.dots import Dots
-from labapp.core.optics import meet_level, ray_directions, reflect, surface_normal
-from labapp.core.pool_fit import (
-    FitSettings,
-    FittedPool,
-    fit_pool,
-    landing_spacing,
-    meet_surface,
-    predict_dots,
-    slope_of_dot,
-)
+from labapp.core.optics import meet_level, ray_directions
+from labapp.core.pool_fit import FitSettings, FittedPool, fit_pool, landing_spacing
 from labapp.core.rig import Rig
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze, median
 
@@ -127,28 +120,53 @@ class Scene:
         """Distance between neighbouring landing points along X and along Y, shape (2,), mm."""
         return landing_spacing(self.landing_mm)
 
-    @property
+    @cached_property
     def absent(self) -> BoolArray:
         """Rays that the lens does not make, shape (rows, columns)."""
         mask = np.zeros(self.rays.shape[:2], bool)
         for i, j in self.rig.pattern.absent_rays:
             mask[i - 1, j - 1] = True
+        mask.flags.writeable = False
         return mask
 
-    @property
+    @cached_property
     def hidden(self) -> BoolArray:
         """Rays of `hidden_rows`, shape (rows, columns)."""
         mask = np.zeros(self.rays.shape[:2], bool)
         mask[[i - 1 for i in self.hidden_rows if 1 <= i <= len(mask)]] = True
+        mask.flags.writeable = False
         return mask
 
-    def fit(self, labels: IntArray, witness: IntArray, settings: FitSettings) -> FittedPool:
-        """Fit the surface to labelled dots (see `fit_pool`)."""
-        at = np.argwhere(labels != UNLABELLED)
-        dot = labels[at[:, 0], at[:, 1]]
-        return fit_pool(
-            at + 1, self.plane_mm[dot], self.covariance_mm2[dot], witness, self.rig, settings
-        )
+    def fit(
+        self,
+        labels: IntArray,
+        witness: IntArray,
+        settings: FitSettings,
+        near: FittedPool | None = None,
+    ) -> FittedPool:
+        """Fit the surface to labelled dots (see `fit_pool`), from one that may be near.
+
+        Hypotheses lead to the same labels again and again: what was fitted once is kept.
+        """
+        key = labels.tobytes(), witness.tobytes(), settings
+        if key not in self._fitted:
+            at = np.argwhere(labels != UNLABELLED)
+            dot = labels[tuple(at.T)]
+            dots = self.plane_mm[dot], self.covariance_mm2[dot]
+            surface = None if near is None else near.surface
+            try:
+                made = fit_pool(at + 1, *dots, witness, self.rig, settings, surface)
+                self._fitted[key] = made
+            except CannotMeasure as reason:
+                self._fitted[key] = reason
+        found = self._fitted[key]
+        if isinstance(found, CannotMeasure):
+            raise found
+        return found
+
+    @cached_property
+    def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | CannotMeasure]:
+        return {}
 
     def in_view(self, plane_mm: FloatArray) -> BoolArray:
         """Whether places on the plane, shape (…, 2), are on it and in the frame, with a rim.
@@ -175,8 +193,8 @@ class Prediction:
     ----------
     at
         Rows and columns of the rays in the pattern's arrays, counted from 0, shape (m, 2).
-    points_mm
-        Reflection points, shape (m, 3), mm.
+    points_mm, slopes
+        Reflection points, shape (m, 3), mm, and the surface's slopes there, shape (m, 2).
     plane_mm
         Dots, IPCS, shape (m, 2), mm.
     spacing_mm
@@ -185,21 +203,35 @@ class Prediction:
 
     at: IntArray
     points_mm: FloatArray
+    slopes: FloatArray
     plane_mm: FloatArray
     spacing_mm: FloatArray
 
     def part(self, which: BoolArray) -> Prediction:
         """Only some of the rays, by a mask of shape (m,)."""
         return Prediction(
-            self.at[which], self.points_mm[which], self.plane_mm[which], self.spacing_mm[which]
+            self.at[which],
+            self.points_mm[which],
+            self.slopes[which],
+            self.plane_mm[which],
+            self.spacing_mm[which],
         )
 
     def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
         """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
-        cells = pool.surface.basis.cells(*self.points_mm[:, :2].T)
-        slopes = np.swapaxes(cells.value_and_slopes()[1:], 0, 1)
-        moved = np.linalg.inv(slope_of_dot(self.points_mm, self.plane_mm, rig)) @ slopes
-        return pool.slopes.covariance_of(cells.splines, moved)
+        from labapp.core import kernels
+
+        laser, axes = rig.laser.position_mm, rig.imaging_plane.pose_mm[1:3]
+        dots = rig.imaging_plane.to_universal(self.plane_mm)
+        grid = pool.surface.basis.grid
+        return kernels.covariance_of_dots(grid, pool.factor, laser, axes, self.points_mm, dots)
+
+    def blocked(self, scene: Scene) -> BoolArray:
+        """Whether the torch may hide the dots, shape (m,) (`kernels.behind_torch`)."""
+        from labapp.core import kernels
+
+        rays, tip = scene.rays[tuple(self.at.T)], scene.rig.electrode.height_mm
+        return kernels.behind_torch(self.points_mm, rays, self.slopes, tip)
 
 
 def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
@@ -244,8 +276,9 @@ def _without_rim(labels: IntArray) -> IntArray:
 def _settled(scene: Scene, labels: IntArray, settings: FitSettings) -> IntArray | None:
     """Predict and match until the labels no longer change, or come round again."""
     before: list[bytes] = []
+    pool: FittedPool | None = None
     while len(before) < 15:
-        pool = try_fit(scene, labels, settings)
+        pool = try_fit(scene, labels, settings, pool)
         if pool is None:
             return None
         labels = _matched(scene, pool, labels)
@@ -261,50 +294,38 @@ def _count(labels: IntArray) -> int:
     return int(np.sum(labels != UNLABELLED))
 
 
-def try_fit(scene: Scene, labels: IntArray, settings: FitSettings = _SOFT) -> FittedPool | None:
+def try_fit(
+    scene: Scene, labels: IntArray, settings: FitSettings = _SOFT, near: FittedPool | None = None
+) -> FittedPool | None:
     """Fit the surface to the dots labelled so far, its level guessed from their rim."""
     if _count(labels) < LEAST_LABELS:
         return None
     try:
-        return scene.fit(labels, np.zeros(labels.shape, np.int64), settings)
+        return scene.fit(labels, np.zeros(labels.shape, np.int64), settings, near)
     except CannotMeasure:
         return None
 
 
 def predict(scene: Scene, pool: FittedPool, where: BoolArray) -> Prediction:
     """Predict the dots of the rays in a mask, shape (rows, columns)."""
+    from labapp.core import dot_kernels, kernels
+
     at = np.argwhere(where)
-    rays = scene.rays[at[:, 0], at[:, 1]]
-    points = meet_surface(pool.surface, rays, scene.landing_mm[at[:, 0], at[:, 1]])
-    plane = predict_dots(pool.surface, points, rays, scene.rig)
-    sane = np.isfinite(plane).all(axis=-1) & pool.surface.basis.contains(*points[:, :2].T)
-    at, points, plane, rays = at[sane], points[sane], plane[sane], rays[sane]
+    index, surface, pose = tuple(at.T), pool.surface, scene.rig.imaging_plane.pose_mm
+    points, slopes, plane = kernels.meet(
+        surface.basis.grid,
+        surface.coefficients,
+        scene.rays[index],
+        scene.landing_mm[index],
+        4,
+        pose,
+    )
+    sane = np.isfinite(plane[:, 0])
+    at, points, slopes, plane = at[sane], points[sane], slopes[sane], plane[sane]
     spacing = np.full(len(plane), np.inf)
     if len(plane) > 1:
-        spacing = cKDTree(plane).query(plane, k=2)[0][:, 1]
-    return Prediction(at, points, plane, spacing)
-
-
-def blocked(points_mm: FloatArray, incident: FloatArray, rig: Rig, pool: FittedPool) -> BoolArray:
-    """Whether the torch may hide reflections of a pool; see `behind_torch`."""
-    x, y = np.clip(points_mm[:, :2], pool.surface.basis.low_mm, pool.surface.basis.high_mm).T
-    reflected = reflect(incident, surface_normal(pool.surface.gradient(x, y)))
-    return behind_torch(points_mm, incident, reflected, rig.electrode.height_mm)
-
-
-def behind_torch(
-    points_mm: FloatArray, incident: FloatArray, reflected: FloatArray, tip_mm: float
-) -> BoolArray:
-    """Whether rays pass above the torch's tip, or nearly (§4.2.1), shape (n,).
-
-    The incident ray for points behind the electrode (y < 0), the reflected one before it.
-    """
-    way = np.where((points_mm[:, 1] < 0)[:, None], -incident, reflected)
-    # Both ways lead towards y = 0 and up.
-    height = points_mm[:, 2] - points_mm[:, 1] * way[:, 2] / np.where(
-        way[:, 1] == 0, 1e-12, way[:, 1]
-    )
-    return np.asarray(height > tip_mm - 0.3)
+        spacing = dot_kernels.two_nearest(plane, plane)[0][:, 1]
+    return Prediction(at, points, slopes, plane, spacing)
 
 
 def amid(lit: BoolArray) -> BoolArray:
@@ -319,8 +340,13 @@ def amid(lit: BoolArray) -> BoolArray:
 
 def within_rings(labels: IntArray, rings: int) -> BoolArray:
     """Labelled rays and their neighbours, so many rings of them."""
-    ring = np.ones((3, 3), bool)
-    return np.asarray(binary_dilation(labels != UNLABELLED, ring, iterations=rings))
+    return widened(labels != UNLABELLED, rings)
+
+
+def widened(mask: BoolArray, rings: int) -> BoolArray:
+    """A mask over rays, shape (rows, columns), and the neighbours, so many rings of them."""
+    lit = np.ascontiguousarray(mask).view(np.uint8)
+    return cv2.dilate(lit, np.ones((3, 3), np.uint8), iterations=rings).view(bool)
 
 
 def surprises(
@@ -330,19 +356,12 @@ def surprises(
 
     Squared distances in σ², and −2 log likelihoods but for a constant, both of shape (n, m).
     """
-    offset = scene.plane_mm[dots][:, None] - predicted.plane_mm
-    uncertain = CAUTION**2 * predicted.covariance_mm2(pool, scene.rig)
-    spread = scene.covariance_mm2[dots][:, None] + uncertain + MODEL_MM**2 * np.eye(2)
-    return surprise_of(offset, spread)
+    from labapp.core import match_kernels
 
-
-def surprise_of(offset: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared length in σ² of offsets, shape (…, 2), and −2 log likelihood but for a constant."""
-    x, y = offset[..., 0], offset[..., 1]
-    xx, xy, yy = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    area = xx * yy - xy * xy
-    distance = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
-    return distance, distance + np.log(area)
+    uncertain = CAUTION**2 * predicted.covariance_mm2(pool, scene.rig) + MODEL_MM**2 * np.eye(2)
+    return match_kernels.surprises(
+        scene.plane_mm[dots], scene.covariance_mm2[dots], predicted.plane_mm, uncertain
+    )
 
 
 def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
@@ -352,19 +371,19 @@ def _matched(scene: Scene, pool: FittedPool, labels: IntArray) -> IntArray:
     than any that is given a dot stand as rivals: where the prediction is so uncertain that the
     dots of the next row but one come into question, nobody gets them.
     """
+    from labapp.core import match_kernels
+
     matched = np.full(labels.shape, UNLABELLED, np.int64)
     far = predict(scene, pool, within_rings(labels, 2))
     if len(far.at) == 0:
         return matched
     distance, surprise = surprises(scene, pool, far, np.arange(len(scene.plane_mm)))
-    ray = np.argmin(surprise, axis=1)
+    ray, next_ray, best_dot, next_dot = match_kernels.two_least(surprise)
     dot = np.arange(len(ray))
     least = surprise[dot, ray]
-    taken = (np.argmin(surprise, axis=0)[ray] == dot) & (distance[dot, ray] < NEAR)
+    taken = (best_dot[ray] == dot) & (distance[dot, ray] < NEAR)
+    taken &= least + CLEAR < np.minimum(next_ray, next_dot[ray])
     taken &= least + CLEAR < AS_LIKELY_FALSE
-    for axis, rivals in ((1, surprise), (0, surprise[:, ray])):
-        if surprise.shape[axis] > 1:
-            taken &= np.partition(rivals, 1, axis=axis).take(1, axis=axis) > least + CLEAR
     at = far.at[ray]
     taken &= within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~scene.absent[at[:, 0], at[:, 1]]
     # Dots that run into each other have no place of their own.

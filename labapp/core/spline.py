@@ -1,4 +1,4 @@
-"""A smooth pool surface in splines, and the one that best has given slopes.
+"""A smooth pool surface in splines.
 
 The basis holds a dent under the torch and an oscillating pool; the penalty on the change of
 curvature keeps it from running away where no ray came back (there it goes on as a quadric).
@@ -11,9 +11,8 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dpbtrf, dpbtrs
 
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 
 DEGREE = 3
 
@@ -73,31 +72,23 @@ def _values_and_slopes(*step_mm: float) -> FloatArray:
     return pieces
 
 
-@lru_cache(maxsize=64)
-def _roughness(nx: int, ny: int, *step_mm: float) -> FloatArray:
-    """`SplineBasis.roughness`; kept, as a search lays the same splines again and again."""
+@lru_cache(maxsize=256)
+def _products(count: int) -> FloatArray:
+    """∫ of the products of the derivatives, of order 0 … 3, of so many splines along an axis.
+
+    In cells of size 1; of each spline with itself and the next three, shape (4, count, 4).
+    """
     node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
     power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
-    x, y = grams = [np.zeros((DEGREE + 1, count, count)) for count in (nx, ny)]
-    for gram, step in zip(grams, step_mm, strict=True):
-        for order, pieces in enumerate(_PIECES):
-            part = power @ (pieces / step**order)
-            within = (part * (weight * step / 2)[:, None]).T @ part
-            for cell in range(gram.shape[1] - DEGREE):
-                own = slice(cell, cell + DEGREE + 1)
-                gram[order, own, own] += within
-    # Where splines i and i + a along x, j and j + b along y meet; columns together, as LAPACK
-    # has them.
-    band = np.zeros((nx, ny, DEGREE * (ny + 1) + 1))
-    for a in range(DEGREE + 1):
-        for b in range(-DEGREE if a else 0, DEGREE + 1):
-            along, across = (np.diagonal(gram, k, 1, 2) for gram, k in ((x, a), (y, abs(b))))
-            own = slice(max(-b, 0), ny - max(b, 0))
-            band[: nx - a, own, a * ny + b] = np.einsum(
-                "o,oi,oj->ij", [1.0, 3.0, 3.0, 1.0], along[::-1], across
-            )
-    band.flags.writeable = False
-    return band.reshape(nx * ny, -1).T
+    products = np.zeros((DEGREE + 1, count, DEGREE + 1))
+    for order, pieces in enumerate(_PIECES):
+        part = power @ pieces
+        within = (part * (weight / 2)[:, None]).T @ part
+        for one in range(DEGREE + 1):
+            for on in range(DEGREE + 1 - one):
+                products[order, one : count - DEGREE + one, on] += within[one, one + on]
+    products.flags.writeable = False
+    return products
 
 
 @dataclass(frozen=True)
@@ -134,6 +125,11 @@ class SplineBasis:
     def shape(self) -> tuple[int, int]:
         """Number of splines along x and along y."""
         return len(self.x_knots) - DEGREE - 1, len(self.y_knots) - DEGREE - 1
+
+    @property
+    def count(self) -> int:
+        """Number of splines."""
+        return self.shape[0] * self.shape[1]
 
     @cached_property
     def low_mm(self) -> FloatArray:
@@ -190,13 +186,16 @@ class SplineBasis:
         x, y = np.asarray(x_mm), np.asarray(y_mm)
         return np.asarray((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high))
 
-    @property
+    @cached_property
     def roughness(self) -> FloatArray:
         """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc.
 
         Its lower band, shape (width + 1, splines), as LAPACK has it.
         """
-        return _roughness(*self.shape, *self.step_mm)
+        from labapp.core import kernels
+
+        nx, ny = self.shape
+        return kernels.roughness(_products(nx), _products(ny), self.step_mm)
 
 
 @dataclass(frozen=True)
@@ -254,127 +253,3 @@ class OpenSplineSurface(SplineSurface):
 
     def _known(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
         return np.ones(np.shape(x_mm), bool)
-
-
-@dataclass(frozen=True)
-class SlopeFit:
-    """The surface that best has given slopes, up to its level.
-
-    Parameters
-    ----------
-    surface
-        The surface, its mean height over the points 0.
-    factor
-        Cholesky factor of the normal matrix with one spline held, lower band, shape
-        (width + 1, splines).
-    level
-        Mean value of each spline over the points, shape (splines,).
-    """
-
-    surface: SplineSurface
-    factor: FloatArray
-    level: FloatArray
-
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """Covariance of the coefficients, the level left out, shape (splines, splines), mm²."""
-        level, ones = self.level, np.ones(len(self.level))
-        covariance = dpbtrs(self.factor, np.eye(len(ones), order="F"), lower=1, overwrite_b=1)[0]
-        # What the held spline seems to know about the level is taken out again.
-        held = covariance - np.outer(ones, level @ covariance) - np.outer(covariance @ level, ones)
-        return np.asarray(held + (level @ covariance @ level) * np.outer(ones, ones))
-
-    def covariance_of(self, splines: IntArray, parts: FloatArray) -> FloatArray:
-        """Covariance of pairs of linear combinations of coefficients, blind to the level.
-
-        Parameters
-        ----------
-        splines
-            Numbers of the 16 splines of each pair, shape (n, 16).
-        parts
-            What each of these coefficients counts for in either, shape (n, 2, 16); either adds up
-            to 0.
-
-        Returns
-        -------
-        FloatArray
-            Shape (n, 2, 2).
-        """
-        from labapp.core import kernels
-
-        return kernels.covariance_of(self.factor, splines, parts)
-
-
-def fit_slopes(
-    basis: SplineBasis,
-    points_mm: FloatArray,
-    slopes: FloatArray,
-    weights: FloatArray,
-    stiffness: float,
-) -> SlopeFit:
-    """Least-squares surface through slopes.
-
-    Parameters
-    ----------
-    basis
-        Splines to build it of.
-    points_mm
-        Where the slopes are known, (x, y), shape (n, 2), mm; held to the basis's rectangle.
-    slopes
-        (∂z/∂x, ∂z/∂y) there, shape (n, 2).
-    weights
-        Inverse of each slope's covariance, shape (n, 2, 2).
-    stiffness
-        Weight of the roughness, mm⁶: the area over which the third derivatives go together, over
-        their expected variance.
-
-    Raises
-    ------
-    CannotMeasure
-        ``no-surface`` if the slopes do not settle the surface.
-    """
-    from labapp.core import kernels
-
-    count = basis.shape[0] * basis.shape[1]
-    splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
-    pull = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
-    target = np.bincount(splines.ravel(), pull.ravel(), count)
-    factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
-    coefficients = dpbtrs(factor, target, lower=1)[0]
-    level = np.bincount(splines.ravel(), value.ravel(), count) / len(points_mm)
-    surface = SplineSurface(basis, coefficients - level @ coefficients)
-    return SlopeFit(surface, factor, level)
-
-
-def normal_factor(
-    basis: SplineBasis, stiffness: FloatArray, points_mm: FloatArray, weights: FloatArray
-) -> FloatArray:
-    """Cholesky factor of the normal matrix of slopes at points, lower band, shape (width + 1, p).
-
-    Slopes leave the level open; it is held by one spline in the middle, which moves nothing else.
-
-    Parameters
-    ----------
-    basis
-        The p splines.
-    stiffness
-        Weight of the roughness times its matrix, lower band, shape (width + 1, p).
-    points_mm, weights
-        See `fit_slopes`.
-
-    Raises
-    ------
-    CannotMeasure
-        ``no-surface`` if there is none.
-    """
-    from labapp.core import kernels
-
-    columns, (height, count) = stiffness.flatten(order="F"), stiffness.shape
-    kernels.add_gram(basis.grid, points_mm, weights, columns, height - 1)
-    band = columns.reshape(count, height).T
-    middle = kernels.splines_at(basis.grid, points_mm[len(points_mm) // 2, None])[0]
-    band[0, middle[0, 5]] += band[0].mean()
-    lower, info = dpbtrf(band, lower=1, overwrite_ab=1)
-    if info:
-        raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
-    return np.asarray(lower)

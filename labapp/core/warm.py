@@ -32,11 +32,11 @@ from labapp.core.pool_fit import Level, place_level
 from labapp.core.ray_growth import UNLABELLED, Scene
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
+from labapp.core.solver import SERVES_MM
 from labapp.core.spline import SplineSurface
 from labapp.core.track import MEMORY, Broken, Track, begin, found_again, rms
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.core.warm_fit import (
-    SERVES_MM,
     Bed,
     Slopes,
     WarmPool,
@@ -59,6 +59,9 @@ datum to be carried on: a pool that has gone on by a row lights other rays, and 
 
 SINKS_EVERY = 16
 """Every so many frames it is asked anew whether the rear sinks."""
+
+WINDOW = 0.4
+"""How far from the last frame's level it is looked for first (`place_level`)."""
 
 POINTS_EVERY = 8
 """Every so many frames the uncertainty of the reflection points is worked out anew."""
@@ -277,7 +280,8 @@ def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, floa
     free = track.count % SINKS_EVERY == SINKS_EVERY - 1
     drop = None if free else before.rear.drop_mm
     y, about = bed.landing_mm[told, 1], (0.0, before.sign)
-    level = place_level(height[told], slope[told], y, witness[told], bed.spacing_mm, drop, about)
+    told_by = height[told], slope[told], y, witness[told]
+    level = place_level(*told_by, bed.spacing_mm, drop, about, WINDOW)
     open_mm = level.sigma_mm if free else track.open_mm
     return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
 

@@ -1,9 +1,7 @@
 """The fit of `pool_fit`, started from the frame before: the same surface in a millisecond.
 
-The normal matrix of the spline coefficients is a band, so that its factor costs little. With one
-factor a few rounds suffice: each takes the slopes where the rays now meet the surface, solves for
-what they still ask for, and meets the rays anew. Rounds end at the same surface whatever factor
-they are solved with; the level is found as ever, from which rays came back and which did not.
+With one factor of the normal matrix (`solver`) a few rounds suffice. The level is found as ever,
+from which rays came back and which did not.
 """
 
 from __future__ import annotations
@@ -11,22 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import types
-from scipy.linalg.blas import dsbmv
-from scipy.linalg.lapack import dpbtrs
 
 from labapp.core import kernels
-from labapp.core.compiled import compiled
 from labapp.core.optics import meet_level, ray_directions
 from labapp.core.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
 from labapp.core.rig import Rig
-from labapp.core.spline import SplineBasis, normal_factor
+from labapp.core.solver import NormalEquations
+from labapp.core.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 
 ROUNDS = 8
-SETTLED_MM, SERVES_MM = 3e-4, 5e-3
-"""No reflection point moves by more in the last round; a factor serves for moves that are small
-beside the splines' cells."""
+SETTLED_MM = 3e-4
+"""No reflection point moves by more in the last round."""
 
 
 @dataclass(frozen=True)
@@ -162,28 +156,8 @@ class Slopes:
     def of(cls, bed: Bed, ray: IntArray, plane_mm: FloatArray, covariance: FloatArray) -> Slopes:
         """Weigh dots on the plane, shape (n, 2), of the covariance given, shape (n, 2, 2)."""
         dots = bed.rig.imaging_plane.to_universal(plane_mm)
-        jacobian = kernels.slopes_of_dots(bed.laser_mm, bed.plane[1:3], bed.landing_mm[ray], dots)
-        return cls(ray, dots, weights_of(jacobian, covariance, bed.settings.floor_mm))
-
-
-_matrices = types.Array(types.float64, 3, "A", readonly=True)
-
-
-@compiled(_matrices, _matrices, types.float64)
-def weights_of(jacobian: FloatArray, covariance: FloatArray, floor: float) -> FloatArray:
-    """What `pool_fit.slope_weights` gives."""
-    made = np.empty(jacobian.shape)
-    for k in range(len(jacobian)):
-        xx, xy, yy = covariance[k, 0, 0] + floor**2, covariance[k, 0, 1], covariance[k, 1, 1]
-        yy += floor**2
-        (a, b), (c, d) = jacobian[k, 0], jacobian[k, 1]
-        one = a * a * xx + 2.0 * a * b * xy + b * b * yy
-        other = c * c * xx + 2.0 * c * d * xy + d * d * yy
-        both = a * c * xx + (a * d + b * c) * xy + b * d * yy
-        area = one * other - both * both
-        made[k, 0, 0], made[k, 1, 1] = other / area, one / area
-        made[k, 0, 1] = made[k, 1, 0] = -both / area
-    return made
+        at = bed.laser_mm, bed.plane[1:3], bed.landing_mm[ray], dots
+        return cls(ray, dots, kernels.slope_weights(*at, covariance, bed.settings.floor_mm))
 
 
 def fit_slopes_to(
@@ -198,14 +172,14 @@ def fit_slopes_to(
     """Fit the surface to slopes, round by round from a pool that is near.
 
     Each round takes the slopes where the rays now meet the surface, fits, and meets them anew,
-    until no reflection point moves by ``until_mm``. A factor serves the next round, too, where
-    points hardly move; one that serves for the first may be given as ``lower``. What is held down
-    is the roughness; of the difference to a surface where coefficients ``rest`` are given.
+    until no reflection point moves by ``until_mm``. A factor that serves for the first may be given
+    as ``lower``. What is held down is the roughness; of the difference to a surface where
+    coefficients ``rest`` are given.
 
     Returns
     -------
     pool, lower, moved_mm
-        The surface; the factor of the normal matrix (`spline.normal_factor`); how far the
+        The surface; the factor of the normal matrix (`solver.normal_factor`); how far the
         reflection point moved that moved most in the last round.
 
     Raises
@@ -213,27 +187,20 @@ def fit_slopes_to(
     CannotMeasure
         ``no-surface`` if the slopes do not settle the surface.
     """
-    grid, rays, weights = bed.basis.grid, bed.rays[slopes.ray], slopes.weights
-    coefficients, points = pool.coefficients, pool.points_mm[slopes.ray]
-    width, moved = len(bed.stiffness) - 1, 0.0
-    lower = normal_factor(bed.basis, bed.stiffness, points, weights) if lower is None else lower
+    grid, rays = bed.basis.grid, bed.rays[slopes.ray]
+    equations = NormalEquations(
+        bed.basis, bed.stiffness, bed.laser_mm, slopes.dots_mm, slopes.weights, lower
+    )
+    coefficients, points, moved = pool.coefficients, pool.points_mm[slopes.ray], 0.0
     for _ in range(rounds):
-        if moved > SERVES_MM:
-            lower = normal_factor(bed.basis, bed.stiffness, points, weights)
-        target = kernels.pull(grid, coefficients, points, weights, bed.laser_mm, slopes.dots_mm)
-        target -= dsbmv(width, 1.0, bed.stiffness, coefficients - rest, lower=1)
-        coefficients = coefficients + solve(lower, target)
+        coefficients = equations.improve(coefficients, points, moved, rest)
         points, moved = kernels.advance(grid, coefficients, rays, points, 1)
         if moved < until_mm:
             break
     every = pool.points_mm.copy()
     every[slopes.ray] = points
-    return met(bed, coefficients, every, 1), lower, moved
-
-
-def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve the normal equations of a factor for right sides, shape (p,) or (p, m)."""
-    return np.asarray(dpbtrs(lower, right, lower=1)[0])
+    assert equations.factor is not None
+    return met(bed, coefficients, every, 1), equations.factor, moved
 
 
 def lay(bed: Bed, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numba import types
 
-from labapp.core import dot_kernels, kernels
-from labapp.core.compiled import compiled
+from labapp.core import dot_kernels, kernels, match_kernels
 from labapp.core.hypothesis import BEYOND, FEW
 from labapp.core.pool_fit import Level
 from labapp.core.ray_growth import (
@@ -24,10 +22,9 @@ from labapp.core.ray_growth import (
     UNLABELLED,
     Scene,
     amid,
-    surprise_of,
 )
 from labapp.core.values import BoolArray, FloatArray, IntArray, median
-from labapp.core.warm_fit import Bed, WarmPool, lay, solve
+from labapp.core.warm_fit import Bed, WarmPool, lay
 
 GATE, CLEARLY = 0.35, 2.0
 """A dot is a tracked ray's within this share of the way to the next predicted dot, if no other dot
@@ -159,21 +156,19 @@ def widened(
 def _surprise(
     bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, ray: IntArray, dot: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What `ray_growth.surprise_of` says of rays making dots, shapes (rays, dots)."""
-    splines, values = kernels.splines_at(bed.basis.grid, pool.points_mm[ray, :2])
-    by = np.zeros((2, len(ray), len(pool.coefficients)))
-    for axis in range(2):
-        np.put_along_axis(by[axis], splines, values[1 + axis], axis=1)
+    """What `match_kernels.surprises` says of rays making dots, shapes (rays, dots)."""
     dots_mm = bed.rig.imaging_plane.to_universal(pool.plane_mm[ray])
-    axes = bed.plane[1:3]
-    slopes = kernels.slopes_of_dots(bed.laser_mm, axes, pool.points_mm[ray], dots_mm)
-    moved = np.linalg.inv(slopes)
-    rows = moved @ np.moveaxis(by, 0, 1)
-    across = solve(lower, np.asfortranarray(rows.reshape(2 * len(ray), -1).T))
-    spread = rows @ across.T.reshape(len(ray), 2, -1).swapaxes(1, 2)
-    spread = CAUTION**2 * spread[:, None] + scene.covariance_mm2[dot] + MODEL_MM**2 * np.eye(2)
-    offset = scene.plane_mm[dot] - pool.plane_mm[ray, None]
-    return surprise_of(offset, spread)
+    laser, axes = bed.laser_mm, bed.plane[1:3]
+    spread = kernels.covariance_of_dots(
+        bed.basis.grid, lower, laser, axes, pool.points_mm[ray], dots_mm
+    )
+    made = match_kernels.surprises(
+        scene.plane_mm[dot],
+        scene.covariance_mm2[dot],
+        pool.plane_mm[ray],
+        CAUTION**2 * spread + MODEL_MM**2 * np.eye(2),
+    )
+    return made[0].T, made[1].T
 
 
 @dataclass(frozen=True)
@@ -199,7 +194,9 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
     known = np.isfinite(pool.plane_mm[:, 0])
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
     merged = next_mm < scene.resolution_mm
-    hidden = behind_torch(pool.points_mm, bed.rays, pool.slopes, bed.rig.electrode.height_mm)
+    hidden = kernels.behind_torch(
+        pool.points_mm, bed.rays, pool.slopes, bed.rig.electrode.height_mm
+    )
     seen = known & ~hidden & ~merged
     seen[seen] = scene.in_view(pool.plane_mm[seen])
     among = amid(on_pattern(bed, lit).view(bool))[tuple(bed.at.T)]
@@ -216,21 +213,6 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
         if run_together.any():
             stray = stray[apart[run_together].min(axis=0) > scene.resolution_mm]
     return Testimony(witness, len(stray), missed)
-
-
-@compiled(*3 * [types.Array(types.float64, 2, "A", readonly=True)], types.float64)
-def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: float) -> BoolArray:
-    """What `ray_growth.behind_torch` says of rays that a surface of some slopes reflects."""
-    hidden = np.empty(len(rays), np.bool_)
-    for k in range(len(rays)):
-        x, y, z = -rays[k, 0], -rays[k, 1], -rays[k, 2]
-        if points[k, 1] >= 0.0:  # Eq. 4-4
-            a, b = slopes[k, 0], slopes[k, 1]
-            twice = 2.0 * (a * x + b * y - z) / (a * a + b * b + 1.0)
-            y, z = twice * b - y, -twice - z
-        y = y if y != 0.0 else 1e-12
-        hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - 0.3
-    return hidden
 
 
 def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray, before: BoolArray) -> IntArray:

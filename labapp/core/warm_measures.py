@@ -151,7 +151,7 @@ def sigma_of(
     Parameters
     ----------
     lower
-        Factor of the normal matrix (`spline.normal_factor`).
+        Factor of the normal matrix (`solver.normal_factor`).
     gradients
         Derivatives by the spline coefficients.
     level_at

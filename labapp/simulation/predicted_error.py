@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.optics import bisecting_gradient, meet_level, ray_directions
-from labapp.core.pool_fit import CORRELATED_MM2, REACH, FitSettings, landing_spacing, slope_of_dot
+from labapp.core.pool_fit import CORRELATED_MM2, REACH, FitSettings, landing_spacing
 from labapp.core.rig import Laser, Rig
-from labapp.core.spline import SlopeFit, SplineBasis, fit_slopes
+from labapp.core.solver import SlopeFit, fit_slopes
+from labapp.core.spline import SplineBasis
 from labapp.core.values import FloatArray, freeze
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.parameter_deviation import (
@@ -145,6 +146,8 @@ class _Model:
     """The smooth surface through the true slopes, and what it makes of changes to them."""
 
     def __init__(self, pool: Pool, rig: Rig, seen: Reflections, dot_sigma_mm: float) -> None:
+        from labapp.core import kernels
+
         settings = FitSettings()
         self.pool, self.rig, self.seen = pool, rig, seen
         self.points = seen.point_mm[seen.visible]
@@ -164,11 +167,11 @@ class _Model:
         )
         self.stiffness = CORRELATED_MM2 / settings.jerk**2
         # The weights are those of the fit; the noise is what it will be.
-        jacobian = slope_of_dot(self.points, self.plane, rig)
         variance = dot_sigma_mm**2 + settings.floor_mm**2
-        self.weights: FloatArray = np.asarray(
-            np.linalg.inv(variance * jacobian @ np.swapaxes(jacobian, -1, -2)), float
-        )
+        covariance = np.broadcast_to(variance * np.eye(2), (len(self.points), 2, 2))
+        laser, pose = rig.laser.position_mm, rig.imaging_plane.pose_mm
+        dots = rig.imaging_plane.to_universal(self.plane)
+        self.weights = kernels.slope_weights(laser, pose[1:3], self.points, dots, covariance, 0.0)
         self.fitted = self.fit(self.points, pool.gradient(*self.points[:, :2].T))
         self.inward = self._inward(ground)
         self.dark = ~seen.hit & ~seen.absent & self.basis.contains(ground[..., 0], ground[..., 1])

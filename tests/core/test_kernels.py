@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.stats import multivariate_normal
 
 from labapp.core import (
     dot_kernels,
@@ -18,8 +19,7 @@ from labapp.core import (
     dots,
     kernels,
     level_kernels,
-    quadric_kernels,
-    ray_growth,
+    match_kernels,
 )
 from labapp.core.coordinates import ImageCalibration
 from labapp.core.optics import (
@@ -30,13 +30,12 @@ from labapp.core.optics import (
     reflect,
     surface_normal,
 )
-from labapp.core.pool_fit import Rear, slope_of_dot, slope_weights
+from labapp.core.pool_fit import Rear
 from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.solver import normal_factor
 from labapp.core.spline import SplineBasis, SplineSurface
 from labapp.core.track import recurrence
 from labapp.core.values import FloatArray
-from labapp.core.warm_fit import weights_of
-from labapp.core.warm_match import behind_torch
 
 RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
 PLANE, LASER = RIG.imaging_plane, RIG.laser.position_mm
@@ -109,11 +108,74 @@ def test_a_ray_that_runs_away_from_the_plane_has_no_dot() -> None:
 BASIS_Y = np.tile((BASIS.y_knots[:-4] + BASIS.y_knots[4:]) / 2, BASIS.shape[0]) - 0.3
 
 
-def test_slopes_of_dots_are_those_of_the_bisector() -> None:
+def slopes_of_dots(points: FloatArray, plane_mm: FloatArray) -> FloatArray:
+    """∂(slopes at points)/∂(dots X′, Z′), shape (n, 2, 2), mm⁻¹, from how they change."""
+    dots = PLANE.to_universal(plane_mm)
+    step = 1e-4
+    ahead, behind = (
+        [
+            bisecting_gradient(points - LASER, dots + way * step * axis - points)
+            for axis in (PLANE.x_axis, PLANE.z_axis)
+        ]
+        for way in (1, -1)
+    )
+    return (np.stack(ahead, axis=-1) - np.stack(behind, axis=-1)) / (2 * step)
+
+
+def test_slopes_weigh_as_the_covariance_of_their_dots_has_it() -> None:
     rng, (_, landing) = random(), landings()
     seen = rng.uniform([10.0, 10.0], [80.0, 60.0], (len(landing), 2))
-    made = kernels.slopes_of_dots(LASER, PLANE.pose_mm[1:3], landing, PLANE.to_universal(seen))
-    np.testing.assert_allclose(made, slope_of_dot(landing, seen, RIG), atol=1e-9)
+    half = rng.normal(0.0, 0.05, (len(landing), 2, 2))
+    covariance, floor = half @ half.swapaxes(1, 2), 0.02
+    made = kernels.slope_weights(
+        LASER, PLANE.pose_mm[1:3], landing, PLANE.to_universal(seen), covariance, floor
+    )
+    jacobian = slopes_of_dots(landing, seen)
+    spread = jacobian @ (covariance + floor**2 * np.eye(2)) @ jacobian.swapaxes(1, 2)
+    np.testing.assert_allclose(made @ spread, np.broadcast_to(np.eye(2), spread.shape), atol=5e-3)
+
+
+def test_dots_are_uncertain_by_what_the_coefficients_are() -> None:
+    rng = random()
+    points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
+    weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
+    factor = normal_factor(BASIS, 10.0 * BASIS.roughness, points, weights)
+    lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
+    at, seen = points[:7], rng.uniform([10.0, 10.0], [80.0, 60.0], (7, 2))
+    made = kernels.covariance_of_dots(
+        BASIS.grid, factor, LASER, PLANE.pose_mm[1:3], at, PLANE.to_universal(seen)
+    )
+    slopes = np.stack([BASIS.matrix(*at[:, :2].T, 1, 0), BASIS.matrix(*at[:, :2].T, 0, 1)], axis=1)
+    parts = np.linalg.inv(slopes_of_dots(at, seen)) @ slopes
+    expected = parts @ np.linalg.inv(lower @ lower.T) @ parts.swapaxes(1, 2)
+    np.testing.assert_allclose(made, expected, rtol=1e-4)
+
+
+def test_surprises_are_those_of_the_normal_distribution() -> None:
+    rng = random()
+    places, predicted = rng.normal(0.0, 1.0, (9, 2)), rng.normal(0.0, 1.0, (5, 2))
+    half = rng.normal(0.0, 0.5, (9, 2, 2)), rng.normal(0.0, 0.5, (5, 2, 2))
+    covariance, uncertain = (one @ one.swapaxes(1, 2) for one in half)
+    distance, surprise = match_kernels.surprises(places, covariance, predicted, uncertain)
+    for n in range(9):
+        for m in range(5):
+            law = multivariate_normal(predicted[m], covariance[n] + uncertain[m])
+            np.testing.assert_allclose(
+                surprise[n, m], -2 * law.logpdf(places[n]) - 2 * np.log(2 * np.pi), rtol=1e-9
+            )
+            whole = -2 * law.logpdf(places[n]) + 2 * law.logpdf(predicted[m])
+            np.testing.assert_allclose(distance[n, m], whole, rtol=1e-9)
+
+
+def test_the_two_least_are_those_of_the_sorted_values() -> None:
+    values = random().integers(0, 40, (9, 7)).astype(float)  # some are there twice
+    column, next_in_row, row, next_in_column = match_kernels.two_least(values)
+    np.testing.assert_array_equal(column, values.argmin(axis=1))
+    np.testing.assert_array_equal(row, values.argmin(axis=0))
+    np.testing.assert_array_equal(next_in_row, np.sort(values, axis=1)[:, 1])
+    np.testing.assert_array_equal(next_in_column, np.sort(values, axis=0)[1])
+    assert np.isinf(match_kernels.two_least(values[:1])[3]).all()
+    assert np.isinf(match_kernels.two_least(values[:, :1])[1]).all()
 
 
 @pytest.mark.parametrize("banded", [True, False])
@@ -146,23 +208,17 @@ def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
     )
 
 
-def test_slopes_weigh_as_the_covariance_of_their_dots_has_it() -> None:
-    rng = random()
-    jacobian, half = rng.normal(0.0, 1e-2, (30, 2, 2)), rng.normal(0.0, 0.05, (30, 2, 2))
-    covariance = half @ half.swapaxes(1, 2)
-    np.testing.assert_allclose(
-        weights_of(jacobian, covariance, 0.02), slope_weights(jacobian, covariance, 0.02)
-    )
-
-
 def test_rays_are_hidden_by_the_torch_as_when_they_are_reflected_one_by_one() -> None:
     rays, landing = landings()
     points = landing + random().normal(0.0, 0.2, landing.shape)
     slopes = random().normal(0.0, 0.1, (len(rays), 2))
     way = reflect(rays, surface_normal(slopes))
-    hidden = ray_growth.behind_torch(points, rays, way, 2.4)
+    # On its way to or from the laser's side a ray is highest beside the torch where y is 0.
+    towards = np.where((points[:, 1] < 0)[:, None], -rays, way)
+    height = points[:, 2] - points[:, 1] * towards[:, 2] / towards[:, 1]
+    hidden = height > 2.4 - 0.3
     assert 10 < hidden.sum() < len(rays) - 10
-    np.testing.assert_array_equal(behind_torch(points, rays, slopes, 2.4), hidden)
+    np.testing.assert_array_equal(kernels.behind_torch(points, rays, slopes, 2.4), hidden)
 
 
 def test_frames_follow_on_each_other_by_the_least_squares_recurrence() -> None:
@@ -399,7 +455,7 @@ def test_rays_meet_quadrics() -> None:
     rays = ray_directions(RIG.laser, RIG.pattern)[7:12, 7:12].reshape(-1, 3)
     center = np.array([0.2, -0.3])
     quadrics = np.array([[0.02, -0.03, -0.05, 0.01, -0.04], [0.0, 0.01, 0.03, 0.0, 0.02]])
-    points, plane = quadric_kernels.meet(center, quadrics, rays, LASER, PLANE.pose_mm)
+    points, plane = kernels.meet_quadrics(center, quadrics, rays, LASER, PLANE.pose_mm)
     for (g_x, g_y, k_x, k_xy, k_y), met, seen in zip(quadrics, points, plane, strict=True):
         x, y = (met[:, :2] - center).T
         z = g_x * x + g_y * y + (k_x * x**2 + 2 * k_xy * x * y + k_y * y**2) / 2
@@ -417,7 +473,7 @@ def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
     absent = np.zeros((3, 4), bool)
     absent[1, 1] = True
     places = np.array([[0.9, 0.0], [2.0, 3.0], [6.0, 1.1], [4.0, 5.0]])
-    hit, dot, off = (part[0] for part in quadric_kernels.hits(pattern[None], places, absent, 0.5))
+    hit, dot, off = (part[0] for part in kernels.hits(pattern[None], places, absent, 0.5))
     np.testing.assert_allclose(off[0, 0], 0.9)  # of half the 2 mm to the next in its row
     assert hit[0, 0]
     assert not hit[1, 1]  # nobody makes that dot
@@ -427,6 +483,25 @@ def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
     assert not hit[2, 3]
     assert np.isinf(off[2, 3])
     assert np.argwhere(hit).tolist() == [[0, 0]]
+
+
+@pytest.mark.parametrize("lit", [range(9), [0, 1, 2, 3, 8], [3, 4, 5], [0, 4, 8, 5]])
+def test_quadrics_are_fitted_by_least_squares_of_slopes(lit: list[int]) -> None:
+    rays, center = ray_directions(RIG.laser, RIG.pattern)[7:12, 7:12], np.array([0.1, -0.2])
+    true = np.array([[0.02, -0.03, -0.05, 0.01, -0.04]])
+    near, absent = true + 0.003 * random().normal(size=(1, 5)), np.zeros((5, 5), bool)
+    bench = LASER, PLANE.pose_mm
+    places = kernels.meet_quadrics(center, true, rays.reshape(-1, 3), *bench)[1]
+    places = places.reshape(5, 5, 2)[1:4, 1:4].reshape(-1, 2)[list(lit)]
+    fitted = kernels.fit_quadrics(center, near, rays, *bench, places, absent, 0.5)
+    if len(lit) < 4:
+        np.testing.assert_array_equal(fitted, near)
+        return
+    pattern = kernels.meet_quadrics(center, fitted, rays.reshape(-1, 3), *bench)[1][0]
+    off = np.linalg.norm(places[:, None] - pattern, axis=-1).min(axis=1)
+    assert off.max() < 0.02
+    if len(lit) > 4:
+        np.testing.assert_allclose(fitted, true, atol=2e-4)
 
 
 @pytest.mark.parametrize("witnesses", [1, 90, 2 * level_kernels.FACTORS + 7])

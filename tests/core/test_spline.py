@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.spline import SplineBasis, SplineSurface, fit_slopes
+from labapp.core.solver import fit_slopes
+from labapp.core.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 
 LOW, HIGH = np.array([-3.0, -2.0]), np.array([2.0, 4.0])
@@ -145,17 +146,3 @@ def test_the_covariance_is_the_spread_of_repeated_fits() -> None:
     np.testing.assert_allclose(found / told, 1.0, atol=0.2)
     level = BASIS.matrix(*xy.T).mean(axis=0)
     assert level @ fitted.covariance @ level == pytest.approx(0.0, abs=1e-12)
-
-
-def test_the_covariance_of_slopes_is_that_of_the_coefficients() -> None:
-    xy, at = places(120), places(12, seed=3) * 0.8
-    weights = np.tile(np.diag([4e4, 1e4]), (len(xy), 1, 1))
-    fitted = fit_slopes(BASIS, xy, np.zeros_like(xy), weights, 1e-3)
-    matrix = np.stack([BASIS.matrix(*at.T, 1, 0), BASIS.matrix(*at.T, 0, 1)], axis=1)
-    cells = BASIS.cells(*at.T)
-    parts = np.swapaxes(cells.value_and_slopes()[1:], 0, 1)
-    np.testing.assert_allclose(
-        fitted.covariance_of(cells.splines, parts),
-        matrix @ fitted.covariance @ np.swapaxes(matrix, 1, 2),
-        rtol=1e-6,
-    )

@@ -1,0 +1,63 @@
+"""Inner loops of matching dots with rays, compiled (docs/adr/0018)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled
+from labapp.core.values import FloatArray, IntArray
+
+_f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (2, 3))
+
+
+@compiled(_f2, _f3, _f2, _f3)
+def surprises(
+    places: FloatArray, covariance: FloatArray, predicted: FloatArray, uncertain: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """How far n places are from m predictions, and how unlikely that makes each pair.
+
+    Places and predictions have shapes (n, 2) and (m, 2), their covariances (n, 2, 2) and (m, 2, 2).
+
+    Returns
+    -------
+    distance, surprise
+        Squared distances in σ², and −2 log likelihoods but for a constant, both of shape (n, m).
+    """
+    distance = np.empty((len(places), len(predicted)))
+    surprise = np.empty((len(places), len(predicted)))
+    for n in range(len(places)):
+        for m in range(len(predicted)):
+            x, y = places[n, 0] - predicted[m, 0], places[n, 1] - predicted[m, 1]
+            xx = covariance[n, 0, 0] + uncertain[m, 0, 0]
+            xy = covariance[n, 0, 1] + uncertain[m, 0, 1]
+            yy = covariance[n, 1, 1] + uncertain[m, 1, 1]
+            area = xx * yy - xy * xy
+            distance[n, m] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
+            surprise[n, m] = area
+    surprise[:] = distance + np.log(surprise)
+    return distance, surprise
+
+
+@compiled(_f2)
+def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+    """Where each row's least value is and its second least; the same of each column.
+
+    Values have shape (n, m), m > 0; where there is no second it is infinite.
+    """
+    rows, columns = values.shape
+    column, next_in_row = np.zeros(rows, np.int64), np.full(rows, np.inf)
+    row, next_in_column = np.zeros(columns, np.int64), np.full(columns, np.inf)
+    in_row, in_column = np.full(rows, np.inf), np.full(columns, np.inf)
+    for n in range(rows):
+        for m in range(columns):
+            value = values[n, m]
+            if value < in_row[n]:
+                in_row[n], next_in_row[n], column[n] = value, in_row[n], m
+            elif value < next_in_row[n]:
+                next_in_row[n] = value
+            if value < in_column[m]:
+                in_column[m], next_in_column[m], row[m] = value, in_column[m], n
+            elif value < next_in_column[m]:
+                next_in_column[m] = value
+    return column, next_in_row, row, next_in_column
