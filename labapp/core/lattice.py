@@ -7,17 +7,20 @@ text's two searches are in `row_search`.
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from labapp.core.dots import Dots
-from labapp.core.values import CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, ComplexArray, FloatArray, IntArray, freeze
 
 Site = tuple[int, int]
+
+MOST_STEPS = 1000
+"""A grid grows no further than so many steps from the dot that it begins at."""
+
+_NEXT: tuple[Site, ...] = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 @dataclass(frozen=True)
@@ -77,313 +80,192 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         ``too-few-dots`` if fewer dots than a grid needs were found, ``no-rows`` if they do not
         form one.
     """
+    from labapp.core.lattice_kernels import BORDER, grow
+
     if len(dots) < settings.least:
         raise CannotMeasure(
             "too-few-dots", f"{len(dots)} dots were found, a grid needs {settings.least}"
         )
-    points = dots.image_px * [1.0, -1.0]
-    tree = cKDTree(points)
-    plane = [complex(*point) for point in points]
-    grid: dict[Site, int] = {}
-    tried: set[int] = set()
-    for seed, first, second in _seeds(points, tree):
-        if seed in tried:
+    plane = dots.u_px - 1j * dots.v_px
+    order = np.argsort(plane.real)
+    rank, in_order = np.argsort(order), plane[order]
+    across = 2 * (min(len(dots), MOST_STEPS) + BORDER) + 1
+    dot_at = np.full((across, across), -1)
+    tried = np.zeros(len(dots), np.bool_)
+    grid = np.empty((0, 0), np.int64)
+    for seed, first, second in _seeds(plane):
+        if tried[seed]:
             continue
-        grown = _sound_part(_Growth(points, tree, settings).run(seed, first, second), plane)
-        tried.update(grown.values())
+        k, t, dot = _sound_part(
+            grow(in_order, dot_at, rank[seed], first, second, settings.gate, settings.doubt)
+        )
+        dot = order[dot]
+        tried[dot] = True
         # Held against the best so far by what is left of it: a slip halves the largest grid.
-        if len(grown) > len(grid):
-            grown = _without_slips(_upright(_unsheared(grown, plane), points), plane)
-            grid = max(grid, grown, key=len)
-    if len(grid) < max(settings.least, settings.share * len(dots)):
+        if len(dot) > _count(grid):
+            grown = _upright(_unsheared(_grid_of(k, t, dot), plane), plane)
+            grid = max(grid, _without_slips(grown, plane), key=_count)
+    if _count(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
-    grid = _from_one(grid)
-    holes = find_holes(grid, dots)
+    grid = _grid_of(*_sites(grid))
+    sites = {(k + 1, t + 1): dot for k, t, dot in np.stack(_sites(grid), axis=-1).tolist()}
+    holes = find_holes(sites, dots)
     certain = [site for site, sides in holes if sides == 4]
     return lattice_of_sites(
-        grid,
+        sites,
         len(dots),
         reference=certain[0] if len(certain) == 1 else None,
         candidates=tuple(site for site, _ in holes),
     )
 
 
-def _seeds(points: FloatArray, tree: cKDTree) -> list[tuple[int, FloatArray, FloatArray]]:
+def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
     """Dots that lie midway between two neighbours, the most regular first.
 
     Returns triples of the dot, the step to such a neighbour, and the step across: to the other
     such neighbour where there is one, otherwise to the nearest dot well off the first line (rows
     may be ten times further apart than the dots within them).
     """
-    near = tree.query(points, k=min(41, len(points)))[1][:, 1:]
-    seeds = []
-    for p in range(len(points)):
-        offset = points[near[p]] - points[p]
-        length = np.linalg.norm(offset, axis=1)
-        some = slice(0, 10)
-        error = np.linalg.norm(offset[some, None] + offset[None, some], axis=2)
-        error /= np.minimum(length[some, None], length[None, some])
-        pairs = [
-            (length[a] + length[b], error[a, b], (offset[b] - offset[a]) / 2)
-            for a, b in zip(*np.nonzero(np.triu(error < 0.5, 1)), strict=True)
-        ]
-        if not pairs:
-            continue
-        pairs.sort(key=lambda pair: pair[0])
-        first = pairs[0][2]
-        across = [(step, err) for _, err, step in pairs[1:] if _turn(first, step) > 0.4]
-        off_line = np.nonzero(_turn(first, offset) > 0.6)[0]
-        if len(off_line):
-            across.append((offset[off_line[0]], 0.5))
-        seeds += [(pairs[0][1] + err, p, first, step) for step, err in across[:1] + across[-1:]]
-    seeds.sort(key=lambda seed: seed[0])
-    return [(p, first, second) for _, p, first, second in seeds]
+    points = np.stack([plane.real, plane.imag], axis=-1)
+    near = cKDTree(points).query(points, k=min(41, len(points)))[1][:, 1:]
+    offset = plane[near] - plane[:, None]
+    length = np.abs(offset)
+    a, b = np.triu_indices(min(10, near.shape[1]), 1)
+    step = (offset[:, b] - offset[:, a]) / 2
+    dots = np.arange(len(plane))
+    with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
+        error = np.abs(offset[:, a] + offset[:, b]) / np.minimum(length[:, a], length[:, b])
+        size = np.where(error < 0.5, length[:, a] + length[:, b], np.inf)
+        shortest = dots, size.argmin(axis=1)
+        first = step[shortest]
+        crossing = np.where(_turn(first, step) > 0.4, size, np.inf)
+        off_line = _turn(first, offset) > 0.6
+    # A dot off the line is taken after all that have another one opposite.
+    last = np.where(off_line.any(axis=1), np.finfo(float).max, np.inf)
+    size_across = np.column_stack([crossing, last])
+    across = np.column_stack([step, offset[dots, off_line.argmax(axis=1)]])
+    doubt = np.column_stack([error, np.full(len(plane), 0.5)])
+    found = np.isfinite(size_across)
+    ends = np.where(found, size_across, -np.inf).argmax(axis=1)
+    both = np.column_stack([size_across.argmin(axis=1), ends])
+    second = np.take_along_axis(across, both, axis=1)
+    doubt = np.take_along_axis(doubt, both, axis=1) + error[shortest][:, None]
+    doubt[~(found.any(axis=1) & np.isfinite(size[shortest]))] = np.inf
+    order = np.argsort(doubt, axis=None, kind="stable")[: np.isfinite(doubt).sum()]
+    seed = order // 2
+    return list(
+        zip(seed.tolist(), first[seed].tolist(), second.ravel()[order].tolist(), strict=True)
+    )
 
 
-def _turn(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Absolute sine of the angle between steps, shapes (2,) and (…, 2)."""
-    cross = np.abs(first[0] * second[..., 1] - first[1] * second[..., 0])
-    return np.asarray(cross / (np.linalg.norm(first) * np.linalg.norm(second, axis=-1)))
+def _turn(first: ComplexArray, second: ComplexArray) -> FloatArray:
+    """Absolute sine of the angle between steps, shapes (n,) and (n, m)."""
+    return np.abs((first[:, None].conj() * second).imag) / np.abs(first[:, None]) / np.abs(second)
 
 
-_NEXT: tuple[Site, ...] = ((0, 1), (0, -1), (1, 0), (-1, 0))
+def _sound_part(sites: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Row, column and dot of the largest part of what has grown; none if nothing hangs together."""
+    k, t, dot, part = sites.T
+    size = np.bincount(part)[part]
+    kept = (part == part[size.argmax()]) & (size > 1)
+    return k[kept], t[kept], dot[kept]
 
 
-class _Growth:
-    """One grid growing over the dots; a scratch pad, not a value."""
-
-    def __init__(self, points: FloatArray, tree: cKDTree, settings: GrowSettings) -> None:
-        self.points, self.tree, self.settings = points, tree, settings
-        self.plane = [complex(*point) for point in points]
-        self.dot_at: dict[Site, int] = {}
-        self.site_of: dict[int, Site] = {}
-        self.queue: list[tuple[float, Site, int]] = []
-
-    def run(self, seed: int, first: FloatArray, second: FloatArray) -> dict[Site, int]:
-        self._place((0, 0), seed)
-        for site, step in (
-            ((0, 1), first),
-            ((0, -1), -first),
-            ((1, 0), second),
-            ((-1, 0), -second),
-        ):
-            distance, dot = self.tree.query(self.points[seed] + step)
-            if distance < 0.3 * np.linalg.norm(step) and dot not in self.site_of:
-                self._place(site, int(dot))
-        while self.queue:
-            badness, site, dot = heapq.heappop(self.queue)
-            if site in self.dot_at or dot in self.site_of:
-                continue
-            again = self._claim(site)
-            if again is None:
-                continue
-            if again != (badness, dot):  # what is known round the site has changed since
-                heapq.heappush(self.queue, (again[0], site, again[1]))
-                continue
-            self._place(site, dot)
-        return self.dot_at
-
-    def _place(self, site: Site, dot: int) -> None:
-        self.dot_at[site] = dot
-        self.site_of[dot] = site
-        for dk in range(-2, 3):
-            for dt in range(-2, 3):
-                near = (site[0] + dk, site[1] + dt)
-                if near not in self.dot_at:
-                    claim = self._claim(near)
-                    if claim is not None:
-                        heapq.heappush(self.queue, (claim[0], near, claim[1]))
-
-    def _claim(self, site: Site) -> tuple[float, int] | None:
-        """The dot that the predictions of the site point at, and how badly they fit.
-
-        Every prediction that falls on a dot must fall on the same one, and most must.
-        """
-        chosen: int | None = None
-        errors = []
-        predictions = list(self._predictions(site))
-        for predicted, step, gate in predictions:
-            distance, near = self.tree.query((predicted.real, predicted.imag), k=2)
-            if distance[0] > gate * step:
-                continue
-            if distance[1] < self.settings.doubt * distance[0]:
-                return None
-            if chosen is not None and near[0] != chosen:
-                return None
-            chosen = int(near[0])
-            errors.append(distance[0] / step)
-        if chosen is None or chosen in self.site_of or 2 * len(errors) < len(predictions):
-            return None
-        return float(np.mean(errors)) / len(errors), chosen
-
-    def _predictions(self, site: Site) -> Iterator[tuple[complex, float, float]]:
-        """Where the site's dot should be, the local step, and the gate as a fraction of it.
-
-        Steps are complex numbers, so that a row's turning and stretching go on as a ratio: arcs
-        and fans of rows are followed exactly.
-        """
-        k, t = site
-
-        def at(dk: int, dt: int) -> complex | None:
-            dot = self.dot_at.get((k + dk, t + dt))
-            return None if dot is None else self.plane[dot]
-
-        gate = self.settings.gate
-        for dk, dt in _NEXT:
-            one, two, three = at(dk, dt), at(2 * dk, 2 * dt), at(3 * dk, 3 * dt)
-            if one is None or two is None:
-                continue
-            step = one - two
-            if three is None:
-                yield one + step, abs(step), 1.4 * gate
-            else:
-                yield one + step * _tame(step / (two - three)), abs(step), gate
-            for ek, et in ((dt, dk), (-dt, -dk)):
-                beside, near, far = at(ek, et), at(dk + ek, dt + et), at(2 * dk + ek, 2 * dt + et)
-                if beside is not None and near is not None and far is not None:
-                    yield one + step * _tame((beside - near) / (near - far)), abs(step), gate
-        for (dk, dt), (ek, et) in ((a, b) for a in _NEXT[:2] for b in _NEXT[2:]):
-            one, other, corner = at(dk, dt), at(ek, et), at(dk + ek, dt + et)
-            if one is None or other is None or corner is None:
-                continue
-            shorter = min(abs(other - corner), abs(one - corner))
-            yield one + other - corner, shorter, 1.4 * gate
+def _count(grid: IntArray) -> int:
+    """How many sites of a grid have a dot."""
+    return int((grid >= 0).sum())
 
 
-def _tame(ratio: complex) -> complex:
-    """A ratio of steps, kept within what neighbouring steps of one surface can differ by."""
-    size = min(max(abs(ratio), 0.6), 1.6)
-    return ratio / abs(ratio) * size if abs(ratio) else 1.0
+def _sites(grid: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Row, column and dot of each site that has one, shape (s,) each."""
+    k, t = np.nonzero(grid >= 0)
+    return k, t, grid[k, t]
 
 
-def _sound_part(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
-    """The largest part of a grid that hangs together by cells whose two ways round agree.
-
-    Opposite sides of a cell may differ by little more than half of a step; where a row or column
-    has slipped they differ by a whole one.
-    """
-    cells = []
-    for k, t in grid:
-        corners = [(k, t), (k, t + 1), (k + 1, t), (k + 1, t + 1)]
-        if not all(corner in grid for corner in corners):
-            continue
-        a, b, c, d = (plane[grid[corner]] for corner in corners)
-        open_by = abs(a - b - c + d)
-        if open_by < 0.6 * min(max(abs(b - a), abs(d - c)), max(abs(c - a), abs(d - b))):
-            cells.append(corners)
-    parent = {site: site for site in grid}
-
-    def root(site: Site) -> Site:
-        while parent[site] != site:
-            parent[site] = parent[parent[site]]
-            site = parent[site]
-        return site
-
-    for corners in cells:
-        for corner in corners[1:]:
-            parent[root(corner)] = root(corners[0])
-    parts: dict[Site, list[Site]] = {}
-    for site in grid:
-        parts.setdefault(root(site), []).append(site)
-    largest = max(parts.values(), key=len)
-    return {site: grid[site] for site in largest} if len(largest) > 1 else {}
+def _grid_of(k: IntArray, t: IntArray, dot: IntArray) -> IntArray:
+    """Dot at each site, −1 where there is none, shape (rows, columns)."""
+    grid = np.full((np.ptp(k) + 1, np.ptp(t) + 1), -1)
+    grid[k - k.min(), t - t.min()] = dot
+    return grid
 
 
-def _unsheared(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
+def _places(grid: IntArray, plane: ComplexArray) -> ComplexArray:
+    """Place of each site's dot, px; NaN where there is none."""
+    return np.where(grid >= 0, plane[grid], complex(np.nan, np.nan))
+
+
+def _unsheared(grid: IntArray, plane: ComplexArray) -> IntArray:
     """Index by the two shortest steps: a grid grown next to a hole may run along diagonals.
 
     Lagrange's reduction of the lattice, its inner products summed over the cells.
     """
-    along, across, mixed = 0.0, 0.0, 0.0
-    for (k, t), dot in grid.items():
-        if (k, t + 1) in grid and (k + 1, t) in grid:
-            a, b = plane[grid[k, t + 1]] - plane[dot], plane[grid[k + 1, t]] - plane[dot]
-            size = abs(a) * abs(b)
-            along, across = along + abs(a) ** 2 / size, across + abs(b) ** 2 / size
-            mixed += (a * b.conjugate()).real / size
+    place = _places(grid, plane)
+    a, b = place[:-1, 1:] - place[:-1, :-1], place[1:, :-1] - place[:-1, :-1]
+    with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
+        along, across = np.nansum(np.abs(a) / np.abs(b)), np.nansum(np.abs(b) / np.abs(a))
+        mixed = np.nansum((a * b.conj()).real / (np.abs(a) * np.abs(b)))
+    row, column = (1, 0), (0, 1)  # how many times the old k and t go into the new k, the new t
     for _ in range(8):
         if 2 * abs(mixed) <= 1.05 * min(along, across):
             break
         if along <= across:  # step over rows less as many steps along them
             m = round(mixed / along)
-            grid = {(k, t + m * k): dot for (k, t), dot in grid.items()}
+            column = column[0] + m * row[0], column[1] + m * row[1]
             mixed, across = mixed - m * along, across - 2 * m * mixed + m * m * along
         else:
             m = round(mixed / across)
-            grid = {(k + m * t, t): dot for (k, t), dot in grid.items()}
+            row = row[0] + m * column[0], row[1] + m * column[1]
             mixed, along = mixed - m * across, along - 2 * m * mixed + m * m * across
+    rows, columns = (abs(a) * grid.shape[0] + abs(b) * grid.shape[1] for a, b in (row, column))
+    if rows * columns > 4 * MOST_STEPS**2:  # steps that differ so much are of no grid
+        return grid
+    k, t, dot = _sites(grid)
+    return _grid_of(row[0] * k + row[1] * t, column[0] * k + column[1] * t, dot)
+
+
+def _upright(grid: IntArray, plane: ComplexArray) -> IntArray:
+    """Turn the grid so that rows run left to right and are counted from the bottom up."""
+    place = _places(grid, plane)
+    along, across = np.diff(place, axis=1), np.diff(place, axis=0)
+    level = [
+        np.nansum(np.abs(steps.real)) / max(np.nansum(np.abs(steps)), 1e-9)
+        for steps in (along, across)
+    ]
+    if level[0] < level[1]:
+        grid, along, across = grid.T, across, along
+    if np.nansum(along.real) < 0:
+        grid = grid[:, ::-1]
+    if np.nansum(across.imag) < 0:
+        grid = grid[::-1]
     return grid
 
 
-def _without_slips(grid: dict[Site, int], plane: list[complex]) -> dict[Site, int]:
+def _without_slips(grid: IntArray, plane: ComplexArray) -> IntArray:
     """Keep the most rows that hang together without a slip.
 
     Neighbour by neighbour a row may be joined to the next one column off all along, or by dots of
     two rows in turn. Its columns then slant by a whole step more than those of other rows, which
     bowed and fanned rows do not.
     """
-    rows: dict[int, dict[int, complex]] = {}
-    for (k, t), dot in grid.items():
-        rows.setdefault(k, {})[t] = plane[dot]
-    slants = {}
-    for k in sorted(rows):
-        below = rows.get(k - 1, {})
-        leans = [
-            ((rows[k][t] - below[t]) / step).real
-            for t in rows[k].keys() & below.keys()
-            for step in _steps_at(below, t)
-        ]
-        if leans:
-            slants[k] = float(np.median(leans))
-    usual = float(np.median(list(slants.values()))) if slants else 0.0
-    parts: list[list[int]] = []
-    for k in sorted(rows):
-        if k in slants and abs(slants[k] - usual) < 0.55 and abs(slants[k]) < 0.7 and parts:
-            parts[-1].append(k)
-        else:
-            parts.append([k])
-    kept = max(parts, key=lambda part: sum(len(rows[k]) for k in part))
-    return {site: dot for site, dot in grid.items() if site[0] in kept}
+    place = _places(grid, plane)
+    with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
+        lean = (np.diff(place, axis=0) / _steps_along(place[:-1])).real
+    slant = np.full(len(grid), np.nan)
+    for k in np.nonzero(~np.isnan(lean).all(axis=1))[0]:
+        slant[k + 1] = np.median(lean[k][~np.isnan(lean[k])])
+    usual = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
+    joined = (np.abs(slant - usual) < 0.55) & (np.abs(slant) < 0.7)
+    part = np.cumsum(~joined)
+    kept: BoolArray = part == np.bincount(part, (grid >= 0).sum(axis=1)).argmax()
+    return grid[kept]
 
 
-def _steps_at(row: dict[int, complex], t: int) -> list[complex]:
-    """Step along a row at column t: across it, or to the one neighbour there is."""
-    if t - 1 in row and t + 1 in row:
-        return [(row[t + 1] - row[t - 1]) / 2]
-    if t + 1 in row:
-        return [row[t + 1] - row[t]]
-    return [row[t] - row[t - 1]] if t - 1 in row else []
-
-
-def _upright(grid: dict[Site, int], points: FloatArray) -> dict[Site, int]:
-    """Turn the grid so that rows run left to right and are counted from the bottom up."""
-
-    def steps(dk: int, dt: int) -> FloatArray:
-        pairs = [
-            points[grid[k + dk, t + dt]] - points[dot]
-            for (k, t), dot in grid.items()
-            if (k + dk, t + dt) in grid
-        ]
-        return np.array(pairs).reshape(-1, 2)
-
-    along, across = steps(0, 1), steps(1, 0)
-    level = [
-        np.abs(s[:, 0]).sum() / max(np.linalg.norm(s, axis=1).sum(), 1e-9) for s in (along, across)
-    ]
-    if level[0] < level[1]:
-        grid = {(t, k): dot for (k, t), dot in grid.items()}
-        along, across = across, along
-    if along[:, 0].sum() < 0:
-        grid = {(k, -t): dot for (k, t), dot in grid.items()}
-    if across[:, 1].sum() < 0:
-        grid = {(-k, t): dot for (k, t), dot in grid.items()}
-    return grid
-
-
-def _from_one(grid: dict[Site, int]) -> dict[Site, int]:
-    """Count rows and columns from 1."""
-    k0, t0 = (min(site[axis] for site in grid) for axis in (0, 1))
-    return {(k - k0 + 1, t - t0 + 1): dot for (k, t), dot in grid.items()}
+def _steps_along(place: ComplexArray) -> ComplexArray:
+    """Step along its row at each site: across it, or to the one neighbour there is, else NaN."""
+    wide = np.pad(place, ((0, 0), (1, 1)), constant_values=np.nan)
+    left, right = place - wide[:, :-2], wide[:, 2:] - place
+    step = np.where(np.isnan(left), right, left)
+    return np.where(np.isnan(left + right), step, (left + right) / 2)
 
 
 def lattice_of_sites(

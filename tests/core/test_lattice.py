@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from labapp.core.lattice import GrowSettings, Lattice, grow_lattice
+from labapp.core.lattice_kernels import BORDER, grow
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.pools import egg, ellipsoidal_cap, spherical_cap
 from tests.scenes import as_dots, see
@@ -66,6 +67,45 @@ def test_missing_and_false_dots_never_cause_a_wrong_index(seed: int) -> None:
     assert wrong(own, site) == 0
     # Up to a seventh of the dots are gone; one with no whole cell beside it is left in doubt.
     assert np.mean(own.row > 0) > 0.8
+
+
+@pytest.mark.parametrize("seed", range(0, ROWS * COLUMNS, 25))
+@pytest.mark.parametrize("reach", [3, 20])
+def test_a_grid_grows_from_any_dot_as_far_as_there_are_sites(seed: int, reach: int) -> None:
+    u, v = bowed(sites(), 1.2, 0.06, 3.0).T
+    order = np.argsort(u)
+    plane, site = (u - 1j * v)[order], sites()[order]
+    across = 2 * (reach + BORDER) + 1
+    dot_at = np.full((across, across), -1)
+    at = {(k, t): dot for dot, (k, t) in enumerate(site.tolist())}
+    k, t = site[seed]
+    # Steps as its neighbours have them, from the side where it has one.
+    right, up = (t + 1 if t < COLUMNS else t - 1), (k + 1 if k < ROWS else k - 1)
+    first = (plane[at[k, right]] - plane[seed]) * (right - t)
+    second = (plane[at[up, t]] - plane[seed]) * (up - k)
+    row, column, dot, part = grow(plane, dot_at, seed, first, second, 0.36, 1.8).T
+    grown = np.stack([row, column], axis=-1) - across // 2
+    off = site - site[seed]
+    assert set(dot.tolist()) == set(np.nonzero(np.abs(off).max(axis=1) <= reach)[0].tolist())
+    np.testing.assert_array_equal(grown, off[dot])
+    assert len(set(part.tolist())) == 1  # all hangs together
+    assert (dot_at == -1).all()
+
+
+def test_of_what_does_not_hang_together_nothing_is_joined() -> None:
+    # Five dots in a cross have no cell.
+    plane = np.array([-20.0, -20.0j, 0.0, 20.0j, 20.0])
+    dot_at = np.full((21, 21), -1)
+    grown = grow(plane, dot_at, 2, 20.0 + 0.0j, 20.0j, 0.36, 1.8)
+    assert len(grown) == 5
+    np.testing.assert_array_equal(grown[:, 2], grown[:, 3])
+
+
+def test_dots_in_one_place_do_no_harm() -> None:
+    site = np.concatenate([sites(), sites()[::9]])
+    lattice = grow_lattice(as_dots(bowed(site, 1.0, 0.04)), GrowSettings())
+    assert wrong(lattice, site) == 0
+    assert np.mean(lattice.row > 0) > 0.5  # all of them are in doubt
 
 
 def test_the_absent_centre_stands_out() -> None:

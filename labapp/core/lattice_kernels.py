@@ -1,0 +1,231 @@
+"""Inner loops of `lattice`: a grid growing over the dots, compiled (docs/adr/0018).
+
+Dots are complex numbers, px, in order of their real parts.
+"""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled, part
+from labapp.core.values import BoolArray, ComplexArray, FloatArray, IntArray
+
+BORDER = 3
+"""A site's dot is predicted from sites so far from it at most."""
+
+MOST = 16
+"""A site has so many predictions at most."""
+
+Claim = tuple[float, int, int, int]
+"""How badly its predictions fit a site's dot; the site's row and column; the dot."""
+
+_f, _i, _c = types.float64, types.int64, types.complex128
+_plane = types.Array(_c, 1, "C", readonly=True)
+_sites = types.Array(_i, 2, "C")
+
+
+@part
+def _nearest(plane: ComplexArray, place: complex, within: float) -> tuple[int, float, float]:
+    """The dot nearest to a place, its distance and the next one's, of dots within a distance.
+
+    Where there is none the dot is −1 and the distance infinite.
+    """
+    start, end = 0, len(plane)
+    while start < end:
+        middle = (start + end) // 2
+        if plane[middle].real < place.real - within:
+            start = middle + 1
+        else:
+            end = middle
+    nearest, least, second = -1, np.inf, np.inf
+    for dot in range(start, len(plane)):
+        off = plane[dot] - place
+        if not off.real <= within:
+            break
+        square = off.real * off.real + off.imag * off.imag
+        if square < least:
+            nearest, least, second = dot, square, least
+        elif square < second:
+            second = square
+    return nearest, np.sqrt(least), np.sqrt(second)
+
+
+@part
+def _tame(ratio: complex) -> complex:
+    """A ratio of steps, kept within what neighbouring steps of one surface can differ by."""
+    size = abs(ratio)
+    return ratio * (min(max(size, 0.6), 1.6) / size) if size > 0.0 else 1.0 + 0.0j
+
+
+@part
+def _predictions(
+    plane: ComplexArray, dot_at: IntArray, k: int, t: int, gate: float
+) -> tuple[ComplexArray, FloatArray]:
+    """Where the site's dot should be; the local step, and how far off the dot may be.
+
+    Steps are complex numbers, so that a row's turning and stretching go on as a ratio: arcs and
+    fans of rows are followed exactly.
+
+    Returns shapes (p,) and (p, 2).
+    """
+    places, sizes, count = np.empty(MOST, np.complex128), np.empty((MOST, 2)), 0
+    for dk, dt in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        one, two = dot_at[k + dk, t + dt], dot_at[k + 2 * dk, t + 2 * dt]
+        if one < 0 or two < 0:
+            continue
+        step = plane[one] - plane[two]
+        for ek, et in ((dk, dt), (dt, dk), (-dt, -dk)):  # its own row, and those beside it
+            near, next_one = dot_at[k + ek, t + et], dot_at[k + dk + ek, t + dt + et]
+            far = dot_at[k + 2 * dk + ek, t + 2 * dt + et]
+            if near >= 0 and next_one >= 0 and far >= 0:
+                ratio = (plane[near] - plane[next_one]) / (plane[next_one] - plane[far])
+                places[count] = plane[one] + step * _tame(ratio)
+                sizes[count, 0], sizes[count, 1] = abs(step), gate * abs(step)
+                count += 1
+            elif near == one:
+                places[count] = plane[one] + step
+                sizes[count, 0], sizes[count, 1] = abs(step), 1.4 * gate * abs(step)
+                count += 1
+    for dt in (1, -1):
+        for dk in (1, -1):
+            one, other, corner = dot_at[k, t + dt], dot_at[k + dk, t], dot_at[k + dk, t + dt]
+            if one >= 0 and other >= 0 and corner >= 0:
+                shorter = min(abs(plane[other] - plane[corner]), abs(plane[one] - plane[corner]))
+                places[count] = plane[one] + plane[other] - plane[corner]
+                sizes[count, 0], sizes[count, 1] = shorter, 1.4 * gate * shorter
+                count += 1
+    return places[:count], sizes[:count]
+
+
+@part
+def _claim(
+    plane: ComplexArray,
+    dot_at: IntArray,
+    taken: BoolArray,
+    k: int,
+    t: int,
+    gate: float,
+    doubt: float,
+) -> Claim:
+    """The dot that the predictions of the site point at, and how badly they fit; −1 if none.
+
+    Every prediction that falls on a dot must fall on the same one, and most must.
+    """
+    places, sizes = _predictions(plane, dot_at, k, t, gate)
+    chosen, fitting, error = -1, 0, 0.0
+    for p in range(len(places)):
+        step, reach = sizes[p, 0], sizes[p, 1]
+        dot, distance, second = _nearest(plane, places[p], max(doubt, 1.0) * reach)
+        if dot < 0 or distance >= reach:
+            continue
+        if second < doubt * distance or (chosen >= 0 and dot != chosen):
+            return np.inf, k, t, -1
+        chosen, fitting, error = dot, fitting + 1, error + distance / step
+    if chosen < 0 or taken[chosen] or 2 * fitting < len(places):
+        return np.inf, k, t, -1
+    return error / fitting / fitting, k, t, chosen
+
+
+@part
+def _beginning(
+    plane: ComplexArray, middle: int, seed: int, first: complex, second: complex
+) -> list[Claim]:
+    """A dot and its neighbours: claims that come before all others, in this order."""
+    queue = [(-5.0, middle, middle, seed)]
+    for dk, dt, step in ((0, 1, first), (0, -1, -first), (1, 0, second), (-1, 0, -second)):
+        dot, distance, _ = _nearest(plane, plane[seed] + step, 0.3 * abs(step))
+        if dot >= 0 and distance < 0.3 * abs(step):
+            queue.append((len(queue) - 5.0, middle + dk, middle + dt, dot))
+    return queue
+
+
+@part
+def _root(parent: IntArray, dot: int) -> int:
+    """The dot at the root of another's tree."""
+    while parent[dot] != dot:
+        parent[dot] = parent[parent[dot]]
+        dot = parent[dot]
+    return dot
+
+
+@part
+def _joined(plane: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntArray:
+    """Parent of each dot in trees of those that hang together by cells whose two ways round agree.
+
+    Opposite sides of a cell may differ by little more than half of a step; where a row or column
+    has slipped they differ by a whole one.
+    """
+    parent = np.arange(len(plane))
+    for _, k, t, dot in placed:
+        right, up, across = dot_at[k, t + 1], dot_at[k + 1, t], dot_at[k + 1, t + 1]
+        if right < 0 or up < 0 or across < 0:
+            continue
+        a, b, c, d = plane[dot], plane[right], plane[up], plane[across]
+        sides = min(max(abs(b - a), abs(d - c)), max(abs(c - a), abs(d - b)))
+        if abs(a - b - c + d) < 0.6 * sides:
+            for corner in (right, up, across):
+                parent[_root(parent, corner)] = _root(parent, dot)
+    return parent
+
+
+@compiled(_plane, _sites, _i, _c, _c, _f, _f)
+def grow(
+    plane: ComplexArray,
+    dot_at: IntArray,
+    seed: int,
+    first: complex,
+    second: complex,
+    gate: float,
+    doubt: float,
+) -> IntArray:
+    """Grow a grid from a dot, and tell which parts of it hang together.
+
+    Parameters
+    ----------
+    plane
+        The dots, shape (n,).
+    dot_at
+        −1 at every site, shape (m, m); a scratch pad, left as it was. The grid grows from its
+        middle, and not into its outer BORDER sites.
+    seed, first, second
+        The dot to begin with, and the steps to the next column and to the next row, px.
+    gate, doubt
+        As in `lattice.GrowSettings`.
+
+    Returns
+    -------
+    IntArray
+        Of each site its row and column in ``dot_at``, its dot, and one dot of the part that hangs
+        together with it by sound cells (`_joined`), shape (s, 4).
+    """
+    taken, middle, end = np.zeros(len(plane), np.bool_), len(dot_at) // 2, len(dot_at) - BORDER
+    queue, placed = _beginning(plane, middle, seed, first, second), [(0.0, 0, 0, 0)][:0]
+    while queue:
+        claim = heapq.heappop(queue)
+        badness, k, t, dot = claim
+        if dot_at[k, t] >= 0 or taken[dot]:
+            continue
+        if badness >= 0.0:  # what is known round the site may have changed since
+            again = _claim(plane, dot_at, taken, k, t, gate, doubt)
+            if again != claim:
+                if again[3] >= 0:
+                    heapq.heappush(queue, again)
+                continue
+        dot_at[k, t], taken[dot] = dot, True
+        placed.append(claim)
+        for near_k in range(k - 2, k + 3):
+            for near_t in range(t - 2, t + 3):
+                inside = BORDER <= near_k < end and BORDER <= near_t < end
+                if inside and dot_at[near_k, near_t] < 0:
+                    near = _claim(plane, dot_at, taken, near_k, near_t, gate, doubt)
+                    if near[3] >= 0:
+                        heapq.heappush(queue, near)
+    parent = _joined(plane, dot_at, placed)
+    sites = np.empty((len(placed), 4), np.int64)
+    for at, (_, k, t, dot) in enumerate(placed):
+        sites[at, 0], sites[at, 1], sites[at, 2], sites[at, 3] = k, t, dot, _root(parent, dot)
+        dot_at[k, t] = -1
+    return sites
