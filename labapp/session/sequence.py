@@ -215,7 +215,7 @@ def _begun(pool: Executor, job: Job, stretch: Sequence[int]) -> deque[Future[lis
 def _ready() -> None:
     """Have a process start, and load what it measures with."""
     import labapp.core.lattice_kernels
-    import labapp.core.quadric_kernels
+    import labapp.core.match_kernels
     import labapp.core.warm
     import labapp.session.quick_rows  # noqa: F401
 
