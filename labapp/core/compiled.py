@@ -6,12 +6,23 @@ a measurement and not to the app's start.
 
 from __future__ import annotations
 
+import shutil
+import time
 from collections.abc import Callable
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, TypeVar
 
-from numba import njit, types
+import numba
+import platformdirs
+from numba import types
+from numba.core.caching import _CacheLocator
 
 F = TypeVar("F", bound=Callable[..., object])
+
+_njit: Any = numba.njit
+_config: Any = numba.config
 
 HOW: dict[str, Any] = {
     "nogil": True,
@@ -19,6 +30,9 @@ HOW: dict[str, Any] = {
     "fastmath": {"reassoc", "contract", "nsz"},
 }
 """Sums may be taken in any order and division by zero gives infinity or NaN, as in NumPy."""
+
+OLD_S = 60 * 86400.0
+"""What was compiled for a source that nobody has is deleted after so long, s."""
 
 
 def compiled(*signature: types.Type) -> Callable[[F], F]:
@@ -40,10 +54,61 @@ def part(function: F) -> F:
     return _kept(function)
 
 
+class BySource(_CacheLocator):
+    """Keeps what is compiled by what its file says, wherever that file is.
+
+    A second checkout or environment of a user finds what the first one compiled.
+    """
+
+    def __init__(self, function: Any, file: str) -> None:
+        self._source = sha256(Path(file).read_bytes()).hexdigest()[:24]
+        self._line: int = function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> BySource | None:
+        """Return the place of a function; None where it cannot be written to."""
+        try:
+            place = cls(function, file)
+            is_new = not Path(place.get_cache_path()).exists()
+            place.ensure_cache_path()  # type: ignore[no-untyped-call]
+        except OSError:
+            return None
+        if is_new:
+            _delete_old(_folder())
+        return place
+
+    def get_cache_path(self) -> str:
+        """Return the folder of the function's file."""
+        return str(_folder() / self._source)
+
+    def get_source_stamp(self) -> str:
+        """Return what the file says, as a digest."""
+        return self._source
+
+    def get_disambiguator(self) -> str:
+        """Return what tells functions of one name apart."""
+        return str(self._line)
+
+
+def _folder() -> Path:
+    own = _config.CACHE_DIR or platformdirs.user_cache_dir("labapp", appauthor=False)
+    return Path(own) / "loops"
+
+
+def _delete_old(folder: Path) -> None:
+    with suppress(OSError):
+        for each in folder.iterdir():
+            if each.stat().st_mtime < time.time() - OLD_S:
+                shutil.rmtree(each, ignore_errors=True)
+
+
 def _kept(function: F, *signature: Any) -> F:
-    compile_it: Any = njit
+    usual, ours = _config.CACHE_LOCATOR_CLASSES, f"{__name__}.{BySource.__name__}"
+    _config.CACHE_LOCATOR_CLASSES = ours
     try:
-        made: F = compile_it(*signature, cache=True, **HOW)(function)
-    except RuntimeError:  # neither beside the file nor in the user's own cache can be written
-        made = compile_it(*signature, **HOW)(function)
+        made: F = _njit(*signature, cache=True, **HOW)(function)
+    except RuntimeError:  # nowhere to keep it
+        made = _njit(*signature, **HOW)(function)
+    finally:
+        _config.CACHE_LOCATOR_CLASSES = usual
     return made
