@@ -343,33 +343,41 @@ def covariance_of_dots(
     (n, 3), dots are in the UCS, shape (n, 3), axes those of the imaging plane.
     """
     width, count, pairs = lower.shape[0] - 1, lower.shape[1], len(points)
-    right, first = np.zeros((count, 2 * pairs)), count
     work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
+    first = np.empty(pairs, np.int64)
     for k in range(pairs):
-        (a, b), (c, d) = _slopes_of_dot(laser, axes, points[k], dots[k])
-        area = a * d - b * c
         first_x = _along(grid[0], points[k, 0], work[0], work[1])
-        first_y = _along(grid[1], points[k, 1], work[2], work[3])
-        first = min(first, first_x * many + first_y)
-        for m in range(4):
-            for n in range(4):
-                at = (first_x + m) * many + first_y + n
-                by_x, by_y = work[1, m] * work[2, n], work[0, m] * work[3, n]
-                right[at, 2 * k] = (d * by_x - b * by_y) / area
-                right[at, 2 * k + 1] = (a * by_y - c * by_x) / area
-    made = np.zeros((pairs, 2, 2))
-    for i in range(first, count):
+        first[k] = first_x * many + _along(grid[1], points[k, 1], work[2], work[3])
+    order = np.argsort(first)
+    right = np.zeros((count, 2 * pairs))
+    for n in range(pairs):
+        point, dot = points[order[n]], dots[order[n]]
+        (a, b), (c, d) = _slopes_of_dot(laser, axes, point, dot)
+        area = a * d - b * c
+        _along(grid[0], point[0], work[0], work[1])
+        _along(grid[1], point[1], work[2], work[3])
+        for own in range(16):
+            by_x = work[1, own // 4] * work[2, own % 4]
+            by_y = work[0, own // 4] * work[3, own % 4]
+            at = first[order[n]] + own // 4 * many + own % 4
+            right[at, 2 * n] = (d * by_x - b * by_y) / area
+            right[at, 2 * n + 1] = (a * by_y - c * by_x) / area
+    made, begun = np.zeros((pairs, 2, 2)), 0
+    start = first[order[0]] if pairs else count
+    for i in range(start, count):
+        while begun < pairs and first[order[begun]] <= i:
+            begun += 1
         row = right[i]
-        for j in range(max(first, i - width), i):
+        for j in range(max(start, i - width), i):
             factor, before = lower[i - j, j], right[j]
-            for k in range(2 * pairs):
+            for k in range(2 * begun):
                 row[k] -= factor * before[k]
-        row /= lower[0, i]
-        for k in range(pairs):
-            a, b = row[2 * k], row[2 * k + 1]
-            made[k, 0, 0] += a * a
-            made[k, 0, 1] += a * b
-            made[k, 1, 1] += b * b
+        for n in range(begun):
+            a, b = row[2 * n] / lower[0, i], row[2 * n + 1] / lower[0, i]
+            row[2 * n], row[2 * n + 1] = a, b
+            made[order[n], 0, 0] += a * a
+            made[order[n], 0, 1] += a * b
+            made[order[n], 1, 1] += b * b
     made[:, 1, 0] = made[:, 0, 1]
     return made
 

@@ -259,6 +259,8 @@ def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
             if grown is not None and (best is None or _count(grown) > _count(best)):
                 best = grown
             labels = labels if best is None else best
+            if best is not None and _count(best) == len(scene.plane_mm):
+                return best  # there is no more to be had
         if best is None or _count(best) >= enough or attempt:
             break
         # A wrong label at the rim bars the way and holds itself up: take the rim off once.
