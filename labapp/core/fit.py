@@ -6,10 +6,11 @@ import numpy as np
 
 from labapp.core.boundary import Boundary
 from labapp.core.correspondence import Match
-from labapp.core.pool_fit import FitSettings, FittedPool, Level, Rear, fit_pool
+from labapp.core.pool_fit import FitSettings, Level, Rear, fit_pool
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
-from labapp.core.spline import OpenSplineSurface, SplineSurface
+from labapp.core.sizes import sizes_of
+from labapp.core.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
 
 LEAST_DOTS = 9
@@ -45,20 +46,19 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
     x, y = pool.points_mm[:, 0], pool.points_mm[:, 1]
     center = (pool.points_mm[:, :2].min(axis=0) + pool.points_mm[:, :2].max(axis=0)) / 2
     boundary = contour(pool.surface, center, pool.level)
-    at_points = pool.surface.basis.matrix(x, y)
-    # Level and slopes are known independently of each other, so their variances add.
-    ones = np.ones(at_points.shape[1])
-    covariance = pool.covariance + pool.level.sigma_mm**2 * np.outer(ones, ones)
-    spread = at_points @ covariance @ at_points.T
+    surface, level, outline = pool.surface, pool.level, boundary.points_mm
+    climb = surface.gradient(*outline[:, :2].T)
+    climb[:, 1] -= level.rear.slope(outline[:, 1])
+    sizes = sizes_of(surface.basis, surface.coefficients, level, boundary, climb)
     return Reconstruction(
         scheme="fit",
-        surface=pool.surface,
+        surface=surface,
         boundary=boundary,
         ray=match.ray,
         points_mm=pool.points_mm,
         residual_mm=pool.residual_mm,
-        sigma_mm=np.sqrt(np.diag(spread)),
-        variants=_variants(pool, boundary, covariance, at_points, spread),
+        sigma_mm=pool.sigma_of(surface.basis.matrix(x, y)),
+        size_sigma=pool.sigma_of(sizes.gradient),
     )
 
 
@@ -123,30 +123,3 @@ def _refine_radius(
         safe = np.where(np.abs(outward) > 1e-6, outward, np.inf)
         radius = radius + np.clip(np.nan_to_num(-height / safe), -bound, bound)
     return radius
-
-
-def _variants(
-    pool: FittedPool,
-    boundary: Boundary,
-    covariance: FloatArray,
-    at_points: FloatArray,
-    spread: FloatArray,
-    modes: int = 6,
-) -> tuple[tuple[SplineSurface, Boundary], ...]:
-    """Surfaces one σ away along the principal directions of the heights' covariance."""
-    variance, direction = np.linalg.eigh(spread)
-    variants = []
-    surface, rear, center = pool.surface, pool.level.rear, boundary.center_mm
-    radius = np.linalg.norm(boundary.points_mm[:, :2] - center, axis=-1)
-    theta = np.radians(boundary.theta_deg)
-    way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    for k in range(1, min(modes, len(variance)) + 1):
-        if variance[-k] < 1e-4 * variance[-1]:
-            break
-        mode = covariance @ at_points.T @ direction[:, -k] / np.sqrt(variance[-k])
-        for step in (mode, -mode):
-            # The boundary of one may lie beyond the rectangle where that of the pool is near it.
-            moved = OpenSplineSurface(surface.basis, surface.coefficients + step)
-            out = _refine_radius(moved, rear, center, way, radius, 0.3)
-            variants.append((moved, _boundary_of(rear, center, way, out)))
-    return tuple(variants)

@@ -441,7 +441,7 @@ def follow_rim(
     steps: int,
     last: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Newton steps along directions to where a surface meets its rim: `warm_measures.follow_rim`.
+    """Newton steps along directions to where a surface meets its rim: `rim.follow_rim`.
 
     The rear is its depth and where it starts and ends. Gives radii, gradients of the height over
     the rim and that height, where each was before its last step.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -110,17 +110,11 @@ class Measures:
 
 
 def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
-    """Measure a reconstructed pool.
-
-    The uncertainties come from the reconstruction's variants m₊, m₋ along each principal
-    direction: σ² = Σ ((m₊ − m₋)/2)².
-    """
+    """Measure a reconstructed pool."""
     errors = reflection_errors(reconstruction, match, rig)
     boundary = reconstruction.boundary
     size, peak = size_of(reconstruction.whole, boundary)
-    variants = [size_of(surface, outline)[0] for surface, outline in reconstruction.variants]
-    sigma = _sigma(variants, len(size))
-    made = measures_of(errors, size, peak, boundary.center_mm, sigma)
+    made = measures_of(errors, size, peak, boundary.center_mm, reconstruction.size_sigma)
     return replace(made, own_are_mm=reconstruction.own_are_mm)
 
 
@@ -267,14 +261,6 @@ def refined(
         return start_mm
     refined = np.append(at, height(at[0], at[1]))
     return refined if sign * refined[2] >= sign * start_mm[2] else start_mm
-
-
-def _sigma(variants: Sequence[FloatArray], count: int) -> FloatArray:
-    """Combine pairs (plus, minus) of variants' sizes into standard uncertainties."""
-    if not variants:
-        return np.full(count, np.nan)
-    plus, minus = np.array(variants[0::2]), np.array(variants[1::2])
-    return np.asarray(np.sqrt(np.sum(((plus - minus) / 2) ** 2, axis=0)))
 
 
 def surface_grid(

@@ -12,12 +12,13 @@ the reflection residual there whose squares are least.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from labapp.core.optics import meet_level, ray_directions
 from labapp.core.rig import Rig
-from labapp.core.solver import NormalEquations, covariance_of
+from labapp.core.solver import NormalEquations, sigma_of
 from labapp.core.spline import SplineBasis, SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze, median
 
@@ -70,6 +71,11 @@ class Rear:
     drop_mm: float = 0.0
     start_mm: float = 0.0
     end_mm: float = -1.0
+
+    @property
+    def numbers(self) -> FloatArray:
+        """Its three numbers, as compiled functions have it, shape (3,)."""
+        return np.array([self.drop_mm, self.start_mm, self.end_mm])
 
     def _part(self, y_mm: FloatArray) -> FloatArray:
         return np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
@@ -139,14 +145,18 @@ class FittedPool:
     def __post_init__(self) -> None:
         freeze(self)
 
-    @property
-    def covariance(self) -> FloatArray:
-        """Of the spline coefficients, the level left out, shape (splines, splines), mm²."""
+    @cached_property
+    def level_at(self) -> FloatArray:
+        """Mean value of each spline over the reflection points, shape (splines,)."""
         from labapp.core import kernels
 
-        x_y, share = self.points_mm[:, :2], np.full(len(self.points_mm), 1 / len(self.points_mm))
-        mean = kernels.gradient_of_sum(self.surface.basis.grid, self.factor.shape[1], x_y, share)
-        return covariance_of(self.factor, mean)
+        share = np.full(len(self.points_mm), 1 / len(self.points_mm))
+        grid, count = self.surface.basis.grid, self.factor.shape[1]
+        return kernels.gradient_of_sum(grid, count, self.points_mm, share)
+
+    def sigma_of(self, gradients: FloatArray) -> FloatArray:
+        """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p)."""
+        return sigma_of(self.factor, gradients, self.level_at, self.level.sigma_mm)
 
 
 def fit_pool(

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -75,10 +75,9 @@ class Reconstruction:
     sigma_mm
         Standard uncertainty of each reflection point's height, noise and level only, shape (n,),
         mm; NaN where the scheme gives none.
-    variants
-        Surfaces and boundaries one standard deviation away along each principal direction of
-        the result's uncertainty, in pairs (plus, minus); empty where the scheme gives none.
-        `measures` turns them into the ± of width, length, height, area and volume.
+    size_sigma
+        Standard uncertainty of width, length, height, depth, area and volume, noise and level
+        only, shape (6,), mm, mm², mm³; NaN where the scheme gives none.
     own_are_mm
         ARE of the points as the scheme has them, with the surface through nothing else (step 4 of
         §6.3.1 and §7.1), mm: what the text tells. NaN for fit, whose points are the surface's.
@@ -91,7 +90,7 @@ class Reconstruction:
     points_mm: FloatArray
     residual_mm: FloatArray
     sigma_mm: FloatArray
-    variants: tuple[tuple[Surface, Boundary], ...] = ()
+    size_sigma: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     own_are_mm: float = math.nan
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg.blas import dsbmv
-from scipy.linalg.lapack import dpbtrf, dpbtrs
+from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs
 
 from labapp.core.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
@@ -132,21 +132,30 @@ def normal_factor(
     return np.asarray(lower)
 
 
-def covariance_of(factor: FloatArray, level: FloatArray) -> FloatArray:
-    """Covariance of the coefficients, the level left out, shape (p, p), mm².
+def sigma_of(
+    lower: FloatArray, gradients: FloatArray, level_at: FloatArray, sigma_mm: float
+) -> FloatArray:
+    """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p).
+
+    The covariance of the coefficients is the inverse of the normal matrix; the level is known
+    independently of them.
 
     Parameters
     ----------
-    factor
-        See `normal_factor`.
-    level
-        Mean value of each spline over the points whose mean height is the level, shape (p,).
+    lower
+        Factor of the normal matrix (`normal_factor`).
+    gradients
+        Derivatives by the spline coefficients.
+    level_at
+        Mean value of each spline over the reflection points, shape (p,): what slopes tell is the
+        surface without its mean there.
+    sigma_mm
+        Uncertainty of the level.
     """
-    ones = np.ones(len(level))
-    covariance = solve(factor, np.eye(len(ones), order="F"))
-    # What the held spline seems to know about the level is taken out again.
-    held = covariance - np.outer(ones, level @ covariance) - np.outer(covariance @ level, ones)
-    return np.asarray(held + (level @ covariance @ level) * np.outer(ones, ones))
+    by_level = gradients.sum(axis=1)
+    free = gradients - by_level[:, None] * level_at
+    half = dtbtrs(lower, np.asfortranarray(free.T), uplo="L")[0]
+    return np.asarray(np.sqrt((half * half).sum(axis=0) + (sigma_mm * by_level) ** 2))
 
 
 @dataclass(frozen=True)
@@ -168,10 +177,9 @@ class SlopeFit:
     factor: FloatArray
     level: FloatArray
 
-    @property
-    def covariance(self) -> FloatArray:
-        """Covariance of the coefficients, the level left out, shape (splines, splines), mm²."""
-        return covariance_of(self.factor, self.level)
+    def sigma_of(self, gradients: FloatArray) -> FloatArray:
+        """`sigma_of` quantities that the level does not change, shape (m,)."""
+        return sigma_of(self.factor, gradients, self.level, 0.0)
 
 
 def fit_slopes(

@@ -219,7 +219,7 @@ class SplineSurface:
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height z at (x, y), arrays of one shape, mm."""
         x, y = np.asarray(x_mm, float), np.asarray(y_mm, float)
-        inside = self._known(x, y)
+        inside = self.basis.contains(x, y)
         cells = self.basis.cells(x[inside], y[inside])
         height = np.full(x.shape, np.nan)
         height[inside] = np.vecdot(cells.values(), self.coefficients[cells.splines])
@@ -230,7 +230,7 @@ class SplineSurface:
     ) -> tuple[FloatArray, FloatArray]:
         """Both at once, in little more time than either takes."""
         x, y = np.asarray(x_mm, float), np.asarray(y_mm, float)
-        inside = self._known(x, y)
+        inside = self.basis.contains(x, y)
         cells = self.basis.cells(x[inside], y[inside])
         every = np.full((*x.shape, 3), np.nan)
         every[inside] = np.vecdot(cells.value_and_slopes(), self.coefficients[cells.splines]).T
@@ -243,13 +243,3 @@ class SplineSurface:
     def raised(self, by_mm: float) -> SplineSurface:
         """Shift the whole surface up."""
         return SplineSurface(self.basis, self.coefficients + by_mm)  # the splines add up to 1
-
-    def _known(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
-        return self.basis.contains(x_mm, y_mm)
-
-
-class OpenSplineSurface(SplineSurface):
-    """The same, which goes on beyond the rectangle as it is at its edge."""
-
-    def _known(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
-        return np.ones(np.shape(x_mm), bool)

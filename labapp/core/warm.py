@@ -32,7 +32,9 @@ from labapp.core.pool_fit import Level, place_level
 from labapp.core.ray_growth import UNLABELLED, Scene
 from labapp.core.reconstruction import Reconstruction
 from labapp.core.rig import Rig
-from labapp.core.solver import SERVES_MM
+from labapp.core.rim import follow_rim
+from labapp.core.sizes import sizes_of
+from labapp.core.solver import SERVES_MM, sigma_of
 from labapp.core.spline import SplineSurface
 from labapp.core.track import MEMORY, Broken, Track, begin, found_again, rms
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
@@ -45,7 +47,6 @@ from labapp.core.warm_fit import (
     met,
 )
 from labapp.core.warm_match import beyond, testimony, widened
-from labapp.core.warm_measures import follow_rim, sigma_of, sizes_of
 
 WORSE = 2.0
 """The residual of a track is at most so many times that of its first frame."""
@@ -378,7 +379,7 @@ def _sized(
     points = pool.points_mm[ray]
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     boundary, climb = follow_rim(bed, coefficients, level, center, track.boundary)
-    sizes = sizes_of(bed, coefficients, level, boundary, climb)
+    sizes = sizes_of(bed.basis, coefficients, level, boundary, climb)
     if not sizes.holds:
         raise Broken("the surface comes down to the work piece within its boundary")
     share = np.full(len(ray), 1 / len(ray))

@@ -64,6 +64,9 @@ SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
 }
 """Surfaces that are not dataclasses; the one thing each is made from, what it is, its shape."""
 
+RETIRED = {("Reconstruction", "variants")}
+"""Fields that values of earlier versions have: they are left out where these are read."""
+
 LARGEST = 100_000_000
 """No value takes more bytes, unpacked, nor do all its arrays: few bytes cannot fill the memory.
 
@@ -253,7 +256,8 @@ class _Reader:
             return {key: self.read(item) for key, item in held}
         if kind in SURFACES:
             return self._surface(kind, self.read(held))
-        value = DATACLASSES[kind](**{name: self.read(item) for name, item in held.items()})
+        fields = {name: item for name, item in held.items() if (kind, name) not in RETIRED}
+        value = DATACLASSES[kind](**{name: self.read(item) for name, item in fields.items()})
         check_fields(value)
         return value
 

@@ -151,9 +151,6 @@ class Results:
         What it gave with other dots and rows is put aside for `bring_back`. If that is what stands,
         as the correction was taken back meanwhile, it stays, and the new is put aside.
 
-        All of it but the surfaces one σ away (`Reconstruction.variants`): they are five times the
-        rest, and what they are for, the ± of points and sizes, is kept.
-
         Parameters
         ----------
         frame, measurement
@@ -169,12 +166,9 @@ class Results:
             If it cannot be saved; then nothing has changed.
         """
         setup, settings = pack(basis.setup.text), pack(basis.settings)
-        reconstruction = measurement.reconstruction
-        if reconstruction is not None:
-            reconstruction = replace(reconstruction, variants=())
         key, made = (labapp.__version__, setup, settings), (correction, _now())
         seal = fingerprint((frame, basis.scheme, *key, *made))
-        content = pack((replace(measurement, reconstruction=reconstruction), seal))
+        content = pack((measurement, seal))
         row = _Row(*key, *made, content)
         with self._database.transaction() as connection:
             former = self._row(frame, basis.scheme)

@@ -190,7 +190,7 @@ class _Model:
         rows = self.basis.matrix(*self.peak_xy[:, None])[0] - self.basis.matrix(
             *self.level_at.T
         ).mean(0)
-        return float(np.sqrt(rows @ self.fitted.covariance @ rows))
+        return float(self.fitted.sigma_of(rows[None])[0])
 
     def boundary(self) -> float:
         """Standard uncertainty of the level: uniform between the last lit and first dark ray."""

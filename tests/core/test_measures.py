@@ -88,24 +88,14 @@ def test_an_egg_off_the_origin_is_measured():
     assert measures.area_mm2 == pytest.approx(len(x) * 0.02**2, rel=1e-3)
 
 
-def test_no_variants_no_uncertainty_and_pairs_add_up_in_squares():
-    pool = spherical_cap(6.0, 0.4)
-    reconstruction, match = truth(pool)
+def test_the_uncertainties_of_sizes_are_those_of_the_reconstruction():
+    reconstruction, match = truth(spherical_cap(6.0, 0.4))
     assert np.isnan(measure(reconstruction, match, RIG).height_sigma_mm)
-    boundary = reconstruction.boundary
-    wider, narrower = (
-        replace(boundary, points_mm=boundary.points_mm * [s, 1.0, 1.0]) for s in (1.0, 0.98)
-    )
-    variants = (
-        (spherical_cap(6.0, 0.43), boundary),
-        (spherical_cap(6.0, 0.37), boundary),
-        (spherical_cap(6.0, 0.36), wider),
-        (spherical_cap(6.0, 0.44), narrower),
-    )
-    measures = measure(replace(reconstruction, variants=variants), match, RIG)
-    assert measures.height_sigma_mm == pytest.approx(0.05, rel=1e-3)
-    assert measures.width_sigma_mm == pytest.approx(0.06, rel=1e-3)
-    assert measures.length_sigma_mm == pytest.approx(0.0, abs=1e-9)
+    sigma = np.array([0.06, 0.05, 0.04, 0.03, 0.2, 0.1])
+    measures = measure(replace(reconstruction, size_sigma=sigma), match, RIG)
+    names = ("width_sigma_mm", "length_sigma_mm", "height_sigma_mm", "depth_sigma_mm")
+    told = [getattr(measures, name) for name in (*names, "area_sigma_mm2", "volume_sigma_mm3")]
+    np.testing.assert_array_equal(told, sigma)
 
 
 def test_reflection_errors_are_eq_6_3_to_6_8():
