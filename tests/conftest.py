@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import platformdirs
 import pytest
 from hypothesis import settings
 
@@ -19,6 +20,9 @@ from labapp.session import log
 # The same examples every time, and no verdict that depends on how busy the machine is.
 settings.register_profile("labapp", derandomize=True, deadline=None)
 settings.load_profile("labapp")
+
+# Programs with a home of their own need not compile for themselves what is kept in the user's.
+os.environ.setdefault("NUMBA_CACHE_DIR", platformdirs.user_cache_dir("labapp", appauthor=False))
 
 Run = Callable[..., tuple[int, str, str]]
 

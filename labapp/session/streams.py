@@ -15,6 +15,7 @@ import math
 import os
 import threading
 from collections.abc import Coroutine, Iterable, Mapping
+from functools import partial
 from typing import Any, Protocol
 
 import labapp
@@ -24,7 +25,7 @@ from labapp.session.alarms import Alarm
 from labapp.session.log import NAME
 from labapp.session.tables import SIZES, sigma_of
 
-MOST_LISTENERS = 32
+MOST_LISTENERS, AT_ONCE = 32, 16
 """Each takes an open file, of which the measurement needs some itself."""
 
 MOST_WAITING = 1_000_000
@@ -255,6 +256,9 @@ class OpcuaStream:
         self._loop.close()
 
     async def _start(self, server: Any) -> Any:
+        # All that are accepted at once take a file each, before the first is refused.
+        loop: Any = asyncio.get_running_loop()
+        loop.create_server = partial(loop.create_server, backlog=AT_ONCE)
         await server.init()
         server.iserver.max_connections = MOST_LISTENERS
         server.set_endpoint(self.address)

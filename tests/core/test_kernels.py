@@ -550,8 +550,10 @@ def test_what_cannot_be_kept_on_disk_is_compiled_all_the_same(tmp_path: Path) ->
     script = "from labapp.core.compiled import compiled\nfrom numba import types\n" + (
         "made = compiled(types.int64)(eval('lambda x: x + 1'))\nprint(made(1))\n"
     )
+    (tmp_path / "file").touch()
     told = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False,
-        cwd=Path(__file__).parents[2], env={**os.environ, "HOME": str(tmp_path)},
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "file")},
     )  # fmt: skip
     assert (told.returncode, told.stdout) == (0, "2\n"), told.stderr

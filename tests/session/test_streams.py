@@ -169,6 +169,7 @@ def test_what_was_missed_is_told_at_the_end_too(monkeypatch: pytest.MonkeyPatch)
     idle = listener(stream)
     for frame in range(1500):
         stream.publish({"frame": frame, "reason": "x" * 10_000})
+    stream._loop.run(asyncio.sleep(0))  # all were sent, or missed, before any is read
     ending = threading.Thread(target=stream.close)
     ending.start()
     told = [json.loads(line) for line in idle]
