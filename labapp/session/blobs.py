@@ -7,7 +7,6 @@ that were changed are noticed.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import math
@@ -19,43 +18,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core import detection, dots, ers, irs, lattice, pool_fit, row_search, threshold_dots
-from labapp.core.boundary import Boundary
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.correction import Correction
-from labapp.core.correspondence import Match, MatchSettings, Trial
 from labapp.core.interpolation import CloughTocherSurface, ThinPlateSurface
-from labapp.core.laser_calibration import LaserCalibration
-from labapp.core.measures import Measures
-from labapp.core.pipeline import Measurement, Settings
-from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.reconstruction import BoundedSurface, Reconstruction
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.reconstruction import BoundedSurface
 from labapp.core.surface import FlatSurface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.session.kinds import check_fields, is_a
-from labapp.session.limits import Limits
-from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
-from labapp.session.signals import Signals
+from labapp.session.stored import NAMES, STORED
 
 MAGIC = b"LAB1"
 HEAD = struct.Struct("<4sI")
-
-DATACLASSES: dict[str, Any] = {
-    kind.__name__: kind
-    for kind in (
-        *(Boundary, Correction, dots.Dots, ImageCalibration, lattice.Lattice, LaserCalibration),
-        *(LaserReadings, Match, Measurement, Measures, PlaneCalibration, PlanePicture, Record),
-        *(Limits, Reconstruction, Recording, Signals, SplineBasis, SplineSurface, Trial),
-        *(DotPattern, Electrode, ImagingPlane, Laser, Rig),
-        *(Settings, MatchSettings, detection.DotSettings, detection.LatticeSettings),
-        *(dots.BandPassSettings, threshold_dots.BlockThresholdSettings),
-        *(threshold_dots.WaveletSettings, lattice.GrowSettings, row_search.RowSearchSettings),
-        *(row_search.MaskRowsSettings, pool_fit.FitSettings, ers.ErsSettings, irs.IrsSettings),
-    )
-}
 
 SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
     "CloughTocherSurface": (CloughTocherSurface, "points_mm", FloatArray, (3,)),
@@ -64,8 +36,7 @@ SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
 }
 """Surfaces that are not dataclasses; the one thing each is made from, what it is, its shape."""
 
-RETIRED = {("Reconstruction", "variants")}
-"""Fields that values of earlier versions have: they are left out where these are read."""
+SURFACE_NAMES = {made: name for name, (made, *_) in SURFACES.items()}
 
 LARGEST = 100_000_000
 """No value takes more bytes, unpacked, nor do all its arrays: few bytes cannot fill the memory.
@@ -206,18 +177,14 @@ def _tree(value: object, arrays: dict[bytes, int]) -> object:
         return {"dict": [[key, _tree(item, arrays)] for key, item in value.items()]}
     if isinstance(value, BoundedSurface):
         value = value.whole  # the boundary is kept beside it, in the reconstruction
-    name = type(value).__name__
-    if name in SURFACES:
+    if type(value) in SURFACE_NAMES:
+        name = SURFACE_NAMES[type(value)]
         return {name: _tree(getattr(value, SURFACES[name][1]), arrays)}
-    if DATACLASSES.get(name) is not type(value):
+    if type(value) not in NAMES:
         raise TypeError(f"a {type(value).__qualname__} cannot be kept in a session")
-    assert dataclasses.is_dataclass(value)
-    return {
-        name: {
-            field.name: _tree(getattr(value, field.name), arrays)
-            for field in dataclasses.fields(value)
-        }
-    }
+    name = NAMES[type(value)]
+    fields = STORED[name].names().items()
+    return {name: {theirs: _tree(getattr(value, ours), arrays) for theirs, ours in fields}}
 
 
 def _place(array: npt.NDArray[Any], arrays: dict[bytes, int]) -> int:
@@ -256,9 +223,16 @@ class _Reader:
             return {key: self.read(item) for key, item in held}
         if kind in SURFACES:
             return self._surface(kind, self.read(held))
-        fields = {name: item for name, item in held.items() if (kind, name) not in RETIRED}
-        value = DATACLASSES[kind](**{name: self.read(item) for name, item in fields.items()})
-        check_fields(value)
+        stored = STORED[kind]
+        fields = {
+            stored.renamed.get(name, name): self.read(item)
+            for name, item in held.items()
+            if name not in stored.retired
+        }
+        value = stored.kind(**fields)
+        check_fields(value, stored.shapes)
+        if not stored.fits(value):
+            raise TypeError(f"the fields of {kind} do not fit each other")
         return value
 
     def _take(self, size: int) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Mapping
 from typing import Any, Never
 
 import numpy as np
@@ -15,75 +15,18 @@ import numpy.typing as npt
 from labapp.core.reconstruction import BoundedSurface
 from labapp.core.surface import Surface
 
-SHAPES: dict[str, dict[str, str]] = {
-    "Boundary": {"center_mm": "2", "theta_deg": "m", "points_mm": "m 3"},
-    "Dots": dict.fromkeys(
-        ("u_px", "v_px", "u_sigma_px", "v_sigma_px", "size_px", "peak", "snr"), "n"
-    ),
-    "ImageCalibration": {"matrix": "3 3"},
-    "ImagingPlane": {"origin_mm": "3", "x_axis": "3", "z_axis": "3"},
-    "Lattice": {"row": "n", "column": "n"},
-    "Match": {
-        "dot": "n",
-        "ray": "n 2",
-        "reflected": "n 2",
-        "plane_mm": "n 2",
-        "plane_covariance_mm2": "n 2 2",
-        "witness": "rows columns",
-    },
-    "Reconstruction": {
-        "ray": "n 2",
-        "points_mm": "n 3",
-        "residual_mm": "n 2",
-        "sigma_mm": "n",
-        "size_sigma": "6",
-    },
-    "Signals": dict.fromkeys(("time_s", "current_a", "voltage_v"), "n"),
-    "SplineBasis": {"x_knots": "x", "y_knots": "y"},
-    "SplineSurface": {"coefficients": "n"},
-}
-"""Shape of every array of a class; equal letters are equal lengths."""
-
-
-def _measurement_fits(value: Any) -> bool:
-    count = 0 if value.dots is None else len(value.dots)
-    return (value.lattice is None or len(value.lattice.row) == count) and (
-        value.match is None or _all_within(value.match.dot, 0, count - 1)
-    )
-
-
-def _match_fits(value: Any) -> bool:
-    return _all_within(value.ray[:, 0], 1, value.witness.shape[0]) and _all_within(
-        value.ray[:, 1], 1, value.witness.shape[1]
-    )
-
-
-def _spline_fits(value: Any) -> bool:
-    shape = value.basis.shape
-    knots = (value.basis.x_knots, value.basis.y_knots)
-    return (
-        min(shape) > 0
-        and len(value.coefficients) == shape[0] * shape[1]
-        and all(np.isfinite(each).all() and (np.diff(each) > 0).all() for each in knots)
-    )
-
-
-def _all_within(numbers: Any, least: int, most: int) -> bool:
-    return bool(((numbers >= least) & (numbers <= most)).all())
-
-
-FITS: dict[str, Callable[[Any], bool]] = {
-    "Match": _match_fits,
-    "Measurement": _measurement_fits,
-    "SplineSurface": _spline_fits,
-}
-"""What the fields of a class must be together."""
-
 ARRAYS = {np.float64: "fiu", np.int64: "iu", np.bool_: "b"}
 
 
-def check_fields(value: Any) -> None:
+def check_fields(value: Any, shapes: Mapping[str, str]) -> None:
     """Hold the fields of a dataclass instance to what the class says of them.
+
+    Parameters
+    ----------
+    value
+        The instance.
+    shapes
+        Shape of every array; equal letters are equal lengths.
 
     Raises
     ------
@@ -95,7 +38,7 @@ def check_fields(value: Any) -> None:
         if not is_a(getattr(value, name), hint):
             raise TypeError(f"{kind.__name__}.{name} is {_shown(getattr(value, name))}")
     lengths: dict[str, int] = {}
-    for name, shape in SHAPES.get(kind.__name__, {}).items():
+    for name, shape in shapes.items():
         array = getattr(value, name)
         letters = shape.split()
         fits = array.ndim == len(letters) and all(
@@ -104,8 +47,6 @@ def check_fields(value: Any) -> None:
         )
         if not fits:
             raise TypeError(f"{kind.__name__}.{name} has the shape {array.shape}")
-    if kind.__name__ in FITS and not FITS[kind.__name__](value):
-        raise TypeError(f"the fields of {kind.__name__} do not fit each other")
 
 
 def is_a(value: object, hint: Any) -> bool:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import shutil
 import sqlite3
 import zlib
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from labapp.core.plane_calibration import PlaneCalibration
-from labapp.session.blobs import HEAD, MAGIC
+from labapp.core.rig import Electrode
+from labapp.session.blobs import HEAD, MAGIC, SURFACES, Damaged, pack, unpack
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED
 from labapp.session.schema import VERSION
 from labapp.session.session import Session
+from labapp.session.stored import NAMES, STORED, Stored
 
 WRITTEN = sorted((Path(__file__).parent / "data").glob("version_*.labsession"))
 
@@ -97,3 +101,53 @@ def test_a_plane_calibration_from_before_marks_is_read(tmp_path: Path):
         session.redo()
         assert session.plane_calibration == readings
         assert session.problems() == []
+
+
+# --- names --------------------------------------------------------------------------------------
+
+EVER = json.loads((Path(__file__).parent / "data" / "stored_names.json").read_text("utf-8"))
+"""Every value that was ever written, and the names of its fields in files."""
+
+
+def test_every_name_that_was_ever_written_is_read():
+    for name, fields in EVER.items():
+        if name in SURFACES:
+            continue
+        stored = STORED[name]
+        ours = {field.name for field in dataclasses.fields(stored.kind)}
+        for field in fields:
+            assert field in stored.retired or stored.renamed.get(field, field) in ours, field
+
+
+def test_every_name_that_is_written_is_kept():
+    # A name that is new here belongs in stored_names.json, from which nothing is ever taken away.
+    for name, stored in STORED.items():
+        assert set(stored.names()) <= set(EVER[name]), name
+    assert SURFACES.keys() <= EVER.keys()
+
+
+@dataclass(frozen=True)
+class Apparatus:
+    """What is kept as an electrode would be called so from today on, its tip, too."""
+
+    tip_mm: float = 5.0
+
+
+def test_what_is_renamed_is_read_and_written_by_its_old_name(monkeypatch: pytest.MonkeyPatch):
+    before = pack(Electrode(4.5))
+    stored = Stored(Apparatus, renamed={"height_mm": "tip_mm"}, retired=("bent",))
+    monkeypatch.setitem(STORED, "Electrode", stored)
+    monkeypatch.setitem(NAMES, Apparatus, "Electrode")
+    assert unpack(before, Apparatus) == Apparatus(4.5)
+    assert pack(Apparatus(4.5)) == before
+
+
+def test_a_field_that_is_retired_is_left_out():
+    text = b'{"Electrode":{"height_mm":4.5,"bent":true}}'
+    body = zlib.compress(len(text).to_bytes(4, "little") + text)
+    blob = HEAD.pack(MAGIC, zlib.crc32(body)) + body
+    with pytest.raises(Damaged):
+        unpack(blob)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(STORED, "Electrode", Stored(Electrode, retired=("bent",)))
+        assert unpack(blob) == Electrode(4.5)

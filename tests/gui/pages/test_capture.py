@@ -264,6 +264,7 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     qtbot.waitUntil(lambda: page.preview is not None)
     assert "wants a session of its own" in page.chosen.replace_words.text()
     assert page.chosen.replace_words.isVisible()
+    assert not page.chosen.import_button.isEnabled()
     second = tmp_path / "second.labsession"
     hand.answer(second)
     hand.button("New session from this recording …")

@@ -131,14 +131,16 @@ class ImportChoice(QWidget):
         choice = None if preview is None else self.choice()
         why_not = refusal(session, choice, working)
         self.setVisible(preview is not None)
-        self.import_button.setEnabled(not why_not)
-        self.import_button.setToolTip(
-            plain_tip(why_not or "Read it through once, and take its frames in")
-        )
+        has_one = session is not None and session.recording is not None
+        wants_own = has_one and measured
+        self.import_button.setEnabled(not (why_not or wants_own))
+        self.import_button.setDefault(not wants_own)
+        self.next_button.setDefault(wants_own)
+        tip = why_not or (MEASURED if wants_own else "Read it through once, and take its frames in")
+        self.import_button.setToolTip(plain_tip(tip))
         if preview is not None and choice is not None:
             words = choice_in_words(preview, choice)
             self.choice_words.setText(f"{words}. {why_not}" if why_not else words)
-        has_one = session is not None and session.recording is not None
         self.replace_words.setText(MEASURED if measured else REPLACED)
         self.replace_words.setVisible(has_one and not why_not)
         self.next_button.setVisible(has_one)
