@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from labapp.core.measures import Measures
+from labapp.core.surface.measures import Measures
 
 
 def assert_same(one: Measures | None, other: Measures | None) -> None:

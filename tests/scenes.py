@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.dots import Dots
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.images.dots import Dots
 from labapp.core.values import FloatArray, IntArray
 from labapp.simulation.forward import PoolSurface, Reflections, trace
 

@@ -251,7 +251,7 @@ def test_a_full_disk_leaves_whole_frames(
 SLOW = """
     import signal, sys, time
     from labapp.cli import main
-    from labapp.core.dots import Dots
+    from labapp.core.images.dots import Dots
     from labapp.core.pipeline import Measurement
     from labapp.session import run
     import numpy as np

@@ -373,7 +373,7 @@ def calibrate_laser(
     setup: SetupToChange = None,
 ) -> None:
     """Find the laser's angle, distance and height from its cross-hair (Appendix I)."""
-    from labapp.core import laser_calibration as core
+    from labapp.core.calibration import laser_calibration as core
 
     try:
         found = core.calibrate_laser(l1, l2, l3, fan_angle)
@@ -410,7 +410,7 @@ def calibrate_plane(
     setup: SetupToChange = None,
 ) -> None:
     """Find the origin and the axes of the imaging plane in a picture of the target (§5.1)."""
-    from labapp.core import plane_calibration as core
+    from labapp.core.calibration import plane_calibration as core
     from labapp.core.values import CannotMeasure
     from labapp.media import open_source
 

@@ -1,6 +1,7 @@
 """`labapp session correct`: dots and rows of a frame put right, and carried on from frame to frame.
 
-Each option is an edit of `labapp.core.correction`; they are applied in the order they are given in.
+Each option is an edit of `labapp.core.rows.correction`; they are applied in the order they are
+given in.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from labapp.errors import InputError
 from labapp.words import several
 
 if TYPE_CHECKING:
-    from labapp.core.correction import Correction
-    from labapp.core.measures import Measures
     from labapp.core.pipeline import Measurement
+    from labapp.core.rows.correction import Correction
+    from labapp.core.surface.measures import Measures
     from labapp.session.session import Session
 
 NEAR_PX = 5.0
@@ -202,7 +203,7 @@ def _apply(
     session: Session, frame: int, correction: Correction, name: str, value: str
 ) -> Correction:
     """Apply one edit; ValueError if it does not fit."""
-    from labapp.core import correction as core
+    from labapp.core.rows import correction as core
     from labapp.session.corrections_csv import read_correction
 
     if name == "dots":
@@ -262,7 +263,7 @@ def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
     """The dot that a place means."""
     import numpy as np
 
-    from labapp.core.correction import named
+    from labapp.core.rows.correction import named
 
     dots = correction.dots
     if not len(dots):
@@ -277,8 +278,8 @@ def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
 
 def _carried_on(session: Session, frame: int, correction: Correction) -> dict[int, Correction]:
     """Corrections of the frames after it, as far as it fits; says up to where."""
-    from labapp.core.detection import find_dots
-    from labapp.core.tracking import carry_on
+    from labapp.core.rows.detection import find_dots
+    from labapp.core.rows.tracking import carry_on
     from labapp.core.values import CannotMeasure
 
     carried: dict[int, Correction] = {}

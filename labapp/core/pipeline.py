@@ -5,22 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from labapp.core import ers, fit, irs, measures
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.corrected_rows import confirmed_lattice, match_corrected
-from labapp.core.correction import Correction
-from labapp.core.correspondence import (
-    Match,
-    MatchSettings,
-    indexed_lattice,
-    match_rays,
-)
-from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
-from labapp.core.dots import Dots, Image
-from labapp.core.lattice import Lattice
-from labapp.core.pool_fit import FitSettings
-from labapp.core.reconstruction import Reconstruction, Scheme
-from labapp.core.rig import Rig
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
+from labapp.core.images.dots import Dots, Image
+from labapp.core.match import Match
+from labapp.core.matching.corrected_rows import confirmed_lattice, match_corrected
+from labapp.core.matching.correspondence import MatchSettings, indexed_lattice, match_rays
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.rows.lattice import Lattice
+from labapp.core.schemes import ers, fit, irs
+from labapp.core.surface import measures
+from labapp.core.surface.pool_fit import FitSettings
+from labapp.core.surface.reconstruction import Reconstruction, Scheme
 from labapp.core.values import CannotMeasure
 
 

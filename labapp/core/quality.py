@@ -10,14 +10,14 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.detection import find_dots, find_lattice
-from labapp.core.dots import Dots, Image
-from labapp.core.exposure import Exposure, judge_exposure
-from labapp.core.lattice import Lattice
-from labapp.core.measures import Measures
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
+from labapp.core.images.dots import Dots, Image
+from labapp.core.images.exposure import Exposure, judge_exposure
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.rig import Rig
+from labapp.core.rows.detection import find_dots, find_lattice
+from labapp.core.rows.lattice import Lattice
+from labapp.core.surface.measures import Measures
 from labapp.core.values import CannotMeasure
 
 Grade = Literal["good", "doubtful", "bad"]

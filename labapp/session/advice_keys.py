@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from labapp.core.rig import DotPattern
+from labapp.core.geometry.rig import DotPattern
 from labapp.errors import InputError
 from labapp.session.setup_keys import SECTIONS
 from labapp.session.toml_keys import Rule, are_numbers, check_keys, is_number, unknown_key

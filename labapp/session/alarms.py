@@ -12,7 +12,7 @@ import threading
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 
-from labapp.core.measures import Measures
+from labapp.core.surface.measures import Measures
 from labapp.session.limits import NAMES, Limits, Size, Standing, sizes_of, standing
 from labapp.words import several
 

@@ -15,7 +15,7 @@ from labapp.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from labapp.core.reconstruction import Scheme
+    from labapp.core.surface.reconstruction import Scheme
     from labapp.session.setup import Setup
     from labapp.simulation.error_analysis import ErrorSurvey
     from labapp.simulation.parallel import Progress

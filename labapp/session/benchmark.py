@@ -18,11 +18,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from threadpoolctl import ThreadpoolController
 
-from labapp.core.band_pass import Exposure, band_pass_dots, quick_dots
-from labapp.core.dots import Dots, Image
+from labapp.core.images.band_pass import Exposure, band_pass_dots, quick_dots
+from labapp.core.images.dots import Dots, Image
 from labapp.core.pipeline import Settings, measure
+from labapp.core.sequence.warm import WarmChain
 from labapp.core.values import FloatArray, IntArray
-from labapp.core.warm import WarmChain
 from labapp.media import open_source
 from labapp.session.files import made_whole
 from labapp.session.results import ResultsWriter

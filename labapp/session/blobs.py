@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.interpolation import CloughTocherSurface, ThinPlateSurface
-from labapp.core.reconstruction import BoundedSurface
-from labapp.core.surface import FlatSurface
+from labapp.core.surface.interpolation import CloughTocherSurface, ThinPlateSurface
+from labapp.core.surface.reconstruction import BoundedSurface
+from labapp.core.surface.surface import FlatSurface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.session.kinds import check_fields, is_a

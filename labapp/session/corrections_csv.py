@@ -18,9 +18,9 @@ from typing import TextIO
 import numpy as np
 from scipy.spatial import cKDTree
 
-from labapp.core.correction import MOST, PLACED_PX, Correction, set_reference
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import MOST, PLACED_PX, Correction, set_reference
+from labapp.core.rows.lattice import Lattice
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.session.csv_tables import (

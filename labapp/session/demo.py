@@ -5,7 +5,7 @@ from __future__ import annotations
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.session.pictures import write_surface_picture
 from labapp.session.samples import begin_session

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
-from labapp.core.dots import BandPassSettings, Dots
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import BandPassSettings, Dots
+from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.rows.lattice import Lattice
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.media import open_source

@@ -13,8 +13,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Never
 
-from labapp.core.correction import Correction
 from labapp.core.pipeline import Settings
+from labapp.core.rows.correction import Correction
 from labapp.session.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
 from labapp.session.database import Database
 from labapp.session.kept import Kept

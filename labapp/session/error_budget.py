@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.correspondence import Match
-from labapp.core.laser_calibration import LaserCalibration
-from labapp.core.measures import Measures, measure
+from labapp.core.calibration.laser_calibration import LaserCalibration
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings, reconstruct
-from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.rig import Rig
+from labapp.core.surface.measures import Measures, measure
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.session.setup import Setup
 from labapp.simulation.parameter_deviation import NOMINAL, OFFSETS, QUANTITIES, AxisPoints, move

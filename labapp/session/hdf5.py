@@ -30,8 +30,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.measures import surface_grid
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.surface.measures import surface_grid
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.session.files import as_bytes
 from labapp.session.tables import TABLES, Column, Table
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, freeze
 
 PROFILE_POINTS = 241

@@ -12,8 +12,8 @@ from typing import Any, Never
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.reconstruction import BoundedSurface
-from labapp.core.surface import Surface
+from labapp.core.surface.reconstruction import BoundedSurface
+from labapp.core.surface.surface import Surface
 
 ARRAYS = {np.float64: "fiu", np.int64: "iu", np.bool_: "b"}
 

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from labapp.core.measures import Measures
+from labapp.core.surface.measures import Measures
 from labapp.core.values import BoolArray, FloatArray
 from labapp.errors import InputError
 

@@ -11,9 +11,9 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from labapp.core.measures import Measures
 from labapp.core.pipeline import Settings
 from labapp.core.quality import Quality, judge_quality
+from labapp.core.surface.measures import Measures
 from labapp.media import GreyImage
 from labapp.session.scene import Scene, scene_of
 from labapp.session.setup import Setup
@@ -117,7 +117,7 @@ _measure: list[Callable[[GreyImage, bool], LiveMeasurement | None]] = []
 
 def _begin(given: _Chain) -> None:
     setup, settings, depth = given
-    from labapp.core.warm import WarmChain
+    from labapp.core.sequence.warm import WarmChain
 
     chain = WarmChain(setup.rig, setup.calibration, settings)
     rays = setup.rig.pattern.rows * setup.rig.pattern.columns

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.measures import surface_mesh
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.surface.measures import surface_mesh
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, freeze
 from labapp.errors import InputError
 

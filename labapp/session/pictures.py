@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.pipeline import Measurement
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.session.files import write_whole
 from labapp.session.scene import scene_of

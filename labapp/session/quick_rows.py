@@ -7,7 +7,7 @@ import numpy.typing as npt
 from numba import types
 
 from labapp.core.compiled import compiled
-from labapp.core.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray, IntArray
 from labapp.session.tables import TABLES, Table, csv_rows, frame_tables

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from labapp.core.laser_calibration import LaserCalibration
-from labapp.core.plane_calibration import PlaneCalibration
+from labapp.core.calibration.laser_calibration import LaserCalibration
+from labapp.core.calibration.plane_calibration import PlaneCalibration
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from types import TracebackType
 from typing import Self
 
 import labapp
-from labapp.core.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.session.files import as_bytes, write_whole
 from labapp.session.meshes import FORMATS, SPACING_MM, solid, surface

@@ -13,8 +13,8 @@ from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
-from labapp.core.correction import Correction
 from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource
 from labapp.session.results import ResultsWriter

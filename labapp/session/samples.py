@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from labapp.bundled import bundled
-from labapp.core.correction import block_row, set_reference
 from labapp.core.pipeline import start_correction
+from labapp.core.rows.correction import block_row, set_reference
 from labapp.errors import InputError
 from labapp.session.record import Record
 from labapp.session.session import Session

@@ -15,7 +15,7 @@ import numpy as np
 import tomlkit
 
 from labapp.bundled import bundled
-from labapp.core.rig import Rig
+from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.session.scenario_keys import RECORDINGS, SHAPES, TABLES, TERMS, pool_rules

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.correspondence import Match
-from labapp.core.measures import surface_mesh
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.rig import Rig
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
+from labapp.core.surface.measures import surface_mesh
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, freeze
 from labapp.session.heights import difference_at, sigma_at
 from labapp.session.meshes import drawn_spacing

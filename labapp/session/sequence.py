@@ -1,4 +1,4 @@
-"""A recording measured frame from frame (`core.warm`), long stretches of it at once.
+"""A recording measured frame from frame (`core.sequence.warm`), long stretches of it at once.
 
 Stretches are of one length, however many processes there are, and begin with a cold frame each:
 results do not depend on the machine. A process opens the recording itself, and gives back what it
@@ -19,8 +19,8 @@ from pathlib import Path
 import cv2
 from threadpoolctl import ThreadpoolController
 
-from labapp.core.correction import Correction
 from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
 from labapp.media import Frame, FrameSource, open_source
 from labapp.session.results import ResultsWriter
@@ -183,7 +183,7 @@ def follow_each(
 
     A frame that was corrected by hand is measured as it was corrected.
     """
-    from labapp.core.warm import WarmChain
+    from labapp.core.sequence.warm import WarmChain
 
     threads, chain = ThreadpoolController(), WarmChain(setup.rig, setup.calibration, settings)
     for place, number in enumerate(frames):
@@ -214,9 +214,9 @@ def _begun(pool: Executor, job: Job, stretch: Sequence[int]) -> deque[Future[lis
 
 def _ready() -> None:
     """Have a process start, and load what it measures with."""
-    import labapp.core.lattice_kernels
-    import labapp.core.match_kernels
-    import labapp.core.warm
+    import labapp.core.matching.match_kernels
+    import labapp.core.rows.lattice_kernels
+    import labapp.core.sequence.warm
     import labapp.session.quick_rows  # noqa: F401
 
 
@@ -224,7 +224,7 @@ class Following:
     """Measures one stretch of a recording."""
 
     def __init__(self, job: Job) -> None:
-        from labapp.core.warm import WarmChain
+        from labapp.core.sequence.warm import WarmChain
         from labapp.session.quick_rows import quick_rows
 
         self._job, self._rows = job, quick_rows

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from labapp.core.correction import Correction
-from labapp.core.laser_calibration import LaserCalibration, calibrate_laser
-from labapp.core.pipeline import Measurement, Settings
-from labapp.core.plane_calibration import (
+from labapp.core.calibration.laser_calibration import LaserCalibration, calibrate_laser
+from labapp.core.calibration.plane_calibration import (
     PlaneCalibration,
     PlaneCalibrationSettings,
     calibrate_plane,
 )
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.rows.correction import Correction
 from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.media import Frame, GreyImage, open_source
@@ -365,7 +365,7 @@ class Session:
         pool
             Processes to measure in (`run.measuring_pool`); None: here.
         warm
-            Whether to measure each frame from the one before (`core.warm`), here.
+            Whether to measure each frame from the one before (`core.sequence.warm`), here.
 
         Raises
         ------

@@ -14,8 +14,8 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.errors import InputError
 from labapp.session.files import write_whole
 from labapp.session.setup_keys import SECTIONS, rules_for

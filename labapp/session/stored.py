@@ -13,18 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from labapp.core import detection, dots, ers, irs, lattice, pool_fit, row_search, threshold_dots
-from labapp.core.boundary import Boundary
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.correction import Correction
-from labapp.core.correspondence import Match, MatchSettings, Trial
-from labapp.core.laser_calibration import LaserCalibration
-from labapp.core.measures import Measures
+from labapp.core.calibration.laser_calibration import LaserCalibration
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.images import dots, threshold_dots
+from labapp.core.match import Match, Trial
+from labapp.core.matching.correspondence import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.rows import detection, lattice, row_search
+from labapp.core.rows.correction import Correction
+from labapp.core.schemes import ers, irs
+from labapp.core.surface import pool_fit
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.measures import Measures
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.session.limits import Limits
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.signals import Signals

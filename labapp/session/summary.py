@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from labapp.core.measures import Measures
 from labapp.core.pipeline import Measurement
+from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 
 TOLD = {

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.measures import Measures, surface_grid
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.surface.measures import Measures, surface_grid
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.words import SIGMA_OF, as_cell
 
 PX_DIGITS, MM_DIGITS = 4, 6

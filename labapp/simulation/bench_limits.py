@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import FloatArray
 from labapp.simulation.expected_pools import ExpectedPools, Range
 from labapp.simulation.forward import Reflections, trace

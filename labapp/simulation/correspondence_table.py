@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import spherical_cap

@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core import ers, irs
-from labapp.core.correspondence import Match
-from labapp.core.measures import Measures, measure
+from labapp.core.geometry.rig import DotPattern, Laser, Rig
+from labapp.core.match import Match
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.reconstruction import Scheme
-from labapp.core.rig import DotPattern, Laser, Rig
+from labapp.core.schemes import ers, irs
+from labapp.core.surface.measures import Measures, measure
+from labapp.core.surface.reconstruction import Scheme
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.correspondence_table import OPEN_BENCH
 from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace

@@ -11,9 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from labapp.core.correspondence import Match
-from labapp.core.orientation import Orientation
-from labapp.core.rig import Rig
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match, Orientation
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.simulation.pools import PoolSize
 from labapp.simulation.torch import Torch, YozTorch

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.measures import measure
 from labapp.core.pipeline import Settings, reconstruct
+from labapp.core.surface.measures import measure
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.simulation.bench_limits import BenchLimits, Place
 from labapp.simulation.error_analysis import relative_errors

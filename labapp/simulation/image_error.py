@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.measures import measure
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.pipeline import measure as measure_frame
-from labapp.core.reconstruction import Scheme
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.surface.measures import measure
+from labapp.core.surface.reconstruction import Scheme
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.error_analysis import (

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.correspondence import Match
-from labapp.core.measures import measure
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
 from labapp.core.pipeline import reconstruct
-from labapp.core.reconstruction import Scheme
-from labapp.core.rig import Rig
+from labapp.core.surface.measures import measure
+from labapp.core.surface.reconstruction import Scheme
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.error_analysis import circle_settings, relative_errors
 from labapp.simulation.parallel import Progress, in_parallel

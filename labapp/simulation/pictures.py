@@ -10,7 +10,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from labapp.core.rig import Rig
+from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.simulation.error_analysis import ErrorSurvey
 from labapp.simulation.forward import Reflections

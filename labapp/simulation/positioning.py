@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.rig import Rig
+from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import PoolSurface, Reflections, trace
 from labapp.simulation.pools import ellipsoidal_cap

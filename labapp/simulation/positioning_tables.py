@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import BoolArray, FloatArray, freeze
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import spherical_cap

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.optics import bisecting_gradient, meet_level, ray_directions
-from labapp.core.pool_fit import CORRELATED_MM2, REACH, FitSettings, landing_spacing
-from labapp.core.rig import Laser, Rig
-from labapp.core.solver import SlopeFit, fit_slopes
-from labapp.core.spline import SplineBasis
+from labapp.core.geometry.optics import bisecting_gradient, meet_level, ray_directions
+from labapp.core.geometry.rig import Laser, Rig
+from labapp.core.surface.pool_fit import CORRELATED_MM2, REACH, FitSettings, landing_spacing
+from labapp.core.surface.solver import SlopeFit, fit_slopes
+from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import FloatArray, freeze
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.parameter_deviation import (
@@ -146,7 +146,7 @@ class _Model:
     """The smooth surface through the true slopes, and what it makes of changes to them."""
 
     def __init__(self, pool: Pool, rig: Rig, seen: Reflections, dot_sigma_mm: float) -> None:
-        from labapp.core import kernels
+        from labapp.core.surface import kernels
 
         settings = FitSettings()
         self.pool, self.rig, self.seen = pool, rig, seen

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
-from labapp.core.rig import Rig
+from labapp.core.geometry.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace

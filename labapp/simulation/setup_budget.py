@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.measures import measure
+from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.rig import Rig
+from labapp.core.surface.measures import measure
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.error_analysis import relative_errors
 from labapp.simulation.forward import exact_match, trace

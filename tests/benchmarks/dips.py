@@ -18,11 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core import fit
-from labapp.core.correspondence import Match, MatchSettings, match_rays
-from labapp.core.fit import FitSettings
-from labapp.core.lattice import GrowSettings, grow_lattice
-from labapp.core.measures import measure
+from labapp.core.match import Match
+from labapp.core.matching.correspondence import MatchSettings, match_rays
+from labapp.core.rows.lattice import GrowSettings, grow_lattice
+from labapp.core.schemes import fit
+from labapp.core.schemes.fit import FitSettings
+from labapp.core.surface.measures import measure
 from labapp.core.values import CannotMeasure
 from labapp.simulation.pools import Dent, Pool, egg
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see

@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from PySide6.QtWidgets import QApplication, QLabel, QWidget
 
-from labapp.core.correction import Correction
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Lattice
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.views.picture import PictureView

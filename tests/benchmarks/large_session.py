@@ -24,8 +24,8 @@ import imageio_ffmpeg
 import numpy as np
 
 import labapp
-from labapp.core.correction import Correction
 from labapp.core.pipeline import start_correction
+from labapp.core.rows.correction import Correction
 from labapp.session.session import Session
 
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"

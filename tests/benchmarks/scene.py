@@ -17,9 +17,9 @@ os.environ["LIBGL_ALWAYS_SOFTWARE"] = "1"
 import numpy as np
 import pyvista
 
-from labapp.core.boundary import Boundary
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.session.drawing import build_scene
 from labapp.session.scene import scene_of
 

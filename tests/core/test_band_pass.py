@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp.core import dot_size
-from labapp.core.band_pass import band_pass_dots
-from labapp.core.dots import BandPassSettings
+from labapp.core.images import dot_size
+from labapp.core.images.band_pass import band_pass_dots
+from labapp.core.images.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
 
 SHAPE = (240, 320)

@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.boundary import (
+from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.surface.boundary import (
     Boundary,
     EdgePoints,
     boundary_on_work_piece,
@@ -17,8 +19,6 @@ from labapp.core.boundary import (
     edge_points,
     piecewise,
 )
-from labapp.core.optics import meet_level, ray_directions
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import CannotMeasure
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg, spherical_cap

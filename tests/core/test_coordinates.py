@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
 
 pixels = st.tuples(st.floats(0.0, 640.0), st.floats(0.0, 480.0)).map(np.array)
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.correction import (
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import (
     PLACED_PX,
     Correction,
     add_dot,
@@ -24,8 +25,7 @@ from labapp.core.correction import (
     shift_row,
     split_row,
 )
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
+from labapp.core.rows.lattice import Lattice
 from labapp.core.values import FloatArray, IntArray
 from tests.scenes import as_dots
 

@@ -9,9 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from labapp.core import correspondence
-from labapp.core.corrected_rows import confirmed_lattice, match_corrected
-from labapp.core.correction import (
+from labapp.core.geometry.rig import DotPattern, Laser, Rig
+from labapp.core.images.dots import Dots
+from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
+from labapp.core.matching import correspondence
+from labapp.core.matching.corrected_rows import confirmed_lattice, match_corrected
+from labapp.core.matching.correspondence import MatchSettings, indexed_lattice, match_rays
+from labapp.core.rows.correction import (
     Correction,
     assign,
     block_row,
@@ -20,16 +24,7 @@ from labapp.core.correction import (
     set_reference,
     shift_row,
 )
-from labapp.core.correspondence import (
-    Match,
-    MatchSettings,
-    indexed_lattice,
-    match_rays,
-)
-from labapp.core.dots import Dots
-from labapp.core.lattice import GrowSettings, Lattice, Site, grow_lattice
-from labapp.core.orientation import ORIENTATIONS, Orientation, ways
-from labapp.core.rig import DotPattern, Laser, Rig
+from labapp.core.rows.lattice import GrowSettings, Lattice, Site, grow_lattice
 from labapp.core.values import BoolArray, CannotMeasure
 from labapp.simulation.forward import Reflections, seen_orientation, trace
 from labapp.simulation.pools import Dent, Pool, Wave, egg, ellipsoidal_cap, spherical_cap

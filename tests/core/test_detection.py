@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.band_pass import band_pass_dots
-from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
-from labapp.core.lattice import grow_lattice
-from labapp.core.row_search import mask_rows, search_rows
-from labapp.core.threshold_dots import block_threshold_dots, wavelet_dots
+from labapp.core.images.band_pass import band_pass_dots
+from labapp.core.images.threshold_dots import block_threshold_dots, wavelet_dots
+from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.rows.lattice import grow_lattice
+from labapp.core.rows.row_search import mask_rows, search_rows
 from labapp.core.values import CannotMeasure, FloatArray
 from tests.scenes import as_dots
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.hypothesis import Hypothesis, contested, moved, weigh
-from labapp.core.ray_growth import UNLABELLED, Scene
+from labapp.core.matching.hypothesis import Hypothesis, contested, moved, weigh
+from labapp.core.matching.ray_growth import UNLABELLED, Scene
 from labapp.core.values import IntArray
 from tests.benchmarks.dips import answer, draw
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core import ers
-from labapp.core.interpolation import ThinPlateSurface
-from labapp.core.measures import measure, reflection_scale
-from labapp.core.optics import meet_plane, reflect, surface_normal
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.slopes import Paths, parents_from, reflected_rays
-from labapp.core.surface import intersect
+from labapp.core.geometry.optics import meet_plane, reflect, surface_normal
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.schemes import ers
+from labapp.core.schemes.slopes import Paths, parents_from, reflected_rays
+from labapp.core.surface.interpolation import ThinPlateSurface
+from labapp.core.surface.measures import measure, reflection_scale
+from labapp.core.surface.surface import intersect
 from labapp.core.values import CannotMeasure
 from labapp.simulation.error_analysis import followed
 from labapp.simulation.forward import exact_match, trace

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg.lapack import dtbtrs
 
-from labapp.core import ers, fit
-from labapp.core.correspondence import Match
-from labapp.core.measures import Measures, measure, reflection_errors, size_of
-from labapp.core.pool_fit import FitSettings, fit_pool
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.spline import SplineSurface
+from labapp.core.match import Match
+from labapp.core.schemes import ers, fit
+from labapp.core.surface.measures import Measures, measure, reflection_errors, size_of
+from labapp.core.surface.pool_fit import FitSettings, fit_pool
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import (

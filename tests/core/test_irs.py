@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from labapp.core import irs
-from labapp.core.measures import measure
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.schemes import irs
+from labapp.core.surface.measures import measure
 from labapp.core.values import CannotMeasure
 from labapp.simulation.error_analysis import aside
 from labapp.simulation.forward import exact_match, trace

@@ -13,16 +13,8 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.stats import multivariate_normal
 
-from labapp.core import (
-    dot_kernels,
-    dot_size,
-    dots,
-    kernels,
-    level_kernels,
-    match_kernels,
-)
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.optics import (
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.optics import (
     bisecting_gradient,
     meet_level,
     meet_plane,
@@ -30,11 +22,14 @@ from labapp.core.optics import (
     reflect,
     surface_normal,
 )
-from labapp.core.pool_fit import Rear
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.solver import normal_factor
-from labapp.core.spline import SplineBasis, SplineSurface
-from labapp.core.track import recurrence
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.images import dot_kernels, dot_size, dots
+from labapp.core.matching import match_kernels
+from labapp.core.sequence.track import recurrence
+from labapp.core.surface import kernels, level_kernels
+from labapp.core.surface.pool_fit import Rear
+from labapp.core.surface.solver import normal_factor
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 
 RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.laser_calibration import LaserCalibrationSettings, calibrate_laser
+from labapp.core.calibration.laser_calibration import LaserCalibrationSettings, calibrate_laser
 
 
 def cross_hair(angle_deg: float, distance_mm: float, fan_deg: float = 10.0) -> np.ndarray:

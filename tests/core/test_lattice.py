@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.lattice import GrowSettings, Lattice, grow_lattice
-from labapp.core.lattice_kernels import BORDER, grow
+from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice
+from labapp.core.rows.lattice_kernels import BORDER, grow
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.pools import egg, ellipsoidal_cap, spherical_cap
 from tests.scenes import as_dots, see

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from labapp.core.mark_fit import MarkFits, fit_marks, root_mean_square
-from labapp.core.plane_calibration import (
+from labapp.core.calibration.mark_fit import MarkFits, fit_marks, root_mean_square
+from labapp.core.calibration.plane_calibration import (
     PlaneCalibration,
     PlaneCalibrationSettings,
     calibrate_plane,

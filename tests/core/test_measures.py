@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core import ers, irs
-from labapp.core.boundary import Boundary
-from labapp.core.measures import (
+from labapp.core.geometry.optics import meet_plane, ray_directions, reflect, surface_normal
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.schemes import ers, irs
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.measures import (
     measure,
     reflection_errors,
     reflection_scale,
     surface_grid,
     surface_mesh,
 )
-from labapp.core.optics import meet_plane, ray_directions, reflect, surface_normal
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Pool, egg, spherical_cap
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.optics import (
+from labapp.core.geometry.optics import (
     bisecting_gradient,
     meet_level,
     meet_plane,
@@ -15,7 +15,7 @@ from labapp.core.optics import (
     reflect,
     surface_normal,
 )
-from labapp.core.rig import DotPattern, ImagingPlane, Laser
+from labapp.core.geometry.rig import DotPattern, ImagingPlane, Laser
 
 slopes = st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)).map(np.array)
 elevations = st.floats(10.0, 80.0)

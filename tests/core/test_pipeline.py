@@ -10,11 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from labapp.core.correction import Correction, add_dot, assign, delete_dots, set_reference
-from labapp.core.detection import DotSettings
-from labapp.core.dots import Dots
-from labapp.core.lattice import GrowSettings, Lattice, grow_lattice
-from labapp.core.measures import measure as size_of
+from labapp.core.images.dots import Dots
 from labapp.core.pipeline import (
     Measurement,
     Settings,
@@ -22,6 +18,10 @@ from labapp.core.pipeline import (
     reconstruct,
     start_correction,
 )
+from labapp.core.rows.correction import Correction, add_dot, assign, delete_dots, set_reference
+from labapp.core.rows.detection import DotSettings
+from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice
+from labapp.core.surface.measures import measure as size_of
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.media import open_source
 from labapp.session.setup import read_setup

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp.core.plane_calibration import (
+from labapp.core.calibration.plane_calibration import (
     PlaneCalibration,
     PlaneCalibrationSettings,
     calibrate_plane,
 )
-from labapp.core.target_marks import thinned
+from labapp.core.calibration.target_marks import thinned
 from labapp.core.values import CannotMeasure
 
 

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from labapp.core import fit
-from labapp.core.correspondence import Match
-from labapp.core.optics import meet_plane, reflect, surface_normal
-from labapp.core.pool_fit import (
+from labapp.core.geometry.optics import meet_plane, reflect, surface_normal
+from labapp.core.geometry.rig import ImagingPlane
+from labapp.core.match import Match
+from labapp.core.schemes import fit
+from labapp.core.surface.pool_fit import (
     FitSettings,
     FittedPool,
     Level,
@@ -21,8 +22,7 @@ from labapp.core.pool_fit import (
     fit_pool,
     place_level,
 )
-from labapp.core.rig import ImagingPlane
-from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Pool, egg, spherical_cap

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp.core.exposure import ADVICE
+from labapp.core.images.exposure import ADVICE
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import GRADES, Quality, judge_quality, look
 from labapp.media import GreyImage, open_source

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core.band_pass import Exposure, band_pass_dots, quick_dots
-from labapp.core.dots import BandPassSettings
+from labapp.core.images.band_pass import Exposure, band_pass_dots, quick_dots
+from labapp.core.images.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
 
 SIZE_PX = 2.0
@@ -57,7 +57,7 @@ def test_light_is_the_same_round_the_dots_alone_and_over_the_whole_picture(
     exposure = Exposure.of(image, BandPassSettings())
     made = []
     for much in (np.inf, 0.0):
-        monkeypatch.setattr("labapp.core.band_pass.MUCH", much)
+        monkeypatch.setattr("labapp.core.images.band_pass.MUCH", much)
         made.append(quick_dots(image, exposure, BandPassSettings()))
     np.testing.assert_allclose(made[0].image_px, made[1].image_px, atol=1e-4)
     np.testing.assert_allclose(made[0].size_px, made[1].size_px, atol=1e-3)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.rig import DotPattern, ImagingPlane, Laser
+from labapp.core.geometry.rig import DotPattern, ImagingPlane, Laser
 
 angles = st.floats(-np.pi, np.pi)
 lengths = st.floats(-100.0, 100.0)

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
-from labapp.core.row_search import mask_rows, search_rows
+from labapp.core.images.dots import Dots
+from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.row_search import mask_rows, search_rows
 from labapp.core.values import CannotMeasure
 
 SHAPE = (640, 480)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core import measures
-from labapp.core.boundary import Boundary
-from labapp.core.pool_fit import FitSettings, Level, Rear
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.rim import follow_rim
-from labapp.core.sizes import Sizes, sizes_of
-from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.sequence.warm_fit import Bed
+from labapp.core.surface import measures
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.pool_fit import FitSettings, Level, Rear
+from labapp.core.surface.rim import follow_rim
+from labapp.core.surface.sizes import Sizes, sizes_of
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
-from labapp.core.warm_fit import Bed
 
 BASIS = SplineBasis.over(np.array([-4.0, -5.0]), np.array([4.0, 4.0]), 0.9)
 RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
@@ -32,7 +32,7 @@ def coefficients(dent_mm: float) -> FloatArray:
 def measured(made: FloatArray, level: Level) -> tuple[Sizes, Boundary]:
     circle = Boundary.polar(CENTER, np.full(360, 3.0))
     for _ in range(4):
-        circle, climb = follow_rim(BED, made, level, CENTER, circle)
+        circle, climb = follow_rim(BASIS, made, level, CENTER, circle)
     return sizes_of(BASIS, made, level, circle, climb), circle
 
 

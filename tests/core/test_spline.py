@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.solver import fit_slopes
-from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.surface.solver import fit_slopes
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 
 LOW, HIGH = np.array([-3.0, -2.0]), np.array([2.0, 4.0])

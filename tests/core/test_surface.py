@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.boundary import Boundary
-from labapp.core.interpolation import CloughTocherSurface, ThinPlateSurface, whole_surface
-from labapp.core.optics import meet_level, ray_directions
-from labapp.core.rig import DotPattern, Laser
-from labapp.core.surface import FlatSurface, intersect
+from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.rig import DotPattern, Laser
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.interpolation import CloughTocherSurface, ThinPlateSurface, whole_surface
+from labapp.core.surface.surface import FlatSurface, intersect
 from labapp.core.values import CannotMeasure
 from labapp.simulation.pools import spherical_cap
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core.dots import Dots
-from labapp.core.threshold_dots import (
+from labapp.core.images.dots import Dots
+from labapp.core.images.threshold_dots import (
     BlockThresholdSettings,
     WaveletSettings,
     block_threshold_dots,

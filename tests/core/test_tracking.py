@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from labapp.core.correction import Correction, block_row, clear_rows
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
-from labapp.core.tracking import carry_on
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import Correction, block_row, clear_rows
+from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.tracking import carry_on
 from labapp.core.values import BoolArray, IntArray
 from labapp.simulation.pools import Oscillation, egg
 from tests.scenes import SeenDots, as_dots, see

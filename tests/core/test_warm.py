@@ -9,12 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from labapp.core.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.track import Broken
+from labapp.core.sequence.track import Broken
+from labapp.core.sequence.warm import WarmChain, follow
 from labapp.core.values import CannotMeasure, FloatArray
-from labapp.core.warm import WarmChain, follow
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Wave, egg
 from labapp.simulation.recording import RecordedFrame, Recording

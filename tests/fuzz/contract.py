@@ -17,8 +17,8 @@ import numpy as np
 
 from labapp import cli
 from labapp.cli.info import _facts, _text
-from labapp.core.correction import Correction
 from labapp.core.pipeline import Measurement, Settings
+from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.media import open_source

@@ -16,18 +16,18 @@ import imageio_ffmpeg
 import numpy as np
 import tifffile
 
-from labapp.core.boundary import Boundary
-from labapp.core.correction import Correction
-from labapp.core.correspondence import Match, Trial
-from labapp.core.dots import Dots
-from labapp.core.interpolation import ThinPlateSurface
-from labapp.core.lattice import Lattice
-from labapp.core.measures import Measures
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.images.dots import Dots
+from labapp.core.match import Match, Trial
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.spline import SplineBasis, SplineSurface
-from labapp.core.surface import Surface
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Lattice
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.interpolation import ThinPlateSurface
+from labapp.core.surface.measures import Measures
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.spline import SplineBasis, SplineSurface
+from labapp.core.surface.surface import Surface
 from labapp.session.export import ExportChoice, export
 from labapp.session.measured import Basis
 from labapp.session.record import PlanePicture, Record

@@ -9,9 +9,9 @@ import pytest
 from PySide6.QtGui import QImage
 from PySide6.QtWidgets import QApplication
 
-from labapp.core.correction import Correction
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Lattice
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.theme import palette
 from labapp.gui.views.picture import PictureView

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.core.boundary import Boundary
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.correspondence import Match
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
-from labapp.core.measures import Measures
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.images.dots import Dots
+from labapp.core.match import Match
 from labapp.core.pipeline import Measurement
-from labapp.core.reconstruction import Reconstruction
+from labapp.core.rows.lattice import Lattice
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.measures import Measures
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.session.results import ResultsWriter
 
 RADIUS_MM, HEIGHT_MM = 3.0, 0.3

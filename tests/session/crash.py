@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.core.correction import Correction
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Settings
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Lattice
 from labapp.errors import InputError
 from labapp.session.record import Record
 from labapp.session.session import Session

@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from labapp.core.boundary import Boundary
-from labapp.core.dots import Dots
-from labapp.core.interpolation import CloughTocherSurface, ThinPlateSurface
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.spline import SplineBasis, SplineSurface
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.interpolation import CloughTocherSurface, ThinPlateSurface
+from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.errors import InputError
 from labapp.session.blobs import HEAD, MAGIC, Damaged, fingerprint, fingerprint_of, pack, unpack
 from tests.scripts import peak_mb

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.correction import Correction
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Lattice
 from labapp.errors import InputError
 from labapp.session.corrections_csv import MOST_DOTS, read_correction
 

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.correction import Correction
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
+from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
 from labapp.session import export as module
 from labapp.session.export import ExportChoice, ExportedFile, export, verify_export
@@ -512,8 +512,8 @@ FULL_DISK = """
     import resource, sys
     import numpy as np
     from pathlib import Path
-    from labapp.core.coordinates import ImageCalibration
-    from labapp.core.dots import Dots
+    from labapp.core.geometry.coordinates import ImageCalibration
+    from labapp.core.images.dots import Dots
     from labapp.core.pipeline import Measurement
     from labapp.errors import InputError
     from labapp.session.export import ExportChoice, export, verify_export

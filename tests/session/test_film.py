@@ -15,7 +15,7 @@ import av
 import numpy as np
 import pytest
 
-from labapp.core.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.session.export import ExportChoice, export, verify_export

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-from labapp.core.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.session.hdf5 import Hdf5Writer
 from labapp.session.tables import TABLES, frame_tables
@@ -201,8 +201,8 @@ FULL_DISK = """
     import resource, sys
     import numpy as np
     from pathlib import Path
-    from labapp.core.coordinates import ImageCalibration
-    from labapp.core.dots import Dots
+    from labapp.core.geometry.coordinates import ImageCalibration
+    from labapp.core.images.dots import Dots
     from labapp.core.pipeline import Measurement
     from labapp.session.hdf5 import Hdf5Writer
     from labapp.session.tables import frame_tables

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.core.measures import Measures
 from labapp.core.pipeline import Measurement
+from labapp.core.surface.measures import Measures
 from labapp.errors import InputError
 from labapp.session.alarms import Alarm, Alarms
 from labapp.session.limits import Limits, Size, sizes_of, standing

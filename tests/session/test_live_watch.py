@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from labapp.core import warm
-from labapp.core.measures import Measures
 from labapp.core.pipeline import Measurement, Settings
+from labapp.core.sequence import warm
+from labapp.core.surface.measures import Measures
 from labapp.media import open_source
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event

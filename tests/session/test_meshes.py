@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from labapp.core.boundary import Boundary
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.surface import Surface
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.surface import Surface
 from labapp.session import meshes
 from labapp.session.meshes import Mesh
 from labapp.simulation.pools import Dent, Pool, egg, spherical_cap

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 import labapp
-from labapp.core import correction, ers
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.correspondence import Trial
-from labapp.core.laser_calibration import calibrate_laser
-from labapp.core.measures import measure
+from labapp.core.calibration.laser_calibration import calibrate_laser
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Laser
+from labapp.core.match import Trial
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.rig import Laser
+from labapp.core.rows import correction
+from labapp.core.schemes import ers
+from labapp.core.surface.measures import measure
 from labapp.errors import InputError
 from labapp.session.error_budget import SIZES, Contribution, calibration_budget, together
 from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED

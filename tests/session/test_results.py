@@ -14,10 +14,10 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from labapp.core.measures import measure
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Measurement, Settings, reconstruct
-from labapp.core.reconstruction import Scheme
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.surface.measures import measure
+from labapp.core.surface.reconstruction import Scheme
 from labapp.errors import InputError
 from labapp.session import results
 from labapp.session.results import ResultsWriter
@@ -317,9 +317,9 @@ def test_a_write_that_takes_a_part_is_carried_on() -> None:
 
 FULL_DISK = """
     import resource, sys
-    from labapp.core.coordinates import ImageCalibration
+    from labapp.core.geometry.coordinates import ImageCalibration
     from labapp.core.pipeline import Measurement
-    from labapp.core.dots import Dots
+    from labapp.core.images.dots import Dots
     from labapp.errors import InputError
     from labapp.session.results import ResultsWriter
     from pathlib import Path

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from labapp.core.pipeline import Measurement
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.surface import FlatSurface
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.surface import FlatSurface
 from labapp.session import drawing as draws
 from labapp.session import scene as scenes
 from labapp.session.heights import difference_at, profile, sigma_at

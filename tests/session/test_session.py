@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import labapp
-from labapp.core.correction import Correction
 from labapp.core.pipeline import Settings
+from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.media import open_source

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.rig import Electrode
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.geometry.rig import Electrode
 from labapp.session.blobs import HEAD, MAGIC, SURFACES, Damaged, pack, unpack
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED
 from labapp.session.schema import VERSION

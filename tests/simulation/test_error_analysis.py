@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from labapp.core import fit
-from labapp.core.measures import measure
-from labapp.core.pool_fit import FitSettings
-from labapp.core.rig import Electrode, ImagingPlane
+from labapp.core.geometry.rig import Electrode, ImagingPlane
+from labapp.core.schemes import fit
+from labapp.core.surface.measures import measure
+from labapp.core.surface.pool_fit import FitSettings
 from labapp.simulation import error_analysis, image_error, parameter_deviation
 from labapp.simulation.error_analysis import ErrorSurvey, aside, error_table, survey
 from labapp.simulation.forward import exact_match, trace

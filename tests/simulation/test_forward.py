@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.simulation import forward
 from labapp.simulation.correspondence_table import correspondence_letters
 from labapp.simulation.forward import exact_match, trace
@@ -332,5 +332,5 @@ def test_truth_never_comes_from_the_code_that_measures():
             waiting += [one for one in found if one not in used]
     core = {name for name in used if name.startswith("labapp.core")}
     assert {"labapp.simulation.recording", "labapp.simulation.render"} <= used
-    assert "labapp.core.rig" in core
+    assert "labapp.core.geometry.rig" in core
     assert core <= allowed

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.errors import InputError
 from labapp.simulation.forward import trace
 from labapp.simulation.outlined_pool import OutlinedPool, pool_from_heights

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.optics import reflect, surface_normal
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.optics import reflect, surface_normal
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import ellipsoidal_cap
 from labapp.simulation.positioning import Fate, clearance, side_view

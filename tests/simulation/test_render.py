@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.simulation.camera import CameraView, Lens
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import Wave, egg

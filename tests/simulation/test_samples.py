@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp.core.correction import block_row, set_reference
 from labapp.core.pipeline import Settings, measure, start_correction
+from labapp.core.rows.correction import block_row, set_reference
 from labapp.media import open_source
 from labapp.session.setup import read_setup
 from labapp.simulation.recording import TARGET

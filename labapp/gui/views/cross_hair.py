@@ -8,7 +8,7 @@ from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import QVBoxLayout
 
-from labapp.core.laser_calibration import LaserCalibration
+from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Drawn
 from labapp.gui.views.labels import plain_label

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from labapp.core.measures import Measures
+from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.rig import ImagingPlane
+from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.session.error_budget import SIZES, Contribution, together

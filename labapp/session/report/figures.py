@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.patches import Polygon
 
-from labapp.core.measures import surface_mesh
-from labapp.core.optics import meet_level, meet_plane, ray_directions, reflect
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.geometry.optics import meet_level, meet_plane, ray_directions, reflect
+from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Measurement
-from labapp.core.plane_calibration import PlaneCalibration
-from labapp.core.rig import Rig
+from labapp.core.surface.measures import surface_mesh
 from labapp.core.values import FloatArray
 from labapp.media import GreyImage
 from labapp.session.meshes import drawn_spacing

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from labapp.core.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import FloatArray
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Footprint, Oscillation, Pool, egg, spherical_cap

@@ -14,8 +14,8 @@ import pytest
 from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
-from labapp.core.detection import DotSettings
-from labapp.core.exposure import judge_exposure
+from labapp.core.images.exposure import judge_exposure
+from labapp.core.rows.detection import DotSettings
 from labapp.errors import InputError
 from labapp.gui import dialogs
 from labapp.gui.pages.capture.page import CapturePage

@@ -14,8 +14,8 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QHBoxLayout, QToolButton, QWidget
 from pytestqt.qtbot import QtBot
 
-from labapp.core.correction import Correction, add_dot, delete_dots, shift_row
 from labapp.core.pipeline import start_correction
+from labapp.core.rows.correction import Correction, add_dot, delete_dots, shift_row
 from labapp.errors import InputError
 from labapp.gui.pages.dots import DotsPage, presenter
 from labapp.gui.pages.dots.fitting import Processes, Refit

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.correction import Correction
-from labapp.core.dots import Dots
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Lattice
 from labapp.gui.pages.dots import picking
 
 

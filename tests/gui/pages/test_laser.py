@@ -11,7 +11,7 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
-from labapp.core.laser_calibration import calibrate_laser
+from labapp.core.calibration.laser_calibration import calibrate_laser
 from labapp.gui.pages.laser import LaserPage, presenter
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
 from labapp.gui.steps import states

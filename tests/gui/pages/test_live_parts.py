@@ -19,9 +19,9 @@ from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
-from labapp.core.exposure import Exposure
-from labapp.core.measures import Measures
+from labapp.core.images.exposure import Exposure
 from labapp.core.quality import Quality, Remark
+from labapp.core.surface.measures import Measures
 from labapp.gui.pages.capture import live_view
 from labapp.gui.pages.capture.live_figures import (
     FIRST,

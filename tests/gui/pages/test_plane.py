@@ -13,8 +13,8 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
-from labapp.core.mark_fit import Model
-from labapp.core.plane_calibration import PlaneCalibration
+from labapp.core.calibration.mark_fit import Model
+from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.gui.pages.plane import PlanePage, presenter

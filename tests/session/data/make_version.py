@@ -13,8 +13,8 @@ from pathlib import Path
 import tifffile
 
 import labapp
-from labapp.core.correction import set_reference
 from labapp.core.pipeline import Settings, start_correction
+from labapp.core.rows.correction import set_reference
 from labapp.session.record import Record
 from labapp.session.schema import VERSION
 from labapp.session.session import Session

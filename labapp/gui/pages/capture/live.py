@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.core.band_pass import Exposure, quick_dots
-from labapp.core.detection import find_dots
-from labapp.core.dots import Dots
+from labapp.core.images.band_pass import Exposure, quick_dots
+from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import UNMEASURED, Quality, judge_quality
+from labapp.core.rows.detection import find_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.gui.pages.capture.presenter import size_in_words

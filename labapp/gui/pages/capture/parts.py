@@ -14,7 +14,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.core.exposure import Exposure
+from labapp.core.images.exposure import Exposure
 from labapp.gui.pages.capture.presenter import bars
 from labapp.gui.views.fields import NumberField
 from labapp.gui.views.labels import Message, headed, plain_label, plain_tip

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from labapp.core.detection import DotSettings, find_dots
-from labapp.core.exposure import Exposure, judge_exposure
+from labapp.core.images.exposure import Exposure, judge_exposure
+from labapp.core.rows.detection import DotSettings, find_dots
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.gui.steps import calibrations_in_use, recording_gone

@@ -1,6 +1,7 @@
 """What is chosen in a frame and what the operator does to it; without Qt.
 
-Every edit is one of `labapp.core.correction`, handed to the session as one step that can be undone.
+Every edit is one of `labapp.core.rows.correction`, handed to the session as one step that can be
+undone.
 """
 
 from __future__ import annotations
@@ -9,11 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from labapp.core import correction as core
-from labapp.core.correction import Correction
-from labapp.core.dots import Image
-from labapp.core.lattice import Site
+from labapp.core.images.dots import Image
 from labapp.core.pipeline import Settings
+from labapp.core.rows import correction as core
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Site
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.dots import picking
 

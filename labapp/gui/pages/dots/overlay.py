@@ -16,7 +16,7 @@ from PySide6.QtCore import QRectF, Qt
 from PySide6.QtGui import QBrush, QColor, QPen
 from scipy.spatial import cKDTree
 
-from labapp.core.correction import Correction
+from labapp.core.rows.correction import Correction
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.dots import picking
 from labapp.gui.views.picture import PictureView

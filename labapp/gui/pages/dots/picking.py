@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from labapp.core.correction import Correction, assign, clear_rows
-from labapp.core.lattice import Site
+from labapp.core.rows.correction import Correction, assign, clear_rows
+from labapp.core.rows.lattice import Site
 from labapp.core.values import FloatArray, IntArray
 
 NEIGHBOURS = 8

@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from labapp.core.correction import Correction
-from labapp.core.detection import DotSettings, LatticeSettings, find_dots, find_lattice
-from labapp.core.dots import Dots, Image
-from labapp.core.lattice import Lattice
+from labapp.core.images.dots import Dots, Image
 from labapp.core.pipeline import Measurement, Settings, start_correction
-from labapp.core.tracking import carry_on
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.tracking import carry_on
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow, plain

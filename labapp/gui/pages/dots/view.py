@@ -8,9 +8,9 @@ from typing import NamedTuple
 from PySide6.QtCore import QEvent, QObject, Qt
 from PySide6.QtGui import QAction, QKeyEvent, QKeySequence, QPixmap
 
-from labapp.core.correction import Correction
-from labapp.core.lattice import Site
 from labapp.core.pipeline import Settings
+from labapp.core.rows.correction import Correction
+from labapp.core.rows.lattice import Site
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.background import Looking, carry_on
 from labapp.gui.pages.dots.editing import Editor

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.core.laser_calibration import LaserCalibration, calibrate_laser
+from labapp.core.calibration.laser_calibration import LaserCalibration, calibrate_laser
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown

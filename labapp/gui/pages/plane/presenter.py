@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.core.coordinates import ImageCalibration
-from labapp.core.mark_fit import Model, root_mean_square
-from labapp.core.plane_calibration import (
+from labapp.core.calibration.mark_fit import Model, root_mean_square
+from labapp.core.calibration.plane_calibration import (
     PlaneCalibration,
     PlaneCalibrationSettings,
     calibrate_plane,
 )
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow

@@ -7,8 +7,8 @@ from pathlib import Path
 import pyqtgraph as pg
 from PySide6.QtWidgets import QFileDialog, QPushButton
 
-from labapp.core.mark_fit import Model
-from labapp.core.plane_calibration import PlaneCalibration
+from labapp.core.calibration.mark_fit import Model
+from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.gui.pages.laser.presenter import read_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter

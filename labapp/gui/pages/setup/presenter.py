@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from labapp.core.rig import Rig
+from labapp.core.geometry.rig import Rig
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.session.files import write_whole

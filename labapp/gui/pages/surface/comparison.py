@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.measures import Measures, measure
 from labapp.core.pipeline import Measurement, reconstruct
+from labapp.core.surface.measures import Measures, measure
 from labapp.core.values import CannotMeasure
 from labapp.gui.digits import rounded
 from labapp.gui.pages.surface.presenter import (

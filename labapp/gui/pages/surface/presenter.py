@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.correspondence import Match
-from labapp.core.measures import Measures
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.reconstruction import Reconstruction
-from labapp.core.rig import Rig
+from labapp.core.surface.measures import Measures
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow

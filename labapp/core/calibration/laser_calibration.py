@@ -1,0 +1,231 @@
+"""Cross-hair lengths → angle, distance and height of the laser (Appendix I).
+
+A cross-hair lens with a known fan angle θ draws a cross on the work piece. With α = θ/2, the
+half lengths of the cross are, by the law of sines in the beam's plane,
+
+    l₁ = x·sin α / sin(α₅ + α)      along the beam, on the laser's side
+    l₂ = x·sin α / sin(α₅ − α)      along the beam, away from the laser
+    l₃ = x·tan α                    across the beam, each side
+
+for a laser at distance x from the centre of the cross, its beam at elevation α₅.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.geometry.rig import Laser
+from labapp.core.values import FloatArray
+
+
+@dataclass(frozen=True)
+class LaserCalibration:
+    """Where the laser stands; every quantity with its standard uncertainty.
+
+    Parameters
+    ----------
+    angle_deg, angle_sigma_deg
+        Elevation α₅ of the beam above the work piece, degrees.
+    distance_mm, distance_sigma_mm
+        Slant distance x_l from the diode to the centre of the cross (the origin), mm.
+    height_mm, height_sigma_mm
+        Height h_l of the diode above the work piece, mm.
+    horizontal_mm, horizontal_sigma_mm
+        Horizontal distance d_l from the diode to the origin, mm.
+    expected_l1_mm
+        The l₁ that follows from l₂, l₃ and the fan angle, mm: the check on the measured one.
+    warnings
+        Sentences for the operator about lengths that fit each other badly.
+    """
+
+    angle_deg: float
+    angle_sigma_deg: float
+    distance_mm: float
+    distance_sigma_mm: float
+    height_mm: float
+    height_sigma_mm: float
+    horizontal_mm: float
+    horizontal_sigma_mm: float
+    expected_l1_mm: float
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def laser(self) -> Laser:
+        """The laser as the rig wants it."""
+        return Laser(projection_angle_deg=self.angle_deg, distance_mm=self.distance_mm)
+
+
+@dataclass(frozen=True)
+class LaserCalibrationSettings:
+    """How exactly the lengths are known, and what counts as a contradiction.
+
+    Parameters
+    ----------
+    resolution_mm
+        Smallest step of the caliper or ruler; a reading is uniform within it, mm.
+    fan_angle_sigma_deg
+        Standard uncertainty of the lens's fan angle, degrees.
+    doubt_sigma
+        Lengths that disagree by more than this many standard uncertainties give a warning.
+    refuse_sigma, refuse_fraction
+        Lengths that disagree by more than this many standard uncertainties and by more than this
+        part of the length are refused.
+    """
+
+    resolution_mm: float = 0.1
+    fan_angle_sigma_deg: float = 0.0
+    doubt_sigma: float = 2.0
+    refuse_sigma: float = 4.0
+    refuse_fraction: float = 0.05
+
+
+def calibrate_laser(
+    l1_mm: npt.ArrayLike,
+    l2_mm: npt.ArrayLike,
+    l3_mm: npt.ArrayLike,
+    fan_angle_deg: float = 10.0,
+    settings: LaserCalibrationSettings | None = None,
+) -> LaserCalibration:
+    """Find the laser from its cross-hair on the work piece (Appendix I, Fig. A-1).
+
+    Angle and distance come from l₂ and l₃ as in Appendix I; l₁ then follows and is compared with
+    the measured one. A beam square to the work piece, l₁ = l₂ = l₃, is the case α₅ = 90°.
+
+    Parameters
+    ----------
+    l1_mm, l2_mm, l3_mm
+        Half lengths of the cross: laser's side, far side, across; one reading or repeated
+        readings, shape () or (n,), mm.
+    fan_angle_deg
+        Fan angle θ of the cross-hair lens, degrees.
+    settings
+        Uncertainties and limits; None for the defaults.
+
+    Raises
+    ------
+    ValueError
+        If a reading is not a length, or the lengths contradict each other. The message names the
+        length, its value and what would be right.
+    """
+    settings = settings or LaserCalibrationSettings()
+    if not 0.0 < fan_angle_deg < 90.0:
+        raise ValueError(
+            f"fan_angle_deg = {fan_angle_deg:g}: the fan angle lies between 0 and 90 degrees"
+        )
+    l1, u1 = _mean(l1_mm, "l1_mm", settings)
+    l2, u2 = _mean(l2_mm, "l2_mm", settings)
+    l3, u3 = _mean(l3_mm, "l3_mm", settings)
+    warnings: list[str] = []
+    _check_order("l1_mm", l1, l2, float(np.hypot(u1, u2)), settings, warnings)
+    _check_order("l3_mm", l3, l2, float(np.hypot(u2, u3)), settings, warnings)
+
+    half = np.radians(fan_angle_deg / 2.0)
+    values, jacobian = _appendix_i(l2, l3, float(half))
+    sigmas = np.array([u2, u3, np.radians(settings.fan_angle_sigma_deg / 2.0)])
+    covariance = jacobian @ np.diag(sigmas**2) @ jacobian.T
+    sigma = np.sqrt(np.diag(covariance))
+    angle, distance, height, horizontal, expected_l1 = (float(v) for v in values)
+    _check_l1(l1, expected_l1, float(np.hypot(u1, sigma[4])), settings, warnings)
+    return LaserCalibration(
+        angle_deg=float(np.degrees(angle)),
+        angle_sigma_deg=float(np.degrees(sigma[0])),
+        distance_mm=distance,
+        distance_sigma_mm=float(sigma[1]),
+        height_mm=height,
+        height_sigma_mm=float(sigma[2]),
+        horizontal_mm=horizontal,
+        horizontal_sigma_mm=float(sigma[3]),
+        expected_l1_mm=expected_l1,
+        warnings=tuple(warnings),
+    )
+
+
+def _appendix_i(l2: float, l3: float, half: float) -> tuple[FloatArray, FloatArray]:
+    """Angle, distance, height, horizontal distance, l₁; and their Jacobian by (l₂, l₃, α).
+
+    Shapes (5,) and (5, 3); radians and mm. With α₂ = 90° + α, the law of sines gives
+    sin α₃ = (l₃/l₂)·sin α₂, and the elevation is α₅ = α₃ + α.
+    """
+    ratio = min(l3 / l2, 1.0)  # l₃ above l₂ by less than their uncertainty: square to the plane
+    sine = ratio * np.cos(half)
+    angle = np.arcsin(sine) + half
+    d_angle = np.array([-sine / l2, sine / l3, -ratio * np.sin(half)]) / np.sqrt(1.0 - sine**2)
+    d_angle[2] += 1.0
+
+    distance = l3 / np.tan(half)
+    d_distance = np.array([0.0, 1.0 / np.tan(half), -l3 / np.sin(half) ** 2])
+
+    height, horizontal = distance * np.sin(angle), distance * np.cos(angle)
+    d_height = d_distance * np.sin(angle) + horizontal * d_angle
+    d_horizontal = d_distance * np.cos(angle) - height * d_angle
+
+    near = angle + half
+    l1 = distance * np.sin(half) / np.sin(near)
+    d_half = np.array([0.0, 0.0, 1.0])
+    d_l1 = l1 * (d_distance / distance + d_half / np.tan(half) - (d_angle + d_half) / np.tan(near))
+    return (
+        np.array([angle, distance, height, horizontal, l1]),
+        np.stack([d_angle, d_distance, d_height, d_horizontal, d_l1]),
+    )
+
+
+def _mean(
+    readings: npt.ArrayLike, name: str, settings: LaserCalibrationSettings
+) -> tuple[float, float]:
+    """Mean of repeated readings and its standard uncertainty (scatter and resolution), mm."""
+    values = np.atleast_1d(np.asarray(readings, float)).ravel()
+    if values.size == 0:
+        raise ValueError(f"{name} is empty: give at least one reading in mm")
+    for value in values:
+        if not (np.isfinite(value) and value > 0.0):
+            raise ValueError(f"{name} = {value:g}: a reading is a positive number of mm")
+    resolution = settings.resolution_mm / np.sqrt(12.0)
+    scatter = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
+    return float(values.mean()), float(np.hypot(scatter, resolution))
+
+
+def _check_order(
+    name: str,
+    length: float,
+    l2: float,
+    sigma: float,
+    settings: LaserCalibrationSettings,
+    warnings: list[str],
+) -> None:
+    """Refuse a length above l₂, the longest half of the cross; warn when it is barely above."""
+    excess = length - l2
+    if excess > settings.refuse_sigma * sigma:
+        raise ValueError(
+            f"{name} = {length:.4g} is longer than l2_mm = {l2:.4g}: l2 is the half that points "
+            f"away from the laser and is the longest; {name} is at most {l2:.4g}"
+        )
+    if excess > 1e-9 * l2:
+        warnings.append(
+            f"{name} = {length:.4g} is longer than l2_mm = {l2:.4g} by no more than their "
+            "uncertainty; the beam is taken to be nearly square to the work piece."
+        )
+
+
+def _check_l1(
+    l1: float,
+    expected: float,
+    sigma: float,
+    settings: LaserCalibrationSettings,
+    warnings: list[str],
+) -> None:
+    """Compare the measured l₁ with the one that follows from l₂, l₃ and the fan angle."""
+    off = abs(l1 - expected)
+    if off > settings.refuse_sigma * sigma and off > settings.refuse_fraction * expected:
+        raise ValueError(
+            f"l1_mm = {l1:.4g} contradicts l2_mm and l3_mm: with these and the fan angle it "
+            f"should be {expected:.4g} ± {sigma:.2g}; measure the three lengths again and check "
+            "that the cross is aligned with the tilt of the laser"
+        )
+    if off > settings.doubt_sigma * sigma:
+        warnings.append(
+            f"l1_mm = {l1:.4g} differs from the {expected:.4g} ± {sigma:.2g} that follow from "
+            "l2_mm, l3_mm and the fan angle."
+        )

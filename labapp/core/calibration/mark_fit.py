@@ -1,0 +1,377 @@
+"""Marks of the target whose places are known → affine map and homography, and which to use.
+
+§5.1.2 takes three points: an affine map. A camera that looks askew sees the plane in perspective,
+which more marks than three can tell. The marks lie along two axes only, so that a homography has
+to be extrapolated to where the dots land: it is worth taking only if it errs less *there* (a
+focused information criterion, Claeskens and Hjort 2003). Perspective that the marks tell along one
+axis only is taken along that one. Where a mark is along its axis is known less well than where the
+bar is across it, and less well in the dark than in the light: each place counts by its own scatter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import chdtri, fdtrc, stdtrit
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.values import FloatArray, freeze
+
+Model = Literal["three points", "affine", "homography"]
+"""What takes pixels to the plane: the text's three points, or a fit to all marks."""
+
+FEWEST_ON_AXIS, FEWEST_MARKS = 4, 9
+"""A homography wants so many marks on each axis, O′ included, and so many in all."""
+
+LARGEST_CHANCE = 0.001
+"""A homography is doubted while noise alone gains as much with a larger probability than this."""
+
+WHAT_MATTERS_MM = 0.5
+"""A map that may err more where dots land is said to."""
+
+AFFINE = (0, 1, 2, 3, 4, 5)
+PERSPECTIVE = ((6,), (7,), (6, 7))
+"""Entries of the matrix, row by row, that make it affine; and perspective along X′, Z′, both."""
+
+HELP = "set the camera square, or use more marks"
+
+FIELD = 1.5
+"""Dots land within the square from O′ whose side is this many times the longer axis."""
+
+LEAST_SIGMA_PX = 0.02
+"""No mark is known better than this, however well a fit goes through it."""
+
+ROUNDS = 5
+"""Of fitting and estimating the scatter in turn; it has settled by then."""
+
+
+@dataclass(frozen=True)
+class MarkFit:
+    """Imaging plane → picture, fitted to marks.
+
+    Parameters
+    ----------
+    matrix
+        Shape (3, 3): (X′, Z′, 1) in mm to homogeneous (u, v, 1) in px; its last entry is 1.
+    free
+        Entries of it, row by row, that were fitted; the others are those of an affine map.
+    covariance
+        Of these entries, from the residuals.
+    residual_px, residual_mm
+        Computed minus measured place of each mark, shape (n, 2).
+    left_out_px
+        The same of each mark when the others alone are fitted, to first order, shape (n, 2), px.
+    spare
+        Degrees of freedom that each residual leaves along and across its axis, shape (n, 2).
+    variance
+        Of the residuals, in units of what the marks' scatter has them.
+    """
+
+    matrix: FloatArray
+    free: tuple[int, ...]
+    covariance: FloatArray
+    residual_px: FloatArray
+    residual_mm: FloatArray
+    left_out_px: FloatArray
+    spare: FloatArray
+    variance: float
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def calibration(self) -> ImageCalibration:
+        """Picture → imaging plane."""
+        return _calibration(self.matrix)
+
+    def covariance_px2(self, plane_mm: FloatArray) -> FloatArray:
+        """Covariance of where points (X′, Z′), shape (n, 2), are seen: u, v, u, v, …, px²."""
+        rows = _jacobian(self.matrix, plane_mm)[:, self.free]
+        return np.asarray(rows @ self.covariance @ rows.T)
+
+    def moved(self) -> list[ImageCalibration]:
+        """Calibrations that are one σ off, each along another main direction of the covariance."""
+        # In units of each entry's own σ: the entries differ by orders of magnitude.
+        scale = np.sqrt(np.diag(self.covariance))
+        power, way = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        steps = (way * np.sqrt(np.maximum(power, 0.0))).T * scale
+        return [_calibration(_with(self.matrix, self.free, step)) for step in steps]
+
+
+@dataclass(frozen=True)
+class MarkFits:
+    """Both fits to the same marks, and which of them errs less where the dots land.
+
+    Parameters
+    ----------
+    affine, homography
+        The fits; None for a homography that the marks cannot tell.
+    whole
+        The homography with perspective along both axes, also where less is used: what the marks
+        leave open; None if they are too few.
+    corner_mm
+        X′ = Z′ of the far corner of where dots land, mm.
+    chance
+        How probable it is that noise alone gains as much by perspective as was gained (F-test).
+    affine_error_mm, homography_error_mm
+        How far each is expected to err where dots land, root mean square; NaN without homography.
+    best
+        The better model.
+    reason
+        Why, in a sentence.
+    """
+
+    affine: MarkFit
+    homography: MarkFit | None
+    whole: MarkFit | None
+    corner_mm: float
+    chance: float
+    affine_error_mm: float
+    homography_error_mm: float
+    best: Model
+    reason: str
+
+    def of(self, model: Model) -> MarkFit:
+        """The fit of a model.
+
+        Raises
+        ------
+        ValueError
+            If these marks do not give it.
+        """
+        fit = {"affine": self.affine, "homography": self.homography}.get(model)
+        if fit is None:
+            raise ValueError(f"these marks give no {model}")
+        return fit
+
+    def bound_mm(self, used: ImageCalibration) -> float:
+        """How far a map may err at the far corner: 95 % bound, mm; NaN if nothing tells.
+
+        The truth is a homography, with perspective along both axes, as uncertain as its fit to the
+        marks: what they leave open counts in full, whichever map is used.
+        """
+        if self.whole is None:
+            return float("nan")
+        corner = np.full((1, 2), self.corner_mm)
+        seen = self.whole.calibration.to_image(corner)
+        slope = used.jacobian(seen)[0]
+        off = (used.to_plane(seen) - corner)[0]
+        # Scatter along an axis is itself known from the few residuals there only.
+        wider = stdtrit(self.whole.spare[:, 0].sum(), 0.975) / 1.96
+        covariance = wider**2 * slope @ self.whole.covariance_px2(corner) @ slope.T
+        # |off + noise|² is nearly c·χ²(n) with its mean and variance (Satterthwaite 1946).
+        mean = off @ off + np.trace(covariance)
+        spread = 2 * np.sum(covariance**2) + 4 * off @ covariance @ off
+        n = 2 * mean**2 / max(spread, 1e-300)
+        return float(np.sqrt(mean * chdtri(n, 0.05) / n)) if n < 1e6 else float(np.sqrt(mean))
+
+    def bound_words(self, used: ImageCalibration) -> tuple[str, ...]:
+        """How far a map may err where dots land, and what helps where that matters."""
+        bound, whole = self.bound_mm(used), self.whole
+        if whole is None:
+            return (f"nothing tells how far the camera looks askew: {HELP}",)
+        corner = f"{self.corner_mm:.0f}, {self.corner_mm:.0f} mm"
+        told = f"± {bound:.2g} mm at the plate's far corner (X′, Z′ = {corner}; 95 %)"
+        if bound <= WHAT_MATTERS_MM:
+            return (told,)
+        if self.best == "homography" and bound > 1.5 * self.bound_mm(
+            self.of("homography").calibration
+        ):
+            return told, "the homography would leave less: the marks show perspective"
+        on_x, on_z = np.diag(whole.covariance)[list(PERSPECTIVE[-1])]
+        axis, way = ("O′Z′", "up or down") if on_z > on_x else ("O′X′", "from the side")
+        return (
+            f"if the camera looks {way}, the marks on {axis} cannot tell: at the plate's far "
+            f"corner (X′, Z′ = {corner}) the map may then be {bound:.2g} mm off (95 %); {HELP}",
+        )
+
+
+def root_mean_square(offsets: FloatArray) -> float:
+    """Root mean square of the lengths of offsets, shape (n, 2)."""
+    return float(np.sqrt(np.mean(np.sum(np.square(offsets), axis=-1))))
+
+
+def fit_marks(
+    plane_mm: FloatArray, image_px: FloatArray, noise: FloatArray | None = None
+) -> MarkFits:
+    """Fit an affine map and a homography to marks by least squares in the picture.
+
+    Parameters
+    ----------
+    plane_mm, image_px
+        (X′, Z′), mm, and (u, v), px, of at least 4 marks on the two axes, shape (n, 2).
+    noise
+        Of the picture at each mark, shape (n,), in any unit: a mark's scatter goes with it.
+
+    Raises
+    ------
+    ValueError
+        If the marks do not span the plane.
+    """
+    plane_mm, image_px = np.asarray(plane_mm, float), np.asarray(image_px, float)
+    if len(plane_mm) < 4 or np.linalg.matrix_rank(plane_mm - plane_mm.mean(axis=0)) < 2:
+        raise ValueError("at least 4 marks that span the plane are needed")
+    noise = np.ones(len(plane_mm)) if noise is None else noise
+    noise = np.clip(noise / max(float(np.median(noise)), 1e-12), 0.2, 5.0)
+    alike = np.eye(2) / LEAST_SIGMA_PX / noise[:, None, None]
+    affine = _fit(plane_mm, image_px, AFFINE, alike)
+    on_x, on_z = (int(np.sum(plane_mm[:, axis] == 0.0)) for axis in (1, 0))
+    if min(on_x, on_z) < FEWEST_ON_AXIS or len(plane_mm) < FEWEST_MARKS:
+        reason = (
+            f"{on_x} marks on O′X′ and {on_z} on O′Z′, O′ included, are too few to tell "
+            f"perspective: {FEWEST_ON_AXIS} on each and {FEWEST_MARKS} in all are needed"
+        )
+        corner = FIELD * float(np.abs(plane_mm).max())
+        return MarkFits(affine, None, None, corner, 1.0, np.nan, np.nan, "affine", reason)
+    whiten = _by_scatter(plane_mm, image_px, noise, affine)
+    affine, *fits = (_fit(plane_mm, image_px, AFFINE + more, whiten) for more in ((), *PERSPECTIVE))
+    return _chosen(affine, fits, float(np.abs(plane_mm).max()))
+
+
+def _by_scatter(
+    plane_mm: FloatArray, image_px: FloatArray, noise: FloatArray, affine: MarkFit
+) -> FloatArray:
+    """What turns each mark's residual to along and across its axis, in σ, shape (n, 2, 2)."""
+    on_x = plane_mm[:, 1:] == 0.0
+    along = np.where(on_x, affine.matrix[:2, 0], affine.matrix[:2, 1])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    turn = np.stack([along, along[:, ::-1] * [-1.0, 1.0]], axis=1)
+    # Nothing bounds the dot at O′ along an axis: it scatters as little as the bars do across.
+    is_along = np.stack([plane_mm.any(axis=1), np.zeros(len(plane_mm), bool)], axis=1)
+    noises = np.stack([noise, noise], axis=1)
+    sigma = LEAST_SIGMA_PX * noises
+    for _ in range(ROUNDS):
+        fit = _fit(plane_mm, image_px, AFFINE + PERSPECTIVE[-1], turn / sigma[..., None])
+        squares = (np.einsum("nij,nj->ni", turn, fit.residual_px) / noises) ** 2
+        for kind in (is_along, ~is_along):
+            scatter = squares[kind].sum() / fit.spare[kind].sum()
+            sigma[kind] = max(float(np.sqrt(scatter)), LEAST_SIGMA_PX) * noises[kind]
+    return np.asarray(turn / sigma[..., None])
+
+
+def _chosen(affine: MarkFit, fits: list[MarkFit], axis_mm: float) -> MarkFits:
+    """Choose the homography, and whether its gain is no accident and outweighs its greater ±."""
+    k = int(np.argmin([fit.variance for fit in fits[:2]]))
+    if _gains(fits[k], fits[2], axis_mm):
+        k = 2
+    homography, chance = fits[k], _chance(affine, fits[k])
+    affine_error, error = _expected_errors_mm(affine, homography, axis_mm)
+    here = f"dots are expected to be {affine_error:.2g} mm off without it, {error:.2g} mm with it"
+    best: Model = "affine"
+    if _gains(affine, homography, axis_mm):
+        best = "homography"
+        along = ("along X′", "along Z′", "along both axes")[k]
+        reason = f"The plane is seen in perspective {along}: {here}"
+    elif chance > LARGEST_CHANCE:
+        reason = f"No perspective is seen: noise alone gains as much in {chance:.0%} of pictures"
+    else:
+        reason = f"There is perspective, but the marks tell it too poorly: {here}"
+    whole, corner, errors = fits[2], FIELD * axis_mm, (affine_error, error)
+    return MarkFits(affine, homography, whole, corner, chance, *errors, best, reason)
+
+
+def _chance(smaller: MarkFit, larger: MarkFit) -> float:
+    """How probable it is that noise alone gains as much by a fit's further entries (F-test)."""
+    more, spare = len(larger.free) - len(smaller.free), float(larger.spare.sum())
+    gain = smaller.variance * (spare + more) - larger.variance * spare
+    return float(fdtrc(more, spare, max(gain, 0.0) / more / larger.variance))
+
+
+def _gains(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> bool:
+    """Whether a fit's further entries are no accident, and it errs less where dots land."""
+    before, after = _expected_errors_mm(smaller, larger, axis_mm)
+    return _chance(smaller, larger) <= LARGEST_CHANCE and after < before
+
+
+def _expected_errors_mm(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> tuple[float, float]:
+    """Root mean square error of two fits where dots land, if the larger is right but for noise."""
+    across = np.linspace(0.0, FIELD * axis_mm, 6)
+    field = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
+    seen = larger.calibration.to_image(field)
+    mm2_per_px2 = np.abs(np.linalg.det(larger.calibration.jacobian(seen)))
+
+    def spread(fit: MarkFit) -> float:
+        # With one noise for both: the residuals of a map that is wrong hold its bias too.
+        noise = np.diag(fit.covariance_px2(field)).reshape(-1, 2).sum(axis=1) / fit.variance
+        return float(np.mean(noise * mm2_per_px2)) * larger.variance
+
+    apart = root_mean_square(smaller.calibration.to_plane(seen) - field)
+    # The difference of nested fits has the difference of their variances (Hausman).
+    bias = max(apart**2 - (spread(larger) - spread(smaller)), 0.0)
+    return float(np.sqrt(bias + spread(smaller))), float(np.sqrt(spread(larger)))
+
+
+def _fit(
+    plane_mm: FloatArray, image_px: FloatArray, free: tuple[int, ...], whiten: FloatArray
+) -> MarkFit:
+    """Least squares in the picture over some entries of the matrix, residuals as whitened."""
+    # Lengths of about 1 keep the equations well conditioned.
+    size = np.abs(plane_mm).max()
+    plane = plane_mm / size
+    matrix = np.eye(3)
+    matrix[:2] = np.linalg.lstsq(_with_ones(plane), image_px, rcond=None)[0].T
+
+    def off(step: FloatArray) -> FloatArray:
+        residual = _seen(_with(matrix, free, step), plane) - image_px
+        return np.asarray(np.einsum("nij,nj->ni", whiten, residual).ravel())
+
+    def slopes(step: FloatArray) -> FloatArray:
+        by_mark = _jacobian(_with(matrix, free, step), plane)[:, free]
+        return np.asarray((whiten @ by_mark.reshape(-1, 2, len(free))).reshape(-1, len(free)))
+
+    found = least_squares(off, np.zeros(len(free)), jac=slopes, method="lm", x_scale="jac")
+    rows, weighted = slopes(found.x), off(found.x)
+    matrix = _with(matrix, free, found.x)
+    inverse = np.asarray(np.linalg.inv(rows.T @ rows), np.float64)
+    by_mark = rows.reshape(-1, 2, len(free))
+    leverage = by_mark @ inverse @ np.swapaxes(by_mark, 1, 2)
+    kept = np.eye(2) - leverage
+    left_out = np.linalg.solve(kept, weighted.reshape(-1, 2, 1))
+    # Scatter that was estimated is not certain to be more than it is: never below 1.
+    variance = max(float(weighted @ weighted) / max(len(weighted) - len(free), 1), 1.0)
+    residual = _seen(matrix, plane) - image_px
+    matrix = np.asarray(matrix @ np.diag([1 / size, 1 / size, 1.0]))
+    unit = np.array([1, 1, size, 1, 1, size, 1, 1])[list(free)] / size
+    return MarkFit(
+        matrix=matrix,
+        free=free,
+        covariance=inverse * np.outer(unit, unit) * variance,
+        residual_px=residual,
+        residual_mm=plane_mm - _calibration(matrix).to_plane(image_px),
+        left_out_px=np.linalg.solve(whiten, left_out)[..., 0],
+        spare=np.diagonal(kept, axis1=1, axis2=2),
+        variance=variance,
+    )
+
+
+def _calibration(matrix: FloatArray) -> ImageCalibration:
+    return ImageCalibration(np.asarray(np.linalg.inv(matrix), np.float64))
+
+
+def _seen(matrix: FloatArray, plane: FloatArray) -> FloatArray:
+    projected = _with_ones(plane) @ matrix.T
+    return np.asarray(projected[:, :2] / projected[:, 2:])
+
+
+def _jacobian(matrix: FloatArray, plane: FloatArray) -> FloatArray:
+    """∂(u, v)/∂(the first 8 entries of the matrix), shape (2n, 8)."""
+    ones = _with_ones(plane)
+    seen, weight = _seen(matrix, plane), ones @ matrix[2]
+    rows = np.zeros((len(plane), 2, 8))
+    rows[:, 0, :3] = rows[:, 1, 3:6] = ones
+    rows[:, :, 6:] = -seen[:, :, None] * plane[:, None, :]
+    return np.asarray((rows / weight[:, None, None]).reshape(-1, 8))
+
+
+def _with(matrix: FloatArray, free: tuple[int, ...], step: FloatArray) -> FloatArray:
+    """The matrix with a step added to some entries, counted row by row."""
+    flat = matrix.ravel().copy()
+    flat[list(free)] += step
+    return flat.reshape(3, 3)
+
+
+def _with_ones(points: FloatArray) -> FloatArray:
+    return np.column_stack([points, np.ones(len(points))])

@@ -1,0 +1,415 @@
+"""Calibration picture → image calibration: O′ and a point on each axis (§5.1, Fig. 5-1 c).
+
+The imaging plane shows a dot at O′ and a dark bar along each axis. The picture is levelled,
+thresholded, median filtered and dilated until three objects are left; these are thinned and
+told apart by shape. The text takes their centres to a whole pixel; by default each is then
+measured on the grey levels to a fraction of one, and every place is checked against the design:
+a wrong calibration is worse than none. The ends and unit flags of the bars are more marks than
+three points: an affine map and a homography are fitted to them, and the better is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from labapp.core.calibration.mark_fit import MarkFits, Model, fit_marks, root_mean_square
+from labapp.core.calibration.target_bars import (
+    Bar,
+    bar_marks,
+    dot_center,
+    local_noise,
+    measured_bar,
+)
+from labapp.core.calibration.target_marks import (
+    Image,
+    Mark,
+    MarkSettings,
+    Refusal,
+    grey_levels,
+    levelled,
+    segmented,
+    three_marks,
+)
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.values import CannotMeasure, FloatArray
+
+AXES = ("O′X′", "O′Z′")
+
+
+@dataclass(frozen=True)
+class PlaneCalibrationSettings(MarkSettings):
+    """The target's design and how far it may be off; how it is looked for is inherited.
+
+    Parameters
+    ----------
+    unit_mm
+        Length of a unit of the axes, mm, "measured in advance" (§5.1.2).
+    x_units, z_units
+        Where the bars on O′X′ and O′Z′ begin and end, units.
+    subpixel
+        Measure on grey levels; False gives the whole pixels of Eq. 5-5.
+    scale_tolerance
+        The px/mm of the two axes may differ by this part.
+    angle_tolerance_deg
+        The angle between the axes may differ from 90° by this much.
+    sigma_limit_px
+        Largest standard uncertainty of a point that is accepted, px.
+    pointing_tolerance
+        A bar's line may pass by O′ this many units off.
+    middle_tolerance
+        A bar's middle may be this many units from where its length and O′ have it. This tells a
+        bar that is partly hidden: its middle moves by half of what is.
+    flag_units
+        How far the unit flags stand out of their bars, units.
+    mark_tolerance
+        A mark may be this many units from where the others have it, perspective allowed for.
+    """
+
+    unit_mm: float = 12.7
+    x_units: tuple[float, float] = (1.0, 10.0)
+    z_units: tuple[float, float] = (1.0, 4.0)
+    subpixel: bool = True
+    scale_tolerance: float = 0.2
+    angle_tolerance_deg: float = 30.0
+    sigma_limit_px: float = 0.5
+    pointing_tolerance: float = 0.08
+    middle_tolerance: float = 0.1
+    flag_units: float = 0.19
+    mark_tolerance: float = 0.05
+
+
+@dataclass(frozen=True)
+class PlaneCalibration:
+    """Where O′ and the axes are in the picture, and what takes its pixels to the plane.
+
+    Parameters
+    ----------
+    origin_px, x_axis_px, z_axis_px
+        (u, v) of O′ and of the middles of the bars on O′X′ and O′Z′, px.
+    x_axis_mm, z_axis_mm
+        X′ and Z′ of these middles, mm (5.5 and 2.5 units in the text, Eq. 5-6).
+    sigma_px
+        Standard uncertainty of each of the three points along either direction, px.
+    threshold
+        Grey level at O′ below which the three objects were found.
+    marks
+        X′, Z′ (mm), u and v (px) of O′ and of the ends and flags of the bars, and the noise of
+        the picture there (any unit); empty where only the three points are known.
+    model
+        What is used: the three points, or a fit to the marks.
+    """
+
+    origin_px: tuple[float, float]
+    x_axis_px: tuple[float, float]
+    x_axis_mm: float
+    z_axis_px: tuple[float, float]
+    z_axis_mm: float
+    sigma_px: tuple[float, float, float]
+    threshold: float
+    marks: tuple[tuple[float, float, float, float, float], ...] = ()
+    model: Model = "three points"
+
+    @cached_property
+    def fits(self) -> MarkFits | None:
+        """Both fits to the marks; None without marks."""
+        if not self.marks:
+            return None
+        marks = np.array(self.marks)
+        return fit_marks(marks[:, :2], marks[:, 2:4], marks[:, 4])
+
+    @property
+    def points_px(self) -> FloatArray:
+        """(u, v) of O′ and of the points on O′X′ and O′Z′ as the model has them, shape (3, 2)."""
+        if self.fits is None or self.model == "three points":
+            return np.array([self.origin_px, self.x_axis_px, self.z_axis_px])
+        return self.fits.of(self.model).calibration.to_image(self._points_mm)
+
+    @property
+    def points_covariance_px2(self) -> FloatArray:
+        """Covariance of these points, shape (6, 6), px²."""
+        if self.fits is None or self.model == "three points":
+            return np.diag(np.repeat(np.square(self.sigma_px), 2))
+        return self.fits.of(self.model).covariance_px2(self._points_mm)
+
+    @property
+    def points_sigma_px(self) -> tuple[float, float, float]:
+        """Standard uncertainty of each of these points along either direction, px."""
+        variance = np.diag(self.points_covariance_px2).reshape(3, 2).mean(axis=1)
+        origin, on_x, on_z = np.sqrt(variance).tolist()
+        return origin, on_x, on_z
+
+    @property
+    def px_per_mm(self) -> tuple[float, float]:
+        """Scale from O′ to the point on O′X′ and to that on O′Z′ (Eq. 4-6), px/mm."""
+        along_x, along_z, _ = self._scales_and_angle(self.points_px)
+        return float(along_x), float(along_z)
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle from O′X′ to O′Z′ as the picture shows it, anticlockwise, degrees."""
+        return float(self._scales_and_angle(self.points_px)[2])
+
+    @property
+    def scales_and_angle_sigma(self) -> FloatArray:
+        """± of both scales, px/mm, and of the angle, degrees, shape (3,)."""
+        points, step = self.points_px, 1e-3
+        base = self._scales_and_angle(points)
+        change = [
+            (self._scales_and_angle(points + step * one.reshape(3, 2)) - base) / step
+            for one in np.eye(6)
+        ]
+        squares = np.einsum("pk,pq,qk->k", change, self.points_covariance_px2, change)
+        return np.asarray(np.sqrt(squares))
+
+    @property
+    def image_calibration(self) -> ImageCalibration:
+        """The calibration that the measurement uses.
+
+        Raises
+        ------
+        ValueError
+            If the three points lie on one line, or the marks do not give the model.
+        """
+        if self.model != "three points" and self.fits is None:
+            raise ValueError(f"without marks there is no {self.model}")
+        # As the set-up's keys give it, to the last digit: what is proposed is what is used.
+        if self.model == "homography":
+            assert self.fits is not None
+            matrix = self.fits.of(self.model).calibration.matrix
+            return ImageCalibration(matrix / matrix[2, 2])
+        origin, on_x, on_z = (_pair(point) for point in self.points_px)
+        return ImageCalibration.from_three_points(
+            origin, on_x, self.x_axis_mm, on_z, self.z_axis_mm
+        )
+
+    @property
+    def setup_keys(self) -> dict[str, object]:
+        """The same as keys of ``[image_calibration]``; None for one that must not be there."""
+        names = ("origin_px", "x_axis_px", "z_axis_px")
+        lengths = {"x_axis_mm": self.x_axis_mm, "z_axis_mm": self.z_axis_mm}
+        if self.model == "homography":
+            rows = self.image_calibration.matrix.tolist()
+            return {**dict.fromkeys((*names, *lengths)), "homography": rows}
+        points = dict(zip(names, self.points_px.tolist(), strict=True))
+        return {**points, **lengths, "homography": None}
+
+    def fit_lines(self) -> list[str]:
+        """What the fits to the marks leave over, which is used and why, in words."""
+        if self.fits is None:
+            return ["used       the three points: too few marks where the target has them"]
+        named = (("affine", self.fits.affine), ("homography", self.fits.homography))
+        lines = [
+            f"{name:<10} residual {root_mean_square(fit.residual_px):.3f} px, "
+            f"{root_mean_square(fit.residual_mm):.4f} mm; worst "
+            f"{np.hypot(*fit.residual_px.T).max():.3f} px; of a mark left out "
+            f"{root_mean_square(fit.left_out_px):.3f} px"
+            for name, fit in named
+            if fit is not None
+        ]
+        why = self.fits.reason if self.model == self.fits.best else "chosen by hand"
+        lines.append(f"used       {self.model}, {len(self.marks)} marks. {why}")
+        return [*lines, *(f"{'error':<10} {words}" for words in self.bound_words())]
+
+    def bound_words(self) -> tuple[str, ...]:
+        """How far the model may err where dots land; nothing without marks."""
+        return () if self.fits is None else self.fits.bound_words(self.image_calibration)
+
+    def with_scale(self, factor: float) -> PlaneCalibration:
+        """The same picture of a target that is larger by a factor."""
+        return replace(
+            self,
+            x_axis_mm=self.x_axis_mm * factor,
+            z_axis_mm=self.z_axis_mm * factor,
+            marks=tuple((x * factor, z * factor, u, v, noise) for x, z, u, v, noise in self.marks),
+        )
+
+    @property
+    def _points_mm(self) -> FloatArray:
+        return np.array([[0.0, 0.0], [self.x_axis_mm, 0.0], [0.0, self.z_axis_mm]])
+
+    def _scales_and_angle(self, points_px: FloatArray) -> FloatArray:
+        x_arm, z_arm = points_px[1:] - points_px[0]
+        turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
+        return np.array(
+            [
+                np.hypot(*x_arm) / self.x_axis_mm,
+                np.hypot(*z_arm) / self.z_axis_mm,
+                np.degrees(turn) % 360.0,
+            ]
+        )
+
+
+def calibrate_plane(
+    image: Image, settings: PlaneCalibrationSettings | None = None
+) -> PlaneCalibration:
+    """Find O′ and the axes in a picture of the imaging plane (§5.1.2).
+
+    Parameters
+    ----------
+    image
+        Grey or BGR(A) picture, shape (rows, columns[, channels]), of any integer or float type.
+    settings
+        The target's design and limits; None for the defaults.
+
+    Raises
+    ------
+    ValueError
+        If the image is no picture.
+    CannotMeasure
+        ``no-target`` if O′ and the two bars are not found where the design has them; the reason
+        says what is missing or does not fit.
+    """
+    settings = settings or PlaneCalibrationSettings()
+    grey = grey_levels(image)
+    background, darkness = levelled(grey)
+    failure = Refusal(-1, "The picture shows no dark marks on a light plane.")
+    for threshold, binary in segmented(grey, darkness, settings):
+        try:
+            marks = three_marks(binary, settings)
+            return _measured(marks, darkness, background, threshold, settings)
+        except Refusal as refusal:
+            # What failed last in the chain came closest: its reason helps the operator most.
+            if refusal.stage > failure.stage:
+                failure = refusal
+    raise CannotMeasure("no-target", failure.reason)
+
+
+def _measured(
+    marks: tuple[Mark, Mark, Mark],
+    darkness: FloatArray,
+    background: FloatArray,
+    level: float | None,
+    settings: PlaneCalibrationSettings,
+) -> PlaneCalibration:
+    """Measure the three objects and hold them to the design."""
+    dot, x_mark, z_mark = marks
+    origin, origin_sigma = dot_center(dot, darkness)
+    x_bar, z_bar = measured_bar(x_mark, darkness, "O′X′"), measured_bar(z_mark, darkness, "O′Z′")
+    points = [origin, x_bar.middle, z_bar.middle]
+    sigma = [origin_sigma, x_bar.sigma_px, z_bar.sigma_px]
+    for name, uncertain in zip(("dot of O′", "bar on O′X′", "bar on O′Z′"), sigma, strict=True):
+        if uncertain > settings.sigma_limit_px:
+            raise Refusal(
+                4, f"The {name} is blurred or partly covered: known to ±{uncertain:.1f} px only."
+            )
+    if not settings.subpixel:
+        points = [np.floor(mark.center) for mark in marks]
+        sigma = [float(np.hypot(s, 1.0 / np.sqrt(12.0))) for s in sigma]
+    row, column = np.round(origin[::-1]).astype(int)
+    bare = float(background[row, column])
+    found = PlaneCalibration(
+        origin_px=_pair(points[0]),
+        x_axis_px=_pair(points[1]),
+        x_axis_mm=sum(settings.x_units) / 2.0 * settings.unit_mm,
+        z_axis_px=_pair(points[2]),
+        z_axis_mm=sum(settings.z_units) / 2.0 * settings.unit_mm,
+        sigma_px=(sigma[0], sigma[1], sigma[2]),
+        threshold=bare * (1.0 - level) if level is not None else float(settings.threshold or 0.0),
+    )
+    bars = (x_bar, z_bar)
+    for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
+        _check_pointing(axis, origin, bar, units, settings)
+    ticks = _tick_marks(origin, bars, darkness, settings)
+    if not ticks:
+        # Without flags in their places the ends alone must tell whether the bars are whole.
+        for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
+            _check_length(axis, origin, bar, units, settings)
+    if ticks and settings.subpixel:
+        found = replace(found, marks=ticks)
+        assert found.fits is not None
+        found = replace(found, model=found.fits.best)
+    along_x, along_z = found.px_per_mm
+    if abs(along_x / along_z - 1.0) > settings.scale_tolerance:
+        raise Refusal(
+            5,
+            f"The axes' scales disagree: {along_x:.3g} px/mm along O′X′, {along_z:.3g} px/mm "
+            "along O′Z′.",
+        )
+    if abs(found.angle_deg - 90.0) > settings.angle_tolerance_deg:
+        raise Refusal(5, f"The axes are {found.angle_deg:.0f}° apart, which should be about 90°.")
+    return found
+
+
+def _tick_marks(
+    origin: FloatArray,
+    bars: tuple[Bar, Bar],
+    darkness: FloatArray,
+    settings: PlaneCalibrationSettings,
+) -> tuple[tuple[float, float, float, float, float], ...]:
+    """O′, the ends of the bars and their flags; none if too few are where the design has them."""
+    unit_px = float(np.hypot(*(bars[0].middle - origin))) / (sum(settings.x_units) / 2.0)
+    places = [(0.0, 0.0, origin)]
+    least = 1
+    for k, units in enumerate((settings.x_units, settings.z_units)):
+        bar, other = bars[k], bars[1 - k].direction
+        along = bar_marks(bar, origin, units, other, settings.flag_units, darkness)
+        places += [(t, 0.0, place) if k == 0 else (0.0, t, place) for t, place in along]
+        least += 2 + (int(np.ceil(units[1])) - int(np.floor(units[0])) - 1) // 2
+    marks = [
+        (x, z, *_pair(place), local_noise(darkness, place, 0.5 * unit_px)) for x, z, place in places
+    ]
+    ends = {(t, 0.0) for t in settings.x_units} | {(0.0, t) for t in settings.z_units}
+    while len(marks) >= least:
+        table = np.array(marks)
+        fit = fit_marks(table[:, :2] * settings.unit_mm, table[:, 2:4], table[:, 4]).homography
+        if fit is None:
+            return ()
+        off = np.hypot(*fit.left_out_px.T)
+        worst = int(np.argmax(off))
+        stray = off[worst] > max(5.0 * float(np.median(off)), 0.3)
+        # A scratch or a speck can be taken for a flag; O′ and the ends have been checked.
+        if stray and worst and marks[worst][:2] not in ends:
+            del marks[worst]
+            continue
+        if off[worst] > settings.mark_tolerance * unit_px:
+            return ()
+        unit = settings.unit_mm
+        return tuple((x * unit, z * unit, u, v, noise) for x, z, u, v, noise in marks)
+    return ()
+
+
+def _check_pointing(
+    axis: str,
+    origin: FloatArray,
+    bar: Bar,
+    units: tuple[float, float],
+    settings: PlaneCalibrationSettings,
+) -> None:
+    """Refuse a bar that does not point at O′."""
+    arm = bar.middle - origin
+    unit_px = float(np.hypot(*arm)) / (sum(units) / 2.0)
+    passes_by = abs(arm[0] * bar.direction[1] - arm[1] * bar.direction[0]) / unit_px
+    if passes_by > settings.pointing_tolerance:
+        raise Refusal(
+            4, f"The bar on {axis} does not point at O′: it passes {passes_by:.2g} units off."
+        )
+
+
+def _check_length(
+    axis: str,
+    origin: FloatArray,
+    bar: Bar,
+    units: tuple[float, float],
+    settings: PlaneCalibrationSettings,
+) -> None:
+    """Refuse a bar that does not begin and end where it should."""
+    begin, end = units
+    unit_px = float(np.hypot(*(bar.middle - origin))) / ((begin + end) / 2.0)
+    expected = (end - begin) / 2.0 * unit_px
+    # With 2s of it hidden a bar's half is s shorter, but s·(end - begin) / (end + begin) of that
+    # is expected of its new middle. Half a pixel an end may be off even in a coarse picture.
+    tolerance = max(settings.middle_tolerance * 2.0 * begin / (begin + end) * unit_px, 0.5)
+    if abs(bar.half_length - expected) > tolerance:
+        raise Refusal(
+            5,
+            f"The bar on {axis} is {2.0 * bar.half_length:.1f} px long; from its middle's distance "
+            f"to O′ it should be {2.0 * expected:.1f} px: part of it is hidden, or it is not "
+            "this target.",
+        )
+
+
+def _pair(point: FloatArray) -> tuple[float, float]:
+    return float(point[0]), float(point[1])

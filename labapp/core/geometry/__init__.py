@@ -1,0 +1,1 @@
+"""The bench: laser, rays, imaging plane; coordinates of image, plane and work piece."""

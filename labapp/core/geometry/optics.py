@@ -1,0 +1,81 @@
+"""Rays, the reflection law, and where rays meet planes (Eq. 4-1 … 4-4)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from labapp.core.geometry.rig import DotPattern, ImagingPlane, Laser
+from labapp.core.values import FloatArray
+
+
+@lru_cache(maxsize=16)
+def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
+    """Unit direction of every projected ray (Eq. 4-1, tangent grid of Fig. 4-14).
+
+    Returns
+    -------
+    FloatArray
+        Shape (rows, columns, 3), not to be written to; ray (i, j), counted from 1, is at
+        ``[i - 1, j - 1]``. i grows towards the head of the pool (+Y), j with X.
+    """
+    angle = np.radians(laser.projection_angle_deg)
+    axis = np.array([0.0, -np.cos(angle), -np.sin(angle)])
+    across = np.array([1.0, 0.0, 0.0])
+    along = np.array([0.0, -np.sin(angle), np.cos(angle)])
+    step = np.radians(pattern.inter_beam_angle_deg)
+    i = np.arange(1, pattern.rows + 1)[:, None, None]
+    j = np.arange(1, pattern.columns + 1)[None, :, None]
+    direction = (
+        axis
+        + np.tan((j - (pattern.columns + 1) / 2) * step) * across
+        + np.tan(((pattern.rows + 1) / 2 - i) * step) * along
+    )
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction.flags.writeable = False
+    return np.asarray(direction)
+
+
+def surface_normal(gradient: FloatArray) -> FloatArray:
+    """Upward normal (not normalised) of z = f(x, y) from (f_x, f_y), shape (…, 2) (Eq. 4-2)."""
+    gradient = np.asarray(gradient, float)
+    return np.concatenate([-gradient, np.ones((*gradient.shape[:-1], 1))], axis=-1)
+
+
+def reflect(direction: FloatArray, normal: FloatArray) -> FloatArray:
+    """Direction after reflection at a surface with the given normal, shapes (…, 3) (Eq. 4-4).
+
+    The length of ``direction`` is kept; ``normal`` need not be a unit vector.
+    """
+    k = np.vecdot(direction, normal) / np.vecdot(normal, normal)
+    return np.asarray(direction - 2.0 * k[..., None] * normal)
+
+
+def bisecting_gradient(incident: FloatArray, reflected: FloatArray) -> FloatArray:
+    """Gradient (f_x, f_y), shape (…, 2), of the surface that turns one direction into the other.
+
+    The normal bisects the reversed incident ray and the reflected one (Eq. 4-3). Both
+    directions, shape (…, 3), of any length.
+    """
+    back, forth = (way / np.sqrt(np.vecdot(way, way))[..., None] for way in (incident, reflected))
+    normal = forth - back
+    return np.asarray(-normal[..., :2] / normal[..., 2:])
+
+
+def meet_plane(origin_mm: FloatArray, direction: FloatArray, plane: ImagingPlane) -> FloatArray:
+    """Where rays meet the imaging plane, as IPCS (X′, Z′), shape (…, 2), mm.
+
+    A ray that runs away from the plane or along it gives NaN. The plane is taken as unbounded.
+    """
+    normal = plane.normal
+    along = np.asarray(direction @ normal)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = ((plane.origin_mm - origin_mm) @ normal) / along
+    distance = np.where((distance > 0) & np.isfinite(distance), distance, np.nan)
+    return plane.from_universal(origin_mm + distance[..., None] * direction)
+
+
+def meet_level(origin_mm: FloatArray, direction: FloatArray, z_mm: float = 0.0) -> FloatArray:
+    """Where rays meet the horizontal plane z = z_mm, shape (…, 3), mm."""
+    return np.asarray(origin_mm + ((z_mm - origin_mm[..., 2:]) / direction[..., 2:]) * direction)

@@ -1,0 +1,84 @@
+"""Matched pairs of ray and dot: what matching finds and every scheme begins with (§4.2.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.values import FloatArray, IntArray, freeze
+
+Orientation = Literal["S/S", "S/I", "I/I"]
+"""Column/row correspondence: S grows the same way as the rays, I the other way."""
+
+ORIENTATIONS: tuple[Orientation, ...] = ("S/S", "S/I", "I/I")
+
+
+def ways(orientation: Orientation) -> IntArray:
+    """+1 or −1: whether reflected rows, and columns, grow with the rays'; shape (2,)."""
+    by_column, by_row = orientation.split("/")
+    return np.array([1 if by_row == "S" else -1, 1 if by_column == "S" else -1])
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One orientation that was tried on the matched dots.
+
+    Parameters
+    ----------
+    orientation
+        The correspondence.
+    residual_mm
+        Root mean square distance of computed from captured dots, mm; infinite if no surface has
+        this correspondence.
+    """
+
+    orientation: Orientation
+    residual_mm: float
+
+
+@dataclass(frozen=True)
+class Match:
+    """Matched pairs of ray and reflected dot, n of them.
+
+    Parameters
+    ----------
+    orientation
+        The correspondence that was settled on.
+    dot
+        Index of each pair's dot in `Dots`, shape (n,).
+    ray
+        Its ray (i, j), counted from 1, shape (n, 2).
+    reflected
+        Its reflected row and column (k, t), counted from 1, shape (n, 2); 0 where it is
+        not known.
+    plane_mm
+        The dot on the imaging plane, IPCS (X′, Z′), shape (n, 2), mm.
+    plane_covariance_mm2
+        Covariance of that, shape (n, 2, 2), mm².
+    witness
+        Shape (rows, columns) of the pattern: +1 where the ray came back, −1 where it did not,
+        0 where it cannot testify (absent, blocked by the torch, off the plane, in doubt).
+    trials
+        Every orientation that was tried, the best first.
+    """
+
+    orientation: Orientation
+    dot: IntArray
+    ray: IntArray
+    reflected: IntArray
+    plane_mm: FloatArray
+    plane_covariance_mm2: FloatArray
+    witness: IntArray
+    trials: tuple[Trial, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def margin(self) -> float:
+        """Residual of the best other orientation over that of the chosen one."""
+        others = [t.residual_mm for t in self.trials if t.orientation != self.orientation]
+        own = [t.residual_mm for t in self.trials if t.orientation == self.orientation]
+        return min(others) / max(own[0], 1e-9) if own and others else float("inf")

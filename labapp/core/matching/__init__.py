@@ -1,0 +1,1 @@
+"""Which ray made which dot, and how sure."""

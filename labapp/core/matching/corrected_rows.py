@@ -1,0 +1,204 @@
+"""The operator's rows and columns → Match: what he set is binding (§4.2.2, §7.1).
+
+His sites name the rays; the surface tells the rays of the dots that he left open, and whether any
+surface has what he set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
+from labapp.core.images.dots import Dots
+from labapp.core.match import Match, Orientation, ways
+from labapp.core.matching.correspondence import MatchSettings, as_match, indexed_lattice, match_rays
+from labapp.core.matching.hypothesis import STANDING_OUT, Hypothesis, from_grid, pursue, weigh
+from labapp.core.matching.ray_growth import LEAST_LABELS, UNLABELLED, Scene
+from labapp.core.rows.lattice import Lattice, Site
+from labapp.core.values import CannotMeasure, IntArray
+
+AGREED = 0.8
+"""Such a share of the dots must agree in where the reference is."""
+
+OFF, FEW_OFF = 0.25, 0.04
+"""A dot given a row and a column is off where the surface's is farther than this share of the way
+to the next dot; a larger share of such dots, or more than two, and the correction does not fit."""
+
+
+def match_corrected(
+    dots: Dots,
+    lattice: Lattice,
+    rig: Rig,
+    calibration: ImageCalibration,
+    frame_shape: tuple[int, int],
+    settings: MatchSettings,
+) -> Match:
+    """Find the ray of every dot where the operator has put the rows right: what he set is binding.
+
+    With a reference, every dot that has a row and a column gets the ray that these give; without
+    one, the rows and columns are matched as a block, by `match_rays`. Of the other dots the
+    surface tells the rays, never against a row or a column that a dot has. Reflected numbers stay
+    the operator's.
+
+    Parameters
+    ----------
+    dots, lattice
+        The dots as corrected. 0 for no row or no column; missing dots of blocked rows do not
+        testify.
+    rig, calibration, frame_shape, settings
+        See `match_rays`.
+
+    Raises
+    ------
+    CannotMeasure
+        As `match_rays`; ``no-match`` also where no surface has the rows and columns given, which
+        the reason says.
+    """
+    rows = _whole_sites(lattice)
+    count = int((rows.row > 0).sum())
+    orientations = settings.orientations
+    reference = lattice.reference
+    if reference is None:
+        match = match_rays(dots, rows if count else None, rig, calibration, frame_shape, settings)
+        if count == 0:
+            return match
+        reference, orientations = _found_reference(match, rows, rig), (match.orientation,)
+    elif count < LEAST_LABELS:
+        raise CannotMeasure(
+            "too-few-dots",
+            f"{count} dots have a row and a column, telling rays needs {LEAST_LABELS}",
+        )
+    scene = Scene.of(dots, rig, calibration, frame_shape)
+    tried = (_bound(scene, lattice, reference, orientation) for orientation in orientations)
+    bound = [b for b in tried if b is not None]
+    if not bound:
+        raise CannotMeasure(
+            "no-match",
+            "the correction does not fit: counted from this reference, dots lie where the matrix "
+            "has no rays, or no surface has them there",
+        )
+    best = min(bound, key=lambda b: b.hypothesis.cost)
+    _check_bound(best, rows, settings)
+    for other in bound:
+        if other is not best and other.hypothesis.cost < best.hypothesis.cost + settings.margin:
+            raise CannotMeasure(
+                "ambiguous-orientation",
+                f"{best.orientation} and {other.orientation} explain the dots alike",
+            )
+    # Which rays came back is told by the surface that is fitted to frames without a correction.
+    told = weigh(best.scene, best.hypothesis.labels)
+    final = best.hypothesis if told is None else replace(best.hypothesis, witness=told.witness)
+    return as_match(best.scene, final, best.orientation, reference)
+
+
+def confirmed_lattice(match: Match, rig: Rig, given: Lattice) -> Lattice:
+    """Rows and columns as their rays have them, and the blocked rows that the operator marked.
+
+    Numbers are those of ``given`` unless the rays have dots below or left of its first.
+    """
+    lattice = indexed_lattice(match, rig, len(given.row))
+    sited = np.flatnonzero((given.row > 0) & (given.column > 0))
+    up = int(lattice.row[sited[0]] - given.row[sited[0]]) if len(sited) else 0
+    return replace(lattice, blocked_rows=frozenset(k + up for k in given.blocked_rows))
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """What follows from the operator's sites, one way round.
+
+    ``contested`` are dots with a site whose rays the surface would give to others, or them to
+    other rays; then no dot without a site has a ray.
+    """
+
+    scene: Scene
+    orientation: Orientation
+    hypothesis: Hypothesis
+    contested: IntArray
+
+
+def _whole_sites(lattice: Lattice) -> Lattice:
+    """The lattice without dots that have a row or a column alone."""
+    sited = (lattice.row > 0) & (lattice.column > 0)
+    return replace(
+        lattice, row=np.where(sited, lattice.row, 0), column=np.where(sited, lattice.column, 0)
+    )
+
+
+def _bound(
+    scene: Scene, given: Lattice, reference: Site, orientation: Orientation
+) -> _Bound | None:
+    """Label dots as sites say, and others as the surface does; None if no surface has them."""
+    pattern, way, rows = scene.rig.pattern, ways(orientation), _whole_sites(given)
+    marker = pattern.marker or pattern.reference
+    hidden = (marker[0] + (k - reference[0]) * int(way[0]) for k in given.blocked_rows)
+    scene = replace(scene, hidden_rows=frozenset(hidden))
+    shape = (pattern.rows, pattern.columns)
+    labels = from_grid(rows, reference, marker, orientation, shape)
+    labels = np.where(scene.absent, UNLABELLED, labels)
+    lit = labels != UNLABELLED
+    if lit.sum() < (rows.row > 0).sum():  # a site beyond the pattern, or where no ray is
+        return None
+    hypothesis = weigh(scene, labels, STANDING_OUT)
+    if hypothesis is None:
+        return None
+    wider = pursue(scene, labels)
+    if wider is None:
+        return _Bound(scene, orientation, hypothesis, np.zeros(0, np.int64))
+    taken = (wider.labels != labels) & (wider.labels != UNLABELLED)
+    contested = labels[lit & (taken | (np.isin(labels, wider.labels[taken])))]
+    if len(contested) == 0:
+        ray = np.argwhere(~lit & (wider.labels != UNLABELLED)) + 1
+        dot = wider.labels[ray[:, 0] - 1, ray[:, 1] - 1]
+        numbers = np.stack([given.row[dot], given.column[dot]], axis=-1)
+        against = (numbers > 0) & (numbers != reference + (ray - marker) * way)
+        more = ~against.any(axis=-1)
+        labels = labels.copy()
+        labels[ray[more, 0] - 1, ray[more, 1] - 1] = dot[more]
+        further = weigh(scene, labels, STANDING_OUT)
+        if further is not None and further.cost < hypothesis.cost:
+            hypothesis = further
+    return _Bound(scene, orientation, hypothesis, contested)
+
+
+def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
+    """Site of the reference in the operator's rows, as the rays tell it."""
+    pattern = rig.pattern
+    site = np.stack([rows.row, rows.column], axis=-1)[match.dot]
+    away = (match.ray - (pattern.marker or pattern.reference)) * ways(match.orientation)
+    kinds, count = np.unique((site - away)[site[:, 0] > 0], axis=0, return_counts=True)
+    if len(kinds) == 0 or count.max() < AGREED * count.sum():
+        raise CannotMeasure(
+            "no-match", "the correction does not fit: the dots' rays are in other rows"
+        )
+    k, t = kinds[np.argmax(count)].tolist()
+    return k, t
+
+
+def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
+    """Refuse sites that the surface cannot reconcile, and name the row that is worst."""
+    scene, labels = bound.scene, bound.hypothesis.labels
+    dot = labels[labels != UNLABELLED]
+    next_mm = cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][dot, 1]
+    off = np.linalg.norm(bound.hypothesis.pool.residual_mm, axis=-1) > OFF * next_mm
+    wrong, sited = dot[off & (rows.row[dot] > 0)], int((rows.row > 0).sum())
+    if len(wrong) > max(2, FEW_OFF * sited):
+        raise CannotMeasure(
+            "no-match",
+            f"the correction does not fit: {len(wrong)} of {sited} dots given a row and a column "
+            f"are far from where any surface has them, most in row {_most(rows.row[wrong])}",
+        )
+    stray = bound.hypothesis.stray
+    if stray > settings.stray[0] + settings.stray[1] * len(scene.plane_mm):
+        reason = f"the correction leaves {stray} of {len(scene.plane_mm)} dots without a ray"
+        if len(bound.contested):
+            row = _most(rows.row[bound.contested])
+            reason += f", as the surface would have dots elsewhere that are given row {row}"
+        raise CannotMeasure("no-match", reason)
+
+
+def _most(rows: IntArray) -> int:
+    return int(np.argmax(np.bincount(rows)))

@@ -1,0 +1,318 @@
+"""Lattice → Match: which ray made which dot, and how sure (§4.2.2, §5.2.3, §7.1).
+
+The absent centre dot gives the rays of a whole grid at once, for each orientation. Every such
+hypothesis is followed by what the surface itself says: fit it to the dots labelled so far,
+predict where every ray's dot should be, label the dots that one ray alone can have made, and fit
+again until nothing changes. That finds the dots the grid left in doubt and drops the ones it got
+wrong. Where rows bow too much for a grid to grow, hypotheses come from the optics instead: quadrics
+whose rays round a hole fall on dots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
+from labapp.core.images.dots import Dots
+from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, ways
+from labapp.core.matching.cap_search import search_caps
+from labapp.core.matching.hypothesis import (
+    Hypothesis,
+    contested,
+    from_grid,
+    joined,
+    moved,
+    pursue,
+    turned,
+    weigh,
+    with_repaired,
+    with_rows_beyond,
+    without_false_ends,
+)
+from labapp.core.matching.quadric_search import search_quadrics
+from labapp.core.matching.ray_growth import LEAST_LABELS, UNLABELLED, Scene, try_fit
+from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
+from labapp.core.values import CannotMeasure
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """How the correspondence is decided.
+
+    Parameters
+    ----------
+    correspondence
+        ``auto`` tries every orientation; otherwise the one to use.
+    margin
+        Two hypotheses whose costs differ by less, in units of χ², cannot be told apart.
+    stray, missed
+        Dots without a ray, and rays without a dot amid the others, that are put up with: a number
+        and a share.
+    """
+
+    correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
+    margin: float = 14.0
+    stray: tuple[int, float] = (4, 0.02)
+    missed: tuple[int, float] = (2, 0.06)
+
+    @property
+    def orientations(self) -> tuple[Orientation, ...]:
+        """Those to be tried."""
+        return ORIENTATIONS if self.correspondence == "auto" else (self.correspondence,)
+
+
+def match_rays(
+    dots: Dots,
+    lattice: Lattice | None,
+    rig: Rig,
+    calibration: ImageCalibration,
+    frame_shape: tuple[int, int],
+    settings: MatchSettings,
+) -> Match:
+    """Find the ray of every dot.
+
+    Parameters
+    ----------
+    dots, lattice
+        What the frame shows; no lattice where none could be grown.
+    rig, calibration
+        The bench, and how the camera sees the imaging plane.
+    frame_shape
+        Height and width of the frame, px.
+    settings
+        See `MatchSettings`.
+
+    Raises
+    ------
+    CannotMeasure
+        ``too-few-dots``; ``no-reference`` if no hole can be the absent centre dot,
+        ``ambiguous-rows`` if several can; ``ambiguous-orientation``; ``no-match`` if no surface
+        explains the dots.
+    """
+    if len(dots) < LEAST_LABELS:
+        raise CannotMeasure(
+            "too-few-dots", f"{len(dots)} dots were found, telling rays needs {LEAST_LABELS}"
+        )
+    scene = Scene.of(dots, rig, calibration, frame_shape)
+    orientations = settings.orientations
+    found: list[Hypothesis] = []
+    for way in (_by_grid, _by_placement, _by_optics):
+        found = with_repaired(scene, found + way(scene, lattice, orientations))
+        if _any_explains(scene, found):
+            break
+    try:
+        best = _answer(scene, found, lattice, settings)
+    except CannotMeasure as reason:
+        if reason.status != "no-match":
+            raise
+        best = _answer(scene, found + _by_caps(scene), lattice, settings)
+    return as_match(scene, best, best.orientation(scene))
+
+
+def _answer(
+    scene: Scene, found: list[Hypothesis], lattice: Lattice | None, settings: MatchSettings
+) -> Hypothesis:
+    """Settle on one of the hypotheses, or what one leads to; `CannotMeasure` as `match_rays`."""
+    found = with_rows_beyond(scene, found)
+    # Followed to its end, a hypothesis may have come round to a correspondence not asked for.
+    asked = settings.orientations
+    found = [hypothesis for hypothesis in found if hypothesis.orientation(scene) in asked]
+    if not found:
+        if scene.rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
+            raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
+        raise CannotMeasure("no-match", "no surface explains the reflected dots")
+    return _settled(scene, found, settings)
+
+
+def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
+    """Rows and columns of ``count`` dots as their rays have them.
+
+    They index dots that the picture alone leaves in doubt, and none that the rays do not.
+    """
+    way = ways(match.orientation)
+    k, t = (
+        np.array(rig.pattern.marker or rig.pattern.reference) * way
+        + (match.reflected - match.ray * way)[0]
+    )
+    sites = (tuple(map(int, site)) for site in match.reflected)
+    grid = {(k, t): int(dot) for (k, t), dot in zip(sites, match.dot, strict=True)}
+    return lattice_of_sites(grid, count, reference=(int(k), int(t)))
+
+
+def _by_grid(
+    scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+) -> list[Hypothesis]:
+    """Follow every site of the grid that could be the reference, each way round."""
+    pattern = scene.rig.pattern
+    if lattice is None or pattern.marker is None:
+        return []
+    shape = (pattern.rows, pattern.columns)
+    labelled = (
+        from_grid(lattice, hole, pattern.marker, orientation, shape)
+        for hole in lattice.candidates
+        for orientation in orientations
+    )
+    return [hypothesis for labels in labelled if (hypothesis := pursue(scene, labels)) is not None]
+
+
+MOST_PLACES = 8
+"""So many places of the marker in the grid are followed, of those that fit it best."""
+
+
+def _by_placement(
+    scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+) -> list[Hypothesis]:
+    """Follow the grid with the marker at each empty site, also at its rim, each way round.
+
+    False dots, missing ones or the torch may leave the marker without three lit neighbours.
+    """
+    pattern = scene.rig.pattern
+    if lattice is None or pattern.marker is None:
+        return []
+    shape = (pattern.rows, pattern.columns)
+    rough = []
+    for site in empty_sites(lattice):
+        for orientation in orientations:
+            labels = from_grid(lattice, site, pattern.marker, orientation, shape)
+            pool = try_fit(scene, labels)
+            if pool is not None:
+                rough.append((float(np.mean(pool.residual_mm**2)), labels))
+    rough.sort(key=lambda one: one[0])
+    pursued = (pursue(scene, labels) for _, labels in rough[:MOST_PLACES])
+    return [hypothesis for hypothesis in pursued if hypothesis is not None]
+
+
+def _by_caps(scene: Scene) -> list[Hypothesis]:
+    """Follow the caps that the dots lie on best, and mend what each leaves unexplained."""
+    found: list[Hypothesis] = []
+    for labels in search_caps(scene):
+        hypothesis = pursue(scene, labels)
+        found += with_repaired(scene, [hypothesis]) if hypothesis is not None else []
+    return found
+
+
+def _by_optics(
+    scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+) -> list[Hypothesis]:
+    """Follow the quadrics that explain the dots round some hole, with the grid's help."""
+    found = []
+    for guess in search_quadrics(scene):
+        hypothesis = pursue(scene, guess.labels)
+        if hypothesis is None:
+            continue
+        found.append(hypothesis)
+        if lattice is not None:
+            labels = joined(hypothesis, lattice, hypothesis.orientation(scene))
+            wider = None if labels is None else pursue(scene, labels)
+            found += [wider] if wider is not None else []
+        if _explains(scene, hypothesis):
+            break
+    return found
+
+
+def _explains(scene: Scene, hypothesis: Hypothesis) -> bool:
+    """Hardly a dot is left over, hardly one is missing, and none is where the marker is."""
+    few = max(2, 0.05 * len(scene.plane_mm))
+    return hypothesis.stray <= few and hypothesis.missed <= few and hypothesis.marker != "lit"
+
+
+def _any_explains(scene: Scene, found: list[Hypothesis]) -> bool:
+    return any(_explains(scene, hypothesis) for hypothesis in found)
+
+
+def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hypothesis:
+    """Take the cheapest hypothesis, if nothing else comes near it and it leaves little open.
+
+    It is held against the others and against itself a row or a column further on: a hypothesis
+    that was followed from the wrong hole may lead to almost the right place.
+    """
+    best = min(found, key=lambda hypothesis: hypothesis.cost)
+    while True:  # each round is cheaper than the one before
+        one_on = moved(scene, best.labels)
+        neighbours = [h for labels in one_on if (h := weigh(scene, labels, near=best.pool))]
+        nearest = min(neighbours, key=lambda h: h.cost, default=best)
+        better = pursue(scene, nearest.labels) if nearest.cost < best.cost else None
+        if better is None or better.cost >= best.cost:
+            break
+        best = better
+    best = without_false_ends(scene, best)
+    strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
+    if best.stray > strays or best.missed > settings.missed[0] + settings.missed[1] * best.count:
+        raise CannotMeasure(
+            "no-match",
+            f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
+            f"{_counted(best.missed, 'ray')} without a dot amid {best.count} pairs",
+        )
+    own = best.orientation(scene)
+    if best.marker == "lit":
+        raise CannotMeasure(
+            "ambiguous-rows" if _any_explains(scene, found) else "no-reference",
+            "where the best rows have the absent centre dot, there is a dot",
+        )
+    if best.marker == "unknown":
+        raise CannotMeasure(
+            "no-reference", "the absent centre dot is not amid dots that have their ray"
+        )
+    doubtful: list[int] = contested(scene, best).tolist()
+    for other in [*found, *neighbours]:
+        if other.cost >= best.cost + settings.margin:
+            continue
+        differing, shared = _differing(best, other)
+        if len(differing) <= 0.2 * shared:
+            doubtful += differing
+        elif other.orientation(scene) != own:
+            raise CannotMeasure(
+                "ambiguous-orientation",
+                f"{own} and {other.orientation(scene)} explain the dots alike",
+            )
+        else:
+            raise CannotMeasure(
+                "ambiguous-rows", "several holes in the rows can be the absent centre dot"
+            )
+    if doubtful:
+        certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
+        witness = np.where(certain == best.labels, best.witness, 0)
+        best = replace(weigh(scene, certain, near=best.pool) or best, witness=witness)
+    return best
+
+
+def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
+    """Dots that have different rays in the two, and how many have a ray in both."""
+    rays = [{int(dot): at for at, dot in np.ndenumerate(h.labels)} for h in (one, other)]
+    shared = rays[0].keys() & rays[1].keys() - {UNLABELLED}
+    return [dot for dot in shared if rays[0][dot] != rays[1][dot]], len(shared)
+
+
+def _counted(count: int, thing: str) -> str:
+    return f"{count} {thing}{'s' * (count != 1)}"
+
+
+def as_match(
+    scene: Scene, best: Hypothesis, own: Orientation, reference: Site | None = None
+) -> Match:
+    """Write a hypothesis down; reflected numbers from 1, or so that the reference has its own."""
+    trials = [Trial(own, best.residual_mm)]
+    for orientation in ORIENTATIONS:
+        if orientation != own:
+            other = weigh(scene, turned(scene, best.labels, own, orientation))
+            trials.append(Trial(orientation, float("inf") if other is None else other.residual_mm))
+    at = np.argwhere(best.labels != UNLABELLED)
+    dot = best.labels[at[:, 0], at[:, 1]]
+    pattern = scene.rig.pattern
+    numbers = (at + 1 - (pattern.marker or pattern.reference)) * ways(own)
+    least = numbers.min(axis=0)
+    numbers += 1 - least if reference is None else np.maximum(reference, 1 - least)
+    return Match(
+        orientation=own,
+        dot=dot,
+        ray=at + 1,
+        reflected=numbers,
+        plane_mm=scene.plane_mm[dot],
+        plane_covariance_mm2=scene.covariance_mm2[dot],
+        witness=best.witness,
+        trials=tuple(sorted(trials, key=lambda trial: trial.residual_mm)),
+    )

@@ -1,0 +1,194 @@
+"""Hypotheses from the optics: quadrics whose rays round the absent centre fall on dots.
+
+Where rows bow so far that no grid grows on the picture, the surface can still be told from the
+few dots round the hole: near its middle a pool is a quadric. The hole fixes its slope, the two
+dots beside it the curvature across, and the curvature along is tried out. What then falls near
+the dots round the hole is fitted to them and held against more of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from labapp.core.geometry.optics import bisecting_gradient
+from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.values import BoolArray, FloatArray, IntArray
+
+REACH = 3
+"""Rows and columns each way from the reference that a quadric is held against."""
+
+LOOSE, TIGHT = 0.5, 0.33
+"""A ray finds its dot within this fraction of the spacing of the predicted dots: at first, and
+once the quadric is fitted."""
+
+_LIFTS = np.array([0.0, 0.2, -0.2, 0.4, -0.4])
+"""How far the hole may lie off the middle of the two dots beside it, in their distance."""
+
+_RATIOS = np.geomspace(0.35, 2.2, 12)
+"""Curvature along over curvature across that is tried."""
+
+_FLATTEST, _STEEPEST = 0.004, 0.6
+"""Curvature below which no dots could be told apart, and above which no pool is, mm⁻¹."""
+
+
+@dataclass(frozen=True)
+class QuadricGuess:
+    """The dots that a quadric's rays fall on.
+
+    Parameters
+    ----------
+    labels
+        Index of the dot of each ray next to the reference or `UNLABELLED`, shape (rows, columns).
+    hits
+        How many rays found their dot, less those that should have and did not.
+    """
+
+    labels: IntArray
+    hits: float
+
+
+def search_quadrics(scene: Scene, most: int = 8) -> list[QuadricGuess]:
+    """Find the quadrics that explain the dots round some hole best, the best first.
+
+    Parameters
+    ----------
+    scene
+        The dots and the rig.
+    most
+        How many to return at most; no two with the same labels.
+    """
+    marker = scene.rig.pattern.marker
+    if marker is None or min(marker) < 2 or np.any(np.array(marker) >= scene.rays.shape[:2]):
+        return []  # without rays all round it, a hole cannot be told
+    window = _Window(scene, marker)
+    found: dict[bytes, QuadricGuess] = {}
+    for hole, half_width in _holes(scene, window.tree):
+        for guess in window.judged(window.fitted(_quadrics(window, hole, half_width))):
+            key = guess.labels.tobytes()
+            if key not in found or found[key].hits < guess.hits:
+                found[key] = guess
+    return sorted(found.values(), key=lambda guess: -guess.hits)[:most]
+
+
+def _holes(scene: Scene, tree: cKDTree) -> Iterator[tuple[FloatArray, float]]:
+    """Empty places between two dots, IPCS, and half the dots' distance along X′, mm."""
+    dots = scene.plane_mm
+    for p, near in enumerate(tree.query(dots, k=min(10, len(dots)))[1]):
+        for q in near[1:]:
+            step = dots[q] - dots[p]
+            if step[0] <= 0 or abs(step[1]) > 0.6 * step[0]:
+                continue
+            # Where one dot is missing between two, the next one on lies half as far off.
+            beyond = tree.query([dots[p] - step / 2, dots[q] + step / 2])[0]
+            if beyond.min() > 0.42 * np.linalg.norm(step):
+                continue
+            for lift in _LIFTS * np.linalg.norm(step):
+                hole = (dots[p] + dots[q]) / 2 + [0.0, lift]
+                if tree.query(hole)[0] > 0.3 * np.linalg.norm(step):
+                    yield hole, step[0] / 2
+
+
+def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArray:
+    """Quadrics that put the reference into the hole, and loosely the dots round it in place.
+
+    z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), x and y from where the reference would land on the
+    work piece: (g_x, g_y, κ_x, κ_xy, κ_y) of each, shape (m, 5), mm⁻¹. Every curvature along is
+    tried, and both signs of the curvature across that put the neighbouring dots where they are.
+    """
+    scene = window.scene
+    laser, plane = scene.rig.laser.position_mm, scene.rig.imaging_plane
+    slope = bisecting_gradient(
+        window.landing_mm - laser, plane.to_universal(hole) - window.landing_mm
+    )
+    middle = window.middle
+    beside = window.rays[middle[0], middle[1] + 1][None]
+    # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.
+    trial = np.array([[*slope, -0.02, 0.0, -0.02], [*slope, 0.02, 0.0, 0.02]])
+    moved = window.met(trial, beside)[1][:, 0, 0] - hole[0]
+    across = (np.array([1, -1]) * half_width - moved.mean()) / ((moved[1] - moved[0]) / 0.04)
+    across = across[(np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST)]
+    quadrics = np.zeros((len(across) * len(_RATIOS), 5))
+    quadrics[:, :2] = slope
+    quadrics[:, 2] = np.repeat(across, len(_RATIOS))
+    quadrics[:, 4] = np.outer(across, _RATIOS).ravel()
+    patterns = window.met(quadrics, window.rays.reshape(-1, 3))[1]
+    patterns = patterns.reshape(-1, *window.rays.shape[:2], 2)
+    hit = window.hits(patterns, LOOSE)[0][(slice(None), *window.core)]
+    return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= 5])
+
+
+class _Window:
+    """The rays round the reference, and the dots they may fall on."""
+
+    def __init__(self, scene: Scene, marker: tuple[int, int]) -> None:
+        i, j = (n - 1 for n in marker)
+        rows, columns = scene.rays.shape[:2]
+        reach = min(REACH, i, j, rows - 1 - i, columns - 1 - j)
+        self.scene = scene
+        self.tree, self.plane = cKDTree(scene.plane_mm), scene.rig.imaging_plane.pose_mm
+        self.part = slice(i - reach, i + reach + 1), slice(j - reach, j + reach + 1)
+        self.rays = scene.rays[self.part]
+        self.landing_mm = scene.landing_mm[i, j]
+        self.absent = scene.absent[self.part]
+        self.middle = (reach, reach)
+        self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
+
+    def met(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where rays, shape (n, 3), meet quadrics, shape (m, 5), and their dots.
+
+        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm.
+        """
+        from labapp.core.surface import kernels
+
+        laser = self.scene.rig.laser.position_mm
+        return kernels.meet_quadrics(self.landing_mm[:2], quadrics, rays, laser, self.plane)
+
+    def hits(self, pattern: FloatArray, gate: float) -> tuple[BoolArray, IntArray, FloatArray]:
+        """Which predicted dots, shape (m, rows, columns, 2), fall on a dot, on which, how far off.
+
+        The last is in units of the gate: a share of the way to the next predicted dot in the row
+        or the column.
+        """
+        from labapp.core.surface import kernels
+
+        return kernels.hits(pattern, self.scene.plane_mm, self.absent, gate)
+
+    def fitted(self, quadrics: FloatArray) -> FloatArray:
+        """Fit quadrics to the dots that their rays next to the reference fall near."""
+        from labapp.core.surface import kernels
+
+        laser, places = self.scene.rig.laser.position_mm, self.scene.plane_mm
+        center, plane = self.landing_mm[:2], self.plane
+        bench = self.rays, laser, plane, places, self.absent
+        return kernels.fit_quadrics(center, quadrics, *bench, LOOSE)
+
+    def judged(self, quadrics: FloatArray) -> Iterator[QuadricGuess]:
+        """Hold quadrics against the dots; yield those that explain the dots round the hole."""
+        patterns = self.met(quadrics, self.rays.reshape(-1, 3))[1]
+        patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
+        for pattern, *found in zip(patterns, *self.hits(patterns, TIGHT), strict=True):
+            if found[0][self.core].sum() >= 6:
+                yield self._guess(pattern, *found)
+
+    def _guess(
+        self, pattern: FloatArray, hit: BoolArray, dot: IntArray, off: FloatArray
+    ) -> QuadricGuess:
+        own = np.where(hit, dot, UNLABELLED)
+        chosen, count = np.unique(own[hit], return_counts=True)
+        own[np.isin(own, chosen[count > 1])] = UNLABELLED
+        # A ray next to the hole that should show its dot and does not speaks against the quadric.
+        seen = self.scene.in_view(np.nan_to_num(pattern, nan=1e6)) & ~self.absent
+        silent = np.sum((seen & ~hit)[self.core])
+        nearness = 1 - np.mean(off[hit])
+        # Farther out the pool is no quadric, and the next row's dots may be hit instead.
+        core = (self.core[0], slice(self.core[1].start - 1, self.core[1].stop + 1))
+        near = np.full(own.shape, UNLABELLED)
+        near[core] = own[core]
+        labels = np.full(self.scene.rays.shape[:2], UNLABELLED, np.int64)
+        labels[self.part] = near
+        hits = float(np.sum(own != UNLABELLED) - 3.0 * silent + 4.0 * nearness)
+        return QuadricGuess(labels, hits)

@@ -1,0 +1,1 @@
+"""Rows and columns of the dots, found or corrected by hand."""

@@ -1,0 +1,1 @@
+"""The ways from matched dots to a surface, of one signature."""

@@ -1,0 +1,162 @@
+"""Interpolation reconstruction scheme: edge-points and one-point algorithms (ch. 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
+from labapp.core.schemes.slopes import (
+    Estimate,
+    Paths,
+    ReflectedRays,
+    best_of_loops,
+    lines,
+    parents_along,
+    parents_from,
+    reflected_rays,
+    whole_pool,
+)
+from labapp.core.surface.boundary import BoundaryModel, boundary_on_work_piece
+from labapp.core.surface.interpolation import CloughTocherSurface
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
+
+Algorithm = Literal["opa", "epa-r", "epa-c", "epa-rc"]
+"""One-point algorithm; edge-points algorithm with row slopes, column slopes or both."""
+
+Move = Callable[[FloatArray, FloatArray], FloatArray]
+"""Step 2: normals and distances before, to distances of the slope-oriented points."""
+
+
+@dataclass(frozen=True)
+class IrsSettings:
+    """Settings of the interpolation scheme.
+
+    Parameters
+    ----------
+    algorithm
+        ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``.
+    loops
+        How many loops at most; they end when the reflection points have settled.
+    base_heights_mm
+        Heights of the base point that the one-point algorithm tries, mm.
+    are_margin
+        Heights whose ARE is within this share of the least explain the dots equally well, and
+        the one nearest z = 0 is taken of them; 0 takes the least ARE whatever it is worth.
+    boundary
+        Boundary model: ``piecewise`` (§6.3.2) or ``circle`` (§8.2.1).
+    """
+
+    algorithm: Algorithm = "opa"
+    loops: int = 100
+    base_heights_mm: tuple[float, ...] = tuple(k / 10 for k in range(-5, 6))
+    are_margin: float = 0.1
+    boundary: BoundaryModel = "piecewise"
+
+
+def reconstruct(match: Match, rig: Rig, settings: IrsSettings | None = None) -> Reconstruction:
+    """Reconstruct the pool surface by interpolation (Fig. 6-2).
+
+    The boundary lies on the work piece, z = 0; the whole surface is interpolated through
+    boundary and reflection points (§6.4).
+
+    Raises
+    ------
+    CannotMeasure
+        ``too-few-dots``, ``no-surface`` or ``no-boundary``.
+    """
+    settings = settings or IrsSettings()
+    rays = reflected_rays(match, rig)
+    if settings.algorithm == "opa":
+        moves = _one_point(match, rays, settings.base_heights_mm)
+    else:
+        moves = [(0.0, _edge_points(rays, settings.algorithm))]
+    estimates: list[tuple[float, Estimate]] = []
+    for height, move in moves:
+        estimate = best_of_loops(match, rig, rays, move, CloughTocherSurface, settings.loops)
+        if estimate is not None:
+            estimates.append((height, estimate))
+    best = _best(estimates, settings.are_margin)
+    boundary = boundary_on_work_piece(match, rig, settings.boundary)
+    return whole_pool("irs", match, rays, best, boundary)
+
+
+def lower_left(match: Match) -> int:
+    """Index of the dot in the lower left corner of the image, the base point's (§6.4.2).
+
+    The leftmost dot of the lowest reflected row; where no dot has a reflected row, of the row of
+    rays that lies lowest on the imaging plane.
+    """
+    row = match.reflected[:, 0]
+    if (row > 0).any():
+        lowest = row == row[row > 0].min()
+    else:
+        level = {i: match.plane_mm[match.ray[:, 0] == i, 1].mean() for i in match.ray[:, 0]}
+        lowest = match.ray[:, 0] == min(level, key=lambda i: level[i])
+    return int(np.argmin(np.where(lowest, match.plane_mm[:, 0], np.inf)))
+
+
+def _best(estimates: list[tuple[float, Estimate]], are_margin: float) -> Estimate:
+    """Of (base height, estimate), the one of least ARE; of equals the one nearest z = 0."""
+    if not estimates:
+        raise CannotMeasure("no-surface", "the reflection points diverge from the first loop on")
+    least = min(estimate.are_mm for _, estimate in estimates)
+    equals = [pair for pair in estimates if pair[1].are_mm <= least * (1 + are_margin)]
+    return min(equals, key=lambda pair: (abs(pair[0]), pair[1].are_mm))[1]
+
+
+def _one_point(
+    match: Match, rays: ReflectedRays, heights_mm: tuple[float, ...]
+) -> list[tuple[float, Move]]:
+    """One-point algorithm: all points from one, whose height is tried (Fig. 6-6)."""
+    paths = Paths.along(parents_from(rays.ray, lower_left(match)), rays.direction)
+
+    def move_from(height_mm: float) -> Move:
+        start = rays.distance_at(height_mm)
+        return lambda normals, _: paths.follow(normals, start)
+
+    return [(height_mm, move_from(height_mm)) for height_mm in heights_mm]
+
+
+def _edge_points(rays: ReflectedRays, algorithm: Algorithm) -> Move:
+    """Edge-points algorithm: all points from the ends of their row or column (Fig. 6-5)."""
+    rows, columns = lines(rays.ray, axis=0), lines(rays.ray, axis=1)
+    row_paths, column_paths = _both_ways(rows, rays), _both_ways(columns, rays)
+    edge = _ends(rows, len(rays.ray))
+
+    def move(normals: FloatArray, before: FloatArray) -> FloatArray:
+        # `before` is z = 0 in the first loop, and the loop before's positions from then on.
+        by_rows = _mean(row_paths, normals, before)
+        if algorithm == "epa-r":
+            return by_rows
+        by_columns = _mean(column_paths, normals, np.where(edge, before, by_rows))
+        return by_columns if algorithm == "epa-c" else (by_rows + by_columns) / 2
+
+    return move
+
+
+def _both_ways(chains: list[IntArray], rays: ReflectedRays) -> tuple[Paths, Paths]:
+    """Paths that follow each chain from its one end and from its other."""
+    reverse = [chain[::-1] for chain in chains]
+    return (
+        Paths.along(parents_along(chains), rays.direction),
+        Paths.along(parents_along(reverse), rays.direction),
+    )
+
+
+def _mean(paths: tuple[Paths, Paths], normals: FloatArray, base: FloatArray) -> FloatArray:
+    """Average of the two positions that the two base points of a chain give."""
+    return (paths[0].follow(normals, base) + paths[1].follow(normals, base)) / 2
+
+
+def _ends(rows: list[IntArray], count: int) -> BoolArray:
+    """Which points are edge points: the first and the last of each row."""
+    edge = np.zeros(count, bool)
+    for row in rows:
+        edge[row[[0, -1]]] = True
+    return edge

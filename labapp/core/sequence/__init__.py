@@ -1,0 +1,1 @@
+"""Frames that follow each other: each measured from the one before."""

@@ -1,0 +1,259 @@
+"""What a measured frame leaves to the next, and how the next one's dots are found with it.
+
+A pool that swings is carried on as it swung (`predictions`). Where that does not find the dots, as
+at the start, they are followed from the absent one outwards, ring by ring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled
+from labapp.core.geometry.rig import Rig
+from labapp.core.images.band_pass import Exposure
+from labapp.core.images.dots import Image
+from labapp.core.match import Match
+from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
+from labapp.core.sequence.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, met
+from labapp.core.sequence.warm_match import around, filled, tracked
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.pool_fit import Level, find_level
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.spline import SplineSurface
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
+
+FOUND = 0.85
+"""Share of the dots of the frame before that must be found again."""
+
+STEADY = 0.2
+"""… and half of them within this share of the way to the next dot of where they were predicted."""
+
+FIRST_RING, GROWING_ROUNDS, GROWN_FROM = 2, 3, 12
+"""Where no prediction finds the dots, they are first looked for so near the absent one, in so many
+rounds a ring, from so many surfaces of the past."""
+
+MEMORY, ORDER, TEACHERS = 32, 8, 3
+"""Frames that predictions are learnt from, and from how many of them, at most, one is made; every
+so-many-th lit ray tells as much as all."""
+
+
+class Broken(Exception):
+    """A track does not lead to this frame; says why in a sentence."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """What a frame leaves to the next.
+
+    Parameters
+    ----------
+    bed
+        Splines and rays.
+    exposure
+        Size of dots and noise.
+    match
+        Of the cold chain, where the track began.
+    residual_mm
+        Root mean square residual there, mm.
+    pool, lit, boundary, level
+        The last surface, the rays that had dots, where the pool ends, and z = 0.
+    past, slopes
+        Spline coefficients of the last frames, the newest last, shape (frames, p), mm, and the
+        slopes of those surfaces where rays met them, shape (frames, R, 2).
+    open_mm
+        How far the level was left open when it was last asked how deep the rear lies, mm.
+    free_mm
+        Uncertainty of the height where each ray meets the surface, its level apart, as it was last
+        worked out, shape (R,), mm; NaN where it never was. It changes slowly.
+    unseen
+        Frames since the absent ray's place was last seen dark amid four lit ones.
+    count
+        Frames that were followed.
+    """
+
+    bed: Bed
+    exposure: Exposure
+    match: Match
+    residual_mm: float
+    pool: WarmPool
+    lit: BoolArray
+    boundary: Boundary
+    level: Level
+    past: FloatArray
+    slopes: FloatArray
+    open_mm: float
+    free_mm: FloatArray
+    unseen: int = 0
+    count: int = 0
+
+
+def begin(
+    image: Image, measurement: Measurement, rig: Rig, settings: Settings, former: Track | None
+) -> Track | None:
+    """Start a track from a frame that the cold chain measured; None where none can be.
+
+    What is remembered of a ``former`` track, of the frames just before, stays.
+    """
+    match, made = measurement.match, measurement.reconstruction
+    if match is None or made is None or not isinstance(made.whole, SplineSurface):
+        return None
+    if settings.dots.method != "band-pass" or rig.pattern.marker is None:
+        return None
+    own, pool = Bed.of(rig, made.whole.basis, settings.fit), None
+    if former is not None and np.array_equal(own.at, former.bed.at):
+        bed, pool = former.bed, _moved_to(former, match, made)
+    if pool is None:
+        former, bed = None, own
+        pool = met(bed, made.whole.coefficients, bed.landing_mm, 4)
+    witness = match.witness[tuple(bed.at.T)]
+    told = witness != 0
+    surface = SplineSurface(bed.basis, pool.coefficients)
+    level = find_level(surface, bed.landing_mm[told, :2], witness[told], bed.spacing_mm)
+    if former is None:
+        past, before = np.empty((0, len(pool.coefficients))), np.empty((0, *pool.slopes.shape))
+    else:
+        past, before = former.past[1 - MEMORY :], former.slopes[1 - MEMORY :]
+    return Track(
+        bed=bed,
+        exposure=Exposure.of(image, settings.dots.band_pass),
+        match=match,
+        residual_mm=rms(made.residual_mm),
+        pool=pool,
+        lit=witness > 0,
+        boundary=made.boundary,
+        level=level,
+        past=np.vstack([past, pool.coefficients]),
+        slopes=np.concatenate([before, pool.slopes[None]]),
+        open_mm=level.sigma_mm,
+        free_mm=np.full(len(bed.at), np.nan),
+    )
+
+
+def _moved_to(former: Track, match: Match, made: Reconstruction) -> WarmPool | None:
+    """The surface of a cold fit in the splines of a former track; None if they have no place."""
+    bed = former.bed
+    number = {(i, j): k for k, (i, j) in enumerate((bed.at + 1).tolist())}
+    rays = [number.get((i, j)) for i, j in match.ray.tolist()]
+    if None in rays:
+        return None
+    ray = np.array(rays, np.int64)
+    points = bed.landing_mm.copy()
+    points[ray] = made.points_mm
+    start = replace(former.pool, points_mm=points)
+    slopes = Slopes.of(bed, ray, match.plane_mm, match.plane_covariance_mm2)
+    try:
+        pool, _, moved = fit_slopes_to(bed, start, slopes)
+    except CannotMeasure:
+        return None
+    lower_by = float(np.mean(made.points_mm[:, 2] - pool.points_mm[ray, 2]))
+    pool = met(bed, pool.coefficients + lower_by, pool.points_mm, 4)
+    return pool if moved < UNSETTLED_MM else None
+
+
+def rms(residual: FloatArray) -> float:
+    """Root mean square length of residuals, shape (n, 2)."""
+    return float(np.sqrt(np.mean(np.sum(residual**2, axis=-1))))
+
+
+def predictions(track: Track) -> Iterator[FloatArray]:
+    """Spline coefficients that the next frame may have, the likeliest first.
+
+    A pool that swings goes on as it did: a linear recurrence, learnt from the frames before on the
+    slopes at lit rays, carries any few oscillations on.
+    """
+    past, order = track.past, min(ORDER, len(track.past) // 2)
+    if order > 2:
+        teachers = np.flatnonzero(track.lit)[::TEACHERS]
+        gram, right = recurrence(track.slopes, teachers, order)
+        gram[np.diag_indices(order)] += 1e-4 * np.trace(gram)
+        ratio = np.linalg.solve(gram, right)
+        mean = past.mean(axis=0)
+        yield mean + ratio @ (past[: -order - 1 : -1] - mean)
+    if len(past) > 1:
+        yield 2 * past[-1] - past[-2]
+    yield past[-1]
+
+
+@compiled(
+    types.Array(types.float64, 3, "A", readonly=True),
+    types.Array(types.int64, 1, "A", readonly=True),
+    types.int64,
+)
+def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of the linear recurrence by which frames follow on each other.
+
+    Of the slopes of some rays in M frames, shape (M, R, 2), each over its mean: shapes
+    (order, order) and (order,), the newest of the frames that are followed first.
+    """
+    gram, right = np.zeros((order, order)), np.zeros(order)
+    own = np.empty(len(slopes))
+    for ray in rays:
+        for axis in range(2):
+            mean = 0.0
+            for m in range(len(slopes)):
+                own[m] = slopes[m, ray, axis]
+                mean += own[m] / len(slopes)
+            for m in range(len(slopes)):
+                own[m] -= mean
+            for k in range(order):
+                for m in range(order, len(slopes)):
+                    right[k] += own[m - 1 - k] * own[m]
+                for other in range(k + 1):
+                    product = 0.0
+                    for m in range(order, len(slopes)):
+                        product += own[m - 1 - k] * own[m - 1 - other]
+                    gram[k, other] += product
+    for k in range(order):
+        for other in range(k):
+            gram[other, k] = gram[k, other]
+    return gram, right
+
+
+def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
+    """A surface that finds the dots again, the rays that gives them, and how far dots are off.
+
+    That is the median share of the way to the next dot, from where they were foreseen. Where none
+    that is foreseen finds them, one is grown from the last surface, and from those before it: then
+    dots were nowhere foreseen, and it is infinite.
+    """
+    bed, count = track.bed, int(track.lit.sum())
+    own, looked_for = filled(bed, track.lit), around(bed, track.lit, 2)
+    for coefficients in predictions(track):
+        pool = met(bed, coefficients, track.pool.points_mm, 1)
+        labels, off = tracked(scene, pool, own, looked_for)
+        if len(off) >= FOUND * count and (half := median(off)) < STEADY:
+            return pool, labels, half
+    found = 0
+    for coefficients in track.past[: -GROWN_FROM - 1 : -1]:
+        pool, labels = _grown(track, scene, coefficients)
+        found = max(found, int(np.sum(labels != UNLABELLED)))
+        if found >= max(FOUND * count, LEAST_DOTS):
+            return pool, labels, np.inf
+    raise Broken(f"{found} of {count} dots were found again")
+
+
+def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, IntArray]:
+    """Find the dots again from the absent one outwards, ring by ring.
+
+    Dots in the middle move least from frame to frame; how they moved tells how those around do.
+    """
+    bed = track.bed
+    pool = met(bed, start, track.pool.points_mm)
+    ring = np.abs(bed.at + 1 - np.array(bed.rig.pattern.marker)).max(axis=1)
+    looked_for = around(bed, track.lit, 2)
+    labels = np.full(len(ring), UNLABELLED)
+    for reach in range(FIRST_RING, int(ring[track.lit].max()) + 2):
+        labels, _ = tracked(scene, pool, track.lit & (ring <= reach), looked_for)
+        ray = np.flatnonzero(labels != UNLABELLED)
+        if len(ray) < LEAST_DOTS:
+            break
+        dot = labels[ray]
+        slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+        pool, _, _ = fit_slopes_to(bed, pool, slopes, GROWING_ROUNDS, start)
+    return pool, labels

@@ -1,0 +1,399 @@
+"""Frames one after the other: each measured from where the one before left off.
+
+The cold chain (`pipeline.measure`) looks for dots, rows and rays in every frame as if it were the
+first. Here the surface of the frames before predicts where every ray's dot should be; found there,
+the dots have their rays, and the fit starts from that surface. An answer is given only where the
+absent ray's place is dark amid lit ones, and where no more is left unexplained than the cold chain
+puts up with. Anything else, and the cold chain measures the frame.
+
+The same frames give the same answers: nothing depends on the clock or on how many are measured at
+once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
+from labapp.core.images.band_pass import quick_dots
+from labapp.core.images.dot_size import estimate_size
+from labapp.core.images.dots import Image
+from labapp.core.match import Match, Trial, ways
+from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.rows.lattice import Lattice
+from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
+from labapp.core.sequence.track import MEMORY, Broken, Track, begin, found_again, rms
+from labapp.core.sequence.warm_fit import (
+    Bed,
+    Slopes,
+    WarmPool,
+    fit_slopes_to,
+    lay,
+    met,
+)
+from labapp.core.sequence.warm_match import beyond, testimony, widened
+from labapp.core.surface import kernels, measures
+from labapp.core.surface.measures import scaled_errors
+from labapp.core.surface.pool_fit import Level, place_level
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.rim import follow_rim
+from labapp.core.surface.sizes import sizes_of
+from labapp.core.surface.solver import SERVES_MM, sigma_of
+from labapp.core.surface.spline import SplineSurface
+from labapp.core.values import CannotMeasure, FloatArray, IntArray
+
+WORSE = 2.0
+"""The residual of a track is at most so many times that of its first frame."""
+
+HELD = 8
+"""For so many frames the datum is carried on while a dot beside the absent one is not seen."""
+
+FORESEEN = 0.1
+"""So near half of the dots must be to where they were foreseen, of the way to the next one, for the
+datum to be carried on: a pool that has gone on by a row lights other rays, and all of them fit."""
+
+SINKS_EVERY = 16
+"""Every so many frames it is asked anew whether the rear sinks."""
+
+WINDOW = 0.4
+"""How far from the last frame's level it is looked for first (`place_level`)."""
+
+POINTS_EVERY = 8
+"""Every so many frames the uncertainty of the reflection points is worked out anew."""
+
+ROUGHLY_MM = 0.03
+"""Where no reflection point moved by more, what is left to move does not change which dots have
+which rays."""
+
+WIDENINGS, MANY = 3, 4
+"""Where so many dots at once are found to have rays, others beyond them may: it is looked again, so
+often at most."""
+
+RAISED_MM = 0.01
+"""After a shift of the level by more, the slopes are fitted once more."""
+
+Passed = Callable[[str], None]
+
+
+class WarmChain:
+    """Measures the frames of one recording in their order.
+
+    Parameters
+    ----------
+    rig, calibration
+        The bench, and how the camera sees the imaging plane.
+    settings
+        Of the cold chain. Only the fit to band-passed dots, the default, can be followed.
+    passed
+        Told the name of each step of a followed frame when it is done: dots, match, fit, level,
+        measures.
+
+    Attributes
+    ----------
+    broke
+        Why the last frame was measured by the cold chain; None where it was followed.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        calibration: ImageCalibration,
+        settings: Settings,
+        passed: Passed = lambda _: None,
+    ) -> None:
+        self.rig, self.calibration, self.settings = rig, calibration, settings
+        self._passed = passed
+        self.broke: str | None = None
+        self._track: Track | None = None
+
+    def follow(self, image: Image) -> Measurement | None:
+        """Measure the next frame from those before; None where they do not lead to it.
+
+        That takes no longer, and a frame after it may be followed again.
+        """
+        try:
+            if self._track is None:
+                raise Broken("no frame before it was measured")
+            measurement, self._track = follow(
+                image, self._track, self.calibration, self.settings, self._passed
+            )
+            self.broke = None
+            return measurement
+        except (Broken, CannotMeasure, np.linalg.LinAlgError) as reason:
+            self.broke = str(reason)
+            return None
+
+    def measure(self, image: Image) -> Measurement:
+        """Measure the next frame; see `pipeline.measure`."""
+        found = self.follow(image)
+        if found is not None:
+            return found
+        settings = _with_size(self.settings, image)
+        measurement = measure(image, self.rig, self.calibration, settings)
+        if measurement.status == "ok":
+            self._track = begin(image, measurement, self.rig, settings, self._track)
+        elif self._track is not None:
+            track, unseen = self._track, self._track.unseen + 1
+            past, slopes = track.past[-1:], track.slopes[-1:]
+            kept = replace(track, unseen=unseen, past=past, slopes=slopes)
+            self._track = kept if unseen <= HELD else None
+        return measurement
+
+
+def _with_size(settings: Settings, image: Image) -> Settings:
+    """The settings with the size of the frame's dots, which a search and a track ask for alike."""
+    dots = settings.dots
+    if dots.method != "band-pass" or dots.band_pass.size_px:
+        return settings
+    size = estimate_size(image)
+    band_pass = replace(dots.band_pass, size_px=size)
+    return replace(settings, dots=replace(dots, band_pass=band_pass))
+
+
+# --- one frame ----------------------------------------------------------------------------------
+
+
+def follow(
+    image: Image,
+    track: Track,
+    calibration: ImageCalibration,
+    settings: Settings,
+    passed: Passed = lambda _: None,
+) -> tuple[Measurement, Track]:
+    """Measure a frame from the one before.
+
+    Raises
+    ------
+    Broken
+        If the track does not lead here.
+    CannotMeasure
+        If there are no dots, or no surface.
+    """
+    bed = track.bed
+    if image.shape != track.exposure.noise.shape:
+        raise Broken("the frame has another size than the one before")
+    dots = quick_dots(image, track.exposure, settings.dots.band_pass)
+    passed("dots")
+    scene = Scene.of(dots, bed.rig, calibration, (image.shape[0], image.shape[1]))
+    pool, labels, off = found_again(track, scene)
+    passed("match")
+    pool, labels, lower = _fitted(bed, scene, pool, labels)
+    passed("fit")
+    heard = testimony(bed, scene, pool, labels)
+    level, open_mm = _level(track, pool, heard.witness)
+    outside = beyond(bed, _shifted(pool, level), level, labels, track.lit)
+    if len(outside) or abs(level.shift_mm) > RAISED_MM:
+        labels[outside] = UNLABELLED
+        pool, lower = _settled(bed, _shifted(pool, level), _slopes(bed, scene, labels))
+        heard = testimony(bed, scene, pool, labels)
+        level, open_mm = _level(track, pool, heard.witness)
+    pool = met(bed, pool.coefficients + level.shift_mm, pool.points_mm, 1)
+    passed("level")
+    ray = np.flatnonzero(labels != UNLABELLED)
+    dot = labels[ray]
+    residual = pool.plane_mm[ray] - scene.plane_mm[dot]
+    limits = settings.match
+    if heard.stray > limits.stray[0] + limits.stray[1] * len(dots):
+        raise Broken(f"{heard.stray} dots have no ray")
+    if heard.missed > limits.missed[0] + limits.missed[1] * len(ray):
+        raise Broken(f"{heard.missed} rays amid the others have no dot")
+    if not rms(residual) < WORSE * track.residual_mm:
+        raise Broken("the surface no longer has the dots")
+    unseen = 0 if _datum_seen(bed, scene, pool, labels, off) else track.unseen + 1
+    if unseen > HELD:
+        raise Broken("the dots beside the absent one have not been seen for long")
+    match = _match(track, scene, heard.witness, ray, dot, rms(residual))
+    track = _with_uncertainty(track, pool, ray, lower)
+    reconstruction, size = _sized(track, pool, level, lower, match, residual, ray)
+    after = replace(
+        track,
+        pool=pool,
+        lit=labels != UNLABELLED,
+        boundary=reconstruction.boundary,
+        level=level,
+        past=np.vstack([track.past[1 - MEMORY :], pool.coefficients]),
+        slopes=np.concatenate([track.slopes[1 - MEMORY :], pool.slopes[None]]),
+        open_mm=open_mm,
+        unseen=unseen,
+        count=track.count + 1,
+    )
+    lattice = _lattice(match, bed.rig, len(dots))
+    told = Measurement("ok", "", "fit", dots, lattice, match, reconstruction, size)
+    passed("measures")
+    return told, after
+
+
+def _shifted(pool: WarmPool, level: Level) -> WarmPool:
+    return replace(pool, coefficients=pool.coefficients + level.shift_mm)
+
+
+def _fitted(
+    bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray
+) -> tuple[WarmPool, IntArray, FloatArray]:
+    """Fit the surface, roughly first, and then with the labels that it bears out."""
+    slopes, serves = _slopes(bed, scene, labels), None
+    for _ in range(WIDENINGS):
+        pool, lower, moved = fit_slopes_to(bed, pool, slopes, until_mm=ROUGHLY_MM)
+        serves = lower if moved < SERVES_MM else None
+        before, labels = labels, widened(bed, scene, pool, lower, labels)
+        if np.array_equal(labels, before):
+            break
+        slopes, serves = _slopes(bed, scene, labels), None
+        if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
+            break
+    pool, lower = _settled(bed, pool, slopes, serves)
+    return pool, labels, lower
+
+
+def _settled(
+    bed: Bed, pool: WarmPool, slopes: Slopes, lower: FloatArray | None = None
+) -> tuple[WarmPool, FloatArray]:
+    pool, lower, moved = fit_slopes_to(bed, pool, slopes, lower=lower)
+    if not moved < UNSETTLED_MM:
+        raise Broken("the surface does not settle")
+    return pool, lower
+
+
+def _slopes(bed: Bed, scene: Scene, labels: IntArray) -> Slopes:
+    ray = np.flatnonzero(labels != UNLABELLED)
+    if len(ray) < LEAST_DOTS:
+        raise Broken("hardly a dot is left that has a ray")
+    dot = labels[ray]
+    return Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+
+
+def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, float]:
+    """Where z = 0 lies on the fitted surface, and how far that was open when the rear was free.
+
+    How deep the rear lies is not asked every time; in between the level is known no better.
+    """
+    told = witness != 0
+    if not (witness < 0).any():
+        raise Broken("no ray that would show stayed away")
+    bed, before = track.bed, track.level
+    height, slope = lay(bed, pool.coefficients)
+    free = track.count % SINKS_EVERY == SINKS_EVERY - 1
+    drop = None if free else before.rear.drop_mm
+    y, about = bed.landing_mm[told, 1], (0.0, before.sign)
+    told_by = height[told], slope[told], y, witness[told]
+    level = place_level(*told_by, bed.spacing_mm, drop, about, WINDOW)
+    open_mm = level.sigma_mm if free else track.open_mm
+    return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
+
+
+def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, off: float) -> bool:
+    """Whether all four neighbours of the absent ray are lit.
+
+    Raises
+    ------
+    Broken
+        If the absent ray's place is lit; or a neighbour is dark and the dots are not where they
+        were foreseen, or three are: no hole tells the rows then (`lattice.find_holes`).
+    """
+    if bed.hole is None:
+        raise Broken("the absent ray is at the pool's edge")
+    hole, beside = bed.hole[0], bed.hole[1:]
+    lit = labels[beside] != UNLABELLED
+    reach = min(
+        float(np.linalg.norm(pool.plane_mm[a] - pool.plane_mm[b])) / 2
+        for a, b in beside.reshape(2, 2)
+    )
+    if not np.linalg.norm(scene.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
+        raise Broken("a dot is where the absent one should be dark")
+    if lit.sum() < (2 if off < FORESEEN else 4):
+        raise Broken("the dots beside the absent one are not seen")
+    return bool(lit.all())
+
+
+# --- what is told of it -------------------------------------------------------------------------
+
+
+def _match(
+    track: Track,
+    scene: Scene,
+    witness: IntArray,
+    ray: IntArray,
+    dot: IntArray,
+    residual_mm: float,
+) -> Match:
+    bed, first = track.bed, track.match
+    marker = np.array(bed.rig.pattern.marker)
+    numbers = (bed.at[ray] + 1 - marker) * ways(first.orientation)
+    said = np.zeros((bed.rig.pattern.rows, bed.rig.pattern.columns), np.int64)
+    said[tuple(bed.at.T)] = witness
+    others = tuple(t for t in first.trials if t.orientation != first.orientation)
+    return Match(
+        orientation=first.orientation,
+        dot=dot,
+        ray=bed.at[ray] + 1,
+        reflected=numbers + 1 - numbers.min(axis=0),
+        plane_mm=scene.plane_mm[dot],
+        plane_covariance_mm2=scene.covariance_mm2[dot],
+        witness=said,
+        trials=(Trial(first.orientation, residual_mm), *others),
+    )
+
+
+def _lattice(match: Match, rig: Rig, count: int) -> Lattice:
+    """Rows and columns of all dots (`correspondence.indexed_lattice`)."""
+    way = ways(match.orientation)
+    k, t = np.array(rig.pattern.marker) * way + (match.reflected - match.ray * way)[0]
+    row, column = np.zeros((2, count), np.int64)
+    row[match.dot], column[match.dot] = match.reflected.T
+    at = np.lexsort(match.reflected.T[::-1])
+    step = np.diff(match.reflected[at], axis=0)
+    gaps = match.reflected[at][1:, 0][(step[:, 0] == 0) & (step[:, 1] > 2)]
+    site = (int(k), int(t))
+    return Lattice(row, column, site, (site,), frozenset(np.unique(gaps).tolist()))
+
+
+def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatArray) -> Track:
+    """Work out how uncertain reflection points are, every now and then or where it is not known."""
+    if track.count % POINTS_EVERY and np.isfinite(track.free_mm[ray]).all():
+        return track
+    splines, values = kernels.splines_at(track.bed.basis.grid, pool.points_mm[ray, :2])
+    at_points = np.zeros((len(ray), len(pool.coefficients)))
+    np.put_along_axis(at_points, splines, values[0], axis=1)
+    free = track.free_mm.copy()
+    free[ray] = sigma_of(lower, at_points, at_points.mean(axis=0), 0.0)
+    return replace(track, free_mm=free)
+
+
+def _sized(
+    track: Track,
+    pool: WarmPool,
+    level: Level,
+    lower: FloatArray,
+    match: Match,
+    residual: FloatArray,
+    ray: IntArray,
+) -> tuple[Reconstruction, measures.Measures]:
+    """Boundary, sizes and all their ±."""
+    bed, coefficients = track.bed, pool.coefficients
+    points = pool.points_mm[ray]
+    center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+    boundary, climb = follow_rim(bed.basis, coefficients, level, center, track.boundary)
+    sizes = sizes_of(bed.basis, coefficients, level, boundary, climb)
+    if not sizes.holds:
+        raise Broken("the surface comes down to the work piece within its boundary")
+    share = np.full(len(ray), 1 / len(ray))
+    level_at = kernels.gradient_of_sum(bed.basis.grid, len(coefficients), points[:, :2], share)
+    made = Reconstruction(
+        scheme="fit",
+        surface=SplineSurface(bed.basis, coefficients),
+        boundary=boundary,
+        ray=match.ray,
+        points_mm=points,
+        residual_mm=residual,
+        sigma_mm=np.hypot(track.free_mm[ray], level.sigma_mm),
+    )
+    sigma = sigma_of(lower, sizes.gradient, level_at, level.sigma_mm)
+    # As `measures.reflection_scale` has it; where the rays land is known.
+    scale = np.ptp(bed.landing_mm[ray, :2], axis=0) / np.ptp(match.plane_mm, axis=0)
+    errors = scaled_errors(made, scale)
+    return made, measures.measures_of(errors, sizes.size, sizes.peak_mm, center, sigma)

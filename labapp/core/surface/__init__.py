@@ -1,0 +1,1 @@
+"""The surface under the reflections: splines, fit, level, boundary, sizes."""

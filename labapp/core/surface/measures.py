@@ -1,0 +1,310 @@
+"""Reconstruction → Measures: reflection errors and the pool's size (Eq. 6-3 … 6-8, §7.3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.surface import Surface
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+
+RINGS = 16
+"""Samples along each radius; Gauss–Legendre, so that smooth pools are integrated exactly."""
+
+STENCIL_MM = 0.1
+"""Half the size of the patch that an extreme is refined on."""
+
+
+@dataclass(frozen=True)
+class ReflectionErrors:
+    """How far the computed dots are from the captured ones, mapped onto the work piece.
+
+    Parameters
+    ----------
+    are_mm, mre_mm
+        Average and maximum reflection error (Eq. 6-3, 6-4), mm.
+    are_inner_mm, mre_inner_mm
+        The same without the first and the last row and both ends of each row (ARE-I, MRE-I of
+        §6.4.2), mm; NaN if nothing is left.
+    per_dot_mm
+        E_ij of each reflection point (Eq. 6-5), shape (n,), mm; NaN, and in none of the above,
+        where the ray does not meet the surface.
+    scale
+        See `reflection_scale`, shape (2,).
+    """
+
+    are_mm: float
+    mre_mm: float
+    are_inner_mm: float
+    mre_inner_mm: float
+    per_dot_mm: FloatArray
+    scale: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is told of one pool. Lengths in mm, z over the work piece.
+
+    Parameters
+    ----------
+    are_mm, mre_mm, are_inner_mm, mre_inner_mm
+        Reflection errors, see `ReflectionErrors`.
+    width_mm, length_mm
+        Extent of the boundary along X and along Y.
+    height_mm, depth_mm
+        Largest and smallest z within the boundary and on it.
+    area_mm2
+        Area within the boundary, seen from above.
+    volume_mm3
+        Integral of z over that area: negative for a concave pool.
+    center_x_mm, center_y_mm
+        The "center point of the weld pool" (§7.2): origin of the boundary's polar coordinates.
+    peak_x_mm, peak_y_mm
+        Where the surface is farthest from the work piece: the highest point of a convex pool,
+        the lowest of a concave one.
+    width_sigma_mm, length_sigma_mm, height_sigma_mm, depth_sigma_mm
+        Standard uncertainties, noise and level only; NaN where the scheme gives none.
+    area_sigma_mm2, volume_sigma_mm3
+        The same of area and volume.
+    own_are_mm
+        See `Reconstruction`; NaN where the scheme gives none.
+    scale_x, scale_z
+        What takes a residual along X′, Z′ to the error along X, Y on the work piece: W_p/W_r and
+        L_p/L_r (Eq. 6-5). NaN in results of versions that did not keep them.
+    """
+
+    are_mm: float
+    mre_mm: float
+    are_inner_mm: float
+    mre_inner_mm: float
+    width_mm: float
+    length_mm: float
+    height_mm: float
+    depth_mm: float
+    area_mm2: float
+    volume_mm3: float
+    center_x_mm: float
+    center_y_mm: float
+    peak_x_mm: float
+    peak_y_mm: float
+    width_sigma_mm: float
+    length_sigma_mm: float
+    height_sigma_mm: float
+    depth_sigma_mm: float
+    area_sigma_mm2: float
+    volume_sigma_mm3: float
+    own_are_mm: float = math.nan
+    scale_x: float = math.nan
+    scale_z: float = math.nan
+
+
+def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
+    """Measure a reconstructed pool."""
+    errors = reflection_errors(reconstruction, match, rig)
+    boundary = reconstruction.boundary
+    size, peak = size_of(reconstruction.whole, boundary)
+    made = measures_of(errors, size, peak, boundary.center_mm, reconstruction.size_sigma)
+    return replace(made, own_are_mm=reconstruction.own_are_mm)
+
+
+def measures_of(
+    errors: ReflectionErrors,
+    size: FloatArray,
+    peak_mm: FloatArray,
+    center_mm: FloatArray,
+    sigma: FloatArray,
+) -> Measures:
+    """Write down errors, what `size_of` gave, the centre, and the σ of each size, shape (6,)."""
+    return Measures(
+        are_mm=errors.are_mm,
+        mre_mm=errors.mre_mm,
+        are_inner_mm=errors.are_inner_mm,
+        mre_inner_mm=errors.mre_inner_mm,
+        width_mm=float(size[0]),
+        length_mm=float(size[1]),
+        height_mm=float(size[2]),
+        depth_mm=float(size[3]),
+        area_mm2=float(size[4]),
+        volume_mm3=float(size[5]),
+        center_x_mm=float(center_mm[0]),
+        center_y_mm=float(center_mm[1]),
+        peak_x_mm=float(peak_mm[0]),
+        peak_y_mm=float(peak_mm[1]),
+        width_sigma_mm=float(sigma[0]),
+        length_sigma_mm=float(sigma[1]),
+        height_sigma_mm=float(sigma[2]),
+        depth_sigma_mm=float(sigma[3]),
+        area_sigma_mm2=float(sigma[4]),
+        volume_sigma_mm3=float(sigma[5]),
+        scale_x=float(errors.scale[0]),
+        scale_z=float(errors.scale[1]),
+    )
+
+
+def reflection_scale(match: Match, rig: Rig) -> FloatArray:
+    """W_p/W_r and L_p/L_r: from the imaging plane to the work piece, shape (2,) (Eq. 6-7, 6-8).
+
+    The ranges of the projected dots on z = 0 along X and Y over those of the reflected dots along
+    X′ and Z′.
+    """
+    i, j = match.ray.T - 1
+    direction = ray_directions(rig.laser, rig.pattern)[i, j]
+    projected = meet_level(rig.laser.position_mm, direction)[:, :2]
+    return np.asarray(np.ptp(projected, axis=0) / np.ptp(match.plane_mm, axis=0))
+
+
+def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) -> ReflectionErrors:
+    """Reflection errors of any scheme's reconstruction (Eq. 6-3 … 6-8).
+
+    Only actual reflected dots count: the centre reference that IRS and ERS add is "not an actual
+    visible point" (§6.2), and its stand-in's error would say nothing.
+    """
+    return scaled_errors(reconstruction, reflection_scale(match, rig))
+
+
+def scaled_errors(reconstruction: Reconstruction, scale: FloatArray) -> ReflectionErrors:
+    """Reflection errors where the scale, shape (2,), is known (`reflection_scale`)."""
+    error = np.hypot(*(reconstruction.residual_mm * scale).T)
+    met = np.isfinite(error)
+    every, inner = error[met], error[met & _inner(reconstruction.ray)]
+    return ReflectionErrors(
+        are_mm=float(every.mean()) if len(every) else math.nan,
+        mre_mm=float(every.max()) if len(every) else math.nan,
+        are_inner_mm=float(inner.mean()) if len(inner) else math.nan,
+        mre_inner_mm=float(inner.max()) if len(inner) else math.nan,
+        per_dot_mm=error,
+        scale=scale,
+    )
+
+
+def _inner(ray: IntArray) -> BoolArray:
+    """Which points are neither in the first or last row nor at an end of their row, shape (n,)."""
+    order = np.lexsort(ray.T[::-1])
+    row = ray[order, 0]
+    first = np.concatenate([[True], row[1:] > row[:-1]])
+    last = np.concatenate([first[1:], [True]])
+    inner = np.empty(len(ray), bool)
+    inner[order] = ~first & ~last & (row > row[0]) & (row < row[-1])
+    return inner
+
+
+def size_of(surface: Surface, boundary: Boundary) -> tuple[FloatArray, FloatArray]:
+    """Width, length, height, depth, area, volume, shape (6,); and the peak's (x, y), shape (2,)."""
+    outline = boundary.points_mm
+    width, length = np.ptp(outline[:, :2], axis=0)
+    wedge = wedges(boundary)
+    node, weight = np.polynomial.legendre.leggauss(RINGS)
+    fraction = (node + 1) / 2
+    samples = _spokes(surface, boundary, fraction)
+    # ∫∫ z dA in triangles about the centre: each spoke stands for half of the two beside it.
+    volume = wedge @ (samples[..., 2] @ (weight * fraction))
+    points = np.vstack([samples.reshape(-1, 3), outline])
+    high = refined(surface.height, boundary, points[np.nanargmax(points[:, 2])], sign=1.0)
+    low = refined(surface.height, boundary, points[np.nanargmin(points[:, 2])], sign=-1.0)
+    peak = high if abs(high[2]) >= abs(low[2]) else low
+    return np.array([width, length, high[2], low[2], wedge.sum(), volume]), peak[:2]
+
+
+def wedges(boundary: Boundary) -> FloatArray:
+    """Area that each boundary point stands for, shape (m,), mm²; the sum is the polygon's."""
+    x, y = (boundary.points_mm[:, :2] - boundary.center_mm).T
+    after = (x * np.roll(y, -1) - y * np.roll(x, -1)) / 2
+    return np.asarray((after + np.roll(after, 1)) / 2)
+
+
+def _spokes(surface: Surface, boundary: Boundary, fraction: FloatArray) -> FloatArray:
+    """Surface points at fractions of the way from centre to boundary, shape (m, rings, 3)."""
+    offset = boundary.points_mm[:, None, :2] - boundary.center_mm
+    xy = boundary.center_mm + fraction[:, None] * offset
+    return np.concatenate([xy, surface.height(xy[..., 0], xy[..., 1])[..., None]], axis=-1)
+
+
+_PATCH = STENCIL_MM * np.mgrid[-1:2, -1:2].reshape(2, 9)
+_PARABOLOID = np.linalg.pinv(
+    np.stack([np.ones(9), *_PATCH, _PATCH[0] ** 2, _PATCH[0] * _PATCH[1], _PATCH[1] ** 2], axis=1)
+)[1:]
+"""Offsets of a patch's nine points; slopes and curvatures of the paraboloid through them."""
+
+
+def refined(
+    height: Callable[[FloatArray, FloatArray], FloatArray],
+    boundary: Boundary,
+    start_mm: FloatArray,
+    sign: float,
+) -> FloatArray:
+    """Extreme near a sample, shape (3,): the vertex of the paraboloid through a patch round it.
+
+    An extreme at the boundary, or where the patch has no vertex, stays where it is.
+    """
+    z = height(start_mm[0] + _PATCH[0], start_mm[1] + _PATCH[1])
+    if not np.isfinite(z).all():
+        return start_mm
+    b_x, b_y, c_xx, c_xy, c_yy = (_PARABOLOID @ z).tolist()
+    spread = math.hypot(c_xx - c_yy, c_xy)
+    if not -sign * (c_xx + c_yy) - spread > 1e-9:  # the smaller of twice its curvatures
+        return start_mm
+    area = 4 * c_xx * c_yy - c_xy * c_xy
+    vertex = np.array([c_xy * b_y - 2 * c_yy * b_x, c_xy * b_x - 2 * c_xx * b_y]) / area
+    at = start_mm[:2] + np.clip(vertex, -2 * STENCIL_MM, 2 * STENCIL_MM)
+    if not boundary.contains(at[0], at[1]):
+        return start_mm
+    refined = np.append(at, height(at[0], at[1]))
+    return refined if sign * refined[2] >= sign * start_mm[2] else start_mm
+
+
+def surface_grid(
+    reconstruction: Reconstruction, spacing_mm: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Nodes within the boundary of a grid through the origin: x, y, z, each shape (n,), mm."""
+    boundary = reconstruction.boundary
+    low = np.ceil(boundary.points_mm[:, :2].min(axis=0) / spacing_mm)
+    high = np.floor(boundary.points_mm[:, :2].max(axis=0) / spacing_mm)
+    x, y = np.meshgrid(*(np.arange(a, b + 1) * spacing_mm for a, b in zip(low, high, strict=True)))
+    inside = boundary.contains(x, y)
+    x, y = x[inside], y[inside]
+    return x, y, reconstruction.surface.height(x, y)
+
+
+def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[FloatArray, IntArray]:
+    """Triangles that end exactly at the boundary: rings of its shape about its centre.
+
+    Parameters
+    ----------
+    reconstruction
+        What to mesh.
+    spacing_mm
+        Largest distance between rings, mm; along a ring there is a vertex per boundary point.
+
+    Returns
+    -------
+    vertices, triangles
+        Shape (n, 3), mm, the centre first and the boundary last; and indices, shape (k, 3),
+        counter-clockwise seen from above.
+    """
+    boundary, surface = reconstruction.boundary, reconstruction.surface
+    radius = np.linalg.norm(boundary.points_mm[:, :2] - boundary.center_mm, axis=-1).max()
+    rings = max(int(np.ceil(radius / spacing_mm)), 1)
+    count = len(boundary.points_mm)
+    inner = _spokes(surface, boundary, np.arange(1, rings) / rings)
+    x, y = boundary.center_mm
+    centre = [x, y, surface.height(np.asarray(x), np.asarray(y))]
+    vertices = np.vstack([centre, inner.transpose(1, 0, 2).reshape(-1, 3), boundary.points_mm])
+    here = np.arange(count)
+    after = np.roll(here, -1)
+    triangles = [np.column_stack([np.zeros(count, int), 1 + here, 1 + after])]
+    for ring in range(rings - 1):
+        a, b = 1 + ring * count, 1 + (ring + 1) * count
+        triangles.append(np.column_stack([a + here, b + here, b + after]))
+        triangles.append(np.column_stack([a + here, b + after, a + after]))
+    return vertices, np.vstack(triangles)

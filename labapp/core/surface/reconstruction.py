@@ -1,0 +1,103 @@
+"""What every reconstruction scheme returns: `irs`, `ers` and `fit` share this one signature.
+
+``reconstruct(match: Match, rig: Rig, settings) -> Reconstruction``
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.surface import Surface
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+
+Scheme = Literal["fit", "ers", "irs"]
+
+
+ROUNDING = 1e-9
+"""Share of the way from the centre by which a place may lie beyond the boundary and be on it."""
+
+
+@dataclass(frozen=True)
+class BoundedSurface:
+    """A surface that ends at the pool's boundary: NaN outside it.
+
+    Parameters
+    ----------
+    whole
+        The surface, which may go on beyond.
+    boundary
+        Where it ends.
+    """
+
+    whole: Surface
+    boundary: Boundary
+
+    def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Height z at (x, y), arrays of one shape, mm."""
+        return np.where(self._within(x_mm, y_mm), self.whole.height(x_mm, y_mm), np.nan)
+
+    def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
+        within = self._within(x_mm, y_mm)[..., None]
+        return np.where(within, self.whole.gradient(x_mm, y_mm), np.nan)
+
+    def _within(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+        x, y = self.boundary.center_mm
+        place = np.array([np.subtract(x_mm, x), np.subtract(y_mm, y)]) * (1 - ROUNDING)
+        return self.boundary.contains(x + place[0], y + place[1])
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A pool surface and how far it explains the reflected dots.
+
+    Parameters
+    ----------
+    scheme
+        Which scheme made it.
+    surface
+        z = f(x, y); NaN outside the boundary, whatever surface it is made with (`whole`).
+    boundary
+        The pool's boundary.
+    ray
+        Ray (i, j) of each reflection point, counted from 1, shape (n, 2).
+    points_mm
+        Reflection points, UCS, shape (n, 3), mm. Those of IRS and ERS are where the scheme put
+        them; `surface`, which the boundary holds too, need not pass through them.
+    residual_mm
+        Computed minus captured reflected dot on the imaging plane (X′, Z′), shape (n, 2), mm:
+        where the ray goes from `surface`; NaN if it does not meet it within the boundary.
+    sigma_mm
+        Standard uncertainty of each reflection point's height, noise and level only, shape (n,),
+        mm; NaN where the scheme gives none.
+    size_sigma
+        Standard uncertainty of width, length, height, depth, area and volume, noise and level
+        only, shape (6,), mm, mm², mm³; NaN where the scheme gives none.
+    own_are_mm
+        ARE of the points as the scheme has them, with the surface through nothing else (step 4 of
+        §6.3.1 and §7.1), mm: what the text tells. NaN for fit, whose points are the surface's.
+    """
+
+    scheme: Scheme
+    surface: Surface
+    boundary: Boundary
+    ray: IntArray
+    points_mm: FloatArray
+    residual_mm: FloatArray
+    sigma_mm: FloatArray
+    size_sigma: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
+    own_are_mm: float = math.nan
+
+    def __post_init__(self) -> None:
+        freeze(self)
+        object.__setattr__(self, "surface", BoundedSurface(self.whole, self.boundary))
+
+    @property
+    def whole(self) -> Surface:
+        """The surface as the scheme made it, which may go on beyond the boundary."""
+        return self.surface.whole if isinstance(self.surface, BoundedSurface) else self.surface

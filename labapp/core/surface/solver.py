@@ -1,0 +1,222 @@
+"""The normal equations of the fit: which change of a surface the dots ask for.
+
+The normal matrix of the spline coefficients is a band, so that its Cholesky factor costs little.
+With one factor several rounds of the fit are solved: each takes the slopes where the rays now meet
+the surface, and solves for what they still ask for. Rounds end at the same surface whatever factor
+they are solved with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg.blas import dsbmv
+from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs
+
+from labapp.core.surface.spline import SplineBasis, SplineSurface
+from labapp.core.values import CannotMeasure, FloatArray
+
+SERVES_MM = 5e-3
+"""A factor serves for another round of a track where no reflection point has moved by more: that is
+small beside the splines' cells."""
+
+
+@dataclass
+class NormalEquations:
+    """Of n rays that meet a surface of p splines, and the dots they are to make.
+
+    Parameters
+    ----------
+    basis
+        The splines.
+    stiffness
+        Weight of the roughness times its matrix, lower band, shape (width + 1, p).
+    laser_mm
+        The laser, shape (3,), mm.
+    dots_mm
+        The dots in the UCS, shape (n, 3), mm.
+    weights
+        Inverse covariance of the slopes that follow from them, shape (n, 2, 2).
+    factor
+        Cholesky factor of the normal matrix (`normal_factor`); None: not known yet.
+    serves_mm
+        A factor serves for the next round where no reflection point has moved by more. An old one
+        lets what the dots leave nearly open run away, the sooner the surer the dots are.
+    """
+
+    basis: SplineBasis
+    stiffness: FloatArray
+    laser_mm: FloatArray
+    dots_mm: FloatArray
+    weights: FloatArray
+    factor: FloatArray | None = None
+    serves_mm: float = SERVES_MM
+
+    def improve(
+        self,
+        coefficients: FloatArray,
+        points_mm: FloatArray,
+        moved_mm: float,
+        rest: FloatArray | float = 0.0,
+    ) -> FloatArray:
+        """Solve once for the surface with the slopes that the dots ask for, shape (p,), mm.
+
+        Parameters
+        ----------
+        coefficients
+            The surface so far, shape (p,), mm.
+        points_mm
+            Where the rays meet it, shape (n, 3), mm.
+        moved_mm
+            How far the farthest of these moved in the last round, mm.
+        rest
+            The roughness is that of the difference to a surface with these coefficients.
+
+        Raises
+        ------
+        CannotMeasure
+            ``no-surface`` if the slopes do not settle the surface.
+        """
+        from labapp.core.surface import kernels
+
+        if self.factor is None or not moved_mm <= self.serves_mm:
+            self.factor = normal_factor(self.basis, self.stiffness, points_mm, self.weights)
+        at = self.basis.grid, coefficients, points_mm, self.weights
+        target = kernels.pull(*at, self.laser_mm, self.dots_mm)
+        width = len(self.stiffness) - 1
+        target -= dsbmv(width, 1.0, self.stiffness, coefficients - rest, lower=1)
+        change = solve(self.factor, target)
+        # Slopes leave the level open: the mean height of the points stays.
+        change -= kernels.surface_at(self.basis.grid, change, points_mm)[0].mean()
+        return np.asarray(coefficients + change)
+
+
+def solve(factor: FloatArray, right: npt.ArrayLike) -> FloatArray:
+    """Solve the normal equations of a factor for right sides, shape (p,) or (p, m)."""
+    return np.asarray(dpbtrs(factor, right, lower=1)[0])
+
+
+def normal_factor(
+    basis: SplineBasis, stiffness: FloatArray, points_mm: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """Cholesky factor of the normal matrix of slopes at points, lower band, shape (width + 1, p).
+
+    Slopes leave the level open; it is held by the spline in their middle, which moves nothing else.
+
+    Parameters
+    ----------
+    basis
+        The p splines.
+    stiffness
+        Weight of the roughness times its matrix, lower band, shape (width + 1, p).
+    points_mm, weights
+        See `fit_slopes`.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if there is none.
+    """
+    from labapp.core.surface import kernels
+
+    columns, (height, count) = stiffness.flatten(order="F"), stiffness.shape
+    kernels.add_gram(basis.grid, points_mm, weights, columns, height - 1)
+    band = columns.reshape(count, height).T
+    middle = kernels.splines_at(basis.grid, points_mm.mean(axis=0)[None])[0]
+    band[0, middle[0, 5]] += band[0].mean()
+    lower, info = dpbtrf(band, lower=1, overwrite_ab=1)
+    if info:
+        raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
+    return np.asarray(lower)
+
+
+def sigma_of(
+    lower: FloatArray, gradients: FloatArray, level_at: FloatArray, sigma_mm: float
+) -> FloatArray:
+    """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p).
+
+    The covariance of the coefficients is the inverse of the normal matrix; the level is known
+    independently of them.
+
+    Parameters
+    ----------
+    lower
+        Factor of the normal matrix (`normal_factor`).
+    gradients
+        Derivatives by the spline coefficients.
+    level_at
+        Mean value of each spline over the reflection points, shape (p,): what slopes tell is the
+        surface without its mean there.
+    sigma_mm
+        Uncertainty of the level.
+    """
+    by_level = gradients.sum(axis=1)
+    free = gradients - by_level[:, None] * level_at
+    half = dtbtrs(lower, np.asfortranarray(free.T), uplo="L")[0]
+    return np.asarray(np.sqrt((half * half).sum(axis=0) + (sigma_mm * by_level) ** 2))
+
+
+@dataclass(frozen=True)
+class SlopeFit:
+    """The surface that best has given slopes, up to its level.
+
+    Parameters
+    ----------
+    surface
+        The surface, its mean height over the points 0.
+    factor
+        Cholesky factor of the normal matrix with one spline held, lower band, shape
+        (width + 1, splines).
+    level
+        Mean value of each spline over the points, shape (splines,).
+    """
+
+    surface: SplineSurface
+    factor: FloatArray
+    level: FloatArray
+
+    def sigma_of(self, gradients: FloatArray) -> FloatArray:
+        """`sigma_of` quantities that the level does not change, shape (m,)."""
+        return sigma_of(self.factor, gradients, self.level, 0.0)
+
+
+def fit_slopes(
+    basis: SplineBasis,
+    points_mm: FloatArray,
+    slopes: FloatArray,
+    weights: FloatArray,
+    stiffness: float,
+) -> SlopeFit:
+    """Least-squares surface through slopes.
+
+    Parameters
+    ----------
+    basis
+        Splines to build it of.
+    points_mm
+        Where the slopes are known, (x, y), shape (n, 2), mm; held to the basis's rectangle.
+    slopes
+        (∂z/∂x, ∂z/∂y) there, shape (n, 2).
+    weights
+        Inverse of each slope's covariance, shape (n, 2, 2).
+    stiffness
+        Weight of the roughness, mm⁶: the area over which the third derivatives go together, over
+        their expected variance.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if the slopes do not settle the surface.
+    """
+    from labapp.core.surface import kernels
+
+    splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
+    pull = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
+    target = np.bincount(splines.ravel(), pull.ravel(), basis.count)
+    factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
+    coefficients = solve(factor, target)
+    level = np.bincount(splines.ravel(), value.ravel(), basis.count) / len(points_mm)
+    surface = SplineSurface(basis, coefficients - level @ coefficients)
+    return SlopeFit(surface, factor, level)

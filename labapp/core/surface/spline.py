@@ -1,0 +1,245 @@
+"""A smooth pool surface in splines.
+
+The basis holds a dent under the torch and an oscillating pool; the penalty on the change of
+curvature keeps it from running away where no ray came back (there it goes on as a quadric).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+
+DEGREE = 3
+
+# The four cubic splines over one cell, as polynomials of the place t in it, 0 … 1: row k holds the
+# coefficients of tᵏ. The next tables are their derivatives by t.
+_CUBICS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+_PIECES = [_CUBICS]
+for _ in range(DEGREE):
+    _PIECES.append(np.vstack([_PIECES[-1][1:] * [[1], [2], [3]], np.zeros((1, 4))]))
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a `SplineBasis` that n points lie in.
+
+    Parameters
+    ----------
+    splines
+        The 4 × 4 splines that are not zero in each, as columns of `SplineBasis.matrix`, x first,
+        shape (n, 16).
+    power
+        Powers 0 … 3 of the place in the cell along x and along y, shape (2, n, 4).
+    step_mm
+        Size of a cell along x and along y, shape (2,), mm.
+    """
+
+    splines: IntArray
+    power: FloatArray
+    step_mm: FloatArray
+
+    def values(self, dx: int = 0, dy: int = 0) -> FloatArray:
+        """Value (or derivative) of those splines, shape (n, 16)."""
+        along_x = self.power[0] @ (_PIECES[dx] / self.step_mm[0] ** dx)
+        along_y = self.power[1] @ (_PIECES[dy] / self.step_mm[1] ** dy)
+        product = along_x[:, :, None] * along_y[:, None, :]
+        return np.asarray(product.reshape(-1, (DEGREE + 1) ** 2))
+
+    def value_and_slopes(self) -> FloatArray:
+        """Value and derivatives by x and by y of those splines at once, shape (3, n, 16)."""
+        side, count = DEGREE + 1, len(self.splines)
+        x, y = self.power @ _values_and_slopes(*self.step_mm.tolist())
+        product = np.empty((3, count, side, side))
+        np.multiply(x[:, :side, None], y[:, None, :side], out=product[0])
+        np.multiply(x[:, side:, None], y[:, None, :side], out=product[1])
+        np.multiply(x[:, :side, None], y[:, None, side:], out=product[2])
+        return product.reshape(3, count, side**2)
+
+
+@lru_cache(maxsize=16)
+def _values_and_slopes(*step_mm: float) -> FloatArray:
+    """Pieces of the splines and, beside them, of their derivatives, a cell's size each, (2, 4, 8).
+
+    Kept, as a basis is asked thousands of times.
+    """
+    pieces = np.stack([np.hstack([_PIECES[0], _PIECES[1] / step]) for step in step_mm])
+    pieces.flags.writeable = False
+    return pieces
+
+
+@lru_cache(maxsize=256)
+def _products(count: int) -> FloatArray:
+    """∫ of the products of the derivatives, of order 0 … 3, of so many splines along an axis.
+
+    In cells of size 1; of each spline with itself and the next three, shape (4, count, 4).
+    """
+    node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
+    power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
+    products = np.zeros((DEGREE + 1, count, DEGREE + 1))
+    for order, pieces in enumerate(_PIECES):
+        part = power @ pieces
+        within = (part * (weight / 2)[:, None]).T @ part
+        for one in range(DEGREE + 1):
+            for on in range(DEGREE + 1 - one):
+                products[order, one : count - DEGREE + one, on] += within[one, one + on]
+    products.flags.writeable = False
+    return products
+
+
+@dataclass(frozen=True)
+class SplineBasis:
+    """Tensor product of uniform cubic B-splines over a rectangle.
+
+    Parameters
+    ----------
+    x_knots, y_knots
+        Knot vectors with `DEGREE` extra knots beyond each end of the rectangle, mm.
+    """
+
+    x_knots: FloatArray
+    y_knots: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Leave what is kept of earlier calls behind: it is many times larger."""
+        return SplineBasis, (self.x_knots, self.y_knots)
+
+    @classmethod
+    def over(cls, low_mm: FloatArray, high_mm: FloatArray, knot_mm: float) -> SplineBasis:
+        """Build the basis on the rectangle from ``low_mm`` to ``high_mm``, each shape (2,)."""
+        knots = []
+        for low, high in zip(low_mm, high_mm, strict=True):
+            cells = max(2, int(np.ceil((high - low) / knot_mm)))
+            step = (high - low) / cells
+            knots.append(low + step * np.arange(-DEGREE, cells + DEGREE + 1))
+        return cls(*knots)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of splines along x and along y."""
+        return len(self.x_knots) - DEGREE - 1, len(self.y_knots) - DEGREE - 1
+
+    @property
+    def count(self) -> int:
+        """Number of splines."""
+        return self.shape[0] * self.shape[1]
+
+    @cached_property
+    def low_mm(self) -> FloatArray:
+        """Lower corner of the rectangle, shape (2,), mm."""
+        return np.array([self.x_knots[DEGREE], self.y_knots[DEGREE]])
+
+    @cached_property
+    def high_mm(self) -> FloatArray:
+        """Upper corner of the rectangle, shape (2,), mm."""
+        return np.array([self.x_knots[-DEGREE - 1], self.y_knots[-DEGREE - 1]])
+
+    @cached_property
+    def step_mm(self) -> FloatArray:
+        """Distance between knots along x and along y, shape (2,), mm."""
+        return np.array(
+            [np.ptp(knots) / (len(knots) - 1) for knots in (self.x_knots, self.y_knots)]
+        )
+
+    @cached_property
+    def grid(self) -> FloatArray:
+        """Low and high end, step, mm, and number of cells along x and along y, shape (2, 4)."""
+        cells = np.array(self.shape) - DEGREE
+        return np.column_stack([self.low_mm, self.high_mm, self.step_mm, cells])
+
+    def cells(self, x_mm: FloatArray, y_mm: FloatArray) -> Cells:
+        """Find the cells of points, each shape (n,); the outermost go on beyond the rectangle."""
+        nx, ny = self.shape
+        place = (np.array([x_mm, y_mm]) - self.low_mm[:, None]) / self.step_mm[:, None]
+        last = np.array([[nx - DEGREE - 1], [ny - DEGREE - 1]])
+        first = np.minimum(np.maximum(place.astype(np.int64), 0), last)
+        power = np.empty((*place.shape, DEGREE + 1))
+        power[..., 0] = 1.0
+        power[..., 1] = t = place - first
+        np.multiply(t, t, out=power[..., 2])
+        np.multiply(power[..., 2], t, out=power[..., 3])
+        return Cells((first[0] * ny + first[1])[:, None] + self._corner, power, self.step_mm)
+
+    @cached_property
+    def _corner(self) -> IntArray:
+        """Columns of a cell's splines over that of its first one, shape (16,)."""
+        side = np.arange(DEGREE + 1)
+        return (side[:, None] * self.shape[1] + side).ravel()
+
+    def matrix(self, x_mm: FloatArray, y_mm: FloatArray, dx: int = 0, dy: int = 0) -> FloatArray:
+        """Value (or derivative) of every spline at n points, shape (n, splines)."""
+        cells = self.cells(np.asarray(x_mm, float), np.asarray(y_mm, float))
+        matrix = np.zeros((len(cells.splines), self.shape[0] * self.shape[1]))
+        np.put_along_axis(matrix, cells.splines, cells.values(dx, dy), axis=1)
+        return matrix
+
+    def contains(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+        """Whether points lie in the rectangle, of their shape."""
+        (x_low, y_low), (x_high, y_high) = self.low_mm, self.high_mm
+        x, y = np.asarray(x_mm), np.asarray(y_mm)
+        return np.asarray((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high))
+
+    @cached_property
+    def roughness(self) -> FloatArray:
+        """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc.
+
+        Its lower band, shape (width + 1, splines), as LAPACK has it.
+        """
+        from labapp.core.surface import kernels
+
+        nx, ny = self.shape
+        return kernels.roughness(_products(nx), _products(ny), self.step_mm)
+
+
+@dataclass(frozen=True)
+class SplineSurface:
+    """z = f(x, y) in a `SplineBasis`; NaN outside its rectangle.
+
+    Parameters
+    ----------
+    basis
+        The splines.
+    coefficients
+        Shape (splines,), mm.
+    """
+
+    basis: SplineBasis
+    coefficients: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Height z at (x, y), arrays of one shape, mm."""
+        x, y = np.asarray(x_mm, float), np.asarray(y_mm, float)
+        inside = self.basis.contains(x, y)
+        cells = self.basis.cells(x[inside], y[inside])
+        height = np.full(x.shape, np.nan)
+        height[inside] = np.vecdot(cells.values(), self.coefficients[cells.splines])
+        return height
+
+    def height_and_gradient(
+        self, x_mm: FloatArray, y_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Both at once, in little more time than either takes."""
+        x, y = np.asarray(x_mm, float), np.asarray(y_mm, float)
+        inside = self.basis.contains(x, y)
+        cells = self.basis.cells(x[inside], y[inside])
+        every = np.full((*x.shape, 3), np.nan)
+        every[inside] = np.vecdot(cells.value_and_slopes(), self.coefficients[cells.splines]).T
+        return every[..., 0], every[..., 1:]
+
+    def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
+        return self.height_and_gradient(x_mm, y_mm)[1]
+
+    def raised(self, by_mm: float) -> SplineSurface:
+        """Shift the whole surface up."""
+        return SplineSurface(self.basis, self.coefficients + by_mm)  # the splines add up to 1
