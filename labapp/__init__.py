@@ -8,12 +8,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import labapp.pixels  # noqa: F401 (OpenCV is told before anything loads it)
+from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.session.session import Session
 
 __all__ = ["Session", "__version__"]
-__version__ = "0.1.0"
+__version__ = VERSION
 
 
 def __getattr__(name: str) -> object:

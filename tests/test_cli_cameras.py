@@ -13,7 +13,7 @@ import pytest
 
 from labapp.media import open_source
 from labapp.media.cameras import CameraInfo, CameraLost
-from labapp.media.recorder import Take
+from labapp.media.take_files import Take
 from labapp.session.cameras import simulated_device
 from labapp.session.session import Session
 from tests.conftest import HEEDING, Run

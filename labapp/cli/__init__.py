@@ -19,7 +19,6 @@ import typer
 import typer.core
 import typer.main
 
-import labapp
 from labapp.cli import advise, analyze, benchmark, cameras, session, simulate
 from labapp.cli.shared import (
     BAD_INPUT,
@@ -39,6 +38,7 @@ from labapp.cli.shared import (
 from labapp.cli.window import asks_for_app, open_app, show_in_app, tour
 from labapp.errors import InputError
 from labapp.session.log import log_file, start_log
+from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Measurement, Settings
@@ -159,7 +159,7 @@ def _stoppable() -> Iterator[list[tuple[float, int]]]:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"labapp {labapp.__version__}")
+        typer.echo(f"labapp {VERSION}")
         raise typer.Exit
 
 

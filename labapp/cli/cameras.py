@@ -18,7 +18,8 @@ from labapp.words import several
 if TYPE_CHECKING:
     from labapp.media.cameras import Camera, CameraSettings, Feed, Range
     from labapp.media.events import Event
-    from labapp.media.recorder import Plan, Take
+    from labapp.media.recorder import Plan
+    from labapp.media.take_files import Take
     from labapp.session.session import Session
 
 POLL_S = 0.05

@@ -25,10 +25,10 @@ from PySide6.QtCore import (
 )
 from PySide6.QtWidgets import QApplication
 
-import labapp
 from labapp.errors import InputError
 from labapp.session.log import NAME, start_log
 from labapp.system import has_display
+from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.gui.preferences import Preferences
@@ -156,7 +156,7 @@ def start_app() -> QApplication:
     app = QApplication([NAME])
     app.setApplicationName(NAME)
     app.setApplicationDisplayName(NAME)
-    app.setApplicationVersion(labapp.__version__)
+    app.setApplicationVersion(VERSION)
     app.setDesktopFileName(NAME)
     return app
 

@@ -12,12 +12,12 @@ from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
 
-import labapp
 from labapp.gui.action import MENUS
 from labapp.gui.actions import ACTIONS
 from labapp.gui.standing import Standing
 from labapp.gui.steps import STEPS
 from labapp.session.log import log_file
+from labapp.version import VERSION
 
 PART_OF_SCREEN = 0.85
 """No text takes more of the screen; the rest is for the frame around it."""
@@ -88,7 +88,7 @@ def about() -> str:
         f"Qt for Python {PySide6.__version__}"
     )
     return (
-        f"<h2>labapp {labapp.__version__}</h2>"
+        f"<h2>labapp {VERSION}</h2>"
         "<p>The three-dimensional surface of a molten weld pool, measured from a reflected laser "
         "dot matrix.</p>"
         f"<p>BSD 3-Clause licence. {built_on}.</p><p>The log is {escape(str(log_file()))}.</p>"

@@ -14,14 +14,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from labapp.errors import InputError
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Kind, Say, Tally, silent
 from labapp.media.nut import TICKS_HZ, Codec, NutWriter, WrongFrame
-from labapp.media.take_files import Note, TakeFiles, notes_of
+from labapp.media.take_files import Note, Take, TakeFiles, notes_of
 from labapp.words import several
 
 FRAME_BYTE = 200
@@ -82,52 +82,6 @@ class Plan:
         ]
         if problems:
             raise InputError.gather(problems)
-
-
-@dataclass(eq=False)
-class Take:
-    """One recording, from its trigger on.
-
-    Parameters
-    ----------
-    path
-        The video. Notes are beside it, see `notes`.
-
-    Attributes
-    ----------
-    frames
-        Written so far.
-    lost
-        Left out for want of room in memory, or of a disk; or not as the others are.
-    trouble
-        Why writing ended early; empty if it did not.
-    finished
-        Set when nothing more is written.
-    triggered_s, ends_s
-        When it was triggered and when it ends by itself, by the camera's clock, s; None: not known
-        yet, or never.
-    """
-
-    path: Path
-    frames: int = 0
-    lost: int = 0
-    trouble: str = ""
-    finished: threading.Event = field(default_factory=threading.Event)
-    triggered_s: float = 0.0
-    ends_s: float | None = None
-
-    @property
-    def summary(self) -> Event:
-        """What became of it."""
-        words = f"{several(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
-            self.lost > 0
-        )
-        return Event(self.path.name, "loss" if self.lost else "note", words)
-
-    @property
-    def notes(self) -> Path:
-        """Table of what happened meanwhile: trigger, marks, frames lost (CSV)."""
-        return notes_of(self.path)
 
 
 _Item = tuple[Take, CameraFrame | Note | None]

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
+import threading
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Say, Tally
 from labapp.media.nut import NutWriter
 from labapp.words import as_cell, several
-
-if TYPE_CHECKING:
-    from labapp.media.recorder import Take
 
 NOTES = ("time_s", "frame", "source", "kind", "what")
 """Columns of the notes beside a recording; the frame is the one that was next at that time."""
@@ -37,6 +34,52 @@ class Note:
 def notes_of(path: Path) -> Path:
     """The notes beside a recording."""
     return path.with_name(f"{path.stem}-notes.csv")
+
+
+@dataclass(eq=False)
+class Take:
+    """One recording, from its trigger on.
+
+    Parameters
+    ----------
+    path
+        The video. Notes are beside it, see `notes`.
+
+    Attributes
+    ----------
+    frames
+        Written so far.
+    lost
+        Left out for want of room in memory, or of a disk; or not as the others are.
+    trouble
+        Why writing ended early; empty if it did not.
+    finished
+        Set when nothing more is written.
+    triggered_s, ends_s
+        When it was triggered and when it ends by itself, by the camera's clock, s; None: not known
+        yet, or never.
+    """
+
+    path: Path
+    frames: int = 0
+    lost: int = 0
+    trouble: str = ""
+    finished: threading.Event = field(default_factory=threading.Event)
+    triggered_s: float = 0.0
+    ends_s: float | None = None
+
+    @property
+    def summary(self) -> Event:
+        """What became of it."""
+        words = f"{several(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
+            self.lost > 0
+        )
+        return Event(self.path.name, "loss" if self.lost else "note", words)
+
+    @property
+    def notes(self) -> Path:
+        """Table of what happened meanwhile: trigger, marks, frames lost (CSV)."""
+        return notes_of(self.path)
 
 
 class TakeFiles:

@@ -22,7 +22,8 @@ from labapp.media.cameras import (
     there_and_back,
 )
 from labapp.media.events import Event, Say, logged, silent
-from labapp.media.recorder import Plan, Recorder, Take
+from labapp.media.recorder import Plan, Recorder
+from labapp.media.take_files import Take
 from labapp.session.scenario import read_scenario
 from labapp.session.simulate import simulate
 from labapp.simulation.parallel import Progress

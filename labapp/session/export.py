@@ -19,7 +19,6 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-import labapp
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
@@ -39,6 +38,7 @@ from labapp.session.studio import PICTURE_PX, drawing_process, told
 from labapp.session.summary import Summary
 from labapp.session.tables import TABLES, csv_header, csv_rows, frame_tables
 from labapp.system import sync_folder
+from labapp.version import VERSION
 from labapp.words import SIGMA_OF
 
 MANIFEST = "manifest.json"
@@ -344,7 +344,7 @@ def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
 
 
 def _made() -> dict[str, object]:
-    made = {"program": "labapp", "version": labapp.__version__, "created": now()}
+    made = {"program": "labapp", "version": VERSION, "created": now()}
     return {**made, "sigma_of": SIGMA_OF}
 
 

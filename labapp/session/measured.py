@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-import labapp
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.errors import InputError
@@ -20,6 +19,7 @@ from labapp.session.blobs import Damaged, fingerprint, pack, unpack
 from labapp.session.database import Database
 from labapp.session.schema import MEASURES
 from labapp.session.setup import Setup, parse_setup
+from labapp.version import VERSION
 
 SETUP_CHANGED = "the rig or a calibration was changed"
 SETTINGS_CHANGED = "the settings were changed"
@@ -166,7 +166,7 @@ class Results:
             If it cannot be saved; then nothing has changed.
         """
         setup, settings = pack(basis.setup.text), pack(basis.settings)
-        key, made = (labapp.__version__, setup, settings), (correction, _now())
+        key, made = (VERSION, setup, settings), (correction, _now())
         seal = fingerprint((frame, basis.scheme, *key, *made))
         content = pack((measurement, seal))
         row = _Row(*key, *made, content)

@@ -12,7 +12,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import labapp
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.reconstruction import Reconstruction
@@ -20,6 +19,7 @@ from labapp.errors import InputError
 from labapp.session.files import as_bytes, write_whole
 from labapp.session.meshes import FORMATS, SPACING_MM, solid, surface
 from labapp.session.tables import TABLES, csv_header, surface_csv, table_rows
+from labapp.version import VERSION
 from labapp.words import SIGMA_OF
 
 RUN_FILE = "run.json"
@@ -104,7 +104,7 @@ class ResultsWriter:
         self.surfaces = surfaces
         self._run = {
             "program": "labapp",
-            "version": labapp.__version__,
+            "version": VERSION,
             "sigma_of": SIGMA_OF,
             "state": "running",
             "started": now(),

@@ -18,12 +18,12 @@ from collections.abc import Coroutine, Iterable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
-import labapp
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.session.alarms import Alarm
 from labapp.session.log import NAME
 from labapp.session.tables import SIZES, sigma_of
+from labapp.version import VERSION
 
 MOST_LISTENERS, AT_ONCE = 32, 16
 """Each takes an open file, of which the measurement needs some itself."""
@@ -151,7 +151,7 @@ class LineStream:
         self._loop.close()
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        about = {"labapp": labapp.__version__}
+        about = {"labapp": VERSION}
         if len(self._missed) >= MOST_LISTENERS:
             refusal = {**about, "refused": f"{MOST_LISTENERS} programs are connected"}
             writer.write(json.dumps(refusal).encode() + b"\n")

@@ -53,7 +53,8 @@ from labapp.gui.preferences import Preferences
 from labapp.gui.window import MainWindow
 from labapp.media.cameras import Faults
 from labapp.media.nut import NutWriter
-from labapp.media.recorder import Recorder, Take
+from labapp.media.recorder import Recorder
+from labapp.media.take_files import Take
 from labapp.session.live_measuring import LiveMeasuring
 from labapp.session.samples import sample_folder
 

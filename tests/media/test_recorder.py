@@ -18,7 +18,8 @@ from labapp.media import recorder as recorder_module
 from labapp.media.cameras import CameraFrame, Faults, Feed, SimulatedDevice, feed
 from labapp.media.events import Event
 from labapp.media.nut import NutWriter
-from labapp.media.recorder import Plan, Recorder, Take, recording_path
+from labapp.media.recorder import Plan, Recorder, recording_path
+from labapp.media.take_files import Take
 from labapp.session.session import Session
 from tests.media.cameras.watching import Heard, number_in, numbered
 from tests.waiting import PATIENCE_S, wait_until

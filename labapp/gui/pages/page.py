@@ -13,7 +13,7 @@ from labapp.gui.views.fields import Field
 from labapp.gui.workspace import Workspace
 
 if TYPE_CHECKING:
-    from labapp.media.recorder import Take
+    from labapp.media.take_files import Take
 
 
 class Page(QWidget):

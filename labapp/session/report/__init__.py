@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import scipy
 
-import labapp
 from labapp.errors import InputError
 from labapp.media.base import rate_in_words
 from labapp.session.error_budget import laser_in_use, plane_in_use
@@ -24,6 +23,7 @@ from labapp.session.report.results import (
     tell_results,
 )
 from labapp.session.session import Session
+from labapp.version import VERSION
 
 POOL_MM = (7.0, 0.3)
 """Length and height of the pool in the side view where none is expected or measured."""
@@ -71,7 +71,7 @@ def report_pdf(
     tell_corrections(story, told)
     name = session.path.name
     header = name if title == session.path.stem else f"{title}  ·  {name}"
-    made = f"labapp {labapp.__version__}, {now:%Y-%m-%d %H:%M}"
+    made = f"labapp {VERSION}, {now:%Y-%m-%d %H:%M}"
     return story.pdf(header, made, title)
 
 
@@ -120,7 +120,7 @@ def _experiment(story: Story, told: Told, title: str) -> None:
             ("measured with", ", ".join(f"labapp {v}" for v in versions) or "nothing measured yet"),
             (
                 "reported with",
-                f"labapp {labapp.__version__}, Python {platform.python_version()}, "
+                f"labapp {VERSION}, Python {platform.python_version()}, "
                 f"NumPy {np.__version__}, SciPy {scipy.__version__}, OpenCV {cv2.__version__}",
             ),
         ]

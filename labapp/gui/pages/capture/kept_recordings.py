@@ -11,7 +11,8 @@ from labapp.gui.pages.capture.import_choice import NEXT, NEXT_TIP
 from labapp.gui.pages.capture.parts import button
 from labapp.gui.views.fields import ChoiceField, FieldForm
 from labapp.gui.views.labels import headed
-from labapp.media.recorder import Take, recordings_beside
+from labapp.media.recorder import recordings_beside
+from labapp.media.take_files import Take
 from labapp.session.database import SUFFIX
 from labapp.session.session import Session
 

@@ -27,7 +27,8 @@ from labapp.gui.pages.capture.presenter import size_in_words
 from labapp.media import GreyImage
 from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
 from labapp.media.events import Event
-from labapp.media.recorder import Plan, Recorder, Take
+from labapp.media.recorder import Plan, Recorder
+from labapp.media.take_files import Take
 from labapp.session.limits import Limits
 from labapp.session.live_measuring import LiveMeasuringEnded
 from labapp.session.live_queue import newest_of

@@ -41,7 +41,8 @@ from labapp.media.cameras import (
     open_camera,
 )
 from labapp.media.events import Event
-from labapp.media.recorder import Take, recording_path
+from labapp.media.recorder import recording_path
+from labapp.media.take_files import Take
 from labapp.session.live_watch import Followed, LiveWatch
 from labapp.session.session import Session
 from labapp.session.simulated_pool import pool_camera, simulated_pool

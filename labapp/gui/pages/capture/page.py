@@ -35,7 +35,7 @@ from labapp.gui.tasks import Control, Task
 from labapp.gui.views.labels import Message, headed, keep_room, plain_label
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import MISSING, Workspace
-from labapp.media.recorder import Take
+from labapp.media.take_files import Take
 from labapp.session.record import Recording
 from labapp.session.session import Session
 from labapp.words import several
