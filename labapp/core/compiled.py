@@ -55,13 +55,15 @@ def part(function: F) -> F:
 
 
 class BySource(_CacheLocator):
-    """Keeps what is compiled by what its file says, wherever that file is.
+    """Keeps what is compiled by its module's name and what that says, wherever its file is.
 
     A second checkout or environment of a user finds what the first one compiled.
     """
 
     def __init__(self, function: Any, file: str) -> None:
-        self._source = sha256(Path(file).read_bytes()).hexdigest()[:24]
+        # What is kept names its module, too.
+        source = function.__module__.encode() + b"\0" + Path(file).read_bytes()
+        self._source = sha256(source).hexdigest()[:24]
         self._line: int = function.__code__.co_firstlineno
 
     @classmethod
