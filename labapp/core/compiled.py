@@ -105,8 +105,9 @@ def _delete_old(folder: Path) -> None:
 
 
 def _kept(function: F, *signature: Any) -> F:
-    usual, ours = _config.CACHE_LOCATOR_CLASSES, f"{__name__}.{BySource.__name__}"
-    _config.CACHE_LOCATOR_CLASSES = ours
+    # A numba that does not know the setting keeps what it compiles where it always does.
+    usual = getattr(_config, "CACHE_LOCATOR_CLASSES", "")
+    _config.CACHE_LOCATOR_CLASSES = f"{__name__}.{BySource.__name__}"
     try:
         made: F = _njit(*signature, cache=True, **HOW)(function)
     except RuntimeError:  # nowhere to keep it
