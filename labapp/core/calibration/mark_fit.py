@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.special import chdtri, fdtrc, stdtrit
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -321,6 +320,9 @@ def _fit(
     def slopes(step: FloatArray) -> FloatArray:
         by_mark = _jacobian(_with(matrix, free, step), plane)[:, free]
         return np.asarray((whiten @ by_mark.reshape(-1, 2, len(free))).reshape(-1, len(free)))
+
+    # Loaded here: the start of every program would wait for it.
+    from scipy.optimize import least_squares
 
     found = least_squares(off, np.zeros(len(free)), jac=slopes, method="lm", x_scale="jac")
     rows, weighted = slopes(found.x), off(found.x)

@@ -11,7 +11,6 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.ndimage import convolve
 from scipy.spatial import cKDTree
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -270,8 +269,9 @@ def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
 
 def _without_rim(labels: IntArray) -> IntArray:
     """Only labels with most of their neighbours labelled."""
-    lit = (labels != UNLABELLED).astype(int)
-    neighbours = convolve(lit, np.ones((3, 3), int), mode="constant") - lit
+    lit = (labels != UNLABELLED).astype(np.uint8)
+    border = cv2.BORDER_CONSTANT
+    neighbours = cv2.boxFilter(lit, -1, (3, 3), normalize=False, borderType=border) - lit
     return np.where(neighbours >= 4, labels, UNLABELLED)
 
 
