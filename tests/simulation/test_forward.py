@@ -312,7 +312,7 @@ def test_truth_never_comes_from_the_code_that_measures():
 
     What analyses (chapters 4 and 8) may measure; nothing that makes truth knows it.
     """
-    allowed = {f"labapp.core.{name}" for name in ("rig", "values", "correspondence", "orientation")}
+    allowed = {f"labapp.core.{name}" for name in ("geometry.rig", "values", "match")}
     package = Path(forward.__file__).parents[2]
     waiting = ["labapp.simulation.samples.runs", "labapp.simulation.surface_files"]
     used = set()
