@@ -136,6 +136,11 @@ def test_continuous_integration_runs_the_same_test():
     assert [line.split("&&")[-1].strip() for line in commands] == ["./run test"]
 
 
+def test_run_takes_every_folder_of_tests():
+    folders = {path.relative_to(ROOT).parts[1] for path in (ROOT / "tests").rglob("*/test_*.py")}
+    assert {f for f in folders if f"tests/{f}" not in (ROOT / "run").read_text("utf-8")} == set()
+
+
 def test_run_without_a_command_says_what_there_is():
     answer = subprocess.run([ROOT / "run"], capture_output=True, text=True, check=False)
     assert answer.returncode == 2
