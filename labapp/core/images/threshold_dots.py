@@ -143,7 +143,9 @@ def wavelet_dots(frame: Frame, settings: WaveletSettings | None = None) -> Dots:
     settings = settings or WaveletSettings()
     grey = _checked(frame)
     shifted = grey - grey.mean()
-    smooth = cv2.GaussianBlur(shifted, (settings.denoise_px, settings.denoise_px), 0)
+    smooth = np.asarray(
+        cv2.GaussianBlur(shifted, (settings.denoise_px, settings.denoise_px), 0), float
+    )
     noise = _noise(grey, frame.dtype)
     enhanced = _enhance(smooth, noise, settings)
     mean = cv2.blur(enhanced, (settings.window_px, settings.window_px))

@@ -270,7 +270,7 @@ def statistics_cells(lines: Sequence[FrameLine]) -> Cells:
         found = values(lines, name)
         if not len(found):
             continue
-        figures = [found.mean(), found.std(), found.min(), found.max(), np.ptp(found)]
+        figures: list[float] = [found.mean(), found.std(), found.min(), found.max(), np.ptp(found)]
         sigma = values(lines, sigma_name(name))
         figures.append(np.median(sigma) if len(sigma) else math.nan)
         rows.append([label, str(len(found)), *(number(float(f), digits) for f in figures)])
