@@ -184,20 +184,20 @@ def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
     if banded:
         width = 3 * BASIS.shape[1] + 3
         flat = np.zeros(COUNT * (width + 1))
-        kernels.add_gram(BASIS.grid, points, weights, flat, width)
+        kernels.accumulate_normal_matrix(BASIS.grid, points, weights, flat, width)
         band = flat.reshape(COUNT, width + 1).T
         for k in range(width + 1):
             np.testing.assert_allclose(band[k, : COUNT - k], np.diagonal(normal, -k), atol=1e-9)
         assert not np.diagonal(normal, -width - 1).any()
     else:
         flat = np.zeros(COUNT**2)
-        kernels.add_gram(BASIS.grid, points, weights, flat, COUNT)
+        kernels.accumulate_normal_matrix(BASIS.grid, points, weights, flat, COUNT)
         np.testing.assert_allclose(flat.reshape(COUNT, COUNT), np.triu(normal), atol=1e-9)
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
     asked = bisecting_gradient(points - LASER, dots_mm - points)
     off = asked - surface().gradient(*points[:, :2].T)
     np.testing.assert_allclose(
-        kernels.pull(BASIS.grid, surface().coefficients, points, weights, LASER, dots_mm),
+        kernels.gradient_rhs(BASIS.grid, surface().coefficients, points, weights, LASER, dots_mm),
         np.einsum("nap,nab,nb->p", by, weights, off),
         atol=1e-9,
     )
@@ -506,7 +506,9 @@ def test_doubts_are_logarithms_of_what_was_seen(witnesses: int) -> None:
     side = random().choice([-1.0, 1.0], witnesses) / random().uniform(0.01, 0.04, witnesses)
     side[0] = 0.0
     levels, blurs = np.linspace(-0.05, 0.07, 31), np.array([0.005, 0.04, 0.25])
-    made = level_kernels.doubts(over, side, levels[0], levels[1] - levels[0], 31, blurs)
+    made = level_kernels.level_negative_log_likelihood(
+        over, side, levels[0], levels[1] - levels[0], 31, blurs
+    )
     inside = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
     expected = np.logaddexp(0.0, -inside).sum(axis=-1)
     np.testing.assert_allclose(made, expected, rtol=1e-11)
@@ -536,7 +538,7 @@ def test_levels_are_weighed_by_what_speaks_against_them(depth: int) -> None:
 
 def test_doubts_of_what_is_unknown_are_unknown() -> None:
     over = np.array([[0.1, np.nan], [0.1, 0.2]])
-    made = level_kernels.doubts(over, np.ones(2), 0.0, 0.1, 3, np.ones(2))
+    made = level_kernels.level_negative_log_likelihood(over, np.ones(2), 0.0, 0.1, 3, np.ones(2))
     assert np.isnan(made[0]).all()
     assert np.isfinite(made[1]).all()
 

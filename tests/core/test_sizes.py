@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.sequence.warm_fit import Bed
+from labapp.core.sequence.warm_fit import SequenceGeometry
 from labapp.core.surface import measures
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.pool_fit import FitSettings, Level, Rear
@@ -17,7 +17,7 @@ from labapp.core.values import FloatArray
 
 BASIS = SplineBasis.over(np.array([-4.0, -5.0]), np.array([4.0, 4.0]), 0.9)
 RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
-BED = Bed.of(RIG, BASIS, FitSettings())
+BED = SequenceGeometry.of(RIG, BASIS, FitSettings())
 CENTER = np.array([0.1, -0.4])
 
 

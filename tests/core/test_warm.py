@@ -12,7 +12,7 @@ import pytest
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.sequence.track import Broken
+from labapp.core.sequence.track import TrackLost
 from labapp.core.sequence.warm import WarmChain, follow
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.simulation.camera import CameraView
@@ -209,7 +209,7 @@ def test_a_pool_that_goes_on_by_a_row_is_not_followed_to_the_wrong_rays(way: int
         image = without_dots(frame.image, frame.dot_px[[9 + way], [9]])
         try:
             result, _ = follow(image, track, CALIBRATION, Settings())
-        except (Broken, CannotMeasure):
+        except (TrackLost, CannotMeasure):
             continue
         assert wrong_rays(result, frame) == 0
 

@@ -16,7 +16,13 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, ways
 from labapp.core.matching.correspondence import MatchSettings, as_match, indexed_lattice, match_rays
-from labapp.core.matching.hypothesis import STANDING_OUT, Hypothesis, from_grid, pursue, weigh
+from labapp.core.matching.hypothesis import (
+    STANDING_OUT,
+    Hypothesis,
+    from_grid,
+    grow_and_score,
+    weigh,
+)
 from labapp.core.matching.ray_growth import LEAST_LABELS, UNLABELLED, Scene
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.values import CannotMeasure, IntArray
@@ -145,7 +151,7 @@ def _bound(
     hypothesis = weigh(scene, labels, STANDING_OUT)
     if hypothesis is None:
         return None
-    wider = pursue(scene, labels)
+    wider = grow_and_score(scene, labels)
     if wider is None:
         return _Bound(scene, orientation, hypothesis, np.zeros(0, np.int64))
     taken = (wider.labels != labels) & (wider.labels != UNLABELLED)

@@ -24,9 +24,9 @@ from labapp.core.matching.hypothesis import (
     Hypothesis,
     contested,
     from_grid,
+    grow_and_score,
     joined,
     moved,
-    pursue,
     turned,
     weigh,
     with_repaired,
@@ -156,7 +156,11 @@ def _by_grid(
         for hole in lattice.candidates
         for orientation in orientations
     )
-    return [hypothesis for labels in labelled if (hypothesis := pursue(scene, labels)) is not None]
+    return [
+        hypothesis
+        for labels in labelled
+        if (hypothesis := grow_and_score(scene, labels)) is not None
+    ]
 
 
 MOST_PLACES = 8
@@ -182,15 +186,15 @@ def _by_placement(
             if pool is not None:
                 rough.append((float(np.mean(pool.residual_mm**2)), labels))
     rough.sort(key=lambda one: one[0])
-    pursued = (pursue(scene, labels) for _, labels in rough[:MOST_PLACES])
-    return [hypothesis for hypothesis in pursued if hypothesis is not None]
+    scored = (grow_and_score(scene, labels) for _, labels in rough[:MOST_PLACES])
+    return [hypothesis for hypothesis in scored if hypothesis is not None]
 
 
 def _by_caps(scene: Scene) -> list[Hypothesis]:
     """Follow the caps that the dots lie on best, and mend what each leaves unexplained."""
     found: list[Hypothesis] = []
     for labels in search_caps(scene):
-        hypothesis = pursue(scene, labels)
+        hypothesis = grow_and_score(scene, labels)
         found += with_repaired(scene, [hypothesis]) if hypothesis is not None else []
     return found
 
@@ -201,13 +205,13 @@ def _by_optics(
     """Follow the quadrics that explain the dots round some hole, with the grid's help."""
     found = []
     for guess in search_quadrics(scene):
-        hypothesis = pursue(scene, guess.labels)
+        hypothesis = grow_and_score(scene, guess.labels)
         if hypothesis is None:
             continue
         found.append(hypothesis)
         if lattice is not None:
             labels = joined(hypothesis, lattice, hypothesis.orientation(scene))
-            wider = None if labels is None else pursue(scene, labels)
+            wider = None if labels is None else grow_and_score(scene, labels)
             found += [wider] if wider is not None else []
         if _explains(scene, hypothesis):
             break
@@ -235,7 +239,7 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
         one_on = moved(scene, best.labels)
         neighbours = [h for labels in one_on if (h := weigh(scene, labels, near=best.pool))]
         nearest = min(neighbours, key=lambda h: h.cost, default=best)
-        better = pursue(scene, nearest.labels) if nearest.cost < best.cost else None
+        better = grow_and_score(scene, nearest.labels) if nearest.cost < best.cost else None
         if better is None or better.cost >= best.cost:
             break
         best = better

@@ -119,7 +119,7 @@ class Hypothesis:
         return "S/I" if np.nansum(np.sign(np.diff(place[..., 0], axis=1))) >= 0 else "I/I"
 
 
-def pursue(scene: Scene, labels: IntArray) -> Hypothesis | None:
+def grow_and_score(scene: Scene, labels: IntArray) -> Hypothesis | None:
     """Follow labels to where the surface leads, and weigh what comes of it."""
     grown = grow_labels(scene, labels)
     hypothesis = None if grown is None else weigh(scene, grown)
@@ -281,7 +281,7 @@ def with_repaired(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
     best = min(found, key=lambda hypothesis: hypothesis.cost, default=None)
     while best is not None:
         labels = np.where(_about_unexplained(scene, best), UNLABELLED, best.labels)
-        wider = pursue(scene, labels) if (labels != best.labels).any() else None
+        wider = grow_and_score(scene, labels) if (labels != best.labels).any() else None
         best = wider if wider is not None and wider.cost < best.cost else None
         found = found if best is None else [*found, best]
     return found
@@ -348,7 +348,7 @@ def _rows_begun(scene: Scene, hypothesis: Hypothesis, most: int = 8) -> list[Hyp
             continue
         more = labels.copy()
         more[at] = stray[dot]
-        wider = pursue(scene, more)
+        wider = grow_and_score(scene, more)
         if wider is not None and wider.count >= hypothesis.count + LEAST_ROW:
             found.append(wider)
     return found

@@ -20,7 +20,13 @@ from labapp.core.match import Match
 from labapp.core.matching.ray_growth import UNLABELLED, Scene
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
-from labapp.core.sequence.warm_fit import Bed, Slopes, WarmPool, fit_slopes_to, met
+from labapp.core.sequence.warm_fit import (
+    SequenceGeometry,
+    Slopes,
+    WarmPool,
+    fit_slopes_to,
+    intersect_and_reflect,
+)
 from labapp.core.sequence.warm_match import around, filled, tracked
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.pool_fit import Level, find_level
@@ -43,7 +49,7 @@ MEMORY, ORDER, TEACHERS = 32, 8, 3
 so-many-th lit ray tells as much as all."""
 
 
-class Broken(Exception):
+class TrackLost(Exception):
     """A track does not lead to this frame; says why in a sentence."""
 
 
@@ -53,7 +59,7 @@ class Track:
 
     Parameters
     ----------
-    bed
+    geometry
         Splines and rays.
     exposure
         Size of dots and noise.
@@ -77,7 +83,7 @@ class Track:
         Frames that were followed.
     """
 
-    bed: Bed
+    geometry: SequenceGeometry
     exposure: Exposure
     match: Match
     residual_mm: float
@@ -105,22 +111,24 @@ def begin(
         return None
     if settings.dots.method != "band-pass" or rig.pattern.marker is None:
         return None
-    own, pool = Bed.of(rig, made.whole.basis, settings.fit), None
-    if former is not None and np.array_equal(own.at, former.bed.at):
-        bed, pool = former.bed, _moved_to(former, match, made)
+    own, pool = SequenceGeometry.of(rig, made.whole.basis, settings.fit), None
+    if former is not None and np.array_equal(own.at, former.geometry.at):
+        geometry, pool = former.geometry, _moved_to(former, match, made)
     if pool is None:
-        former, bed = None, own
-        pool = met(bed, made.whole.coefficients, bed.landing_mm, 4)
-    witness = match.witness[tuple(bed.at.T)]
-    told = witness != 0
-    surface = SplineSurface(bed.basis, pool.coefficients)
-    level = find_level(surface, bed.landing_mm[told, :2], witness[told], bed.spacing_mm)
+        former, geometry = None, own
+        pool = intersect_and_reflect(geometry, made.whole.coefficients, geometry.landing_mm, 4)
+    witness = match.witness[tuple(geometry.at.T)]
+    witnesses = witness != 0
+    surface = SplineSurface(geometry.basis, pool.coefficients)
+    level = find_level(
+        surface, geometry.landing_mm[witnesses, :2], witness[witnesses], geometry.spacing_mm
+    )
     if former is None:
         past, before = np.empty((0, len(pool.coefficients))), np.empty((0, *pool.slopes.shape))
     else:
         past, before = former.past[1 - MEMORY :], former.slopes[1 - MEMORY :]
     return Track(
-        bed=bed,
+        geometry=geometry,
         exposure=Exposure.of(image, settings.dots.band_pass),
         match=match,
         residual_mm=rms(made.residual_mm),
@@ -131,28 +139,28 @@ def begin(
         past=np.vstack([past, pool.coefficients]),
         slopes=np.concatenate([before, pool.slopes[None]]),
         open_mm=level.sigma_mm,
-        free_mm=np.full(len(bed.at), np.nan),
+        free_mm=np.full(len(geometry.at), np.nan),
     )
 
 
 def _moved_to(former: Track, match: Match, made: Reconstruction) -> WarmPool | None:
     """The surface of a cold fit in the splines of a former track; None if they have no place."""
-    bed = former.bed
-    number = {(i, j): k for k, (i, j) in enumerate((bed.at + 1).tolist())}
+    geometry = former.geometry
+    number = {(i, j): k for k, (i, j) in enumerate((geometry.at + 1).tolist())}
     rays = [number.get((i, j)) for i, j in match.ray.tolist()]
     if None in rays:
         return None
     ray = np.array(rays, np.int64)
-    points = bed.landing_mm.copy()
+    points = geometry.landing_mm.copy()
     points[ray] = made.points_mm
     start = replace(former.pool, points_mm=points)
-    slopes = Slopes.of(bed, ray, match.plane_mm, match.plane_covariance_mm2)
+    slopes = Slopes.of(geometry, ray, match.plane_mm, match.plane_covariance_mm2)
     try:
-        pool, _, moved = fit_slopes_to(bed, start, slopes)
+        pool, _, moved = fit_slopes_to(geometry, start, slopes)
     except CannotMeasure:
         return None
     lower_by = float(np.mean(made.points_mm[:, 2] - pool.points_mm[ray, 2]))
-    pool = met(bed, pool.coefficients + lower_by, pool.points_mm, 4)
+    pool = intersect_and_reflect(geometry, pool.coefficients + lower_by, pool.points_mm, 4)
     return pool if moved < UNSETTLED_MM else None
 
 
@@ -222,10 +230,10 @@ def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
     that is foreseen finds them, one is grown from the last surface, and from those before it: then
     dots were nowhere foreseen, and it is infinite.
     """
-    bed, count = track.bed, int(track.lit.sum())
-    own, looked_for = filled(bed, track.lit), around(bed, track.lit, 2)
+    geometry, count = track.geometry, int(track.lit.sum())
+    own, looked_for = filled(geometry, track.lit), around(geometry, track.lit, 2)
     for coefficients in predictions(track):
-        pool = met(bed, coefficients, track.pool.points_mm, 1)
+        pool = intersect_and_reflect(geometry, coefficients, track.pool.points_mm, 1)
         labels, off = tracked(scene, pool, own, looked_for)
         if len(off) >= FOUND * count and (half := median(off)) < STEADY:
             return pool, labels, half
@@ -235,7 +243,7 @@ def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
         found = max(found, int(np.sum(labels != UNLABELLED)))
         if found >= max(FOUND * count, LEAST_DOTS):
             return pool, labels, np.inf
-    raise Broken(f"{found} of {count} dots were found again")
+    raise TrackLost(f"{found} of {count} dots were found again")
 
 
 def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, IntArray]:
@@ -243,10 +251,10 @@ def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, Int
 
     Dots in the middle move least from frame to frame; how they moved tells how those around do.
     """
-    bed = track.bed
-    pool = met(bed, start, track.pool.points_mm)
-    ring = np.abs(bed.at + 1 - np.array(bed.rig.pattern.marker)).max(axis=1)
-    looked_for = around(bed, track.lit, 2)
+    geometry = track.geometry
+    pool = intersect_and_reflect(geometry, start, track.pool.points_mm)
+    ring = np.abs(geometry.at + 1 - np.array(geometry.rig.pattern.marker)).max(axis=1)
+    looked_for = around(geometry, track.lit, 2)
     labels = np.full(len(ring), UNLABELLED)
     for reach in range(FIRST_RING, int(ring[track.lit].max()) + 2):
         labels, _ = tracked(scene, pool, track.lit & (ring <= reach), looked_for)
@@ -254,6 +262,6 @@ def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, Int
         if len(ray) < LEAST_DOTS:
             break
         dot = labels[ray]
-        slopes = Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
-        pool, _, _ = fit_slopes_to(bed, pool, slopes, GROWING_ROUNDS, start)
+        slopes = Slopes.of(geometry, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+        pool, _, _ = fit_slopes_to(geometry, pool, slopes, GROWING_ROUNDS, start)
     return pool, labels

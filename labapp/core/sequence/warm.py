@@ -27,23 +27,23 @@ from labapp.core.matching.ray_growth import UNLABELLED, Scene
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.rows.lattice import Lattice
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
-from labapp.core.sequence.track import MEMORY, Broken, Track, begin, found_again, rms
+from labapp.core.sequence.track import MEMORY, Track, TrackLost, begin, found_again, rms
 from labapp.core.sequence.warm_fit import (
-    Bed,
+    SequenceGeometry,
     Slopes,
     WarmPool,
+    evaluate_at_landing_points,
     fit_slopes_to,
-    lay,
-    met,
+    intersect_and_reflect,
 )
-from labapp.core.sequence.warm_match import beyond, testimony, widened
+from labapp.core.sequence.warm_match import beyond, classify_rays, widened
 from labapp.core.surface import kernels, measures
 from labapp.core.surface.measures import scaled_errors
 from labapp.core.surface.pool_fit import Level, place_level
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.rim import follow_rim
 from labapp.core.surface.sizes import sizes_of
-from labapp.core.surface.solver import SERVES_MM, sigma_of
+from labapp.core.surface.solver import REUSE_MM, sigma_of
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
@@ -118,13 +118,13 @@ class WarmChain:
         """
         try:
             if self._track is None:
-                raise Broken("no frame before it was measured")
+                raise TrackLost("no frame before it was measured")
             measurement, self._track = follow(
                 image, self._track, self.calibration, self.settings, self._passed
             )
             self.broke = None
             return measurement
-        except (Broken, CannotMeasure, np.linalg.LinAlgError) as reason:
+        except (TrackLost, CannotMeasure, np.linalg.LinAlgError) as reason:
             self.broke = str(reason)
             return None
 
@@ -169,44 +169,44 @@ def follow(
 
     Raises
     ------
-    Broken
+    TrackLost
         If the track does not lead here.
     CannotMeasure
         If there are no dots, or no surface.
     """
-    bed = track.bed
+    geometry = track.geometry
     if image.shape != track.exposure.noise.shape:
-        raise Broken("the frame has another size than the one before")
+        raise TrackLost("the frame has another size than the one before")
     dots = quick_dots(image, track.exposure, settings.dots.band_pass)
     passed("dots")
-    scene = Scene.of(dots, bed.rig, calibration, (image.shape[0], image.shape[1]))
+    scene = Scene.of(dots, geometry.rig, calibration, (image.shape[0], image.shape[1]))
     pool, labels, off = found_again(track, scene)
     passed("match")
-    pool, labels, lower = _fitted(bed, scene, pool, labels)
+    pool, labels, lower = _fitted(geometry, scene, pool, labels)
     passed("fit")
-    heard = testimony(bed, scene, pool, labels)
+    heard = classify_rays(geometry, scene, pool, labels)
     level, open_mm = _level(track, pool, heard.witness)
-    outside = beyond(bed, _shifted(pool, level), level, labels, track.lit)
+    outside = beyond(geometry, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
-        pool, lower = _settled(bed, _shifted(pool, level), _slopes(bed, scene, labels))
-        heard = testimony(bed, scene, pool, labels)
+        pool, lower = _settled(geometry, _shifted(pool, level), _slopes(geometry, scene, labels))
+        heard = classify_rays(geometry, scene, pool, labels)
         level, open_mm = _level(track, pool, heard.witness)
-    pool = met(bed, pool.coefficients + level.shift_mm, pool.points_mm, 1)
+    pool = intersect_and_reflect(geometry, pool.coefficients + level.shift_mm, pool.points_mm, 1)
     passed("level")
     ray = np.flatnonzero(labels != UNLABELLED)
     dot = labels[ray]
     residual = pool.plane_mm[ray] - scene.plane_mm[dot]
     limits = settings.match
     if heard.stray > limits.stray[0] + limits.stray[1] * len(dots):
-        raise Broken(f"{heard.stray} dots have no ray")
+        raise TrackLost(f"{heard.stray} dots have no ray")
     if heard.missed > limits.missed[0] + limits.missed[1] * len(ray):
-        raise Broken(f"{heard.missed} rays amid the others have no dot")
+        raise TrackLost(f"{heard.missed} rays amid the others have no dot")
     if not rms(residual) < WORSE * track.residual_mm:
-        raise Broken("the surface no longer has the dots")
-    unseen = 0 if _datum_seen(bed, scene, pool, labels, off) else track.unseen + 1
+        raise TrackLost("the surface no longer has the dots")
+    unseen = 0 if _datum_seen(geometry, scene, pool, labels, off) else track.unseen + 1
     if unseen > HELD:
-        raise Broken("the dots beside the absent one have not been seen for long")
+        raise TrackLost("the dots beside the absent one have not been seen for long")
     match = _match(track, scene, heard.witness, ray, dot, rms(residual))
     track = _with_uncertainty(track, pool, ray, lower)
     reconstruction, size = _sized(track, pool, level, lower, match, residual, ray)
@@ -222,7 +222,7 @@ def follow(
         unseen=unseen,
         count=track.count + 1,
     )
-    lattice = _lattice(match, bed.rig, len(dots))
+    lattice = _lattice(match, geometry.rig, len(dots))
     told = Measurement("ok", "", "fit", dots, lattice, match, reconstruction, size)
     passed("measures")
     return told, after
@@ -233,38 +233,38 @@ def _shifted(pool: WarmPool, level: Level) -> WarmPool:
 
 
 def _fitted(
-    bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray
+    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, labels: IntArray
 ) -> tuple[WarmPool, IntArray, FloatArray]:
     """Fit the surface, roughly first, and then with the labels that it bears out."""
-    slopes, serves = _slopes(bed, scene, labels), None
+    slopes, factor = _slopes(geometry, scene, labels), None
     for _ in range(WIDENINGS):
-        pool, lower, moved = fit_slopes_to(bed, pool, slopes, until_mm=ROUGHLY_MM)
-        serves = lower if moved < SERVES_MM else None
-        before, labels = labels, widened(bed, scene, pool, lower, labels)
+        pool, lower, moved = fit_slopes_to(geometry, pool, slopes, until_mm=ROUGHLY_MM)
+        factor = lower if moved < REUSE_MM else None
+        before, labels = labels, widened(geometry, scene, pool, lower, labels)
         if np.array_equal(labels, before):
             break
-        slopes, serves = _slopes(bed, scene, labels), None
+        slopes, factor = _slopes(geometry, scene, labels), None
         if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
             break
-    pool, lower = _settled(bed, pool, slopes, serves)
+    pool, lower = _settled(geometry, pool, slopes, factor)
     return pool, labels, lower
 
 
 def _settled(
-    bed: Bed, pool: WarmPool, slopes: Slopes, lower: FloatArray | None = None
+    geometry: SequenceGeometry, pool: WarmPool, slopes: Slopes, lower: FloatArray | None = None
 ) -> tuple[WarmPool, FloatArray]:
-    pool, lower, moved = fit_slopes_to(bed, pool, slopes, lower=lower)
+    pool, lower, moved = fit_slopes_to(geometry, pool, slopes, lower=lower)
     if not moved < UNSETTLED_MM:
-        raise Broken("the surface does not settle")
+        raise TrackLost("the surface does not settle")
     return pool, lower
 
 
-def _slopes(bed: Bed, scene: Scene, labels: IntArray) -> Slopes:
+def _slopes(geometry: SequenceGeometry, scene: Scene, labels: IntArray) -> Slopes:
     ray = np.flatnonzero(labels != UNLABELLED)
     if len(ray) < LEAST_DOTS:
-        raise Broken("hardly a dot is left that has a ray")
+        raise TrackLost("hardly a dot is left that has a ray")
     dot = labels[ray]
-    return Slopes.of(bed, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+    return Slopes.of(geometry, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
 
 
 def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, float]:
@@ -272,41 +272,43 @@ def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, floa
 
     How deep the rear lies is not asked every time; in between the level is known no better.
     """
-    told = witness != 0
+    witnesses = witness != 0
     if not (witness < 0).any():
-        raise Broken("no ray that would show stayed away")
-    bed, before = track.bed, track.level
-    height, slope = lay(bed, pool.coefficients)
+        raise TrackLost("no ray that would show stayed away")
+    geometry, before = track.geometry, track.level
+    height, slope = evaluate_at_landing_points(geometry, pool.coefficients)
     free = track.count % SINKS_EVERY == SINKS_EVERY - 1
     drop = None if free else before.rear.drop_mm
-    y, about = bed.landing_mm[told, 1], (0.0, before.sign)
-    told_by = height[told], slope[told], y, witness[told]
-    level = place_level(*told_by, bed.spacing_mm, drop, about, WINDOW)
+    y, about = geometry.landing_mm[witnesses, 1], (0.0, before.sign)
+    at_witnesses = height[witnesses], slope[witnesses], y, witness[witnesses]
+    level = place_level(*at_witnesses, geometry.spacing_mm, drop, about, WINDOW)
     open_mm = level.sigma_mm if free else track.open_mm
     return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
 
 
-def _datum_seen(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray, off: float) -> bool:
+def _datum_seen(
+    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, labels: IntArray, off: float
+) -> bool:
     """Whether all four neighbours of the absent ray are lit.
 
     Raises
     ------
-    Broken
+    TrackLost
         If the absent ray's place is lit; or a neighbour is dark and the dots are not where they
         were foreseen, or three are: no hole tells the rows then (`lattice.find_holes`).
     """
-    if bed.hole is None:
-        raise Broken("the absent ray is at the pool's edge")
-    hole, beside = bed.hole[0], bed.hole[1:]
+    if geometry.hole is None:
+        raise TrackLost("the absent ray is at the pool's edge")
+    hole, beside = geometry.hole[0], geometry.hole[1:]
     lit = labels[beside] != UNLABELLED
     reach = min(
         float(np.linalg.norm(pool.plane_mm[a] - pool.plane_mm[b])) / 2
         for a, b in beside.reshape(2, 2)
     )
     if not np.linalg.norm(scene.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
-        raise Broken("a dot is where the absent one should be dark")
+        raise TrackLost("a dot is where the absent one should be dark")
     if lit.sum() < (2 if off < FORESEEN else 4):
-        raise Broken("the dots beside the absent one are not seen")
+        raise TrackLost("the dots beside the absent one are not seen")
     return bool(lit.all())
 
 
@@ -321,16 +323,16 @@ def _match(
     dot: IntArray,
     residual_mm: float,
 ) -> Match:
-    bed, first = track.bed, track.match
-    marker = np.array(bed.rig.pattern.marker)
-    numbers = (bed.at[ray] + 1 - marker) * ways(first.orientation)
-    said = np.zeros((bed.rig.pattern.rows, bed.rig.pattern.columns), np.int64)
-    said[tuple(bed.at.T)] = witness
+    geometry, first = track.geometry, track.match
+    marker = np.array(geometry.rig.pattern.marker)
+    numbers = (geometry.at[ray] + 1 - marker) * ways(first.orientation)
+    said = np.zeros((geometry.rig.pattern.rows, geometry.rig.pattern.columns), np.int64)
+    said[tuple(geometry.at.T)] = witness
     others = tuple(t for t in first.trials if t.orientation != first.orientation)
     return Match(
         orientation=first.orientation,
         dot=dot,
-        ray=bed.at[ray] + 1,
+        ray=geometry.at[ray] + 1,
         reflected=numbers + 1 - numbers.min(axis=0),
         plane_mm=scene.plane_mm[dot],
         plane_covariance_mm2=scene.covariance_mm2[dot],
@@ -356,7 +358,7 @@ def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatA
     """Work out how uncertain reflection points are, every now and then or where it is not known."""
     if track.count % POINTS_EVERY and np.isfinite(track.free_mm[ray]).all():
         return track
-    splines, values = kernels.splines_at(track.bed.basis.grid, pool.points_mm[ray, :2])
+    splines, values = kernels.splines_at(track.geometry.basis.grid, pool.points_mm[ray, :2])
     at_points = np.zeros((len(ray), len(pool.coefficients)))
     np.put_along_axis(at_points, splines, values[0], axis=1)
     free = track.free_mm.copy()
@@ -374,18 +376,18 @@ def _sized(
     ray: IntArray,
 ) -> tuple[Reconstruction, measures.Measures]:
     """Boundary, sizes and all their ±."""
-    bed, coefficients = track.bed, pool.coefficients
+    geometry, coefficients = track.geometry, pool.coefficients
     points = pool.points_mm[ray]
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-    boundary, climb = follow_rim(bed.basis, coefficients, level, center, track.boundary)
-    sizes = sizes_of(bed.basis, coefficients, level, boundary, climb)
+    boundary, climb = follow_rim(geometry.basis, coefficients, level, center, track.boundary)
+    sizes = sizes_of(geometry.basis, coefficients, level, boundary, climb)
     if not sizes.holds:
-        raise Broken("the surface comes down to the work piece within its boundary")
+        raise TrackLost("the surface comes down to the work piece within its boundary")
     share = np.full(len(ray), 1 / len(ray))
-    level_at = kernels.gradient_of_sum(bed.basis.grid, len(coefficients), points[:, :2], share)
+    level_at = kernels.gradient_of_sum(geometry.basis.grid, len(coefficients), points[:, :2], share)
     made = Reconstruction(
         scheme="fit",
-        surface=SplineSurface(bed.basis, coefficients),
+        surface=SplineSurface(geometry.basis, coefficients),
         boundary=boundary,
         ray=match.ray,
         points_mm=points,
@@ -394,6 +396,6 @@ def _sized(
     )
     sigma = sigma_of(lower, sizes.gradient, level_at, level.sigma_mm)
     # As `measures.reflection_scale` has it; where the rays land is known.
-    scale = np.ptp(bed.landing_mm[ray, :2], axis=0) / np.ptp(match.plane_mm, axis=0)
+    scale = np.ptp(geometry.landing_mm[ray, :2], axis=0) / np.ptp(match.plane_mm, axis=0)
     errors = scaled_errors(made, scale)
     return made, measures.measures_of(errors, sizes.size, sizes.peak_mm, center, sigma)

@@ -24,7 +24,7 @@ SETTLED_MM = 3e-4
 
 
 @dataclass(frozen=True)
-class Bed:
+class SequenceGeometry:
     """What stays the same along a track: the splines, and the R rays that land among them.
 
     Parameters
@@ -70,7 +70,7 @@ class Bed:
         freeze(self)
 
     @classmethod
-    def of(cls, rig: Rig, basis: SplineBasis, settings: FitSettings) -> Bed:
+    def of(cls, rig: Rig, basis: SplineBasis, settings: FitSettings) -> SequenceGeometry:
         """Lay it out for a rig and the basis of a cold fit."""
         rays = ray_directions(rig.laser, rig.pattern)
         landing = meet_level(rig.laser.position_mm, rays)
@@ -126,11 +126,13 @@ class WarmPool:
         freeze(self)
 
 
-def met(bed: Bed, coefficients: FloatArray, points_mm: FloatArray, steps: int = 2) -> WarmPool:
+def intersect_and_reflect(
+    geometry: SequenceGeometry, coefficients: FloatArray, points_mm: FloatArray, steps: int = 2
+) -> WarmPool:
     """Meet every ray with a surface, from points nearby, shape (R, 3)."""
-    grid, rays = bed.basis.grid, bed.rays
+    grid, rays = geometry.basis.grid, geometry.rays
     return WarmPool(
-        coefficients, *kernels.meet(grid, coefficients, rays, points_mm, steps, bed.plane)
+        coefficients, *kernels.meet(grid, coefficients, rays, points_mm, steps, geometry.plane)
     )
 
 
@@ -141,7 +143,7 @@ class Slopes:
     Parameters
     ----------
     ray
-        Number of each one's ray in the bed, shape (n,).
+        Number of each one's ray in the geometry, shape (n,).
     dots_mm
         The dots in the UCS, shape (n, 3), mm.
     weights
@@ -153,15 +155,17 @@ class Slopes:
     weights: FloatArray
 
     @classmethod
-    def of(cls, bed: Bed, ray: IntArray, plane_mm: FloatArray, covariance: FloatArray) -> Slopes:
+    def of(
+        cls, geometry: SequenceGeometry, ray: IntArray, plane_mm: FloatArray, covariance: FloatArray
+    ) -> Slopes:
         """Weigh dots on the plane, shape (n, 2), of the covariance given, shape (n, 2, 2)."""
-        dots = bed.rig.imaging_plane.to_universal(plane_mm)
-        at = bed.laser_mm, bed.plane[1:3], bed.landing_mm[ray], dots
-        return cls(ray, dots, kernels.slope_weights(*at, covariance, bed.settings.floor_mm))
+        dots = geometry.rig.imaging_plane.to_universal(plane_mm)
+        at = geometry.laser_mm, geometry.plane[1:3], geometry.landing_mm[ray], dots
+        return cls(ray, dots, kernels.slope_weights(*at, covariance, geometry.settings.floor_mm))
 
 
 def fit_slopes_to(
-    bed: Bed,
+    geometry: SequenceGeometry,
     pool: WarmPool,
     slopes: Slopes,
     rounds: int = ROUNDS,
@@ -172,8 +176,8 @@ def fit_slopes_to(
     """Fit the surface to slopes, round by round from a pool that is near.
 
     Each round takes the slopes where the rays now meet the surface, fits, and meets them anew,
-    until no reflection point moves by ``until_mm``. A factor that serves for the first may be given
-    as ``lower``. What is held down is the roughness; of the difference to a surface where
+    until no reflection point moves by ``until_mm``. The factor of the first round may be given as
+    ``lower``. What is held down is the roughness; of the difference to a surface where
     coefficients ``rest`` are given.
 
     Returns
@@ -187,9 +191,9 @@ def fit_slopes_to(
     CannotMeasure
         ``no-surface`` if the slopes do not settle the surface.
     """
-    grid, rays = bed.basis.grid, bed.rays[slopes.ray]
+    grid, rays = geometry.basis.grid, geometry.rays[slopes.ray]
     equations = NormalEquations(
-        bed.basis, bed.stiffness, bed.laser_mm, slopes.dots_mm, slopes.weights, lower
+        geometry.basis, geometry.stiffness, geometry.laser_mm, slopes.dots_mm, slopes.weights, lower
     )
     coefficients, points, moved = pool.coefficients, pool.points_mm[slopes.ray], 0.0
     for _ in range(rounds):
@@ -200,10 +204,12 @@ def fit_slopes_to(
     every = pool.points_mm.copy()
     every[slopes.ray] = points
     assert equations.factor is not None
-    return met(bed, coefficients, every, 1), equations.factor, moved
+    return intersect_and_reflect(geometry, coefficients, every, 1), equations.factor, moved
 
 
-def lay(bed: Bed, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+def evaluate_at_landing_points(
+    geometry: SequenceGeometry, coefficients: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Height and slopes of a surface where the rays would land, shapes (R,) and (R, 2)."""
-    z, *slope = kernels.surface_at(bed.basis.grid, coefficients, bed.landing_mm)
+    z, *slope = kernels.surface_at(geometry.basis.grid, coefficients, geometry.landing_mm)
     return z, np.array(slope).T

@@ -23,7 +23,7 @@ from labapp.core.matching.ray_growth import (
     Scene,
     amid,
 )
-from labapp.core.sequence.warm_fit import Bed, WarmPool, lay
+from labapp.core.sequence.warm_fit import SequenceGeometry, WarmPool, evaluate_at_landing_points
 from labapp.core.surface import kernels
 from labapp.core.surface.pool_fit import Level
 from labapp.core.values import BoolArray, FloatArray, IntArray, median
@@ -55,24 +55,24 @@ def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
     return distance
 
 
-def around(bed: Bed, lit: BoolArray, rings: int) -> BoolArray:
+def around(geometry: SequenceGeometry, lit: BoolArray, rings: int) -> BoolArray:
     """Rays in a mask, shape (R,), and their neighbours, so many rings of them."""
-    wide = cv2.dilate(on_pattern(bed, lit), np.ones((3, 3), np.uint8), iterations=rings)
-    return np.asarray(wide[tuple(bed.at.T)], bool)
+    wide = cv2.dilate(on_pattern(geometry, lit), np.ones((3, 3), np.uint8), iterations=rings)
+    return np.asarray(wide[tuple(geometry.at.T)], bool)
 
 
-def on_pattern(bed: Bed, lit: BoolArray) -> npt.NDArray[np.uint8]:
+def on_pattern(geometry: SequenceGeometry, lit: BoolArray) -> npt.NDArray[np.uint8]:
     """A mask of rays, shape (R,), over the whole pattern, shape (rows, columns)."""
-    pattern = bed.rig.pattern
+    pattern = geometry.rig.pattern
     grid = np.zeros((pattern.rows, pattern.columns), np.uint8)
-    grid[tuple(bed.at.T)] = lit
+    grid[tuple(geometry.at.T)] = lit
     return grid
 
 
-def filled(bed: Bed, lit: BoolArray) -> BoolArray:
+def filled(geometry: SequenceGeometry, lit: BoolArray) -> BoolArray:
     """Lit rays and those amid them, whose dots may have been missed: a surface is sure of both."""
-    among = amid(on_pattern(bed, lit).view(bool))[tuple(bed.at.T)]
-    return np.asarray((lit | among) & ~bed.absent)
+    among = amid(on_pattern(geometry, lit).view(bool))[tuple(geometry.at.T)]
+    return np.asarray((lit | among) & ~geometry.absent)
 
 
 def unlabelled(count: int, labels: IntArray) -> IntArray:
@@ -118,7 +118,7 @@ def tracked(
 
 
 def widened(
-    bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, labels: IntArray
+    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, lower: FloatArray, labels: IntArray
 ) -> IntArray:
     """Labels that the fitted surface bears out, and new ones beside them that it makes sure of.
 
@@ -126,7 +126,7 @@ def widened(
     dot for the ray (`ray_growth`), with what the prediction is uncertain by.
     """
     lit = labels != UNLABELLED
-    looked_for = np.flatnonzero(around(bed, lit, 2) & np.isfinite(pool.plane_mm[:, 0]))
+    looked_for = np.flatnonzero(around(geometry, lit, 2) & np.isfinite(pool.plane_mm[:, 0]))
     next_mm = next_of(pool.plane_mm, looked_for)
     rays = np.flatnonzero(lit)
     off = np.linalg.norm(pool.plane_mm[rays] - scene.plane_mm[labels[rays]], axis=-1)
@@ -136,14 +136,14 @@ def widened(
     free = unlabelled(len(scene.plane_mm), labels)
     if len(free) == 0:
         return labels
-    beside = np.flatnonzero(around(bed, lit, 1) & ~lit & ~bed.absent)
+    beside = np.flatnonzero(around(geometry, lit, 1) & ~lit & ~geometry.absent)
     if len(beside) == 0:
         return labels
     apart = apart_mm(pool.plane_mm[looked_for], scene.plane_mm[free])
     near = looked_for[np.unique(np.argsort(apart, axis=0)[:RIVALS])]
     apart = apart_mm(pool.plane_mm[near], scene.plane_mm)
     dots = np.union1d(free, np.argsort(apart, axis=1)[:, : RIVALS + 1])
-    distance, cost = _surprise(bed, scene, pool, lower, near, dots)
+    distance, cost = _surprise(geometry, scene, pool, lower, near, dots)
     for dot in np.searchsorted(dots, free).tolist():
         best = int(np.argmin(cost[:, dot]))
         ray = int(near[best])
@@ -156,13 +156,18 @@ def widened(
 
 
 def _surprise(
-    bed: Bed, scene: Scene, pool: WarmPool, lower: FloatArray, ray: IntArray, dot: IntArray
+    geometry: SequenceGeometry,
+    scene: Scene,
+    pool: WarmPool,
+    lower: FloatArray,
+    ray: IntArray,
+    dot: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
     """What `match_kernels.surprises` says of rays making dots, shapes (rays, dots)."""
-    dots_mm = bed.rig.imaging_plane.to_universal(pool.plane_mm[ray])
-    laser, axes = bed.laser_mm, bed.plane[1:3]
+    dots_mm = geometry.rig.imaging_plane.to_universal(pool.plane_mm[ray])
+    laser, axes = geometry.laser_mm, geometry.plane[1:3]
     spread = kernels.covariance_of_dots(
-        bed.basis.grid, lower, laser, axes, pool.points_mm[ray], dots_mm
+        geometry.basis.grid, lower, laser, axes, pool.points_mm[ray], dots_mm
     )
     made = match_kernels.surprises(
         scene.plane_mm[dot],
@@ -174,7 +179,7 @@ def _surprise(
 
 
 @dataclass(frozen=True)
-class Testimony:
+class RayClasses:
     """What the rays say with a surface under them.
 
     Parameters
@@ -190,20 +195,22 @@ class Testimony:
     missed: int
 
 
-def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testimony:
+def classify_rays(
+    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, labels: IntArray
+) -> RayClasses:
     """Ask every ray, as `hypothesis` does."""
     lit = labels != UNLABELLED
     known = np.isfinite(pool.plane_mm[:, 0])
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
     merged = next_mm < scene.resolution_mm
     hidden = kernels.behind_torch(
-        pool.points_mm, bed.rays, pool.slopes, bed.rig.electrode.height_mm
+        pool.points_mm, geometry.rays, pool.slopes, geometry.rig.electrode.height_mm
     )
     seen = known & ~hidden & ~merged
     seen[seen] = scene.in_view(pool.plane_mm[seen])
-    among = amid(on_pattern(bed, lit).view(bool))[tuple(bed.at.T)]
-    missed = int(np.sum(among & ~bed.absent & ~lit & seen))
-    witness = np.where(seen & ~among & ~bed.absent, -1, 0)
+    among = amid(on_pattern(geometry, lit).view(bool))[tuple(geometry.at.T)]
+    missed = int(np.sum(among & ~geometry.absent & ~lit & seen))
+    witness = np.where(seen & ~among & ~geometry.absent, -1, 0)
     witness[lit] = 1
     stray = unlabelled(len(scene.plane_mm), labels)
     if len(stray):
@@ -214,19 +221,21 @@ def testimony(bed: Bed, scene: Scene, pool: WarmPool, labels: IntArray) -> Testi
         run_together = known & merged & among
         if run_together.any():
             stray = stray[apart[run_together].min(axis=0) > scene.resolution_mm]
-    return Testimony(witness, len(stray), missed)
+    return RayClasses(witness, len(stray), missed)
 
 
-def beyond(bed: Bed, pool: WarmPool, level: Level, labels: IntArray, before: BoolArray) -> IntArray:
+def beyond(
+    geometry: SequenceGeometry, pool: WarmPool, level: Level, labels: IntArray, before: BoolArray
+) -> IntArray:
     """Lit rays whose dots may be false ones, by where they landed.
 
     Well beyond the boundary one or two (`hypothesis`); of those not lit ``before``, shape (R,), all
     that are not within it.
     """
     lit = np.flatnonzero(labels != UNLABELLED)
-    height, slope = lay(bed, pool.coefficients)
-    over = height[lit] - level.rear.height(bed.landing_mm[lit, 1])
-    rise = np.linalg.norm(slope[lit] * bed.spacing_mm, axis=-1)
+    height, slope = evaluate_at_landing_points(geometry, pool.coefficients)
+    over = height[lit] - level.rear.height(geometry.landing_mm[lit, 1])
+    rise = np.linalg.norm(slope[lit] * geometry.spacing_mm, axis=-1)
     is_new, inward = ~before[lit], level.sign * over
     far = ~is_new & (inward < -BEYOND * rise)
     return np.asarray(lit[(is_new & (inward < 0)) | (far & (far.sum() <= FEW))])

@@ -170,7 +170,7 @@ def meet(
     steps: int,
     plane: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Meet rays with a surface and reflect them to a plane: see `warm_fit.met`.
+    """Meet rays with a surface and reflect them to a plane: see `warm_fit.intersect_and_reflect`.
 
     The plane is its origin, its axes along X′ and Z′ and its normal, shape (4, 3).
     """
@@ -300,7 +300,7 @@ def roughness(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> Flo
 
 
 @_compiled(_f2, _f2, _f3, types.Array(_f, 1, "C"), _i)
-def add_gram(
+def accumulate_normal_matrix(
     grid: FloatArray, points: FloatArray, weights: FloatArray, normal: FloatArray, stride: int
 ) -> None:
     """Add what slopes at points weigh to a normal matrix, its coefficients i ≤ j at i·stride + j.
@@ -383,7 +383,7 @@ def covariance_of_dots(
 
 
 @_compiled(_f2, _f1, _f2, _f3, _f1, _f2)
-def pull(
+def gradient_rhs(
     grid: FloatArray,
     coefficients: FloatArray,
     points: FloatArray,
@@ -391,7 +391,7 @@ def pull(
     laser: FloatArray,
     dots: FloatArray,
 ) -> FloatArray:
-    """What the slopes that dots ask for at points pull at the coefficients, shape (p,)."""
+    """Right-hand side of the normal equations, shape (p,)."""
     made, work = np.zeros(len(coefficients)), np.empty((4, 4))
     many = int(grid[1, 3]) + 3
     for k in range(len(points)):

@@ -11,7 +11,7 @@ from labapp.core.values import FloatArray
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
 
-NOTHING = 1e-17
+EPS = 1e-17
 """One and so much is one."""
 
 FACTORS = 1000
@@ -19,7 +19,7 @@ FACTORS = 1000
 
 
 @_compiled(_f2, _f1, _f, _f, _i, _f1)
-def doubts(
+def level_negative_log_likelihood(
     over: FloatArray, side: FloatArray, first: float, step: float, count: int, blurs: FloatArray
 ) -> FloatArray:
     """What witnesses have against levels: Σ log(1 + exp(−side · (over + level) / blur)).
@@ -60,12 +60,12 @@ def doubts(
                 starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
                 shrinks = np.exp(-abs(slope))
                 factor, k = np.exp(-abs(start + turn * slope)), turn
-                while k < count and factor > NOTHING:
+                while k < count and factor > EPS:
                     factors[k] *= 1.0 + factor
                     factor *= shrinks
                     k += 1
                 factor, k = np.exp(-abs(start + (turn - 1) * slope)), turn - 1
-                while k >= 0 and factor > NOTHING:
+                while k >= 0 and factor > EPS:
                     factors[k] *= 1.0 + factor
                     factor *= shrinks
                     k -= 1
@@ -89,7 +89,7 @@ def weigh(
     first: float,
     step: float,
 ) -> tuple[float, float, float, float]:
-    """Weigh levels and depths of the rear by what witnesses have against them (`doubts`).
+    """Weigh levels and depths of the rear (`level_negative_log_likelihood`).
 
     Parameters
     ----------

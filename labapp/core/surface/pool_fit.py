@@ -189,12 +189,12 @@ def fit_pool(
         points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
     )
     grid, covariance = basis.grid, plane_covariance_mm2
-    told = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
+    witnesses = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
     stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
     dots = rig.imaging_plane.to_universal(plane_mm)
     weights = kernels.slope_weights(laser, plane[1:3], points, dots, covariance, settings.floor_mm)
-    serves = settings.floor_mm / 50
-    equations = NormalEquations(basis, stiffness, laser, dots, weights, serves_mm=serves)
+    reuse = settings.floor_mm / 50
+    equations = NormalEquations(basis, stiffness, laser, dots, weights, reuse_mm=reuse)
     out = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
     rim = out > median(out)
     coefficients, moved = np.zeros(basis.count), np.inf
@@ -203,14 +203,17 @@ def fit_pool(
     level = Level(0.0, np.inf, 1, Rear(), np.inf)
     for count in range(settings.rounds):
         coefficients = equations.improve(coefficients, points, moved)
-        if not (witness[told] < 0).any():
+        if not (witness[witnesses] < 0).any():
             level = _rim_level(kernels.surface_at(grid, coefficients, points)[0], rim)
         else:
             # Whether the rear sinks is settled half-way, or the rounds might go to and fro.
             drop = None if 2 * count <= settings.rounds else level.rear.drop_mm
-            height, *slope = kernels.surface_at(grid, coefficients, ground[told])
+            height, *slope = kernels.surface_at(grid, coefficients, ground[witnesses])
             about = (0.0, level.sign) if count else None
-            before, at = level, (np.array(slope).T, ground[told, 1], witness[told], spacing)
+            before, at = (
+                level,
+                (np.array(slope).T, ground[witnesses, 1], witness[witnesses], spacing),
+            )
             level = place_level(height, *at, drop, about)
             if drop is not None:  # how far the rear leaves the level open stays as it was
                 level = replace(level, sigma_mm=max(level.sigma_mm, before.sigma_mm))
@@ -332,7 +335,7 @@ def place_level(
     drops = (_DROPS if seen else _DROPS[:1]) if drop_mm is None else np.array([drop_mm])
     over = np.array([height[near] - Rear(drop, start, end).height(y[near]) for drop in drops])
     side = sign * witness[near] / rise[near]
-    nats = level_kernels.doubts(over, side, first, step, count, _BLURS)
+    nats = level_kernels.level_negative_log_likelihood(over, side, first, step, count, _BLURS)
     asked = _BLUR_COST, _SUNK, drops, first, step
     drop, mean, sigma, off_window = level_kernels.weigh(nats, *asked)
     if about is not None and off_window > (AT_END if reach < 1.0 else AT_FAR_END):
@@ -348,7 +351,10 @@ def _rough_level(height: FloatArray, rise: FloatArray, witness: IntArray) -> tup
 
     scan, side = np.linspace((-height).min(), (-height).max(), 300), witness / rise
     asked = scan[0], scan[1] - scan[0], len(scan), _ROUGH
-    above, below = (level_kernels.doubts(height[None], k * side, *asked)[0, 0] for k in (1, -1))
+    above, below = (
+        level_kernels.level_negative_log_likelihood(height[None], k * side, *asked)[0, 0]
+        for k in (1, -1)
+    )
     if above.min() <= below.min():
         return float(scan[np.argmin(above)]), 1
     return float(scan[np.argmin(below)]), -1

@@ -18,9 +18,9 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
 
-SERVES_MM = 5e-3
-"""A factor serves for another round of a track where no reflection point has moved by more: that is
-small beside the splines' cells."""
+REUSE_MM = 5e-3
+"""A track uses its factor again where no reflection point has moved by more: that is small beside
+the splines' cells."""
 
 
 @dataclass
@@ -41,9 +41,9 @@ class NormalEquations:
         Inverse covariance of the slopes that follow from them, shape (n, 2, 2).
     factor
         Cholesky factor of the normal matrix (`normal_factor`); None: not known yet.
-    serves_mm
-        A factor serves for the next round where no reflection point has moved by more. An old one
-        lets what the dots leave nearly open run away, the sooner the surer the dots are.
+    reuse_mm
+        The factor is used again where no reflection point has moved by more. An old one lets
+        what the dots leave nearly open run away, the sooner the surer the dots are.
     """
 
     basis: SplineBasis
@@ -52,7 +52,7 @@ class NormalEquations:
     dots_mm: FloatArray
     weights: FloatArray
     factor: FloatArray | None = None
-    serves_mm: float = SERVES_MM
+    reuse_mm: float = REUSE_MM
 
     def improve(
         self,
@@ -81,10 +81,10 @@ class NormalEquations:
         """
         from labapp.core.surface import kernels
 
-        if self.factor is None or not moved_mm <= self.serves_mm:
+        if self.factor is None or not moved_mm <= self.reuse_mm:
             self.factor = normal_factor(self.basis, self.stiffness, points_mm, self.weights)
         at = self.basis.grid, coefficients, points_mm, self.weights
-        target = kernels.pull(*at, self.laser_mm, self.dots_mm)
+        target = kernels.gradient_rhs(*at, self.laser_mm, self.dots_mm)
         width = len(self.stiffness) - 1
         target -= dsbmv(width, 1.0, self.stiffness, coefficients - rest, lower=1)
         change = solve(self.factor, target)
@@ -122,7 +122,7 @@ def normal_factor(
     from labapp.core.surface import kernels
 
     columns, (height, count) = stiffness.flatten(order="F"), stiffness.shape
-    kernels.add_gram(basis.grid, points_mm, weights, columns, height - 1)
+    kernels.accumulate_normal_matrix(basis.grid, points_mm, weights, columns, height - 1)
     band = columns.reshape(count, height).T
     middle = kernels.splines_at(basis.grid, points_mm.mean(axis=0)[None])[0]
     band[0, middle[0, 5]] += band[0].mean()
