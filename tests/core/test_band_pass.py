@@ -49,6 +49,7 @@ def test_dots_of_any_size_are_found_and_measured(size: float) -> None:
 
 
 @pytest.mark.parametrize("snr", [6.0, 12.0, 25.0])
+@pytest.mark.slow
 def test_places_are_as_good_as_white_noise_allows_and_said_to_be(snr: float) -> None:
     rng = np.random.default_rng(2)
     settings = BandPassSettings(speckle_px=0.0)
@@ -63,6 +64,7 @@ def test_places_are_as_good_as_white_noise_allows_and_said_to_be(snr: float) -> 
     assert np.mean(sigmas) == pytest.approx(rms, rel=0.25)
 
 
+@pytest.mark.slow
 def test_noise_alone_is_not_a_dot() -> None:
     rng = np.random.default_rng(3)
     false = 0
@@ -106,6 +108,7 @@ def test_lobes_and_grains_of_a_dot_are_not_dots(size: float, grain: float) -> No
 
 @pytest.mark.parametrize("wide", [1, 2])
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom", "amid"])
+@pytest.mark.slow
 def test_a_bright_line_of_pixels_is_not_dots(side: str, wide: int) -> None:
     rng = np.random.default_rng(7)
     frame = draw(grid(), 1.6, 60.0) + rng.normal(10.0, 3.0, SHAPE)

@@ -258,6 +258,7 @@ def edited(correction: Correction, kind: int, numbers: list[int]) -> Correction:
 
 
 @given(EDITS)
+@pytest.mark.slow
 def test_whatever_is_edited_a_correction_stays_whole(edits: list[tuple[int, list[int]]]) -> None:
     correction = grid()
     for kind, numbers in edits:

@@ -156,6 +156,7 @@ def test_a_row_that_growth_does_not_reach_is_begun(monkeypatch: pytest.MonkeyPat
     assert matched(seen.dots) == (None, "no-match")
 
 
+@pytest.mark.slow
 def test_the_orientation_is_right_and_far_ahead(answers: list[Answer]) -> None:
     seen: set[Orientation] = set()
     for answer, match in answered(answers):
@@ -243,6 +244,7 @@ def test_where_the_centre_is_lit_no_ray_is_wrong(pool: Pool) -> None:
 
 @pytest.mark.parametrize("pool", [CONVEX, CONCAVE])
 @pytest.mark.parametrize("hole", [(11, 10), (9, 10)])
+@pytest.mark.slow
 def test_a_second_hole_beside_the_true_one_never_misleads(
     pool: Pool, hole: tuple[int, int]
 ) -> None:
@@ -265,6 +267,7 @@ def test_a_pool_too_shallow_to_be_told_which_way_round_is_not_answered(peak_mm: 
 
 
 @pytest.mark.parametrize(("pool", "forced"), [(CONVEX, "I/I"), (CONVEX, "S/I"), (CONCAVE, "S/S")])
+@pytest.mark.slow
 def test_a_forced_correspondence_that_is_wrong_has_no_answer(
     pool: Pool, forced: Orientation
 ) -> None:
@@ -382,6 +385,7 @@ def test_rows_given_by_hand_are_binding_and_keep_their_numbers(
     assert after.blocked_rows == {5}
 
 
+@pytest.mark.slow
 def test_dots_left_in_doubt_get_rays_that_no_given_number_contradicts() -> None:
     seen = see(CONVEX, np.random.default_rng(3), sigma_px=0.1, false=2)
     correction, reference = by_hand(seen)
@@ -397,6 +401,7 @@ def test_dots_left_in_doubt_get_rays_that_no_given_number_contradicts() -> None:
     assert one not in corrected(assign(correction, [one], row=true + 1)).dot
 
 
+@pytest.mark.slow
 def test_rows_without_a_reference_are_matched_as_a_block() -> None:
     seen = exact(CONVEX)
     correction, reference = by_hand(seen)

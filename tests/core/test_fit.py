@@ -118,6 +118,7 @@ def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
     assert np.isnan(made.surface.gradient(*beyond.T)).all()
 
 
+@pytest.mark.slow
 def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely() -> None:
     # Surfaces drawn from the covariance of the fit, each measured as a whole.
     rng = np.random.default_rng(0)

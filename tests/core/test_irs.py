@@ -47,6 +47,7 @@ def without(match, gone):
 @pytest.mark.parametrize(
     ("algorithm", "median"), [("opa", 0.40), ("epa-r", 0.12), ("epa-c", 0.12), ("epa-rc", 0.08)]
 )
+@pytest.mark.slow
 def test_depths_of_the_caps(algorithm, median):
     settings = irs.IrsSettings(algorithm=algorithm, boundary="circle")
     error = []
@@ -134,6 +135,7 @@ def test_more_loops_never_leave_a_larger_are():
 
 @examples(max_examples=25)
 @given(st.integers(0, 10_000), st.sampled_from([0.1, 0.3, 0.6, 0.9]), st.sampled_from(ALGORITHMS))
+@pytest.mark.slow
 def test_odd_sets_of_dots_are_measured_or_refused(seed, share, algorithm):
     rng = np.random.default_rng(seed)
     match = match_of(egg(6.6, 3.0, 4.0, rng.choice([-0.5, 0.4])), sigma_mm=0.1, rng=rng)

@@ -543,6 +543,7 @@ def test_doubts_of_what_is_unknown_are_unknown() -> None:
     assert np.isfinite(made[1]).all()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_kept_on_disk_is_compiled_all_the_same(tmp_path: Path) -> None:
     script = "from labapp.core.compiled import compiled\nfrom numba import types\n" + (
         "made = compiled(types.int64)(eval('lambda x: x + 1'))\nprint(made(1))\n"

@@ -82,6 +82,7 @@ def noisy(matrix: FloatArray, rng: np.random.Generator, sigma_px: float = 0.06) 
         (300, -20, 20, 5.5, 4.0),
     ],
 )
+@pytest.mark.slow
 def test_a_camera_askew_wants_the_homography(
     distance_mm: float, pitch_deg: float, yaw_deg: float, affine_mm: float, homography_mm: float
 ) -> None:
@@ -105,6 +106,7 @@ def test_a_camera_askew_wants_the_homography(
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.slow
 def test_a_camera_far_off_and_square_wants_the_affine(seed: int) -> None:
     matrix = pinhole(1e6, roll_deg=2.0 * seed - 3.0)
     found = pictured(matrix, seed)
@@ -132,6 +134,7 @@ def test_the_marks_are_not_biased() -> None:
 
 
 @pytest.mark.parametrize("view", [(1e6, 0, 0), (800, 12, -15), (450, -18, 8), (600, 30, 0)])
+@pytest.mark.slow
 def test_the_error_far_from_the_marks_is_within_its_bound(view: tuple[float, float, float]) -> None:
     matrix, rng = pinhole(*view), np.random.default_rng(6121)
     within = []

@@ -55,6 +55,7 @@ def measurements(images: dict[int, npt.NDArray[np.generic]]) -> dict[int, Measur
     }
 
 
+@pytest.mark.slow
 def test_the_sample_run_is_measured_true(measurements: dict[int, Measurement]) -> None:
     truth = {int(row["frame"]): row for row in table("truth.csv")}
     for index, result in measurements.items():

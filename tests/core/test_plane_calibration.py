@@ -132,6 +132,7 @@ def test_random_pictures_are_right_to_half_a_pixel() -> None:
 
 
 @pytest.mark.parametrize("kind", ["uint16", "colour", "alpha", "float"])
+@pytest.mark.slow
 def test_any_kind_of_picture_gives_the_same_points(kind: str) -> None:
     grey = Scene().render()
     image = {
@@ -221,6 +222,7 @@ def test_another_unit_scales_the_marks_too() -> None:
         ({"light": 14.0}, "Three marks are expected|no dark"),
     ],
 )
+@pytest.mark.slow
 def test_what_is_not_the_target_is_refused_with_the_reason(
     change: dict[str, object], words: str
 ) -> None:

@@ -66,6 +66,7 @@ def test_a_good_frame_is_good_and_its_height_known_to_what_is_predicted(
     assert abs(sizes.height_mm - height_mm) < 4 * found.height_sigma_mm
 
 
+@pytest.mark.slow
 def test_a_height_that_is_not_known_well_enough_is_said(
     good: GreyImage, measured: Measurement
 ) -> None:

@@ -58,6 +58,7 @@ def test_dots_are_found_where_they_are(chain: Chain, seed: int) -> None:
 
 
 @both
+@pytest.mark.slow
 def test_the_uncertainty_covers_the_errors(chain: Chain) -> None:
     ratios = []
     for seed in range(4):

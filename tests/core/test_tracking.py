@@ -65,6 +65,7 @@ def subset(dots: Dots, keep: IntArray | BoolArray) -> Dots:
     return Dots(*(getattr(dots, field.name)[keep] for field in fields(Dots)))
 
 
+@pytest.mark.slow
 def test_rows_are_carried_through_a_moving_pool() -> None:
     start = known(frames()[0])
     correction: Correction | None = block_row(start.correction, 2)
@@ -81,6 +82,7 @@ def test_rows_are_carried_through_a_moving_pool() -> None:
 
 
 @pytest.mark.parametrize("frame", range(FRAMES - 1))
+@pytest.mark.slow
 def test_nearly_all_dots_are_found_in_the_next_frame(frame: int) -> None:
     before, after = frames()[frame : frame + 2]
     start = known(before)
@@ -138,6 +140,7 @@ def row_step_px(correction: Correction) -> float:
 
 
 @pytest.mark.parametrize("rows", np.linspace(-2.0, 2.0, 17))
+@pytest.mark.slow
 def test_a_jolt_never_puts_dots_into_a_wrong_row(rows: float) -> None:
     # Shifted by a whole row, a picture looks like itself but for its rim and the reference.
     seen = frames()[7]

@@ -194,6 +194,7 @@ def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() ->
 
 
 @pytest.mark.parametrize("way", [-1, 1])
+@pytest.mark.slow
 def test_a_pool_that_goes_on_by_a_row_is_not_followed_to_the_wrong_rays(way: int) -> None:
     """The dot that would tell, where the absent one was, is missing."""
     track = chain()._track

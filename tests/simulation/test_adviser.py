@@ -139,6 +139,7 @@ def test_a_pool_without_dots_has_no_height() -> None:
 # --- the advice (Show 4, reduced) ---------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_advice_is_possible_within_the_limits_and_the_same_again(advice: Advice) -> None:
     assert advice.possible
     best = advice.best.place
@@ -154,6 +155,7 @@ def test_advice_is_possible_within_the_limits_and_the_same_again(advice: Advice)
     assert (again.best, again.error_mm) == (once.best, once.error_mm)
 
 
+@pytest.mark.slow
 def test_fresh_pools_are_whole_and_as_well_measured_as_promised(checked: Check) -> None:
     assert not checked.chosen[..., 1:].any()
     # So few have a mean that swings by a fifth, so twice Show 4's 20 % and some.

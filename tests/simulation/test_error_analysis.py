@@ -28,6 +28,7 @@ def ce() -> ErrorSurvey:
     return survey("CE", caps=aside(caps_8_3_1(), 1), workers=1)
 
 
+@pytest.mark.slow
 def test_ers_errs_as_the_text_has_it(ce: ErrorSurvey) -> None:
     # Fig. 8-6: CE-D 8.0 % on the mean, 26.9 % at worst; CE-B up to 2.51 %.
     assert len(ce.caps) == 28
@@ -52,6 +53,7 @@ def test_fit_is_below_ers(ce: ErrorSurvey, surface: str) -> None:
     assert ce.of("fit", "depth", surface).max() < 0.036
 
 
+@pytest.mark.slow
 def test_the_best_place_of_the_laser_leaves_ers_less_than_one_percent() -> None:
     # Fig. 8-8: 0.6 % at most. The deep hollows are the worst of the 28.
     found = survey("LE", ["ers"], caps=caps_8_3_1()[21:], workers=1)
@@ -59,6 +61,7 @@ def test_the_best_place_of_the_laser_leaves_ers_less_than_one_percent() -> None:
     assert found.of("ers", "depth").max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_denser_pattern_leaves_less() -> None:
     # §8.3.3, with the laser at nine places.
     caps = caps_8_3_1()[1::5]
@@ -82,6 +85,7 @@ def test_places_of_the_laser_span_the_range_of_8_3_2() -> None:
     assert (min(places), max(places)) == ((25.0, 25.0), (35.0, 35.0))
 
 
+@pytest.mark.slow
 def test_the_thumb_tack_of_8_2() -> None:
     # The text: height 9.12 % with ERS, diameter 1.49 %; exact reflections leave fit 0.5 %.
     frames = image_error.frame_errors([TACK], TACK_RIG, 2, schemes=("ers", "fit"), workers=1)[0]
@@ -118,6 +122,7 @@ def test_a_bench_that_is_off_is_told_by_its_dots() -> None:
     np.testing.assert_allclose(match.plane_mm, axes_of(view).calibration.to_plane(image))
 
 
+@pytest.mark.slow
 def test_parts_add_up_to_what_the_draws_scatter_by() -> None:
     # JCGM 101, 8: a bench that is well known acts linearly.
     known = exactly_seen(spherical_cap(6.0, 0.3), BENCH)
@@ -137,6 +142,7 @@ def test_parts_add_up_to_what_the_draws_scatter_by() -> None:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.slow
 def test_the_predicted_error_is_what_the_fit_makes(sign: int) -> None:
     rng = np.random.default_rng(3)
     predicted, made = [], []

@@ -42,6 +42,7 @@ def table(name):
 
 
 @pytest.mark.parametrize("pool", caps_8_3_1(), ids=lambda p: f"{p.footprint.width_mm}/{p.peak_mm}")
+@pytest.mark.slow
 def test_caps_reflect_as_a_sphere_does(pool):
     """Ray by ray against the quadratic formula for a ray and a sphere, and mirroring at it."""
     rig = rig_with()

@@ -74,6 +74,7 @@ def test_a_pool_ends_at_its_outline():
     assert pool.after(1.0) is pool
 
 
+@pytest.mark.slow
 def test_the_same_pool_by_function_reflects_the_same():
     whole = Dent(0.05, 0.8)
     assert whole in EGG.terms
@@ -199,6 +200,7 @@ def write_mesh(path, kind):
         ("a.ply", "text"),
     ],
 )
+@pytest.mark.slow
 def test_meshes_of_other_programs_are_read(tmp_path, name, kind):
     write_mesh(tmp_path / name, kind)
     assert_is_the_egg(read_pool(tmp_path / name), size_mm=0.02)

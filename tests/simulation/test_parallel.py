@@ -118,6 +118,7 @@ def spawned(parent: int) -> list[int]:
     ]
 
 
+@pytest.mark.slow
 def test_one_that_is_ended_while_it_tells_much_holds_nobody_up(tmp_path: Path) -> None:
     """What is told is larger than what a pipe holds: each is ended half through one."""
     program = tmp_path / "ended.py"

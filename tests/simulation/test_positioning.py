@@ -63,6 +63,7 @@ def test_a_convex_head_needs_more_room_and_a_concave_one_less():
 @pytest.mark.parametrize(
     ("name", "sign"), [("table_4_1_blocking_convex", 1), ("table_4_2_blocking_concave", -1)]
 )
+@pytest.mark.slow
 def test_where_tables_4_1_and_4_2_have_blocking_l2_is_too_short(name, sign):
     with (DATA / f"{name}.csv").open(encoding="utf-8") as file:
         for line in csv.DictReader(file):

@@ -53,6 +53,7 @@ def same_picture(made, kept):
 
 
 @every_sample
+@pytest.mark.slow
 def test_recording_is_what_the_program_makes(sample):
     with open_source(FOLDER / sample.name / sample.file) as source:
         assert len(source) == len(sample.pools)
@@ -66,6 +67,7 @@ def test_recording_is_what_the_program_makes(sample):
 
 
 @every_sample
+@pytest.mark.slow
 def test_pictures_and_texts_are_what_the_program_makes(sample):
     folder = FOLDER / sample.name
     kept = cv2.imread(str(folder / "calibration.png"), cv2.IMREAD_UNCHANGED)
@@ -91,6 +93,7 @@ def test_truth_is_that_of_the_pools(sample):
 
 
 @every_sample
+@pytest.mark.slow
 def test_dots_truth_is_that_of_the_rays(sample):
     index = len(sample.pools) - 1
     frame = sample.frame(index)
@@ -120,6 +123,7 @@ def test_dots_truth_agrees_with_the_picture(sample):
 
 
 @every_sample
+@pytest.mark.slow
 def test_writing_loses_nothing(sample, tmp_path):
     short = replace(sample, pools=sample.pools[:2], exposures=min(sample.exposures, 2))
     short.write(tmp_path)
@@ -260,6 +264,7 @@ def test_torch_out_of_the_way_is_no_matter():
 
 
 @pytest.mark.parametrize("index", [2, 4])
+@pytest.mark.slow
 def test_blocked_frame_is_measured_while_its_rows_can_be_told(index):
     frame = blocked_rows().frame(index)
     result = measured(blocked_rows(), index)
@@ -270,6 +275,7 @@ def test_blocked_frame_is_measured_while_its_rows_can_be_told(index):
 
 
 @pytest.mark.parametrize(("index", "mark"), [(5, True), (5, False)])
+@pytest.mark.slow
 def test_blocked_frame_is_refused_and_put_right_by_hand(index, mark):
     sample, frame = blocked_rows(), blocked_rows().frame(index)
     result = measured(sample, index)

@@ -22,6 +22,7 @@ def objects(image):
 
 
 @pytest.mark.parametrize("roll_deg", [-2.0, 0.0, 1.5])
+@pytest.mark.slow
 def test_picture_holds_three_objects_where_the_view_says(roll_deg):
     target, view = Target(), CameraView.rolled(roll_deg=roll_deg)
     look = TargetLook(vignetting=0.0, slope=0.0)
