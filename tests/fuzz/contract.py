@@ -1,4 +1,4 @@
-"""What must hold of a damaged file, whatever the damage: `TrackLost` says what does not."""
+"""What must hold of a damaged file, whatever the damage: `Broken` says what does not."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SCHEMES = ("fit", "ers")
 UNTOLD = "differs, and problems() is silent"
 
 
-class TrackLost(AssertionError):
+class Broken(AssertionError):
     """The contract does not hold."""
 
 
@@ -64,7 +64,7 @@ class Tally:
         except InputError as error:
             self.refused += 1
             if not str(error).strip() or not error.expected:
-                raise TrackLost(f"an error that says nothing: {error!r}") from error
+                raise Broken(f"an error that says nothing: {error!r}") from error
             return None
         self.used += 1
         return found
@@ -79,7 +79,7 @@ def unchanged(folder: Path) -> Iterator[None]:
     for name in sorted(before.keys() | after.keys()):
         if before.get(name) != after.get(name):
             what = "new" if name not in before else "gone" if name not in after else "changed"
-            raise TrackLost(f"{name} is {what}")
+            raise Broken(f"{name} is {what}")
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
@@ -252,7 +252,7 @@ def try_session(folder: Path, known: dict[Any, Any], rng: random.Random) -> Tall
         session = tally.attempt(lambda: Session.open(path))
         if session is None:
             if not journal and _contents(folder) != before:
-                raise TrackLost("it was not opened, and is changed")
+                raise Broken("it was not opened, and is changed")
             return tally
         stack.enter_context(session)
         problems = tally.attempt(session.problems)
@@ -266,13 +266,13 @@ def try_session(folder: Path, known: dict[Any, Any], rng: random.Random) -> Tall
             _hold_untold(known, after, forged=forged)
     strange = [name for name in _contents(folder) if name not in before]
     if [name for name in strange if not name.endswith("-journal")]:
-        raise TrackLost(f"left beside it: {strange}")
+        raise Broken(f"left beside it: {strange}")
     return tally
 
 
 def _hold_untold(known: dict[Any, Any], now: dict[Any, Any], *, forged: bool) -> None:
     if differing := untold(known, now, forged=forged):
-        raise TrackLost(f"{UNTOLD}: {'; '.join(differing[:3])}")
+        raise Broken(f"{UNTOLD}: {'; '.join(differing[:3])}")
 
 
 def _refuses(session: Session) -> None:
@@ -280,7 +280,7 @@ def _refuses(session: Session) -> None:
         session.set_record(Record(notes="never"))
     except InputError:
         return
-    raise TrackLost("a read-only session was changed")
+    raise Broken("a read-only session was changed")
 
 
 # --- the others -------------------------------------------------------------------------------
@@ -304,7 +304,7 @@ def try_setup(folder: Path, path: Path, rng: random.Random) -> Tally:
     values = {"laser": {"distance_mm": 33.0}, "pattern": {"absent": None}, "electrode": {}}
     refused = not tally.attempt(lambda: update_setup(path, values) or True)
     if refused and path.read_bytes() != before:
-        raise TrackLost("the setup was refused, and is changed")
+        raise Broken("the setup was refused, and is changed")
     return tally
 
 
@@ -324,13 +324,13 @@ def try_recording(folder: Path, path: Path, rng: random.Random) -> Tally:
                 for k in {0, len(source) // 2, len(source) - 1}:
                     frame = tally.attempt(lambda k=k: source.frame(k))
                     if frame is not None and frame.image.shape != source.shape:
-                        raise TrackLost(f"frame {k} is {frame.image.shape}, not {source.shape}")
+                        raise Broken(f"frame {k} is {frame.image.shape}, not {source.shape}")
         with Session.create(session_path) as session:
             embed = rng.random() < 0.5
             found = tally.attempt(lambda: session.import_recording(path, embed=embed))
             if found is None:
                 if session.recording is not None or len(session.frames):
-                    raise TrackLost("it was not imported, and is there")
+                    raise Broken("it was not imported, and is there")
             else:
                 for k in session.frames[:5].tolist():
                     tally.attempt(lambda k=k: session.frame(k))
@@ -349,7 +349,7 @@ def try_table(folder: Path, path: Path, rng: random.Random) -> Tally:
     with unchanged(folder):
         found = tally.attempt(lambda: read_correction(path, 1, SHAPE, before))
         if found is not None and not np.isfinite(found.dots.image_px).all():
-            raise TrackLost("a dot is nowhere")
+            raise Broken("a dot is nowhere")
     return tally
 
 
@@ -363,7 +363,7 @@ def try_manifest(folder: Path, path: Path, rng: random.Random) -> Tally:
     with unchanged(folder):
         found = tally.attempt(lambda: verify_export(path.parent))
         if found is not None and not all(isinstance(each, str) for each in found):
-            raise TrackLost(f"what is no sentence: {found}")
+            raise Broken(f"what is no sentence: {found}")
     return tally
 
 
@@ -391,7 +391,7 @@ def try_command_line(folder: Path, path: Path, originals: Originals, rng: random
         with unchanged(path.parent) if read_only else contextlib.nullcontext():
             code, told = _run([str(part) for part in command])
         if code not in (0, 1, 2) or "Traceback" in told or "a fault in the program" in told:
-            raise TrackLost(f"labapp {' '.join(map(str, command))}: exit code {code}: {told}")
+            raise Broken(f"labapp {' '.join(map(str, command))}: exit code {code}: {told}")
         tally.used += code == 0
         tally.refused += code != 0
     return tally
@@ -404,7 +404,7 @@ def _run(arguments: list[str]) -> tuple[int, str]:
             cli.main(arguments)
         except SystemExit as ended:
             return int(ended.code or 0), err.getvalue()
-    raise TrackLost("the command line came back")
+    raise Broken("the command line came back")
 
 
 # --- one case -----------------------------------------------------------------------------------
