@@ -54,7 +54,7 @@ class Plain(Page):
         self.taken.append(path)
 
 
-class TrackLost(Plain):
+class Broken(Plain):
     key = "export"
 
     def refresh(self) -> None:
@@ -78,7 +78,7 @@ def plain(
     qapp: QApplication, tmp_path: Path, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[MainWindow]:
     """A window with pages of the tests' own."""
-    kinds = (SetUp, Capture, Surface, TrackLost)
+    kinds = (SetUp, Capture, Surface, Broken)
     monkeypatch.setattr(window_module, "PAGES", {kind.key: kind for kind in kinds})
     made = MainWindow(Preferences(theme="light"), tmp_path / "preferences.json")
     KEPT.append(made)
