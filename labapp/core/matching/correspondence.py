@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -21,6 +22,9 @@ from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, ways
 from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.hypothesis import (
+    FINE,
+    FOLLOWING,
+    MODEL_MM,
     Hypothesis,
     contested,
     from_grid,
@@ -36,7 +40,8 @@ from labapp.core.matching.hypothesis import (
 from labapp.core.matching.quadric_search import search_quadrics
 from labapp.core.matching.ray_growth import LEAST_LABELS, UNLABELLED, Scene, try_fit
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
-from labapp.core.values import CannotMeasure
+from labapp.core.surface.pool_fit import FitSettings
+from labapp.core.values import CannotMeasure, IntArray
 
 
 @dataclass(frozen=True)
@@ -52,12 +57,16 @@ class MatchSettings:
     stray, missed
         Dots without a ray, and rays without a dot amid the others, that are put up with: a number
         and a share.
+    scattered
+        The share of missed rays that is put up with where they lie apart: dots that fail at random
+        do, those of a row that was jumped do not.
     """
 
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
     margin: float = 14.0
     stray: tuple[int, float] = (4, 0.02)
     missed: tuple[int, float] = (2, 0.06)
+    scattered: float = 0.12
 
     @property
     def orientations(self) -> tuple[Orientation, ...]:
@@ -235,17 +244,17 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     that was followed from the wrong hole may lead to almost the right place.
     """
     best = min(found, key=lambda hypothesis: hypothesis.cost)
-    while True:  # each round is cheaper than the one before
-        one_on = moved(scene, best.labels)
-        neighbours = [h for labels in one_on if (h := weigh(scene, labels, near=best.pool))]
-        nearest = min(neighbours, key=lambda h: h.cost, default=best)
-        better = grow_and_score(scene, nearest.labels) if nearest.cost < best.cost else None
-        if better is None or better.cost >= best.cost:
-            break
-        best = better
-    best = without_false_ends(scene, best)
+    knots = FINE if best.residual_mm > MODEL_MM else FOLLOWING
+    if knots is FINE:
+        found = [h for each in found if (h := weigh(scene, each.labels, knots, near=each.pool))]
+        best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
+    best, neighbours = _with_neighbours(scene, best, knots)
+    best = without_false_ends(scene, best, knots)
     strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
-    if best.stray > strays or best.missed > settings.missed[0] + settings.missed[1] * best.count:
+    missed = settings.missed[0] + settings.missed[1] * best.count
+    if best.marker == "dark" and _lie_apart(best.unseen.at, best.labels.shape):
+        missed = max(missed, settings.scattered * best.count)
+    if best.stray > strays or best.missed > missed:
         raise CannotMeasure(
             "no-match",
             f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
@@ -280,8 +289,34 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     if doubtful:
         certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
         witness = np.where(certain == best.labels, best.witness, 0)
-        best = replace(weigh(scene, certain, near=best.pool) or best, witness=witness)
+        best = replace(weigh(scene, certain, knots, near=best.pool) or best, witness=witness)
     return best
+
+
+def _with_neighbours(
+    scene: Scene, best: Hypothesis, knots: FitSettings
+) -> tuple[Hypothesis, list[Hypothesis]]:
+    """Return what a hypothesis leads to if one a row or a column on is cheaper; and those then."""
+    while True:  # each round is cheaper than the one before
+        one_on = moved(scene, best.labels)
+        neighbours = [h for labels in one_on if (h := weigh(scene, labels, knots, near=best.pool))]
+        nearest = min(neighbours, key=lambda h: h.cost, default=best)
+        better = grow_and_score(scene, nearest.labels, knots) if nearest.cost < best.cost else None
+        if better is None or better.cost >= best.cost:
+            return best, neighbours
+        best = better
+
+
+PAIR = 2
+"""So many missed rays side by side are no row that was jumped."""
+
+
+def _lie_apart(at: IntArray, shape: tuple[int, ...]) -> bool:
+    """Whether no more than `PAIR` of some rays, shape (n, 2), are next to one another."""
+    seen = np.zeros(shape, np.uint8)
+    seen[at[:, 0], at[:, 1]] = 1
+    sizes = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
+    return bool((sizes <= PAIR).all())
 
 
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:

@@ -33,9 +33,10 @@ MODEL_MM = 0.045
 leave of a dent."""
 
 FOLLOWING = FitSettings(settled_mm=1e-3)
-STANDING_OUT = replace(FOLLOWING, knot_mm=1.0)
-"""Of the surface that a hypothesis is weighed with: fine enough for a dip under the torch; or so
-wide that a row which somebody shifted stands out."""
+FINE, STANDING_OUT = replace(FOLLOWING, knot_mm=0.5), replace(FOLLOWING, knot_mm=1.0)
+"""Of the surface that a hypothesis is weighed with: fine enough for a dip under the torch; for a
+narrow one, whose residuals would hide what is unexplained; or so wide that a row which somebody
+shifted stands out."""
 
 BEYOND, FEW = 0.25, 2
 """A lit ray is beyond the boundary when it lands so far outside, in spacings of the rays; so many
@@ -119,10 +120,12 @@ class Hypothesis:
         return "S/I" if np.nansum(np.sign(np.diff(place[..., 0], axis=1))) >= 0 else "I/I"
 
 
-def grow_and_score(scene: Scene, labels: IntArray) -> Hypothesis | None:
+def grow_and_score(
+    scene: Scene, labels: IntArray, settings: FitSettings = FOLLOWING
+) -> Hypothesis | None:
     """Follow labels to where the surface leads, and weigh what comes of it."""
     grown = grow_labels(scene, labels)
-    hypothesis = None if grown is None else weigh(scene, grown)
+    hypothesis = None if grown is None else weigh(scene, grown, settings)
     if hypothesis is None:
         return None
     outside = _outside(scene, hypothesis)
@@ -131,7 +134,7 @@ def grow_and_score(scene: Scene, labels: IntArray) -> Hypothesis | None:
         return hypothesis
     labels = hypothesis.labels.copy()
     labels[outside[:, 0], outside[:, 1]] = UNLABELLED
-    return weigh(scene, labels)
+    return weigh(scene, labels, settings)
 
 
 def _outside(scene: Scene, hypothesis: Hypothesis) -> IntArray:
@@ -206,7 +209,9 @@ def contested(scene: Scene, hypothesis: Hypothesis) -> IntArray:
     return np.asarray(dots[near])
 
 
-def without_false_ends(scene: Scene, hypothesis: Hypothesis) -> Hypothesis:
+def without_false_ends(
+    scene: Scene, hypothesis: Hypothesis, settings: FitSettings = FOLLOWING
+) -> Hypothesis:
     """Take labels away that alone put a dark ray amid the lit ones, as far as that costs less.
 
     Beyond the last row a false dot may lie where a ray's should.
@@ -216,9 +221,11 @@ def without_false_ends(scene: Scene, hypothesis: Hypothesis) -> Hypothesis:
     for at in {at for ray in hypothesis.unseen.at.tolist() for at in _alone_around(lit, ray)}:
         labels = hypothesis.labels.copy()
         labels[at] = UNLABELLED
-        fewer.append(weigh(scene, labels, near=hypothesis.pool))
+        fewer.append(weigh(scene, labels, settings, near=hypothesis.pool))
     best = min((h for h in fewer if h), key=lambda h: h.cost, default=hypothesis)
-    return without_false_ends(scene, best) if best.cost < hypothesis.cost else hypothesis
+    if best.cost >= hypothesis.cost:
+        return hypothesis
+    return without_false_ends(scene, best, settings)
 
 
 def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:

@@ -210,10 +210,8 @@ def fit_pool(
             drop = None if 2 * count <= settings.rounds else level.rear.drop_mm
             height, *slope = kernels.surface_at(grid, coefficients, ground[witnesses])
             about = (0.0, level.sign) if count else None
-            before, at = (
-                level,
-                (np.array(slope).T, ground[witnesses, 1], witness[witnesses], spacing),
-            )
+            before = level
+            at = np.array(slope).T, ground[witnesses, 1], witness[witnesses], spacing
             level = place_level(height, *at, drop, about)
             if drop is not None:  # how far the rear leaves the level open stays as it was
                 level = replace(level, sigma_mm=max(level.sigma_mm, before.sigma_mm))
