@@ -10,7 +10,9 @@ whose rays round a hole fall on dots.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal
 
 import cv2
@@ -24,7 +26,9 @@ from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.hypothesis import (
     FINE,
     FOLLOWING,
+    MISSED,
     MODEL_MM,
+    STRAY,
     Hypothesis,
     contested,
     from_grid,
@@ -155,25 +159,8 @@ def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
 def _by_grid(
     scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Follow every site of the grid that could be the reference, each way round."""
-    pattern = scene.rig.pattern
-    if lattice is None or pattern.marker is None:
-        return []
-    shape = (pattern.rows, pattern.columns)
-    labelled = (
-        from_grid(lattice, hole, pattern.marker, orientation, shape)
-        for hole in lattice.candidates
-        for orientation in orientations
-    )
-    return [
-        hypothesis
-        for labels in labelled
-        if (hypothesis := grow_and_score(scene, labels)) is not None
-    ]
-
-
-MOST_PLACES = 8
-"""So many places of the marker in the grid are followed, of those that fit it best."""
+    """Follow the grid with the marker at each site that could be it, each way round."""
+    return [] if lattice is None else _placed(scene, lattice, lattice.candidates, orientations)
 
 
 def _by_placement(
@@ -183,19 +170,34 @@ def _by_placement(
 
     False dots, missing ones or the torch may leave the marker without three lit neighbours.
     """
+    return [] if lattice is None else _placed(scene, lattice, empty_sites(lattice), orientations)
+
+
+MOST_PLACES = 8
+"""So many places of the marker in the grid are followed, of those that fit it best."""
+
+MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
+"""Labels that leave larger residuals, mm, and so many times those of the best, are not followed:
+with wrong rays they are mostly ten times those with the right ones."""
+
+
+def _placed(
+    scene: Scene, lattice: Lattice, sites: Iterable[Site], orientations: tuple[Orientation, ...]
+) -> list[Hypothesis]:
+    """Follow the grid with the marker at some of its sites, each way round."""
     pattern = scene.rig.pattern
-    if lattice is None or pattern.marker is None:
+    if pattern.marker is None:
         return []
-    shape = (pattern.rows, pattern.columns)
-    rough = []
-    for site in empty_sites(lattice):
-        for orientation in orientations:
-            labels = from_grid(lattice, site, pattern.marker, orientation, shape)
-            pool = try_fit(scene, labels)
-            if pool is not None:
-                rough.append((float(np.mean(pool.residual_mm**2)), labels))
+    rough: list[tuple[float, IntArray]] = []
+    for site, orientation in product(sites, orientations):
+        shape = (pattern.rows, pattern.columns)
+        labels = from_grid(lattice, site, pattern.marker, orientation, shape)
+        pool = try_fit(scene, labels)
+        if pool is not None:
+            rough.append((pool.residual_rms_mm, labels))
     rough.sort(key=lambda one: one[0])
-    scored = (grow_and_score(scene, labels) for _, labels in rough[:MOST_PLACES])
+    most_mm = max(MISFIT_MM, MISFIT_TIMES * min((off for off, _ in rough), default=0.0))
+    scored = (grow_and_score(scene, labels) for off, labels in rough[:MOST_PLACES] if off < most_mm)
     return [hypothesis for hypothesis in scored if hypothesis is not None]
 
 
@@ -248,12 +250,14 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     if knots is FINE:
         found = [h for each in found if (h := weigh(scene, each.labels, knots, near=each.pool))]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
-    best, neighbours = _with_neighbours(scene, best, knots)
+    neighbours: list[Hypothesis] = []
+    if not _beyond_doubt(scene, best, settings.margin):
+        best, neighbours = _with_neighbours(scene, best, knots)
     best = without_false_ends(scene, best, knots)
     strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
     missed = settings.missed[0] + settings.missed[1] * best.count
     if best.marker == "dark" and _lie_apart(best.unseen.at, best.labels.shape):
-        missed = max(missed, settings.scattered * best.count)
+        missed = max(missed, settings.scattered * best.count - EACH_STRAY * best.stray)
     if best.stray > strays or best.missed > missed:
         raise CannotMeasure(
             "no-match",
@@ -293,19 +297,40 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
     return best
 
 
+def _beyond_doubt(scene: Scene, best: Hypothesis, margin: float) -> bool:
+    """Whether nothing is left unexplained, so that no shift of the labels can come near.
+
+    Any shift puts a dot on the marker's absent ray and leaves the hole to a ray without a dot.
+    """
+    if best.stray or best.missed or best.marker != "dark":
+        return False
+    fine = weigh(scene, best.labels, FINE, near=best.pool)
+    return fine is not None and fine.cost + margin < STRAY + MISSED
+
+
 def _with_neighbours(
     scene: Scene, best: Hypothesis, knots: FitSettings
 ) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return what a hypothesis leads to if one a row or a column on is cheaper; and those then."""
+    """Return what a hypothesis leads to if one a row or two on is cheaper; and its neighbours."""
     while True:  # each round is cheaper than the one before
-        one_on = moved(scene, best.labels)
-        neighbours = [h for labels in one_on if (h := weigh(scene, labels, knots, near=best.pool))]
+        most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
+        neighbours = [
+            hypothesis
+            for labels in moved(scene, best.labels)
+            if (pool := try_fit(scene, labels, near=best.pool)) is not None
+            and pool.residual_rms_mm < most_mm
+            and (hypothesis := weigh(scene, labels, knots, near=pool)) is not None
+        ]
         nearest = min(neighbours, key=lambda h: h.cost, default=best)
         better = grow_and_score(scene, nearest.labels, knots) if nearest.cost < best.cost else None
         if better is None or better.cost >= best.cost:
             return best, neighbours
         best = better
 
+
+EACH_STRAY = 3
+"""By so many missed rays fewer is put up with for each dot without a ray: a row that was jumped
+leaves both."""
 
 PAIR = 2
 """So many missed rays side by side are no row that was jumped."""
@@ -337,8 +362,8 @@ def as_match(
     trials = [Trial(own, best.residual_mm)]
     for orientation in ORIENTATIONS:
         if orientation != own:
-            other = weigh(scene, turned(scene, best.labels, own, orientation))
-            trials.append(Trial(orientation, float("inf") if other is None else other.residual_mm))
+            other = try_fit(scene, turned(scene, best.labels, own, orientation))
+            trials.append(Trial(orientation, np.inf if other is None else other.residual_rms_mm))
     at = np.argwhere(best.labels != UNLABELLED)
     dot = best.labels[at[:, 0], at[:, 1]]
     pattern = scene.rig.pattern

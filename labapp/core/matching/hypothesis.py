@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -108,7 +109,7 @@ class Hypothesis:
     @property
     def residual_mm(self) -> float:
         """Root mean square distance of computed from captured dots, mm."""
-        return float(np.sqrt(np.mean(np.sum(self.pool.residual_mm**2, axis=-1))))
+        return self.pool.residual_rms_mm
 
     def orientation(self, scene: Scene) -> Orientation:
         """Say which correspondence the labels amount to."""
@@ -270,10 +271,12 @@ def joined(hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation) -
 
 
 def moved(scene: Scene, labels: IntArray) -> Iterator[IntArray]:
-    """Yield the same labels a row or a column further on: what a single frame tells worst."""
+    """Yield the same labels up to two rows or columns on: what a single frame tells worst."""
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[at[:, 0], at[:, 1]]
-    for step in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+    for step in (
+        way for way in product(range(-2, 3), repeat=2) if 0 < abs(way[0]) + abs(way[1]) < 3
+    ):
         shifted = _labelled(at + 1 + step, dot, labels.shape)
         shifted[scene.absent] = UNLABELLED
         yield shifted

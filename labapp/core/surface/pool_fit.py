@@ -145,6 +145,11 @@ class FittedPool:
     def __post_init__(self) -> None:
         freeze(self)
 
+    @property
+    def residual_rms_mm(self) -> float:
+        """Root mean square distance of computed from captured dots, mm."""
+        return float(np.sqrt(np.mean(np.sum(self.residual_mm**2, axis=-1))))
+
     @cached_property
     def level_at(self) -> FloatArray:
         """Mean value of each spline over the reflection points, shape (splines,)."""
@@ -212,7 +217,7 @@ def fit_pool(
             about = (0.0, level.sign) if count else None
             before = level
             at = np.array(slope).T, ground[witnesses, 1], witness[witnesses], spacing
-            level = place_level(height, *at, drop, about)
+            level = place_level(height, *at, drop, about, NEARER if count else 1.0)
             if drop is not None:  # how far the rear leaves the level open stays as it was
                 level = replace(level, sigma_mm=max(level.sigma_mm, before.sigma_mm))
         coefficients += level.shift_mm  # the splines add up to 1
@@ -244,6 +249,9 @@ def _rim_level(height: FloatArray, rim: BoolArray) -> Level:
     sign = 1 if height[~rim].mean() + shift > 0 else -1
     return Level(shift, float(np.std(height)), sign, Rear(), np.inf)
 
+
+NEARER = 0.3
+"""Reach of the search for a level (`place_level`) that was found in the round before."""
 
 AT_END, AT_FAR_END = 1e-6, 0.02
 """If so much of the level's probability is at the ends of what was searched, near a level that is
