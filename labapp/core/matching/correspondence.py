@@ -42,7 +42,7 @@ from labapp.core.matching.hypothesis import (
     without_false_ends,
 )
 from labapp.core.matching.quadric_search import search_quadrics
-from labapp.core.matching.ray_growth import LEAST_LABELS, UNLABELLED, Scene, try_fit
+from labapp.core.matching.ray_growth import LEAST_LABELS, SOFT, UNLABELLED, Scene, try_fit
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, IntArray
@@ -176,6 +176,9 @@ def _by_placement(
 MOST_PLACES = 8
 """So many places of the marker in the grid are followed, of those that fit it best."""
 
+QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
+"""Of the surface by which many places are sorted: the right one is not far from the first."""
+
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
 """Labels that leave larger residuals, mm, and so many times those of the best, are not followed:
 with wrong rays they are mostly ten times those with the right ones."""
@@ -188,17 +191,26 @@ def _placed(
     pattern = scene.rig.pattern
     if pattern.marker is None:
         return []
-    rough: list[tuple[float, IntArray]] = []
-    for site, orientation in product(sites, orientations):
-        shape = (pattern.rows, pattern.columns)
-        labels = from_grid(lattice, site, pattern.marker, orientation, shape)
-        pool = try_fit(scene, labels)
-        if pool is not None:
-            rough.append((pool.residual_rms_mm, labels))
-    rough.sort(key=lambda one: one[0])
-    most_mm = max(MISFIT_MM, MISFIT_TIMES * min((off for off, _ in rough), default=0.0))
-    scored = (grow_and_score(scene, labels) for off, labels in rough[:MOST_PLACES] if off < most_mm)
+    shape = (pattern.rows, pattern.columns)
+    labelled = [
+        from_grid(lattice, site, pattern.marker, orientation, shape)
+        for site, orientation in product(sites, orientations)
+    ]
+    if len(labelled) > 2 * MOST_PLACES:
+        labelled = [labels for _, labels in _fitting(scene, labelled, QUICK)][: 2 * MOST_PLACES]
+    rough = _fitting(scene, labelled, SOFT)[:MOST_PLACES]
+    most_mm = max(MISFIT_MM, MISFIT_TIMES * rough[0][0]) if rough else 0.0
+    scored = (grow_and_score(scene, labels) for off_mm, labels in rough if off_mm < most_mm)
     return [hypothesis for hypothesis in scored if hypothesis is not None]
+
+
+def _fitting(
+    scene: Scene, labelled: list[IntArray], settings: FitSettings
+) -> list[tuple[float, IntArray]]:
+    """Sort labels by the residuals that the surface through them leaves, mm, the least first."""
+    pools = ((try_fit(scene, labels, settings), labels) for labels in labelled)
+    found = [(pool.residual_rms_mm, labels) for pool, labels in pools if pool is not None]
+    return sorted(found, key=lambda one: one[0])
 
 
 def _by_caps(scene: Scene) -> list[Hypothesis]:

@@ -55,7 +55,7 @@ LEAST_LABELS = 6
 # lead farther with wider ones.
 _FINE = FitSettings(rounds=5, jerk=0.05, floor_mm=0.03, settled_mm=2e-3)
 _WIDE = replace(_FINE, knot_mm=1.2, jerk=0.036)
-_SOFT, _WIDE_SOFT = replace(_FINE, jerk=0.12), replace(_WIDE, jerk=0.12)
+SOFT, _WIDE_SOFT = replace(_FINE, jerk=0.12), replace(_WIDE, jerk=0.12)
 
 FEW_LABELS = 25
 """A whole grid labels more dots than this, a quadric round a hole fewer."""
@@ -251,7 +251,7 @@ def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
     best: IntArray | None = None
     enough = (1 - FEW_LEFT) * len(scene.plane_mm)
     few = _count(labels) < FEW_LABELS
-    course = (_WIDE, _WIDE_SOFT, _WIDE) if few else (_FINE, _SOFT, _FINE)
+    course = (_WIDE, _WIDE_SOFT, _WIDE) if few else (_FINE, SOFT, _FINE)
     for attempt in range(2):
         for settings in course:
             grown = _settled(scene, labels, settings)
@@ -297,7 +297,7 @@ def _count(labels: IntArray) -> int:
 
 
 def try_fit(
-    scene: Scene, labels: IntArray, settings: FitSettings = _SOFT, near: FittedPool | None = None
+    scene: Scene, labels: IntArray, settings: FitSettings = SOFT, near: FittedPool | None = None
 ) -> FittedPool | None:
     """Fit the surface to the dots labelled so far, its level guessed from their rim."""
     if _count(labels) < LEAST_LABELS:
