@@ -43,6 +43,7 @@ def lacks(words: str) -> None:
     pytest.skip(words)
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist looks for groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what takes long, and make what a module's tests share in one worker only."""
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)

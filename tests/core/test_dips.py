@@ -56,7 +56,7 @@ def test_the_true_rows_cost_less_than_those_that_put_a_dot_on_the_absent_ray() -
     true = weighed(scene, labels)
     shifted = [weighed(scene, other) for other in moved(scene, labels)]
     assert (true.marker, true.stray, true.missed) == ("dark", 0, 0)
-    assert [other.marker for other in shifted] == ["lit"] * 4
+    assert {other.marker for other in shifted} == {"lit"}
     assert true.cost < min(other.cost for other in shifted) - 50
 
 

@@ -199,7 +199,7 @@ def test_a_pool_that_goes_on_by_a_row_is_not_followed_to_the_wrong_rays(way: int
     """The dot that would tell, where the absent one was, is missing."""
     track = chain()._track
     assert track is not None
-    step = way * track.bed.spacing_mm[1]
+    step = way * track.geometry.spacing_mm[1]
     for k, share in enumerate(np.linspace(0.6, 1.4, 17).tolist()):
         pool = egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6 + share * step))
         made = Recording(

@@ -287,7 +287,8 @@ def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> 
             "no-reference", "the absent centre dot is not amid dots that have their ray"
         )
     doubtful: list[int] = contested(scene, best).tolist()
-    for other in [*found, *neighbours]:
+    others = (turned(scene, best.labels, own, way) for way in settings.orientations if way != own)
+    for other in [*found, *neighbours, *_rivals(scene, best, others, knots)]:
         if other.cost >= best.cost + settings.margin:
             continue
         differing, shared = _differing(best, other)
@@ -325,19 +326,27 @@ def _with_neighbours(
 ) -> tuple[Hypothesis, list[Hypothesis]]:
     """Return what a hypothesis leads to if one a row or two on is cheaper; and its neighbours."""
     while True:  # each round is cheaper than the one before
-        most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
-        neighbours = [
-            hypothesis
-            for labels in moved(scene, best.labels)
-            if (pool := try_fit(scene, labels, near=best.pool)) is not None
-            and pool.residual_rms_mm < most_mm
-            and (hypothesis := weigh(scene, labels, knots, near=pool)) is not None
-        ]
-        nearest = min(neighbours, key=lambda h: h.cost, default=best)
-        better = grow_and_score(scene, nearest.labels, knots) if nearest.cost < best.cost else None
-        if better is None or better.cost >= best.cost:
+        neighbours = _rivals(scene, best, moved(scene, best.labels), knots)
+        cheaper = [each.labels for each in neighbours if each.cost < best.cost]
+        grown = [h for labels in cheaper if (h := grow_and_score(scene, labels, knots))]
+        better = min(grown, key=lambda h: h.cost, default=best)
+        if better.cost >= best.cost:
             return best, neighbours
         best = better
+
+
+def _rivals(
+    scene: Scene, best: Hypothesis, labelled: Iterable[IntArray], knots: FitSettings
+) -> list[Hypothesis]:
+    """Weigh other labels beside a hypothesis, as far as a surface goes through them as well."""
+    most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
+    return [
+        hypothesis
+        for labels in labelled
+        if (pool := try_fit(scene, labels, near=best.pool)) is not None
+        and pool.residual_rms_mm < most_mm
+        and (hypothesis := weigh(scene, labels, knots, near=pool)) is not None
+    ]
 
 
 EACH_STRAY = 3

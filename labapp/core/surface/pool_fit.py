@@ -189,10 +189,7 @@ def fit_pool(
     ground = meet_level(laser, pattern)
     rays, points = pattern[tuple(ray.T - 1)], ground[tuple(ray.T - 1)]
     spacing = landing_spacing(ground)
-    margin = REACH * spacing.max()
-    basis = SplineBasis.over(
-        points[:, :2].min(axis=0) - margin, points[:, :2].max(axis=0) + margin, settings.knot_mm
-    )
+    basis = _basis_around(points[:, :2], REACH * spacing.max(), settings.knot_mm)
     grid, covariance = basis.grid, plane_covariance_mm2
     witnesses = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
     stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
@@ -234,6 +231,12 @@ def fit_pool(
     surface = SplineSurface(basis, coefficients)
     assert equations.factor is not None
     return FittedPool(surface, equations.factor, level, points, residual, moved)
+
+
+def _basis_around(places_mm: FloatArray, margin_mm: float, knot_mm: float) -> SplineBasis:
+    """Splines over places, shape (n, 2), mm, and a margin round them."""
+    low, high = places_mm.min(axis=0) - margin_mm, places_mm.max(axis=0) + margin_mm
+    return SplineBasis.over(low, high, knot_mm)
 
 
 def landing_spacing(landing_mm: FloatArray) -> FloatArray:
