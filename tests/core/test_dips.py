@@ -51,6 +51,24 @@ def test_a_cap_takes_no_answer_s_place() -> None:
     assert (got.status, got.wrong) == ("ok", 0)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "missing", "false"),
+    [(20011, 0, 2), (22036, 6, 3), (22099, 6, 3), (30009, 9, 0), (30013, 9, 0)],
+)
+def test_with_dots_missing_and_false_no_row_is_wrong(seed: int, missing: int, false: int) -> None:
+    """Answered a row off, two rows off, and with a row jumped, before."""
+    assert answer(*draw(seed, missing, false)).wrong == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [30005, 30010, 30015])
+def test_many_rays_without_a_dot_are_put_up_with_where_they_lie_apart(seed: int) -> None:
+    got = answer(*draw(seed, missing=9))
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.95 * got.shown
+
+
 def test_the_true_rows_cost_less_than_those_that_put_a_dot_on_the_absent_ray() -> None:
     scene, labels = scene_of(draw(SHIFTED)[1])
     true = weighed(scene, labels)
