@@ -10,7 +10,8 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots, Image
 from labapp.core.match import Match
 from labapp.core.matching.corrected_rows import confirmed_lattice, match_corrected
-from labapp.core.matching.correspondence import MatchSettings, indexed_lattice, match_rays
+from labapp.core.matching.correspondence import indexed_lattice, match_rays
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
 from labapp.core.rows.lattice import Lattice

@@ -19,7 +19,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.images import dots, threshold_dots
 from labapp.core.match import Match, Trial
-from labapp.core.matching.correspondence import MatchSettings
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows import detection, lattice, row_search
 from labapp.core.rows.correction import Correction

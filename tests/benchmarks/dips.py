@@ -18,8 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
-from labapp.core.matching.correspondence import MatchSettings, match_rays
+from labapp.core.matching.correspondence import match_rays
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.lattice import GrowSettings, grow_lattice
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
@@ -57,26 +59,27 @@ class Answer:
     height: float = float("nan")
 
 
-def answer(pool: Pool, seen: SeenDots) -> Answer:
+def answer(pool: Pool, seen: SeenDots, rig: Rig = BENCH_RIG) -> Answer:
     """Match the dots, fit the surface, and hold both against the truth."""
     shown = int((seen.ray[:, 0] > 0).sum())
     try:
-        match = matched(seen)
-        size = measure(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
+        match = matched(seen, rig)
+        size = measure(fit.reconstruct(match, rig, FitSettings()), match, rig)
     except CannotMeasure as reason:
         return Answer(reason.status, shown=shown)
     wrong = int((seen.ray[match.dot] != match.ray).any(axis=-1).sum())
-    height = size.height_mm / pool.size.height_mm - 1
+    name = "height_mm" if pool.size.height_mm > -pool.size.depth_mm else "depth_mm"
+    height = getattr(size, name) / getattr(pool.size, name) - 1
     return Answer("ok", wrong, len(match.dot) - wrong, shown, height)
 
 
-def matched(seen: SeenDots) -> Match:
+def matched(seen: SeenDots, rig: Rig = BENCH_RIG) -> Match:
     """Tell the rays of seen dots."""
     try:
         lattice = grow_lattice(seen.dots, GrowSettings())
     except CannotMeasure:
         lattice = None
-    return match_rays(seen.dots, lattice, BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, MatchSettings())
+    return match_rays(seen.dots, lattice, rig, BENCH_VIEW, FRAME_SHAPE, MatchSettings())
 
 
 def main() -> int:

@@ -14,7 +14,8 @@ from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
 from labapp.core.matching import correspondence
 from labapp.core.matching.corrected_rows import confirmed_lattice, match_corrected
-from labapp.core.matching.correspondence import MatchSettings, indexed_lattice, match_rays
+from labapp.core.matching.correspondence import indexed_lattice, match_rays
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.correction import (
     Correction,
     assign,

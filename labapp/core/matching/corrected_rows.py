@@ -15,7 +15,8 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, ways
-from labapp.core.matching.correspondence import MatchSettings, as_match, indexed_lattice, match_rays
+from labapp.core.matching.correspondence import as_match, indexed_lattice, match_rays
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.matching.hypothesis import (
     STANDING_OUT,
     Hypothesis,

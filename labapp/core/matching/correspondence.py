@@ -11,11 +11,9 @@ whose rays round a hole fall on dots.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
-from typing import Literal
 
-import cv2
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -23,59 +21,28 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, ways
 from labapp.core.matching.cap_search import search_caps
+from labapp.core.matching.decision import (
+    MISFIT_MM,
+    MISFIT_TIMES,
+    MatchSettings,
+    any_explains,
+    decide,
+    explains,
+)
 from labapp.core.matching.hypothesis import (
-    FINE,
-    FOLLOWING,
-    MISSED,
-    MODEL_MM,
-    STRAY,
     Hypothesis,
-    contested,
     from_grid,
     grow_and_score,
     joined,
-    moved,
     turned,
-    weigh,
     with_repaired,
     with_rows_beyond,
-    without_false_ends,
 )
 from labapp.core.matching.quadric_search import search_quadrics
 from labapp.core.matching.ray_growth import LEAST_LABELS, SOFT, UNLABELLED, Scene, try_fit
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, IntArray
-
-
-@dataclass(frozen=True)
-class MatchSettings:
-    """How the correspondence is decided.
-
-    Parameters
-    ----------
-    correspondence
-        ``auto`` tries every orientation; otherwise the one to use.
-    margin
-        Two hypotheses whose costs differ by less, in units of χ², cannot be told apart.
-    stray, missed
-        Dots without a ray, and rays without a dot amid the others, that are put up with: a number
-        and a share.
-    scattered
-        The share of missed rays that is put up with where they lie apart: dots that fail at random
-        do, those of a row that was jumped do not.
-    """
-
-    correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
-    margin: float = 14.0
-    stray: tuple[int, float] = (4, 0.02)
-    missed: tuple[int, float] = (2, 0.06)
-    scattered: float = 0.12
-
-    @property
-    def orientations(self) -> tuple[Orientation, ...]:
-        """Those to be tried."""
-        return ORIENTATIONS if self.correspondence == "auto" else (self.correspondence,)
 
 
 def match_rays(
@@ -115,7 +82,7 @@ def match_rays(
     found: list[Hypothesis] = []
     for way in (_by_grid, _by_placement, _by_optics):
         found = with_repaired(scene, found + way(scene, lattice, orientations))
-        if _any_explains(scene, found):
+        if any_explains(scene, found):
             break
     try:
         best = _answer(scene, found, lattice, settings)
@@ -138,7 +105,7 @@ def _answer(
         if scene.rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
         raise CannotMeasure("no-match", "no surface explains the reflected dots")
-    return _settled(scene, found, settings)
+    return decide(scene, found, settings)
 
 
 def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
@@ -178,10 +145,6 @@ MOST_PLACES = 8
 
 QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
 """Of the surface by which many places are sorted: the right one is not far from the first."""
-
-MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
-"""Labels that leave larger residuals, mm, and so many times those of the best, are not followed:
-with wrong rays they are mostly ten times those with the right ones."""
 
 
 def _placed(
@@ -236,144 +199,9 @@ def _by_optics(
             labels = joined(hypothesis, lattice, hypothesis.orientation(scene))
             wider = None if labels is None else grow_and_score(scene, labels)
             found += [wider] if wider is not None else []
-        if _explains(scene, hypothesis):
+        if explains(scene, hypothesis):
             break
     return found
-
-
-def _explains(scene: Scene, hypothesis: Hypothesis) -> bool:
-    """Hardly a dot is left over, hardly one is missing, and none is where the marker is."""
-    few = max(2, 0.05 * len(scene.plane_mm))
-    return hypothesis.stray <= few and hypothesis.missed <= few and hypothesis.marker != "lit"
-
-
-def _any_explains(scene: Scene, found: list[Hypothesis]) -> bool:
-    return any(_explains(scene, hypothesis) for hypothesis in found)
-
-
-def _settled(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hypothesis:
-    """Take the cheapest hypothesis, if nothing else comes near it and it leaves little open.
-
-    It is held against the others and against itself a row or a column further on: a hypothesis
-    that was followed from the wrong hole may lead to almost the right place.
-    """
-    best = min(found, key=lambda hypothesis: hypothesis.cost)
-    knots = FINE if best.residual_mm > MODEL_MM else FOLLOWING
-    if knots is FINE:
-        found = [h for each in found if (h := weigh(scene, each.labels, knots, near=each.pool))]
-        best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
-    neighbours: list[Hypothesis] = []
-    if not _beyond_doubt(scene, best, settings.margin):
-        best, neighbours = _with_neighbours(scene, best, knots)
-    best = without_false_ends(scene, best, knots)
-    strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
-    missed = settings.missed[0] + settings.missed[1] * best.count
-    if best.marker == "dark" and _lie_apart(best.unseen.at, best.labels.shape):
-        missed = max(missed, settings.scattered * best.count - EACH_STRAY * best.stray)
-    if best.stray > strays or best.missed > missed:
-        raise CannotMeasure(
-            "no-match",
-            f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
-            f"{_counted(best.missed, 'ray')} without a dot amid {best.count} pairs",
-        )
-    own = best.orientation(scene)
-    if best.marker == "lit":
-        raise CannotMeasure(
-            "ambiguous-rows" if _any_explains(scene, found) else "no-reference",
-            "where the best rows have the absent centre dot, there is a dot",
-        )
-    if best.marker == "unknown":
-        raise CannotMeasure(
-            "no-reference", "the absent centre dot is not amid dots that have their ray"
-        )
-    doubtful: list[int] = contested(scene, best).tolist()
-    others = (turned(scene, best.labels, own, way) for way in settings.orientations if way != own)
-    for other in [*found, *neighbours, *_rivals(scene, best, others, knots)]:
-        if other.cost >= best.cost + settings.margin:
-            continue
-        differing, shared = _differing(best, other)
-        if len(differing) <= 0.2 * shared:
-            doubtful += differing
-        elif other.orientation(scene) != own:
-            raise CannotMeasure(
-                "ambiguous-orientation",
-                f"{own} and {other.orientation(scene)} explain the dots alike",
-            )
-        else:
-            raise CannotMeasure(
-                "ambiguous-rows", "several holes in the rows can be the absent centre dot"
-            )
-    if doubtful:
-        certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
-        witness = np.where(certain == best.labels, best.witness, 0)
-        best = replace(weigh(scene, certain, knots, near=best.pool) or best, witness=witness)
-    return best
-
-
-def _beyond_doubt(scene: Scene, best: Hypothesis, margin: float) -> bool:
-    """Whether nothing is left unexplained, so that no shift of the labels can come near.
-
-    Any shift puts a dot on the marker's absent ray and leaves the hole to a ray without a dot.
-    """
-    if best.stray or best.missed or best.marker != "dark":
-        return False
-    fine = weigh(scene, best.labels, FINE, near=best.pool)
-    return fine is not None and fine.cost + margin < STRAY + MISSED
-
-
-def _with_neighbours(
-    scene: Scene, best: Hypothesis, knots: FitSettings
-) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return what a hypothesis leads to if one a row or two on is cheaper; and its neighbours."""
-    while True:  # each round is cheaper than the one before
-        neighbours = _rivals(scene, best, moved(scene, best.labels), knots)
-        cheaper = [each.labels for each in neighbours if each.cost < best.cost]
-        grown = [h for labels in cheaper if (h := grow_and_score(scene, labels, knots))]
-        better = min(grown, key=lambda h: h.cost, default=best)
-        if better.cost >= best.cost:
-            return best, neighbours
-        best = better
-
-
-def _rivals(
-    scene: Scene, best: Hypothesis, labelled: Iterable[IntArray], knots: FitSettings
-) -> list[Hypothesis]:
-    """Weigh other labels beside a hypothesis, as far as a surface goes through them as well."""
-    most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
-    return [
-        hypothesis
-        for labels in labelled
-        if (pool := try_fit(scene, labels, near=best.pool)) is not None
-        and pool.residual_rms_mm < most_mm
-        and (hypothesis := weigh(scene, labels, knots, near=pool)) is not None
-    ]
-
-
-EACH_STRAY = 3
-"""By so many missed rays fewer is put up with for each dot without a ray: a row that was jumped
-leaves both."""
-
-PAIR = 2
-"""So many missed rays side by side are no row that was jumped."""
-
-
-def _lie_apart(at: IntArray, shape: tuple[int, ...]) -> bool:
-    """Whether no more than `PAIR` of some rays, shape (n, 2), are next to one another."""
-    seen = np.zeros(shape, np.uint8)
-    seen[at[:, 0], at[:, 1]] = 1
-    sizes = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
-    return bool((sizes <= PAIR).all())
-
-
-def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
-    """Dots that have different rays in the two, and how many have a ray in both."""
-    rays = [{int(dot): at for at, dot in np.ndenumerate(h.labels)} for h in (one, other)]
-    shared = rays[0].keys() & rays[1].keys() - {UNLABELLED}
-    return [dot for dot in shared if rays[0][dot] != rays[1][dot]], len(shared)
-
-
-def _counted(count: int, thing: str) -> str:
-    return f"{count} {thing}{'s' * (count != 1)}"
 
 
 def as_match(

@@ -13,12 +13,16 @@ from scipy.spatial import cKDTree
 from labapp.core.match import Orientation, ways
 from labapp.core.matching.ray_growth import (
     AS_LIKELY_FALSE,
+    CLEAR,
+    FALSE_PER_MM2,
     NEAR,
     UNLABELLED,
     Prediction,
     Scene,
     amid,
+    as_likely_false,
     grow_labels,
+    neighbours_of,
     predict,
     surprises,
     try_fit,
@@ -227,6 +231,39 @@ def without_false_ends(
     if best.cost >= hypothesis.cost:
         return hypothesis
     return without_false_ends(scene, best, settings)
+
+
+WEAK, LIT = 3, 2 * np.log(2)
+"""A label with so few labelled neighbours rests on what lies to one side of it. Beyond the last row
+a ray is as likely dark as lit: what that adds to −2 log likelihood."""
+
+
+def without_false_rim(
+    scene: Scene, hypothesis: Hypothesis, settings: FitSettings = FOLLOWING
+) -> Hypothesis:
+    """Take labels at the rim away that a false dot explains as well as their ray.
+
+    Each weak label is held against the surface through all that are not weak. How many false dots
+    there are, those without a ray tell.
+    """
+    lit = hypothesis.labels != UNLABELLED
+    weak = lit & (neighbours_of(lit) <= WEAK)
+    if not weak.any():
+        return hypothesis
+    strong = np.where(weak, UNLABELLED, hypothesis.labels)
+    pool = try_fit(scene, strong, settings, hypothesis.pool)
+    if pool is None:
+        return hypothesis
+    rays = predict(scene, pool, weak)
+    surprise = surprises(scene, pool, rays, hypothesis.labels[tuple(rays.at.T)])[1].diagonal()
+    false_per_mm2 = max(FALSE_PER_MM2, (hypothesis.stray + 1) / scene.view_mm2)
+    certain = surprise + CLEAR + LIT < as_likely_false(false_per_mm2)
+    kept = strong.copy()
+    at = tuple(rays.at[certain].T)
+    kept[at] = hypothesis.labels[at]
+    if (kept == hypothesis.labels).all():
+        return hypothesis
+    return weigh(scene, kept, settings, near=hypothesis.pool) or hypothesis
 
 
 def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:

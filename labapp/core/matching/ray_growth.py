@@ -11,6 +11,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -40,8 +41,13 @@ FALSE_PER_MM2 = 5e-4
 """False dots to be expected on the imaging plane: a few in a frame. Where a prediction is vague,
 one of them is as likely a cause of a dot as the ray."""
 
-AS_LIKELY_FALSE = -2 * np.log(2 * np.pi * FALSE_PER_MM2)
-"""−2 log likelihood, less the same constant as `surprises`, of a false dot."""
+
+def as_likely_false(false_per_mm2: float) -> float:
+    """−2 log likelihood, less the same constant as `surprises`, of a false dot."""
+    return -2 * float(np.log(2 * np.pi * false_per_mm2))
+
+
+AS_LIKELY_FALSE = as_likely_false(FALSE_PER_MM2)
 
 MODEL_MM = 0.06
 """How far the right surface's dots may be off for no fault of theirs, mm."""
@@ -118,6 +124,14 @@ class Scene:
     def spacing_mm(self) -> FloatArray:
         """Distance between neighbouring landing points along X and along Y, shape (2,), mm."""
         return landing_spacing(self.landing_mm)
+
+    @cached_property
+    def view_mm2(self) -> float:
+        """Area of the imaging plane that the frame shows, mm²."""
+        height, width = self.frame_shape
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+        seen = self.calibration.to_plane(corners).astype(np.float32)
+        return float(cv2.contourArea(seen))
 
     @cached_property
     def absent(self) -> BoolArray:
@@ -269,10 +283,13 @@ def grow_labels(scene: Scene, labels: IntArray) -> IntArray | None:
 
 def _without_rim(labels: IntArray) -> IntArray:
     """Only labels with most of their neighbours labelled."""
-    lit = (labels != UNLABELLED).astype(np.uint8)
-    border = cv2.BORDER_CONSTANT
-    neighbours = cv2.boxFilter(lit, -1, (3, 3), normalize=False, borderType=border) - lit
-    return np.where(neighbours >= 4, labels, UNLABELLED)
+    return np.where(neighbours_of(labels != UNLABELLED) >= 4, labels, UNLABELLED)
+
+
+def neighbours_of(lit: BoolArray) -> IntArray:
+    """How many of the eight rays round each are lit, shape (rows, columns)."""
+    ones, border = lit.astype(np.int32), cv2.BORDER_CONSTANT
+    return np.asarray(cv2.boxFilter(ones, -1, (3, 3), normalize=False, borderType=border) - ones)
 
 
 def _settled(scene: Scene, labels: IntArray, settings: FitSettings) -> IntArray | None:
