@@ -495,5 +495,5 @@ def _decode_as(
         packet.pts = packet.dts = stamp
     try:
         return stream.codec_context.decode(packet)
-    except FFmpegError:
+    except (FFmpegError, ValueError):  # PyAV raises the latter for a codec it does not know
         return None

@@ -11,7 +11,6 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from labapp.core.geometry.coordinates import ImageCalibration
