@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
+import itertools
 import logging
 import os
 import signal
@@ -49,7 +51,7 @@ NEEDED_LATER = (
 """Sessions, the pages and what draws in 3-D: one or two seconds."""
 
 HEARTBEAT_MS = 300
-"""So often Python gets a turn to notice Ctrl-C in the terminal, or SIGTERM."""
+"""So often Python gets a turn to notice Ctrl-C in the terminal, or SIGTERM, and to free memory."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -103,7 +105,9 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     faults = Faults(window.say, window)
     faults.install()
     heartbeat = QTimer(window)
-    heartbeat.timeout.connect(lambda: None)
+    rounds = itertools.count(1)
+    heartbeat.timeout.connect(lambda: collect_garbage(next(rounds)))
+    gc.disable()  # see `collect_garbage`
     heartbeat.start(HEARTBEAT_MS)
     stops = (signal.SIGINT, signal.SIGTERM)
     former = {number: signal.signal(number, lambda *_: window.close()) for number in stops}
@@ -118,11 +122,31 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     finally:
         load.stop()
         heartbeat.stop()
+        gc.enable()
         if loading.is_alive():
             loading.join()
         for number, handler in former.items():
             signal.signal(number, handler)
         faults.uninstall()
+
+
+def collect_garbage(count: int) -> None:
+    """Free what is unreachable, in the thread that calls.
+
+    Python would do so in whichever thread makes the next object. There the widgets among the
+    garbage would be destroyed beside the window's own thread, on whose locks Qt then waits for ever.
+
+    Parameters
+    ----------
+    count
+        How often it was called: every tenth call also takes objects that were there at the call
+        before, every hundredth all, as Python's own thresholds have it.
+    """
+    young, limit = gc.get_count()[0], gc.get_threshold()[0]
+    if count % 100 == 0:
+        gc.collect()
+    elif young > limit:
+        gc.collect(1 if count % 10 == 0 else 0)
 
 
 def _load_what_is_needed() -> None:

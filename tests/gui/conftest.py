@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 
 os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
@@ -70,6 +71,14 @@ def copy_sample(tmp_path: Path) -> CopySample:
     return copied
 
 
+@pytest.fixture(autouse=True, scope="session")
+def garbage_by_hand() -> Iterator[None]:
+    """As in the app: Python collects in no thread of work, where widgets would be destroyed."""
+    gc.disable()
+    yield
+    gc.enable()
+
+
 @pytest.fixture(autouse=True)
 def nothing_left(qapp: QApplication, tmp_path: Path) -> Iterator[None]:
     """Fail a test that leaves threads, processes, ticking timers or open files behind."""
@@ -93,6 +102,7 @@ def no_windows(nothing_left: None) -> Iterator[None]:
             widget.deleteLater()
     QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
     KEPT.clear()
+    gc.collect()
 
 
 @pytest.fixture

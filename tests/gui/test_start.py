@@ -49,6 +49,37 @@ with open_window(app, Preferences(), Path(sys.argv[1])) as window:
 print(ended, window.isVisible(), Path(sys.argv[1]).exists())
 """
 
+GARBAGE = """
+import sys, threading
+from pathlib import Path
+from labapp.gui.app import open_window, start_app
+from labapp.gui.preferences import Preferences
+app = start_app()
+from PySide6.QtCore import QTimer
+threads = []
+
+class Circle:
+    def __init__(self):
+        self.self = self
+    def __del__(self):
+        threads.append(threading.current_thread().name)
+
+def work():
+    Circle()
+    objects = [[] for _ in range(100_000)]  # Python would collect at one of them
+
+with open_window(app, Preferences(), Path(sys.argv[1])) as window:
+    worker = threading.Thread(target=work, name="worker")
+    worker.start()
+    worker.join()
+    print(*threads or ["none"])
+    look = QTimer(window)
+    look.timeout.connect(lambda: threads and window.close())
+    look.start(10)
+    app.exec()
+print(*threads)
+"""
+
 
 def loaded(program: str, *arguments: object) -> set[str]:
     """Words that a program says, such as the names of the modules that it has loaded."""
@@ -76,3 +107,8 @@ def test_a_surface_is_shown_without_what_reads_and_writes_other_files():
 
 def test_sigterm_closes_the_window(tmp_path: Path):
     assert loaded(STOPPED, tmp_path / "preferences.json") == {"0", "False", "True"}
+
+
+def test_widgets_are_freed_in_the_windows_own_thread_only(tmp_path: Path):
+    """Freed in a thread of work, a widget's end and the window wait for each other."""
+    assert loaded(GARBAGE, tmp_path / "preferences.json") == {"none", "MainThread"}
