@@ -8,6 +8,8 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from labapp.core.match import ORIENTATIONS, Orientation
@@ -75,8 +77,8 @@ def any_explains(scene: Scene, found: list[Hypothesis]) -> bool:
 def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hypothesis:
     """Take the cheapest hypothesis, if nothing else comes near it and it leaves little open.
 
-    It is held against the others and against itself a row or a column further on: a hypothesis
-    that was followed from the wrong hole may lead to almost the right place.
+    It is held against the others and against itself up to two rows or columns further on: a
+    hypothesis that was followed from the wrong hole may lead to almost the right place.
     """
     best = min(found, key=lambda hypothesis: hypothesis.cost)
     knots = FINE if best.residual_mm > MODEL_MM else FOLLOWING
@@ -177,9 +179,9 @@ def _rivals(
     ]
 
 
-PAIR, BESIDE = 2, 1.5
-"""So many missed rays, or dots without a ray, side by side are no row; dots are where they are
-nearer to one another than so many spacings."""
+PAIR, TRIPLE, BESIDE = 2, 3, 1.5
+"""So many missed rays, or dots without a ray, side by side are no row; dots are side by side where
+they are nearer to one another than so many spacings."""
 
 STRAYS_APART, MISSED_APART, EACH_STRAY = 0.25, 0.12, 3
 """Shares of the dots with a ray that are put up with where they lie apart: false dots do, and those
@@ -199,9 +201,13 @@ def _strays_lie_apart(scene: Scene, hypothesis: Hypothesis) -> bool:
     """Whether the dots without a ray are scattered."""
     dots = scene.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
     spacing = median(cKDTree(dots).query(dots, k=2)[0][:, 1])
-    strays = scene.plane_mm[hypothesis.strays]
-    beside = cKDTree(strays).query_ball_point(strays, BESIDE * spacing, return_length=True)
-    return bool((beside <= PAIR).all())
+    pairs = cKDTree(scene.plane_mm[hypothesis.strays]).query_pairs(
+        BESIDE * spacing, output_type="ndarray"
+    )
+    count = hypothesis.stray
+    beside = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    group = connected_components(beside, directed=False)[1]
+    return count == 0 or int(np.bincount(group).max()) <= TRIPLE
 
 
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:

@@ -328,10 +328,28 @@ def with_repaired(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
     best = min(found, key=lambda hypothesis: hypothesis.cost, default=None)
     while best is not None:
         labels = np.where(_about_unexplained(scene, best), UNLABELLED, best.labels)
-        wider = grow_and_score(scene, labels) if (labels != best.labels).any() else None
-        best = wider if wider is not None and wider.cost < best.cost else None
+        tried = [labels] if (labels != best.labels).any() else []
+        led = [h for labels in (*tried, *_closed_up(best)) if (h := grow_and_score(scene, labels))]
+        cheapest = min(led, key=lambda hypothesis: hypothesis.cost, default=best)
+        best = cheapest if cheapest.cost < best.cost else None
         found = found if best is None else [*found, best]
     return found
+
+
+def _closed_up(hypothesis: Hypothesis) -> Iterator[IntArray]:
+    """Yield the labels with a row or column that was jumped closed up, from either side.
+
+    It is one in which most of the rays without a dot lie.
+    """
+    labels = hypothesis.labels
+    for axis in (0, 1):
+        lines, missed = np.unique(hypothesis.unseen.at[:, axis], return_counts=True)
+        for line in lines[missed >= max(LEAST_ROW, 0.5 * hypothesis.missed)]:
+            own = labels if axis == 0 else labels.T
+            after, before = np.full_like(own, UNLABELLED), np.full_like(own, UNLABELLED)
+            after[:line], after[line:-1] = own[:line], own[line + 1 :]
+            before[line + 1 :], before[1 : line + 1] = own[line + 1 :], own[:line]
+            yield from (after, before) if axis == 0 else (after.T.copy(), before.T.copy())
 
 
 def _about_unexplained(scene: Scene, hypothesis: Hypothesis) -> BoolArray:

@@ -1,0 +1,27 @@
+"""Pools of every kind with dots missing and false ones among them, on benches set up otherwise."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.benchmarks.clutter import draw
+from tests.benchmarks.dips import Answer, answer
+
+
+def answered(kind: str, seed: int) -> Answer:
+    rig, seen, pool = draw(kind, seed, 0.05, 12)
+    return answer(pool, seen, rig)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "seed"), [("cap", 100), ("ellipse", 101), ("egg", 100)])
+def test_false_dots_and_missing_ones_that_lie_apart_are_put_up_with(kind: str, seed: int) -> None:
+    got = answered(kind, seed)
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.9 * got.shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "seed"), [("egg", 110), ("lowrear", 110)])
+def test_a_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> None:
+    assert answered(kind, seed).wrong == 0
