@@ -133,8 +133,8 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
 def collect_garbage(count: int) -> None:
     """Free what is unreachable, in the thread that calls.
 
-    Python would do so in whichever thread makes the next object. There the widgets among the
-    garbage would be destroyed beside the window's own thread, on whose locks Qt then waits for ever.
+    Python would do so in whichever thread makes the next object. Widgets among the garbage would
+    be destroyed there, beside the window's own thread, and the two wait for each other for ever.
 
     Parameters
     ----------

@@ -55,27 +55,26 @@ def _drawn(mark: Mark, colour: QColor, ground: QColor) -> QPixmap:
     scale = 3  # sharp on a screen of any scaling
     pixmap = QPixmap(ICON_PX * scale, ICON_PX * scale)
     pixmap.fill(Qt.GlobalColor.transparent)
-    painter = QPainter(pixmap)
-    painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-    painter.scale(ICON_PX * scale, ICON_PX * scale)
-    pen = QPen(colour, 0.1)
-    pen.setCapStyle(Qt.PenCapStyle.RoundCap)
-    pen.setJoinStyle(Qt.PenJoinStyle.RoundJoin)
-    painter.setPen(pen)
-    if mark is Mark.TODO:
-        painter.drawEllipse(QRectF(0.22, 0.22, 0.56, 0.56))
-    elif mark is Mark.DONE:
-        painter.setPen(QPen(colour, 0.16, c=Qt.PenCapStyle.RoundCap))
-        painter.drawPolyline(QPolygonF([QPointF(*point) for point in CHECK]))
-    else:
-        painter.setBrush(colour)
-        corners = ARROW if mark is Mark.READY else WARNING
-        painter.drawPolygon(QPolygonF([QPointF(*point) for point in corners]))
-        if mark is Mark.ATTENTION:
-            painter.setPen(QPen(ground, 0.1))
-            painter.drawLine(QPointF(0.5, 0.38), QPointF(0.5, 0.6))
-            painter.drawPoint(QPointF(0.5, 0.76))
-    painter.end()
+    with QPainter(pixmap) as painter:
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.scale(ICON_PX * scale, ICON_PX * scale)
+        pen = QPen(colour, 0.1)
+        pen.setCapStyle(Qt.PenCapStyle.RoundCap)
+        pen.setJoinStyle(Qt.PenJoinStyle.RoundJoin)
+        painter.setPen(pen)
+        if mark is Mark.TODO:
+            painter.drawEllipse(QRectF(0.22, 0.22, 0.56, 0.56))
+        elif mark is Mark.DONE:
+            painter.setPen(QPen(colour, 0.16, c=Qt.PenCapStyle.RoundCap))
+            painter.drawPolyline(QPolygonF([QPointF(*point) for point in CHECK]))
+        else:
+            painter.setBrush(colour)
+            corners = ARROW if mark is Mark.READY else WARNING
+            painter.drawPolygon(QPolygonF([QPointF(*point) for point in corners]))
+            if mark is Mark.ATTENTION:
+                painter.setPen(QPen(ground, 0.1))
+                painter.drawLine(QPointF(0.5, 0.38), QPointF(0.5, 0.6))
+                painter.drawPoint(QPointF(0.5, 0.76))
     return pixmap
 
 

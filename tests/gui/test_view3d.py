@@ -310,3 +310,22 @@ def test_with_a_display_it_draws_in_the_window() -> None:
             check=False,
         )
     assert (done.returncode, done.stdout.strip()[-4:]) == (0, "well"), done.stderr[-3000:]
+
+
+def test_a_paint_ends_also_where_an_error_keeps_what_was_called(
+    view: View3d, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Text is drawn by what keeps errors that it caught, and these keep what had called it."""
+    kept: list[Exception] = []
+
+    def render(_view: View3d) -> None:
+        try:
+            raise ValueError
+        except ValueError as error:
+            kept.append(error)
+
+    monkeypatch.setattr(OffscreenView, "_render", render)
+    view.show_scene(hill(0.2))
+    qtbot.waitUntil(lambda: bool(kept))
+    frame = kept[0].__traceback__.tb_frame.f_back
+    assert not frame.f_locals["painter"].isActive()

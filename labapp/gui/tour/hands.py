@@ -309,12 +309,11 @@ class Hands:
 
     def _seen(self) -> QImage:
         image = self.window.grab().toImage().convertToFormat(QImage.Format.Format_RGB32)
-        painter = QPainter(image)
-        for view in self.window.findChildren(View3d):
-            self._paint_3d(painter, view)
-        for widget in _over(self.window):
-            self._paint_over(painter, widget)
-        painter.end()
+        with QPainter(image) as painter:
+            for view in self.window.findChildren(View3d):
+                self._paint_3d(painter, view)
+            for widget in _over(self.window):
+                self._paint_over(painter, widget)
         return image
 
     def _paint_3d(self, painter: QPainter, view: View3d) -> None:

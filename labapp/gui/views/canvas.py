@@ -36,7 +36,8 @@ class Drawn(QWidget):
     def paintEvent(self, _event: QPaintEvent) -> None:
         """Frame it while it has the keys; what lies on it leaves a px at the edge."""
         if self.hasFocus():
-            self.paint_frame(QPainter(self))
+            with QPainter(self) as painter:
+                self.paint_frame(painter)
 
     def paint_frame(self, painter: QPainter) -> None:
         """Draw the frame that tells where the keys go."""

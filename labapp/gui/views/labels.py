@@ -117,10 +117,10 @@ class Message(QLabel):
 
     def paintEvent(self, _event: QPaintEvent) -> None:
         """Draw the lines that there is room for."""
-        painter = QPainter(self)
-        painter.setPen(self.palette().color(self.foregroundRole()))
-        place = self.contentsRect().adjusted(max(self.indent(), 0), 0, 0, 0)
-        painter.drawText(place, Qt.AlignmentFlag.AlignTop, "\n".join(self.shown()))
+        with QPainter(self) as painter:
+            painter.setPen(self.palette().color(self.foregroundRole()))
+            place = self.contentsRect().adjusted(max(self.indent(), 0), 0, 0, 0)
+            painter.drawText(place, Qt.AlignmentFlag.AlignTop, "\n".join(self.shown()))
 
     def _tell(self) -> None:
         shown = self.shown()

@@ -50,12 +50,11 @@ class PathLine(QLineEdit):
         if shown == self.text():
             super().paintEvent(event)
             return
-        painter = QPainter(self)
-        panel = QStyle.PrimitiveElement.PE_PanelLineEdit
-        self.style().drawPrimitive(panel, self._option(), painter, self)
-        painter.setPen(self.palette().text().color())
-        painter.drawText(self._contents(), Qt.AlignmentFlag.AlignVCenter, shown)
-        painter.end()
+        with QPainter(self) as painter:
+            panel = QStyle.PrimitiveElement.PE_PanelLineEdit
+            self.style().drawPrimitive(panel, self._option(), painter, self)
+            painter.setPen(self.palette().text().color())
+            painter.drawText(self._contents(), Qt.AlignmentFlag.AlignVCenter, shown)
 
     def _option(self) -> QStyleOptionFrame:
         option = QStyleOptionFrame()

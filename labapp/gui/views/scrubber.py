@@ -159,34 +159,36 @@ class Scrubber(QAbstractSlider):
 
     def paintEvent(self, _event: QPaintEvent) -> None:
         """Draw the ticks, made once for a width and kinds, and the marker over them."""
-        painter = QPainter(self)
-        if not len(self._kinds):
-            return
-        if self._picture is None:
-            self._picture = self._drawn()
-        painter.drawImage(QPointF(0, RAIL_PX), self._picture)
-        width = self.width() / len(self._kinds)
-        left = self.value() * width
-        middle = left + width / 2
-        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        ink = self.palette().color(QPalette.ColorRole.WindowText)
-        if width >= GAP_FROM_PX:
-            painter.setPen(QPen(ink, 1.5))
-            painter.drawRect(QRectF(left + 0.5, RAIL_PX, width - 1, self.height() - RAIL_PX - 1))
-        else:
-            painter.setPen(QPen(ink, 1.5))
-            painter.drawLine(QPointF(middle, RAIL_PX), QPointF(middle, self.height()))
-        painter.setPen(Qt.PenStyle.NoPen)
-        painter.setBrush(ink)
-        half = RAIL_PX * 0.6
-        corners = [(middle - half, 0.0), (middle + half, 0.0), (middle, RAIL_PX - 1.0)]
-        painter.drawPolygon(QPolygonF([QPointF(*corner) for corner in corners]))
-        if self.hasFocus():
-            option = QStyleOptionFocusRect()
-            option.initFrom(self)
-            self.style().drawPrimitive(
-                QStyle.PrimitiveElement.PE_FrameFocusRect, option, painter, self
-            )
+        with QPainter(self) as painter:
+            if not len(self._kinds):
+                return
+            if self._picture is None:
+                self._picture = self._drawn()
+            painter.drawImage(QPointF(0, RAIL_PX), self._picture)
+            width = self.width() / len(self._kinds)
+            left = self.value() * width
+            middle = left + width / 2
+            painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+            ink = self.palette().color(QPalette.ColorRole.WindowText)
+            if width >= GAP_FROM_PX:
+                painter.setPen(QPen(ink, 1.5))
+                painter.drawRect(
+                    QRectF(left + 0.5, RAIL_PX, width - 1, self.height() - RAIL_PX - 1)
+                )
+            else:
+                painter.setPen(QPen(ink, 1.5))
+                painter.drawLine(QPointF(middle, RAIL_PX), QPointF(middle, self.height()))
+            painter.setPen(Qt.PenStyle.NoPen)
+            painter.setBrush(ink)
+            half = RAIL_PX * 0.6
+            corners = [(middle - half, 0.0), (middle + half, 0.0), (middle, RAIL_PX - 1.0)]
+            painter.drawPolygon(QPolygonF([QPointF(*corner) for corner in corners]))
+            if self.hasFocus():
+                option = QStyleOptionFocusRect()
+                option.initFrom(self)
+                self.style().drawPrimitive(
+                    QStyle.PrimitiveElement.PE_FrameFocusRect, option, painter, self
+                )
 
     def _drawn(self) -> QImage:
         scale = self.devicePixelRatioF()

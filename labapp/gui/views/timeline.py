@@ -134,10 +134,9 @@ class Timeline(QWidget):
         self._icons[button] = icon
         ratio = self.devicePixelRatioF()
         pixmap = self.style().standardIcon(icon).pixmap(button.iconSize(), ratio)
-        painter = QPainter(pixmap)
-        painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_SourceIn)
-        painter.fillRect(pixmap.rect(), self.palette().color(QPalette.ColorRole.ButtonText))
-        painter.end()
+        with QPainter(pixmap) as painter:
+            painter.setCompositionMode(QPainter.CompositionMode.CompositionMode_SourceIn)
+            painter.fillRect(pixmap.rect(), self.palette().color(QPalette.ColorRole.ButtonText))
         button.setIcon(QIcon(pixmap))
 
     # --- what it shows ----------------------------------------------------------------------

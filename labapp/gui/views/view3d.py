@@ -331,14 +331,14 @@ class OffscreenView(View3d):
         """Show the scene, or say why there is none."""
         if self._picture is None and self._scene is not None:
             self._render()
-        painter = QPainter(self)
-        painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
-        if self._picture is not None:
-            painter.drawImage(0, 0, self._picture)
-        else:
-            self._paint_words(painter, self._words if self._scene is None else NOTHING_HERE)
-        if self.hasFocus():
-            self.paint_frame(painter)
+        with QPainter(self) as painter:
+            painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
+            if self._picture is not None:
+                painter.drawImage(0, 0, self._picture)
+            else:
+                self._paint_words(painter, self._words if self._scene is None else NOTHING_HERE)
+            if self.hasFocus():
+                self.paint_frame(painter)
 
     def mousePressEvent(self, event: QMouseEvent) -> None:
         """Begin to turn or to move."""
@@ -411,14 +411,14 @@ class InteractiveView(View3d):
 
     def paintEvent(self, event: QPaintEvent) -> None:
         """Show the scene, or say why there is none."""
-        painter = QPainter(self)
-        painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
-        if self._scene is None:
-            self._paint_words(painter, self._words)
-        elif not can_draw():
-            self._paint_words(painter, NOTHING_HERE)
-        if self.hasFocus():
-            self.paint_frame(painter)
+        with QPainter(self) as painter:
+            painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
+            if self._scene is None:
+                self._paint_words(painter, self._words)
+            elif not can_draw():
+                self._paint_words(painter, NOTHING_HERE)
+            if self.hasFocus():
+                self.paint_frame(painter)
 
     def close_view(self) -> None:
         """Let go of OpenGL; it is taken up again when the view is next shown."""
