@@ -11,6 +11,17 @@ def several(count: int, thing: str) -> str:
     return f"{count} {thing}{'s' * (count != 1)}"
 
 
+UNITS = ("bytes", "kB", "MB", "GB", "TB")
+
+
+def size_in_words(size: int) -> str:
+    """A file's size."""
+    value, unit = float(size), 0
+    while value >= 1000 and unit < len(UNITS) - 1:
+        value, unit = value / 1000, unit + 1
+    return f"{value:.0f} {UNITS[unit]}" if unit == 0 else f"{value:.1f} {UNITS[unit]}"
+
+
 FORMULA = tuple("=+-@＝＋－＠\t\r\n")
 """A cell that begins so is a formula to a spreadsheet, which runs it; text may be anybody's.
 

@@ -14,8 +14,7 @@ import platformdirs
 import pytest
 from hypothesis import settings
 
-from labapp import cli
-from labapp.session import log
+from labapp import cli, log
 
 # The same examples every time, and no verdict that depends on how busy the machine is.
 settings.register_profile("labapp", derandomize=True, deadline=None)
@@ -63,7 +62,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture(scope="session")
 def opengl() -> None:
     """Let only what can draw in 3-D off-screen go on."""
-    from labapp.session.drawing import can_draw
+    from labapp.export.drawing import can_draw
 
     if not can_draw():
         lacks("nothing can be drawn in 3-D here")
@@ -81,7 +80,7 @@ def port() -> Iterator[int]:
 @pytest.fixture
 def little_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """The adviser's quick search finds less, in a tenth of the time."""
-    from labapp.simulation import adviser
+    from labapp.studies.adviser import search as adviser
 
     little = adviser.Effort(grid=(1, 1, 2), pools=(2, 2, 3), steps=1, finalists=1, sweep=2)
     monkeypatch.setattr(adviser, "QUICK", little)

@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp import cli
+from labapp import cli, log
 from labapp.core.pipeline import Measurement, Settings
 from labapp.errors import InputError
-from labapp.session import log, results, run
-from labapp.session.run import select_frames
+from labapp.export import results
+from labapp.run import runner as run
+from labapp.run.runner import select_frames
 from tests.conftest import Run
 from tests.waiting import PATIENCE_S, connect, wait_until
 
@@ -253,7 +254,7 @@ SLOW = """
     from labapp.cli import main
     from labapp.core.images.dots import Dots
     from labapp.core.pipeline import Measurement
-    from labapp.session import run
+    from labapp.run import runner as run
     import numpy as np
 
     def slow(*given):
@@ -336,7 +337,7 @@ def test_ctrl_c_again_and_again_is_no_more_than_once(tmp_path: Path) -> None:
     program = """
         import os, signal, sys
         from labapp import cli
-        from labapp.session import run
+        from labapp.run import runner as run
 
         def pressed(*given):
             try:
@@ -572,7 +573,7 @@ def test_calibrate_plane_puts_its_values_into_a_setup(labapp: Run, tmp_path: Pat
     assert said.count("residual 0.0") == 2
     assert "6.35 mm between flags" in said
     assert "scale      5.67" in said
-    from labapp.session.setup import read_setup
+    from labapp.config.setup import read_setup
 
     corners = np.array([[0.0, 0.0], [480, 0], [0, 640], [480, 640]])
     found = read_setup(setup).calibration.to_plane(corners)

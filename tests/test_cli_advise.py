@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from labapp.session.setup import read_setup, update_setup
+from labapp.config.setup import read_setup, update_setup
 from tests.conftest import Run
 
 pytestmark = pytest.mark.usefixtures("little_search")

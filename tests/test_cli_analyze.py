@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from labapp.simulation import error_analysis
+from labapp.studies import error_analysis
 from tests.conftest import Run
 
 DATA = Path(__file__).parent / "data"
@@ -111,8 +111,8 @@ def test_other_parts_have_their_tables(labapp: Run, tmp_path: Path) -> None:
 def test_the_budget_of_a_setup_file(
     labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("labapp.simulation.setup_budget.POOLS", 2)
-    monkeypatch.setattr("labapp.simulation.setup_budget.MOVED_POOLS", 1)
+    monkeypatch.setattr("labapp.studies.setup_budget.POOLS", 2)
+    monkeypatch.setattr("labapp.studies.setup_budget.MOVED_POOLS", 1)
     arguments = ("--setup", str(SETUP), "--width", "6.5", "--length", "7.5", "--height", "0.3")
     code, out, _ = labapp("analyze", "budget", *arguments, "--out", str(tmp_path))
     assert code == 0

@@ -13,9 +13,9 @@ import pytest
 
 from labapp.media import open_source
 from labapp.media.cameras import CameraInfo, CameraLost
-from labapp.media.take_files import Take
-from labapp.session.cameras import simulated_device
+from labapp.media.recording.take_files import Take
 from labapp.session.session import Session
+from labapp.simulated.cameras import simulated_device
 from tests.conftest import HEEDING, Run
 from tests.waiting import wait_until
 
@@ -80,7 +80,7 @@ def test_a_session_that_cannot_take_it_is_refused_before_filming(
     def film(*_: object) -> Take:
         pytest.fail("it was filmed")
 
-    monkeypatch.setattr("labapp.session.cameras.record", film)
+    monkeypatch.setattr("labapp.simulated.cameras.record", film)
     measured = shutil.copytree(SAMPLE.parent, tmp_path / "run") / "gtaw.labsession"
     in_use = tmp_path / "a.labsession"
     damaged = tmp_path / "b.labsession"
@@ -158,7 +158,7 @@ def test_cameras_are_listed_with_what_can_be_set(
 def test_a_scenario_is_played_there_and_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("labapp.session.cameras.FRAMES", 3)
+    monkeypatch.setattr("labapp.simulated.cameras.FRAMES", 3)
     told: list[tuple[int, int]] = []
     scenario = ROOT / "resources/simulations/cap.toml"
     device = simulated_device(scenario, lambda _, done, of: told.append((done, of)))

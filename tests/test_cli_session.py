@@ -22,7 +22,7 @@ from labapp.core.rows.detection import find_dots, find_lattice
 from labapp.core.surface.measures import Measures
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.session import run
+from labapp.run import runner as run
 from labapp.session.frames import Frames
 from labapp.session.measured import Results
 from labapp.session.session import Session

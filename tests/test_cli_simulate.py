@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from labapp.config.scenario import read_scenario
+from labapp.config.setup import parse_setup, read_setup
 from labapp.core.pipeline import Settings, measure
 from labapp.media import open_source
-from labapp.session.scenario import read_scenario
-from labapp.session.setup import parse_setup, read_setup
-from labapp.session.simulate import simulate
+from labapp.simulated.simulate import simulate
 from labapp.simulation.pools import Wave
 from labapp.simulation.torch import ConeTorch
 from tests.conftest import HEEDING, Run

@@ -12,7 +12,7 @@ import typer.core
 import typer.main
 
 from labapp import cli
-from labapp.session.export import verify_export
+from labapp.export.folder import verify_export
 from labapp.session.session import Session
 from tests.conftest import Run
 

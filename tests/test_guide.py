@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from labapp.gui.actions import ACTIONS
-from labapp.gui.steps import STEPS, Step
+from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.steps import STEPS, Step
 
 GUIDE = Path(__file__).resolve().parent.parent / "docs" / "guide"
 PAGES = sorted(GUIDE.glob("*.md"))
@@ -27,7 +27,7 @@ def test_every_step_has_a_page_that_begins_with_its_hint(step: Step):
 
 def test_the_index_says_what_the_app_says_of_itself():
     pytest.importorskip("PySide6")
-    from labapp.gui.help import CLOSING, INTRODUCTION
+    from labapp.gui.shell.help import CLOSING, INTRODUCTION
 
     index = one_line((GUIDE / "index.md").read_text("utf-8"))
     for paragraph in re.findall(r"<p>(.*?)</p>", INTRODUCTION + CLOSING, re.S):

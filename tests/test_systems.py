@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from labapp.export.folder import verify_export
 from labapp.gui.pages import PAGES
-from labapp.session.export import verify_export
 from tests.waiting import PATIENCE_S
 
 ELSEWHERE = Path(__file__).parent / "elsewhere"

@@ -37,12 +37,12 @@ from labapp.cli.shared import (
 )
 from labapp.cli.window import asks_for_app, open_app, show_in_app, tour
 from labapp.errors import InputError
-from labapp.session.log import log_file, start_log
+from labapp.log import log_file, start_log
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Measurement, Settings
-    from labapp.session.summary import Summary
+    from labapp.export.summary import Summary
 
 IMPATIENT_S = 2.0
 """Asked to stop again within this time, nothing more happens: the first is being obeyed."""
@@ -250,7 +250,7 @@ def _teller(
     """Tells measurements to the streams that are asked for; None where none is."""
     if not any(places.values()):
         return None
-    from labapp.session.streams import open_stream, told_values
+    from labapp.run.streams import open_stream, told_values
 
     opened = []
     for kind, place in places.items():
@@ -279,12 +279,12 @@ def _run(
     tell: Callable[[int, float | None, Measurement], None] | None = None,
 ) -> Summary:
     """Measure, showing progress and failures on stderr and the summary on stdout."""
+    from labapp.config.setup import read_setup
+    from labapp.export.results import ResultsWriter
+    from labapp.export.summary import Summary
     from labapp.media import open_source
-    from labapp.session.results import ResultsWriter
-    from labapp.session.run import measure_frames, provenance, select_frames
-    from labapp.session.sequence import follow_frames
-    from labapp.session.setup import read_setup
-    from labapp.session.summary import Summary
+    from labapp.run.runner import measure_frames, provenance, select_frames
+    from labapp.run.sequence import follow_frames
 
     setup = read_setup(setup_path)
     summary = Summary()
@@ -342,7 +342,7 @@ def detect(
 
     A dot in doubt has none: its cells are empty. Exit code 1: no dot has any.
     """
-    from labapp.session.detect import detect_dots, write_detected
+    from labapp.run.detect import detect_dots, write_detected
 
     dots, lattice, doubt = detect_dots(image, size)
     if out.exists() and out.samefile(image):
@@ -446,7 +446,7 @@ def calibrate_plane(
 
 def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]) -> None:
     """Write calibrated values into a setup file and say what the file still lacks."""
-    from labapp.session.setup import read_setup, update_setup
+    from labapp.config.setup import read_setup, update_setup
 
     if setup is None:
         return
@@ -467,8 +467,8 @@ def demo(
     ] = True,
 ) -> None:
     """Measure the sample run in a session of yours, export its results and draw pictures."""
-    from labapp.session.demo import draw_surface, open_demo
-    from labapp.session.export import ExportChoice
+    from labapp.export.folder import ExportChoice
+    from labapp.simulated.demo import draw_surface, open_demo
 
     out = out.absolute()
     with open_demo(out) as session:

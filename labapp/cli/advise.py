@@ -11,8 +11,8 @@ from labapp.cli.shared import NOTHING, progress_told, results_folder, write_file
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
-    from labapp.simulation.bench_limits import BenchLimits
-    from labapp.simulation.expected_pools import ExpectedPools
+    from labapp.studies.adviser.bench_limits import BenchLimits
+    from labapp.studies.adviser.expected_pools import ExpectedPools
 
 
 def advise(
@@ -56,7 +56,7 @@ def advise(
     Options replace what FILE.toml says. The setup.toml that is written lacks the image
     calibration, which the bench must be measured for: labapp calibrate plane.
     """
-    from labapp.session.advice_keys import parse_question, read_question
+    from labapp.studies.adviser.keys import parse_question, read_question
 
     values = read_question(question) if question else {}
     kind = None if convex is None else "convex" if convex else "concave"
@@ -80,9 +80,10 @@ def _advised(
     expected: ExpectedPools, limits: BenchLimits, out: Path, quick: bool, check: bool, seed: int
 ) -> bool:
     """Search, tell and write; whether any set-up is possible."""
-    from labapp.session.advice import advice_files
-    from labapp.simulation import adviser, adviser_check
-    from labapp.simulation.advice_report import advice_text, cost_table
+    from labapp.studies.adviser import check as adviser_check
+    from labapp.studies.adviser import search as adviser
+    from labapp.studies.adviser.files import advice_files
+    from labapp.studies.adviser.report import advice_text, cost_table
 
     folder = results_folder(out)
     assert folder is not None

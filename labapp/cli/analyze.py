@@ -9,7 +9,7 @@ import typer
 
 from labapp.cli.shared import progress_told, results_folder, write_figure, write_file
 from labapp.errors import InputError
-from labapp.session.analysis import (
+from labapp.studies.analysis import (
     PARTS,
     SCHEMES,
     Made,
@@ -39,14 +39,14 @@ Format = Annotated[Literal["png", "svg"], typer.Option("--format", help="Of the 
 @app.command()
 def positioning(out: Out = None, tables: Tables = False, picture: Format = "png") -> None:
     """Which rays the torch blocks, L1, L2 and D1, and dots on and off the plane (§4.2.1)."""
-    from labapp.simulation import positioning_tables as found
+    from labapp.studies import positioning_tables as found
 
     placements = found.coverage()
     made = (*found.blocking_tables(), found.clearance_table(), found.coverage_table(placements))
     folder = results_folder(out, tables)
     _keep(folder, Made(made, {}, made if tables else ()))
     if folder is not None:
-        from labapp.simulation import pictures
+        from labapp.studies import pictures
 
         write_figure(folder, "figure_4_11_coverage", pictures.coverage_picture(placements), picture)
         rig = found.positioning_rig(30.0)
@@ -57,13 +57,13 @@ def positioning(out: Out = None, tables: Tables = False, picture: Format = "png"
 @app.command()
 def correspondence(out: Out = None, tables: Tables = False, picture: Format = "png") -> None:
     """Which way the reflected rows and columns run, by size and depth of the pool (§4.2.2)."""
-    from labapp.simulation import correspondence_table as found
+    from labapp.studies import correspondence_table as found
 
     made = found.correspondence_tables()
     folder = results_folder(out, tables)
     _keep(folder, Made(made, {}, made if tables else ()))
     if folder is not None:
-        from labapp.simulation import pictures
+        from labapp.studies import pictures
 
         for name, title, radius, depth in found.EXAMPLES:
             seen = found.cap_reflections(radius, depth)
@@ -133,7 +133,7 @@ def budget(
 
     The calibration is taken to be known to 0.1 mm, 0.1 degrees and 0.1 px, a dot to 0.3 px.
     """
-    from labapp.session.setup import read_setup
+    from labapp.config.setup import read_setup
 
     read = None if setup is None else read_setup(setup)
     pool = expected_pool(width, length, height)

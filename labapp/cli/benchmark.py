@@ -12,7 +12,7 @@ from labapp.cli.shared import progress_told
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
-    from labapp.session.benchmark import Detected, Latency, Run, Spread
+    from labapp.simulated.benchmark import Detected, Latency, Run, Spread
 
 
 def benchmark(
@@ -36,7 +36,7 @@ def benchmark(
     """
     import platformdirs
 
-    from labapp.session.benchmark import compare_detectors, make_video, run_video, time_frames
+    from labapp.simulated.benchmark import compare_detectors, make_video, run_video, time_frames
 
     folder = cache or Path(platformdirs.user_cache_dir("labapp")) / "benchmark"
     try:

@@ -18,8 +18,8 @@ from labapp.words import several
 if TYPE_CHECKING:
     from labapp.media.cameras import Camera, CameraSettings, Feed, Range
     from labapp.media.events import Event
-    from labapp.media.recorder import Plan
-    from labapp.media.take_files import Take
+    from labapp.media.recording.recorder import Plan
+    from labapp.media.recording.take_files import Take
     from labapp.session.session import Session
 
 POLL_S = 0.05
@@ -107,7 +107,7 @@ def record(
     Ctrl-C or SIGTERM ends the recording: what was recorded is kept, and the exit code is 0.
     """
     from labapp.media.cameras import CameraSettings
-    from labapp.media.recorder import Plan
+    from labapp.media.recording.recorder import Plan
 
     if (out is None) == (session is None):
         raise InputError("labapp record", "--out", out, "either --out or --session")
@@ -135,8 +135,8 @@ def _film(
 ) -> Take:
     """Record for some seconds, or until Ctrl-C or SIGTERM; what happens is told on stderr."""
     from labapp.media.cameras import CameraError
-    from labapp.session.cameras import camera_opener
-    from labapp.session.cameras import record as film
+    from labapp.simulated.cameras import camera_opener
+    from labapp.simulated.cameras import record as film
 
     with progress_bar() as bar:
         task = bar.add_task(camera, total=None)
@@ -167,7 +167,7 @@ def _film(
 
 def _place(out: Path | None, session: Path | None) -> Callable[[], Path]:
     """What gives the recording's file: the one named, or one beside the session."""
-    from labapp.media.recorder import recording_path
+    from labapp.media.recording.recorder import recording_path
 
     if session is None:
         return lambda: out or Path()

@@ -319,7 +319,7 @@ def _measure(session: Session, frames: list[int], before: Measurement | None) ->
 
 
 def _compared(before: Measures | None, after: Measures | None) -> str:
-    from labapp.session.summary import TOLD
+    from labapp.export.summary import TOLD
 
     lines = []
     for label, name in TOLD.items():

@@ -91,9 +91,9 @@ def new(
     notes: Annotated[str, typer.Option(help="Anything else.")] = "",
 ) -> None:
     """Make a session, with the set-up and the experiment record as far as they are known."""
+    from labapp.config.setup import read_setup
     from labapp.session.record import Record
     from labapp.session.session import Session
-    from labapp.session.setup import read_setup
 
     text = None if setup is None else read_setup(setup).text
     record = Record(
@@ -122,8 +122,8 @@ def set_setup(
     setup: Annotated[Path, typer.Argument(help="Setup file (TOML; mm, degrees, px).")],
 ) -> None:
     """Replace the set-up: rig and image calibration. It can be undone."""
+    from labapp.config.setup import read_setup
     from labapp.session.session import Session
-    from labapp.session.setup import read_setup
 
     text = read_setup(setup).text
     with Session.open(file) as session, told_effect(session):
@@ -310,9 +310,9 @@ def export(
 
     Results that no longer stand are refused: measure again first.
     """
-    from labapp.session.export import ExportChoice
+    from labapp.export.folder import ExportChoice
+    from labapp.export.tables import TABLES
     from labapp.session.session import Session
-    from labapp.session.tables import TABLES
 
     if surfaces == pictures == "none" and not (tables or hdf5 or report):
         raise InputError("export", "choice", "nothing", "tables, surfaces, HDF5, pictures, report")

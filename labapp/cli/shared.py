@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from labapp.core.pipeline import Measurement
+    from labapp.export.summary import Summary
     from labapp.session.session import Session
-    from labapp.session.summary import Summary
     from labapp.simulation import parallel
 
 TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 143, 130, 3, 2, 1
@@ -68,7 +68,7 @@ def command(name: str, file: Path) -> str:
 
 def frames_text(frames: Collection[int]) -> str:
     """Frames in short: "frames 0 to 3, 7"; "no frame"."""
-    from labapp.session.summary import runs_text
+    from labapp.export.summary import runs_text
 
     if not frames:
         return "no frame"
@@ -90,7 +90,7 @@ def choose_frames(session: Session, text: str) -> list[int]:
     InputError
         If it is not of that form, or the session has none of these.
     """
-    from labapp.session.run import select_frames
+    from labapp.run.runner import select_frames
 
     recording = session.recording
     if recording is None:
@@ -108,7 +108,7 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
 
     Ctrl-C ends the program; what was finished is kept.
     """
-    from labapp.session.summary import Summary
+    from labapp.export.summary import Summary
 
     summary = Summary()
     with progress_bar() as progress:
@@ -183,7 +183,7 @@ def results_folder(out: Path | None, tables: bool = True) -> Path | None:
 
 def write_figure(folder: Path, name: str, figure: Figure, kind: str) -> None:
     """Write a picture, PNG or SVG."""
-    from labapp.simulation.plotting import as_bytes
+    from labapp.studies.plotting import as_bytes
 
     write_file(folder / f"{name}.{kind}", as_bytes(figure, kind))
 
@@ -196,7 +196,7 @@ def write_file(path: Path, content: bytes) -> None:
     InputError
         If it cannot be written.
     """
-    from labapp.session.files import write_whole
+    from labapp.files import write_whole
 
     try:
         write_whole(path, content)

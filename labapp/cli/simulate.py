@@ -36,8 +36,8 @@ def simulate(
 
     The folder is whole or not there. The same file and seed give the same frames.
     """
-    from labapp.session.scenario import find_scenario, read_scenario
-    from labapp.session.simulate import simulate as write
+    from labapp.config.scenario import find_scenario, read_scenario
+    from labapp.simulated.simulate import simulate as write
 
     read = read_scenario(find_scenario(scenario), frames, seed)
     count = len(read.recording.pools)

@@ -28,13 +28,13 @@ from PySide6.QtCore import (
 from PySide6.QtWidgets import QApplication
 
 from labapp.errors import InputError
-from labapp.session.log import NAME, start_log
+from labapp.log import NAME, start_log
 from labapp.system import has_display
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.gui.preferences import Preferences
-    from labapp.gui.window import MainWindow
+    from labapp.gui.shell.window import MainWindow
 
 WITHOUT = "labapp --help tells what can be done on the command line"
 
@@ -97,7 +97,7 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     file
         Where they are kept.
     """
-    from labapp.gui.window import MainWindow
+    from labapp.gui.shell.window import MainWindow
 
     window = MainWindow(preferences, file)
     window.apply_theme()

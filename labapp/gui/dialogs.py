@@ -8,7 +8,7 @@ from typing import Literal
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
 
-from labapp.session.database import SUFFIX
+from labapp.session.file.database import SUFFIX
 
 SESSIONS = f"Sessions (*{SUFFIX})"
 EVERYTHING = "All files (*)"
@@ -17,8 +17,8 @@ EVERYTHING = "All files (*)"
 def recordings() -> str:
     """The filter of a file dialog for everything that can be imported."""
     from labapp.media import RECORDING_SUFFIXES
-    from labapp.media.images import IMAGE_SUFFIXES
-    from labapp.media.tiff import TIFF_SUFFIXES
+    from labapp.media.formats.images import IMAGE_SUFFIXES
+    from labapp.media.formats.tiff import TIFF_SUFFIXES
 
     suffixes = sorted(RECORDING_SUFFIXES | IMAGE_SUFFIXES | TIFF_SUFFIXES)
     return f"Recordings ({' '.join(f'*{suffix}' for suffix in suffixes)})"

@@ -14,10 +14,10 @@ from PySide6.QtWidgets import QApplication
 
 from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task, Tasks
-from labapp.media import hid
+from labapp.media.devices import hid
+from labapp.media.devices.foot_switch import Action, FootSwitch, Learned, PedalMap, learn
+from labapp.media.devices.hid import AWAY, LONGEST, UNPLUGGED, HidError, HidInfo
 from labapp.media.events import Event
-from labapp.media.foot_switch import Action, FootSwitch, Learned, PedalMap, learn
-from labapp.media.hid import AWAY, LONGEST, UNPLUGGED, HidError, HidInfo
 
 POLL_MS = 20
 """What is pressed is done within this."""

@@ -14,8 +14,8 @@ from typing import Any
 import platformdirs
 from filelock import FileLock, Timeout
 
-from labapp.session.files import as_bytes, write_whole
-from labapp.session.log import NAME
+from labapp.files import as_bytes, write_whole
+from labapp.log import NAME
 
 VERSION = 1
 KEPT_RECENT = 12

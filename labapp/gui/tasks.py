@@ -18,7 +18,7 @@ from PySide6.QtCore import QObject, QTimer, Signal
 
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.session.log import NAME
+from labapp.log import NAME
 
 POLL_MS = 10
 

@@ -9,14 +9,14 @@ import cv2
 
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage
-from labapp.media.cine import CINE_MAGIC, CineSource
-from labapp.media.images import IMAGE_SUFFIXES, ImageSequence, files_in, images_in
-from labapp.media.numpy_stack import NPY_MAGIC, ZIP_MAGIC, NumpyStack
-from labapp.media.photron import PHOTRON_SUFFIXES, PhotronSource
+from labapp.media.formats.cine import CINE_MAGIC, CineSource
+from labapp.media.formats.images import IMAGE_SUFFIXES, ImageSequence, files_in, images_in
+from labapp.media.formats.numpy_stack import NPY_MAGIC, ZIP_MAGIC, NumpyStack
+from labapp.media.formats.photron import PHOTRON_SUFFIXES, PhotronSource
+from labapp.media.formats.stored import regular_size
+from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
+from labapp.media.formats.video import VideoSource
 from labapp.media.quiet import quiet_opencv
-from labapp.media.stored import regular_size
-from labapp.media.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
-from labapp.media.video import VideoSource
 
 __all__ = ["Frame", "FrameSource", "GreyImage", "open_source"]
 

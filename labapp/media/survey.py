@@ -12,7 +12,7 @@ import numpy.typing as npt
 from labapp.core.values import FloatArray, freeze
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage
-from labapp.media.video import VideoSource
+from labapp.media.formats.video import VideoSource
 
 CHECKED_FRAMES = 24
 """Frames drawn to be read again out of order."""

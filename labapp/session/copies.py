@@ -13,9 +13,9 @@ from typing import Any, get_args
 from urllib.parse import quote
 
 from labapp.errors import InputError
-from labapp.session.database import SUFFIX, new_session_path
+from labapp.files import made_whole
 from labapp.session.documents import WHOLE, Key, Kind
-from labapp.session.files import made_whole
+from labapp.session.file.database import SUFFIX, new_session_path
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 

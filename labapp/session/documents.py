@@ -15,10 +15,10 @@ from typing import Any, Literal, Never
 
 from labapp.core.pipeline import Settings
 from labapp.core.rows.correction import Correction
-from labapp.session.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
-from labapp.session.database import Database
-from labapp.session.kept import Kept
-from labapp.session.limits import Limits
+from labapp.run.limits import Limits
+from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
+from labapp.session.file.database import Database
+from labapp.session.file.kept import Kept
 from labapp.session.record import LaserReadings, PlanePicture, Record
 from labapp.session.signals import Signals
 

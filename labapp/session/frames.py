@@ -21,16 +21,16 @@ import numpy.typing as npt
 
 from labapp.core.values import IntArray
 from labapp.errors import InputError
+from labapp.export.summary import runs_text
 from labapp.media import Frame, FrameSource, GreyImage, open_source
-from labapp.media.images import decoded
-from labapp.media.stored import regular_size
+from labapp.media.formats.images import decoded
+from labapp.media.formats.stored import regular_size
 from labapp.media.survey import Survey, frame_checksum, survey
-from labapp.session.blobs import MAGIC, pack, unpack_from
-from labapp.session.database import Database
-from labapp.session.kept import Kept
+from labapp.run.runner import select_frames
+from labapp.session.file.blobs import MAGIC, pack, unpack_from
+from labapp.session.file.database import Database
+from labapp.session.file.kept import Kept
 from labapp.session.record import Recording
-from labapp.session.run import select_frames
-from labapp.session.summary import runs_text
 
 Progress = Callable[[int, int], None]
 """Called with how much is done and of how much; may raise to stop."""

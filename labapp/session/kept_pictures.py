@@ -9,8 +9,8 @@ import numpy as np
 
 from labapp.errors import InputError
 from labapp.media import GreyImage
-from labapp.media.images import decoded
-from labapp.session.database import Database
+from labapp.media.formats.images import decoded
+from labapp.session.file.database import Database
 
 
 class KeptPictures:

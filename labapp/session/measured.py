@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from labapp.config.setup import Setup, parse_setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.errors import InputError
-from labapp.session.blobs import Damaged, fingerprint, pack, unpack
-from labapp.session.database import Database
-from labapp.session.schema import MEASURES
-from labapp.session.setup import Setup, parse_setup
+from labapp.session.file.blobs import Damaged, fingerprint, pack, unpack
+from labapp.session.file.database import Database
+from labapp.session.file.schema import MEASURES
 from labapp.version import VERSION
 
 SETUP_CHANGED = "the rig or a calibration was changed"

@@ -11,7 +11,7 @@ import numpy as np
 
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.session.export import ExportChoice, ExportedFile, export
+from labapp.export.folder import ExportChoice, ExportedFile, export
 from labapp.session.frames import Progress
 from labapp.session.measured import Result, scheme_name
 from labapp.session.report import report_pdf

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from labapp.core.values import FloatArray, IntArray
-from labapp.session.database import Database
+from labapp.session.file.database import Database
+from labapp.session.file.schema import MEASURES
 from labapp.session.measured import Basis, Overview, Results
-from labapp.session.schema import MEASURES
 
 MANY = 500
 """Where more frames than this changed, all are read: it takes no longer."""

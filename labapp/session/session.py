@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from labapp.config.setup import Setup, parse_setup, updated_setup
 from labapp.core.calibration.laser_calibration import LaserCalibration, calibrate_laser
 from labapp.core.calibration.plane_calibration import (
     PlaneCalibration,
@@ -25,22 +26,21 @@ from labapp.core.rows.correction import Correction
 from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.media import Frame, GreyImage, open_source
-from labapp.session.blobs import fingerprint
-from labapp.session.database import Database
+from labapp.run.limits import Limits
+from labapp.run.runner import measure_each
+from labapp.run.sequence import follow_each
 from labapp.session.documents import WHOLE, Change, Documents, KeptSignals, Key
+from labapp.session.file.blobs import fingerprint
+from labapp.session.file.database import Database
 from labapp.session.frames import Frames, Progress
 from labapp.session.kept_pictures import KeptPictures
-from labapp.session.limits import Limits
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
 from labapp.session.overviews import Overviews
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
-from labapp.session.run import measure_each
-from labapp.session.sequence import follow_each
-from labapp.session.setup import Setup, parse_setup, updated_setup
 from labapp.session.signals import Signals
 
 if TYPE_CHECKING:
-    from labapp.session.export import ExportChoice, ExportedFile
+    from labapp.export.folder import ExportChoice, ExportedFile
 
 
 class Session:
@@ -459,7 +459,7 @@ class Session:
         InputError
             If a result no longer stands, nothing was measured, or the folder cannot be written.
         """
-        from labapp.session.export import ExportChoice
+        from labapp.export.folder import ExportChoice
         from labapp.session.outgoing import export_session  # which reports on a `Session`
 
         what = choice or ExportChoice()

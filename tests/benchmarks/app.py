@@ -35,8 +35,8 @@ from stall_meter import StallMeter, run_for, run_until
 
 from labapp.gui.pages import PAGES
 from labapp.gui.preferences import Preferences
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.view3d import OffscreenView
-from labapp.gui.window import MainWindow
 from labapp.session.session import Session
 
 STARTS = 5

@@ -57,7 +57,7 @@ class Onlooker:
         self._timer.start(POLL_MS)
 
     def _look(self) -> None:
-        from labapp.gui.window import MainWindow
+        from labapp.gui.shell.window import MainWindow
 
         for window in self._app.topLevelWidgets():
             if isinstance(window, MainWindow):

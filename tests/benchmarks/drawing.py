@@ -19,10 +19,10 @@ from labapp.core.rows.correction import Correction
 from labapp.core.rows.lattice import Lattice
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.pages.dots.overlay import DotsOverlay
+from labapp.gui.shell.window import TICKS
 from labapp.gui.views.picture import PictureView
 from labapp.gui.views.plots import PlotStack
-from labapp.gui.views.timeline import Timeline
-from labapp.gui.window import TICKS
+from labapp.gui.widgets.timeline import Timeline
 
 FRAMES = 10_000
 TIMES = 30

@@ -47,15 +47,15 @@ from PySide6.QtCore import QEvent, QObject, Qt
 from PySide6.QtWidgets import QApplication
 from stall_meter import run_for, run_until
 
-from labapp.gui.pages.capture import live as live_module
-from labapp.gui.pages.capture import live_view
+from labapp.gui.live import live as live_module
+from labapp.gui.live import view as live_view
 from labapp.gui.preferences import Preferences
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
 from labapp.media.cameras import Faults
-from labapp.media.nut import NutWriter
-from labapp.media.recorder import Recorder
-from labapp.media.take_files import Take
-from labapp.session.live_measuring import LiveMeasuring
+from labapp.media.recording.nut import NutWriter
+from labapp.media.recording.recorder import Recorder
+from labapp.media.recording.take_files import Take
+from labapp.run.live_measuring import LiveMeasuring
 from labapp.session.samples import sample_folder
 
 LEAST_UPDATES = 20.0

@@ -16,8 +16,8 @@ import numpy as np
 
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import CameraSettings, Faults, Feed, SimulatedDevice
-from labapp.media.nut import Codec, NutWriter
-from labapp.media.recorder import Plan, Recorder
+from labapp.media.recording.nut import Codec, NutWriter
+from labapp.media.recording.recorder import Plan, Recorder
 from labapp.session.samples import sample_folder
 
 WRITTEN = 400

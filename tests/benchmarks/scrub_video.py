@@ -15,7 +15,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 
-from labapp.media.video import VideoSource
+from labapp.media.formats.video import VideoSource
 
 ROWS, COLUMNS = 480, 640
 SCRUBBED = 100

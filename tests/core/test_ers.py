@@ -17,9 +17,9 @@ from labapp.core.surface.interpolation import ThinPlateSurface
 from labapp.core.surface.measures import measure, reflection_scale
 from labapp.core.surface.surface import intersect
 from labapp.core.values import CannotMeasure
-from labapp.simulation.error_analysis import followed
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg, spherical_cap
+from labapp.studies.error_analysis import followed
 
 RIG = Rig(
     Laser(31.14, 31.48),

@@ -14,9 +14,9 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.schemes import irs
 from labapp.core.surface.measures import measure
 from labapp.core.values import CannotMeasure
-from labapp.simulation.error_analysis import aside
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import caps_8_3_1, egg, spherical_cap
+from labapp.studies.error_analysis import aside
 
 RIG = Rig(
     Laser(31.14, 31.48),

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from labapp.config.setup import read_setup
 from labapp.core.images.dots import Dots
 from labapp.core.pipeline import (
     Measurement,
@@ -24,7 +25,6 @@ from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice
 from labapp.core.surface.measures import measure as size_of
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.media import open_source
-from labapp.session.setup import read_setup
 from labapp.simulation.pools import spherical_cap
 from tests.same import assert_same
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, as_dots, see

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
+from labapp.config.setup import read_setup
 from labapp.core.images.exposure import ADVICE
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import GRADES, Quality, judge_quality, look
 from labapp.media import GreyImage, open_source
-from labapp.session.setup import read_setup
 
 SAMPLES = Path(__file__).parents[2] / "sample_sessions"
 

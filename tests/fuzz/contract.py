@@ -17,20 +17,20 @@ import numpy as np
 
 from labapp import cli
 from labapp.cli.info import _facts, _text
+from labapp.config.setup import read_setup, update_setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
+from labapp.export.folder import verify_export
+from labapp.export.results import surface_files
+from labapp.export.tables import csv_rows, frame_tables
 from labapp.media import open_source
-from labapp.session.blobs import fingerprint
 from labapp.session.corrections_csv import read_correction
-from labapp.session.export import verify_export
+from labapp.session.file.blobs import fingerprint
+from labapp.session.file.schema import MEASURES
 from labapp.session.record import Record
-from labapp.session.results import surface_files
-from labapp.session.schema import MEASURES
 from labapp.session.session import Session
-from labapp.session.setup import read_setup, update_setup
-from labapp.session.tables import csv_rows, frame_tables
 from tests.fuzz.damage import damage_session, damaged_bytes, damaged_text
 from tests.fuzz.originals import (
     SETUP,

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from labapp.session.blobs import HEAD, MAGIC
+from labapp.session.file.blobs import HEAD, MAGIC
 from tests.fuzz.originals import hot_journal
 
 ODD_BYTES = (0, 1, 2, 0x7F, 0x80, 0xFE, 0xFF)

@@ -28,7 +28,7 @@ from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.surface.surface import Surface
-from labapp.session.export import ExportChoice, export
+from labapp.export.folder import ExportChoice, export
 from labapp.session.measured import Basis
 from labapp.session.record import PlanePicture, Record
 from labapp.session.session import Session
@@ -265,7 +265,7 @@ def _tables(folder: Path) -> tuple[Path, ...]:
 
 
 def _export(folder: Path) -> Path:
-    from labapp.session.setup import read_setup
+    from labapp.config.setup import read_setup
 
     measured = [(k, k / 100, measurement_of(k)) for k in range(2)]
     choice = ExportChoice(surfaces=frozenset({"csv", "stl"}), spacing_mm=0.5)

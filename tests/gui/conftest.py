@@ -21,7 +21,7 @@ from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
 from labapp.gui.preferences import Preferences
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
 from tests.gui.leaks import Left
 from tests.waiting import PATIENCE_S
 

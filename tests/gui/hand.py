@@ -21,9 +21,9 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.gui.views.fields import ChoiceField, Field
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.picture import PictureView
-from labapp.gui.window import MainWindow
+from labapp.gui.widgets.fields import ChoiceField, Field
 
 LEFT, NONE = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftModifier

@@ -40,7 +40,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
 
     from labapp.gui.app import start_app
     from labapp.gui.preferences import Preferences
-    from labapp.gui.window import MainWindow
+    from labapp.gui.shell.window import MainWindow
 
     def tell(number: int) -> None:
         os.write(pipe, number.to_bytes(TOLD, "little"))

@@ -27,9 +27,9 @@ if __name__ == "__main__":
 
 from PySide6.QtWidgets import QApplication
 
-from labapp.session.database import SUFFIX
-from labapp.session.export import MANIFEST, verify_export
-from labapp.session.log import NAME
+from labapp.export.folder import MANIFEST, verify_export
+from labapp.log import NAME
+from labapp.session.file.database import SUFFIX
 from labapp.session.session import Session
 from tests.gui.random_hand import BUSY_S, RandomHand, Run, open_window
 from tests.gui.watching import Answers, Files, noted

@@ -26,8 +26,8 @@ from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.preferences import Preferences, read_preferences
-from labapp.gui.views.fields import Field, NumberField, TextField
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.fields import Field, NumberField, TextField
 from tests.gui.conftest import KEPT
 from tests.gui.watching import Files
 from tests.gui.witness import Witness

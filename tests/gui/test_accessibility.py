@@ -34,15 +34,15 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from labapp.gui import dialogs
-from labapp.gui.actions import ACTIONS
-from labapp.gui.help import HelpDialog
-from labapp.gui.steps import STEPS
+from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.help import HelpDialog
+from labapp.gui.shell.steps import STEPS
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import TOOLS
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.views.canvas import Drawn, Plotted
-from labapp.gui.window import MainWindow
-from labapp.session.analysis import Made
-from labapp.simulation.tables import Table
+from labapp.studies.analysis import Made
+from labapp.studies.tables import Table
 from tests.gui.conftest import CopySample, let_draw
 
 Role = QAccessible.Role

@@ -4,12 +4,12 @@ from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.action import MENUS
-from labapp.gui.actions import ACTIONS
-from labapp.gui.help import TEXTS, keys
-from labapp.gui.steps import STEPS
+from labapp.gui.shell.action import MENUS
+from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.help import TEXTS, keys
+from labapp.gui.shell.steps import STEPS
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.views import picture, plots, view3d
-from labapp.gui.window import MainWindow
 
 
 def test_every_action_is_whole():

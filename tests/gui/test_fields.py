@@ -7,9 +7,9 @@ from PySide6.QtCore import QCoreApplication, Qt
 from PySide6.QtGui import QGuiApplication
 
 from labapp.gui.digits import NOTHING, ResultRow, as_csv, entered, parsed, plain, rounded
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField, TextField
-from labapp.gui.views.path_field import PathField, PathLine
-from labapp.gui.views.result_table import ResultTable
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
+from labapp.gui.widgets.path_field import PathField, PathLine
+from labapp.gui.widgets.result_table import ResultTable
 
 
 @pytest.mark.parametrize(

@@ -16,14 +16,15 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui import foot_switches
 from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
-from labapp.gui.pages.capture import live_view
+from labapp.gui.live import view as live_view
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.preferences import Preferences, read_preferences
-from labapp.gui.window import MainWindow
-from labapp.media import foot_switch, hid, open_source
+from labapp.gui.shell.window import MainWindow
+from labapp.media import open_source
 from labapp.media.cameras import SimulatedDevice
-from labapp.media.foot_switch import PedalMap
-from labapp.media.hid import HidInfo
+from labapp.media.devices import foot_switch, hid
+from labapp.media.devices.foot_switch import PedalMap
+from labapp.media.devices.hid import HidInfo
 from tests.gui.conftest import KEPT, CopySample, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
@@ -431,7 +432,7 @@ def test_a_pedal_is_called_as_people_call_it(number: int, keyboard: bool, name: 
 
 def test_another_device_begins_with_what_no_pedal_does_yet(qapp: QApplication):
     from labapp.gui.tasks import Tasks
-    from labapp.media.foot_switch import Learned
+    from labapp.media.devices.foot_switch import Learned
 
     tasks = Tasks()
     switches = FootSwitches(tasks)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.standing import Standing
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.standing import Standing
+from labapp.gui.shell.window import MainWindow
 from labapp.media.survey import Survey, survey
 from labapp.session import frames as frames_module
 from labapp.session.session import Session

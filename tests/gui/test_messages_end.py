@@ -12,7 +12,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.export import page as export_page
 from labapp.gui.pages.setup.view import BENCH_TAB
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
 from tests.gui.conftest import CopySample, let_draw
 from tests.gui.hand import Hand
 

@@ -16,9 +16,9 @@ from PySide6.QtWidgets import QAbstractItemView, QComboBox, QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
 import labapp.gui
-from labapp.gui.views.labels import plain_label, plain_tip
-from labapp.gui.window import MainWindow
-from labapp.session.blobs import pack
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.labels import plain_label, plain_tip
+from labapp.session.file.blobs import pack
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from tests.gui.conftest import CopySample, let_draw

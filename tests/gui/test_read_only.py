@@ -5,9 +5,9 @@ from __future__ import annotations
 from PySide6.QtWidgets import QCheckBox, QComboBox, QLineEdit
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.steps import READ_ONLY, STEPS
-from labapp.gui.views.fields import ChoiceField, Field, NumberField
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.steps import READ_ONLY, STEPS
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.fields import ChoiceField, Field, NumberField
 from tests.gui.conftest import CopySample
 
 

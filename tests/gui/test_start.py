@@ -22,7 +22,7 @@ from labapp import cli
 from labapp.gui.app import start_app
 from labapp.gui.preferences import Preferences
 app = start_app()
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
 window = MainWindow(Preferences(), Path(sys.argv[1]))
 window.show()
 app.processEvents()

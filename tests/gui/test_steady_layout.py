@@ -18,9 +18,9 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.pages import PAGES
 from labapp.gui.pages.setup.presenter import SAFETY
 from labapp.gui.pages.setup.view import BENCH_TAB, SAFETY_TAB
-from labapp.gui.views.fields import Field
-from labapp.gui.views.labels import Message
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.fields import Field
+from labapp.gui.widgets.labels import Message
 from tests.gui.conftest import CopySample, let_draw
 
 LONG = "words that need more room than there is on a line, and on the next one, too; " * 4

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.views import steering
 from labapp.gui.views.steering import steer
 from labapp.gui.views.view3d import View3d, make_view3d
-from labapp.gui.window import MainWindow
-from labapp.media import hid
-from labapp.media.space_mouse import SixAxes, SpaceMouse
+from labapp.media.devices import hid
+from labapp.media.devices.space_mouse import SixAxes, SpaceMouse
 from tests.gui.conftest import KEPT, CopySample
 from tests.gui.test_view3d import hill
 from tests.media.pedals import AXES, MOUSE_3D, Bench, Device
@@ -113,7 +113,7 @@ def test_it_turns_the_surface_page_while_that_is_in_view(
 ):
     bench = Bench({MOUSE_3D: Device(AXES)})
     monkeypatch.setattr(hid, "RETRY_S", 0.02)
-    monkeypatch.setattr("labapp.media.space_mouse.RETRY_S", 0.02)
+    monkeypatch.setattr("labapp.media.devices.space_mouse.RETRY_S", 0.02)
     made = partial(SpaceMouse, find=bench.find, opened=bench.open)
     monkeypatch.setattr(steering, "SpaceMouse", made)
     window.files.open(copy_sample("thumb_tack"))

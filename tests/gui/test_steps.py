@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from labapp.config.setup import parse_setup
 from labapp.errors import InputError
-from labapp.gui.steps import Mark, setup_to_do, states
+from labapp.gui.shell.steps import Mark, setup_to_do, states
 from labapp.session.session import Session
-from labapp.session.setup import parse_setup
 
 LASER = "[laser]\nprojection_angle_deg = 31.14\ndistance_mm = 31.48\n"
 PATTERN = "[pattern]\nrows = 19\ncolumns = 19\ninter_beam_angle_deg = 0.77\n"

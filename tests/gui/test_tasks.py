@@ -6,7 +6,7 @@ import time
 from pytestqt.qtbot import QtBot
 
 from labapp.errors import InputError
-from labapp.gui.messages import StatusLine
+from labapp.gui.shell.messages import StatusLine
 from labapp.gui.tasks import Control, Tasks
 
 

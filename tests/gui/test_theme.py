@@ -11,14 +11,14 @@ from PySide6.QtGui import QColor, QImage, QPalette
 from PySide6.QtWidgets import QApplication, QGraphicsView, QWidget
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages.capture.live_figures import AlarmStrip, Figure, LiveFigures
+from labapp.gui.live.figures import AlarmStrip, Figure, LiveFigures
 from labapp.gui.recent import Recent
-from labapp.gui.step_list import COLOURS
-from labapp.gui.steps import STEPS
+from labapp.gui.shell.step_list import COLOURS
+from labapp.gui.shell.steps import STEPS
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.theme import RED, palette
 from labapp.gui.views.view3d import View3d
-from labapp.gui.window import MainWindow
-from labapp.session.alarms import Alarm
+from labapp.run.alarms import Alarm
 from tests.gui.conftest import CopySample, let_draw
 
 

@@ -6,12 +6,12 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtGui import QImage
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.standing import Standing, next_frame, standings
-from labapp.gui.views.scrubber import aggregated
-from labapp.gui.views.timeline import Timeline
-from labapp.gui.window import TICKS
+from labapp.gui.shell.standing import Standing, next_frame, standings
+from labapp.gui.shell.window import TICKS
+from labapp.gui.widgets.scrubber import aggregated
+from labapp.gui.widgets.timeline import Timeline
+from labapp.session.file.schema import MEASURES
 from labapp.session.measured import Overview
-from labapp.session.schema import MEASURES
 
 
 def overview(status: list[str], corrected: list[bool], stale: list[bool]) -> Overview:

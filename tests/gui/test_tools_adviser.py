@@ -11,11 +11,11 @@ from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.setup import SetupPage
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import advising
 from labapp.gui.tools.adviser import AdviserWindow
-from labapp.gui.window import MainWindow
-from labapp.session.advice_keys import parse_question
 from labapp.session.session import Session
+from labapp.studies.adviser.keys import parse_question
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
 

@@ -12,12 +12,12 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import analysing
 from labapp.gui.tools.analysis import AnalysisWindow
-from labapp.gui.window import MainWindow
-from labapp.session.analysis import PARTS
 from labapp.session.session import Session
-from labapp.simulation import error_analysis, setup_budget
+from labapp.studies import error_analysis, setup_budget
+from labapp.studies.analysis import PARTS
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
 from tests.waiting import PATIENCE_S

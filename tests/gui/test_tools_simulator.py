@@ -13,10 +13,10 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
+from labapp.config.scenario import shipped_scenarios
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import simulating
 from labapp.gui.tools.simulator import SimulatorWindow
-from labapp.gui.window import MainWindow
-from labapp.session.scenario import shipped_scenarios
 from tests.conftest import Run
 
 

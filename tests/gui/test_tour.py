@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import labapp
-from labapp.gui.action import MENUS
-from labapp.gui.help import TITLES
 from labapp.gui.pages import PAGES
+from labapp.gui.shell.action import MENUS
+from labapp.gui.shell.help import TITLES
 from labapp.gui.tools import TOOLS
 from tests.conftest import Run
 from tests.screen import screen

@@ -26,7 +26,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import PlanePage
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.pages.surface import SurfacePage
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
 from tests.conftest import Run
 from tests.gui.conftest import SAMPLES
 from tests.gui.hand import CONTROL, SHIFT, Hand

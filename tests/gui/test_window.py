@@ -16,20 +16,20 @@ from pytestqt.qtbot import QtBot
 
 from labapp.errors import InputError
 from labapp.gui import app, dialogs
-from labapp.gui import window as window_module
-from labapp.gui.files import title
 from labapp.gui.pages.dots.presenter import NUMBERS, detector_value
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.recent import look_at
-from labapp.gui.step_list import StepList, mark_icon
-from labapp.gui.steps import STEPS, Mark, first_step, states
-from labapp.gui.views.tables import table_text
-from labapp.gui.window import MainWindow
+from labapp.gui.shell import window as window_module
+from labapp.gui.shell.files import title
+from labapp.gui.shell.step_list import StepList, mark_icon
+from labapp.gui.shell.steps import STEPS, Mark, first_step, states
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.tables import table_text
 from labapp.gui.workspace import Workspace
+from labapp.log import log_file
 from labapp.session.copies import copy_sample as copied_sample
 from labapp.session.copies import copy_session
-from labapp.session.log import log_file
 from labapp.session.record import Record
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, CopySample, let_draw

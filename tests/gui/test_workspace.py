@@ -11,8 +11,8 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.workspace import Workspace
-from labapp.session import run
-from labapp.session.log import NAME
+from labapp.log import NAME
+from labapp.run import runner as run
 from labapp.simulation import parallel
 from tests.gui.conftest import CopySample
 from tests.gui.watching import Noting

@@ -19,8 +19,8 @@ from PySide6.QtGui import QDesktopServices
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QAbstractButton, QApplication, QFileDialog, QMenu
 
-from labapp.session.database import SUFFIX
-from labapp.session.log import start_log
+from labapp.log import start_log
+from labapp.session.file.database import SUFFIX
 
 SAMPLES = Path(__file__).parents[2] / "sample_sessions"
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from labapp.session.blobs import pack, unpack
 from labapp.session.documents import Documents
+from labapp.session.file.blobs import pack, unpack
 from labapp.session.frames import Frames
 from labapp.session.measured import Results
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 from collections.abc import Iterable
 
-from labapp.media.hid import HidError, HidInfo
+from labapp.media.devices.hid import HidError, HidInfo
 
 INFINITY = HidInfo("/dev/hidraw4", 0x05F3, 0x00FF, 0, (12, 3), "VEC Infinity foot pedal")
 PCSENSOR = HidInfo("/dev/hidraw5", 0x3553, 0xB001, 0, (1, 6), "PCsensor FootSwitch")

@@ -13,9 +13,9 @@ from types import SimpleNamespace
 import pytest
 
 from labapp.errors import InputError
-from labapp.media import foot_switch, hid, space_mouse
-from labapp.media.foot_switch import Action, FootSwitch, Learned, PedalMap, Pedals, learn
-from labapp.media.hid import (
+from labapp.media.devices import foot_switch, hid, space_mouse
+from labapp.media.devices.foot_switch import Action, FootSwitch, Learned, PedalMap, Pedals, learn
+from labapp.media.devices.hid import (
     HidError,
     HidInfo,
     commands,
@@ -24,7 +24,7 @@ from labapp.media.hid import (
     open_hid,
     why_closed,
 )
-from labapp.media.space_mouse import SixAxes, SpaceMouse
+from labapp.media.devices.space_mouse import SixAxes, SpaceMouse
 from tests.media.cameras.watching import Heard
 from tests.media.pedals import AXES, INFINITY, KEYBOARD, MOUSE_3D, PCSENSOR, THREE, Device
 from tests.waiting import wait_until
@@ -400,6 +400,6 @@ def test_a_3d_controller_is_read_whenever_it_is_plugged_in() -> None:
 def test_actions_are_those_that_the_types_name() -> None:
     from typing import get_args
 
-    from labapp.media.foot_switch import ACTIONS
+    from labapp.media.devices.foot_switch import ACTIONS
 
     assert get_args(Action) == ACTIONS

@@ -14,7 +14,7 @@ import tifffile
 from labapp.errors import InputError
 from labapp.media import open_source
 from labapp.media.base import to_grey
-from labapp.media.images import natural_key
+from labapp.media.formats.images import natural_key
 from tests.media.cine_writer import write_cine
 from tests.media.conftest import WriteVideo
 from tests.scripts import peak_mb, run_python

@@ -11,7 +11,7 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.media import GreyImage, open_source
-from labapp.media.nut import Codec, NutWriter
+from labapp.media.recording.nut import Codec, NutWriter
 from tests.media.conftest import Encode
 
 LEAST = 100
@@ -100,7 +100,7 @@ WRITER = """
 import sys
 import numpy as np
 from pathlib import Path
-from labapp.media.nut import NutWriter
+from labapp.media.recording.nut import NutWriter
 rng = np.random.default_rng(0)
 writer = NutWriter(Path(sys.argv[1]), (240, 320), 8, 1000, sys.argv[2])
 for k in range(10**6):

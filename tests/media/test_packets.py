@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp.media.packets import MAGIC, PacketTable
-from labapp.media.video import VideoSource
+from labapp.media.formats.packets import MAGIC, PacketTable
+from labapp.media.formats.video import VideoSource
 from tests.scripts import peak_mb
 
 COUNT = 12
@@ -88,7 +88,7 @@ def test_an_index_that_would_fill_the_memory_is_left_aside(path: Path, outside: 
     script = """
         import sys
         from pathlib import Path
-        from labapp.media.video import VideoSource
+        from labapp.media.formats.video import VideoSource
         VideoSource(Path(sys.argv[1]), Path(sys.argv[2]).read_bytes()).frame(0)
     """
     assert peak_mb(script, path, path.parent / "index") < 600

@@ -14,12 +14,12 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.media import GreyImage, open_source
-from labapp.media import recorder as recorder_module
 from labapp.media.cameras import CameraFrame, Faults, Feed, SimulatedDevice, feed
 from labapp.media.events import Event
-from labapp.media.nut import NutWriter
-from labapp.media.recorder import Plan, Recorder, recording_path
-from labapp.media.take_files import Take
+from labapp.media.recording import recorder as recorder_module
+from labapp.media.recording.nut import NutWriter
+from labapp.media.recording.recorder import Plan, Recorder, recording_path
+from labapp.media.recording.take_files import Take
 from labapp.session.session import Session
 from tests.media.cameras.watching import Heard, number_in, numbered
 from tests.waiting import PATIENCE_S, wait_until

@@ -12,8 +12,8 @@ import numpy.typing as npt
 import pytest
 
 from labapp.media import open_source
+from labapp.media.formats.video import VideoSource
 from labapp.media.survey import frame_checksum, survey
-from labapp.media.video import VideoSource
 
 Pictures = list[npt.NDArray[Any]]
 WriteVideo = Callable[[Path, Pictures, str], Path]

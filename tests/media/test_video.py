@@ -20,8 +20,8 @@ import pytest
 
 from labapp.errors import InputError
 from labapp.media import open_source
-from labapp.media.packets import Packets
-from labapp.media.video import VideoSource
+from labapp.media.formats.packets import Packets
+from labapp.media.formats.video import VideoSource
 
 Pictures = list[npt.NDArray[Any]]
 WriteVideo = Callable[[Path, Pictures, str], Path]

@@ -20,7 +20,15 @@ from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface, ThinPlateSurface
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.errors import InputError
-from labapp.session.blobs import HEAD, MAGIC, Damaged, fingerprint, fingerprint_of, pack, unpack
+from labapp.session.file.blobs import (
+    HEAD,
+    MAGIC,
+    Damaged,
+    fingerprint,
+    fingerprint_of,
+    pack,
+    unpack,
+)
 from tests.scripts import peak_mb
 
 plain = st.recursive(
@@ -178,7 +186,7 @@ def test_what_would_fill_the_memory_is_refused(tmp_path: Path, forge: Callable[[
     script = """
         import sys
         from pathlib import Path
-        from labapp.session.blobs import Damaged, unpack
+        from labapp.session.file.blobs import Damaged, unpack
         try:
             unpack(Path(sys.argv[1]).read_bytes())
             sys.exit("it was unpacked")

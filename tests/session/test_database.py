@@ -5,14 +5,15 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from labapp.errors import InputError
-from labapp.session import database as module
-from labapp.session.database import Database, SessionInUse
-from labapp.session.schema import APPLICATION_ID, TABLES, VERSION
+from labapp.session.file import database as module
+from labapp.session.file.database import Database, SessionInUse
+from labapp.session.file.schema import APPLICATION_ID, TABLES, VERSION
 from tests.scripts import run_python
 
 DATA = Path(__file__).parent / "data"
@@ -97,7 +98,7 @@ def test_what_is_no_regular_file_is_refused(tmp_path: Path):
     for name in ("pipe.labsession", "zero.labsession", "a\0b.labsession"):
         script = f"""
             from labapp.errors import InputError
-            from labapp.session.database import Database
+            from labapp.session.file.database import Database
             for read_only in (False, True):
                 try:
                     Database.open({str(tmp_path / name)!r}, read_only)
@@ -157,7 +158,7 @@ def test_a_second_writer_is_told_and_may_read(path: Path):
 
 def test_another_process_that_died_does_not_keep_the_session(path: Path):
     script = (
-        "import os, sys; from labapp.session.database import Database; "
+        "import os, sys; from labapp.session.file.database import Database; "
         "d = Database.open(sys.argv[1]); print('open', flush=True); os.kill(os.getpid(), 9)"
     )
     answer = subprocess.run(
@@ -192,7 +193,8 @@ def test_a_change_that_fails_leaves_nothing(path: Path):
     assert kinds(database) == ["one"]
     write(database, "three")
     database.close()
-    assert kinds(Database.open(path, read_only=True)) == ["one", "three"]
+    with closing(Database.open(path, read_only=True)) as again:
+        assert kinds(again) == ["one", "three"]
 
 
 def cut_off(path: Path) -> Path:
@@ -292,7 +294,8 @@ def test_an_older_version_is_copied_and_brought_up_to_date(path: Path):
     database.close()
     kept = path.with_name(f"a.version-{VERSION}.labsession")
     assert kept.read_bytes() == before
-    assert kinds(Database.open(path)) == ["ONE"]  # and only once
+    with closing(Database.open(path)) as again:
+        assert kinds(again) == ["ONE"]  # and only once
 
 
 def test_a_link_in_the_place_of_the_lock_is_refused(path: Path, tmp_path: Path):

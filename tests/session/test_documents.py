@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from labapp.errors import InputError
 from labapp.session import documents as module
-from labapp.session.database import Database
 from labapp.session.documents import WHOLE, Documents
+from labapp.session.file.database import Database
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -14,8 +14,8 @@ import pytest
 from labapp.core.pipeline import Settings
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.session.blobs import HEAD, MAGIC, Damaged, pack, unpack
-from labapp.session.kinds import is_a
+from labapp.session.file.blobs import HEAD, MAGIC, Damaged, pack, unpack
+from labapp.session.file.kinds import is_a
 from labapp.session.record import Record
 from labapp.session.session import Session
 from tests.fuzz.originals import SETUP, keep, measurement_of

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import labapp
+from labapp.config.setup import Setup, parse_setup
 from labapp.core.calibration.laser_calibration import calibrate_laser
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -21,7 +22,7 @@ from labapp.core.rows import correction
 from labapp.core.schemes import ers
 from labapp.core.surface.measures import measure
 from labapp.errors import InputError
-from labapp.session.error_budget import SIZES, Contribution, calibration_budget, together
+from labapp.export.summary import runs_text
 from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
 from labapp.session.report import data, figures, layout, report_pdf
@@ -29,10 +30,9 @@ from labapp.session.report.data import FrameLine, Told
 from labapp.session.report.layout import Story, plain
 from labapp.session.report.results import tell_corrections, tell_example, tell_results
 from labapp.session.session import Session
-from labapp.session.setup import Setup, parse_setup
-from labapp.session.summary import runs_text
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap
+from labapp.studies.error_budget import SIZES, Contribution, calibration_budget, together
 from tests.scenes import FRAME_SHAPE, as_dots
 
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"

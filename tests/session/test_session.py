@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 
 import labapp
+from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings
 from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
+from labapp.export.folder import ExportChoice, verify_export
+from labapp.export.results import ResultsWriter
 from labapp.media import open_source
-from labapp.session.blobs import pack
-from labapp.session.export import ExportChoice, verify_export
+from labapp.run.runner import measuring_pool
+from labapp.session.file.blobs import pack
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
-from labapp.session.results import ResultsWriter
-from labapp.session.run import measuring_pool
 from labapp.session.session import Session
-from labapp.session.setup import read_setup
 from tests.scripts import run_python
 from tests.session.test_blobs import same
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from labapp.session.file.schema import MEASURES
 from labapp.session.measured import Overview
-from labapp.session.schema import MEASURES
 from labapp.session.trends import FEWEST, doubtful_frames, spectrum, spread, trend
 
 RATE_HZ = 60.0

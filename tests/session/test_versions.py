@@ -17,11 +17,11 @@ import pytest
 
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.rig import Electrode
-from labapp.session.blobs import HEAD, MAGIC, SURFACES, Damaged, pack, unpack
+from labapp.session.file.blobs import HEAD, MAGIC, SURFACES, Damaged, pack, unpack
+from labapp.session.file.schema import VERSION
+from labapp.session.file.stored import NAMES, STORED, Stored
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED
-from labapp.session.schema import VERSION
 from labapp.session.session import Session
-from labapp.session.stored import NAMES, STORED, Stored
 
 WRITTEN = sorted((Path(__file__).parent / "data").glob("version_*.labsession"))
 

@@ -10,10 +10,10 @@ import pytest
 
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.simulation import forward
-from labapp.simulation.correspondence_table import correspondence_letters
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Dent, LowRear, Pool, caps_8_3_1, egg, spherical_cap
 from labapp.simulation.pools import Footprint as Foot
+from labapp.studies.correspondence_table import correspondence_letters
 
 DATA = Path(__file__).parents[1] / "data"
 OVERHEAD = 1000.0

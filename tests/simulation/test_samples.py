@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings, measure, start_correction
 from labapp.core.rows.correction import block_row, set_reference
 from labapp.media import open_source
-from labapp.session.setup import read_setup
 from labapp.simulation.recording import TARGET
 from labapp.simulation.samples.__main__ import main
 from labapp.simulation.samples.runs import blocked_rows, concave, gtaw, samples, thumb_tack

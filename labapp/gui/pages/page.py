@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
-from labapp.gui.steps import State, read_only
-from labapp.gui.views.fields import Field
+from labapp.gui.shell.steps import State, read_only
+from labapp.gui.widgets.fields import Field
 from labapp.gui.workspace import Workspace
 
 if TYPE_CHECKING:
-    from labapp.media.take_files import Take
+    from labapp.media.recording.take_files import Take
 
 
 class Page(QWidget):

@@ -19,7 +19,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
 from labapp.gui.tasks import Control
-from labapp.gui.views.labels import plain_label, plain_tip
+from labapp.gui.widgets.labels import plain_label, plain_tip
 from labapp.gui.workspace import Workspace
 
 BUTTONS = (

@@ -9,8 +9,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from labapp.gui.shell.window import MainWindow
     from labapp.gui.tools.tool import ToolWindow
-    from labapp.gui.window import MainWindow
 
 TOOLS = {
     "simulator": "SimulatorWindow",

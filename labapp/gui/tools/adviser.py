@@ -17,20 +17,20 @@ from PySide6.QtWidgets import (
 from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
 from labapp.gui.tools.tool import ToolWindow, told
-from labapp.gui.views.fields import ChoiceField, NumberField
-from labapp.gui.views.labels import headed, plain_label
 from labapp.gui.views.ranges import RangeField
-from labapp.gui.views.result_table import ResultTable
-from labapp.gui.views.sheet import Sheet
-from labapp.gui.views.tables import CellTable
-from labapp.session.advice import advice_files
-from labapp.session.advice_keys import parse_question
-from labapp.simulation import adviser
-from labapp.simulation.advice_report import cost_table
-from labapp.simulation.adviser import Advice, Effort, advise
+from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.labels import headed, plain_label
+from labapp.gui.widgets.result_table import ResultTable
+from labapp.gui.widgets.sheet import Sheet
+from labapp.gui.widgets.tables import CellTable
+from labapp.studies.adviser import search as adviser
+from labapp.studies.adviser.files import advice_files
+from labapp.studies.adviser.keys import parse_question
+from labapp.studies.adviser.report import cost_table
+from labapp.studies.adviser.search import Advice, Effort, advise
 
 if TYPE_CHECKING:
-    from labapp.gui.window import MainWindow
+    from labapp.gui.shell.window import MainWindow
 
 RANGES = (
     ("pools.width_mm", "Width", "mm", 1, 50, 0.1, "Of the pools, along X"),

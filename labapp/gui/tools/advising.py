@@ -6,12 +6,12 @@ from typing import Any
 
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.setup.presenter import rig
-from labapp.session.advice import advised_setup
 from labapp.session.session import Session
-from labapp.simulation.advice_report import WORDS
-from labapp.simulation.adviser import Advice
-from labapp.simulation.bench_limits import CONSTRAINTS, BenchLimits
 from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
+from labapp.studies.adviser.bench_limits import CONSTRAINTS, BenchLimits
+from labapp.studies.adviser.files import advised_setup
+from labapp.studies.adviser.report import WORDS
+from labapp.studies.adviser.search import Advice
 
 USUAL_HEIGHT_MM = 0.25
 

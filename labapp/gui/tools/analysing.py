@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 from labapp.errors import InputError
-from labapp.session.analysis import SCHEMES
 from labapp.session.session import Session
+from labapp.studies.analysis import SCHEMES
 
 BUDGET = "budget"
 

@@ -12,11 +12,11 @@ from labapp.gui.tasks import Control
 from labapp.gui.tools import analysing
 from labapp.gui.tools.analysing import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import ToolWindow, told
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.views.labels import plain_label
-from labapp.gui.views.sheet import Sheet
-from labapp.gui.views.tables import CellTable
-from labapp.session.analysis import (
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.sheet import Sheet
+from labapp.gui.widgets.tables import CellTable
+from labapp.studies.analysis import (
     SCHEMES,
     Made,
     Question,
@@ -24,11 +24,11 @@ from labapp.session.analysis import (
     analyze_errors,
     expected_pool,
 )
-from labapp.simulation.tables import Table
+from labapp.studies.tables import Table
 
 if TYPE_CHECKING:
-    from labapp.gui.window import MainWindow
-    from labapp.session.setup import Setup
+    from labapp.config.setup import Setup
+    from labapp.gui.shell.window import MainWindow
     from labapp.simulation.pools import Pool
 
 SIZES = (

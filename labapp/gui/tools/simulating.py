@@ -6,9 +6,9 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from labapp.config.scenario import Scenario, read_scenario, shipped_scenarios
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow
-from labapp.session.scenario import Scenario, read_scenario, shipped_scenarios
 from labapp.simulation.recording import RecordedFrame
 
 

@@ -11,22 +11,22 @@ import pyqtgraph as pg
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtWidgets import QFileDialog
 
+from labapp.config.scenario import Scenario, read_scenario
 from labapp.gui.dialogs import new_path
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import simulating
 from labapp.gui.tools.simulating import Preview
 from labapp.gui.tools.tool import ToolWindow, told
-from labapp.gui.views.fields import ChoiceField, NumberField
-from labapp.gui.views.labels import plain_label
-from labapp.gui.views.path_field import PathField
 from labapp.gui.views.picture import PictureView
-from labapp.gui.views.result_table import ResultTable
-from labapp.session.scenario import Scenario, read_scenario
-from labapp.session.simulate import begin_session, simulate
+from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.path_field import PathField
+from labapp.gui.widgets.result_table import ResultTable
+from labapp.simulated.simulate import begin_session, simulate
 from labapp.words import several
 
 if TYPE_CHECKING:
-    from labapp.gui.window import MainWindow
+    from labapp.gui.shell.window import MainWindow
 
 RING, RING_PX = "#2fd39b", 15
 """Round the true dots: a colour of the dots page; points of the screen."""

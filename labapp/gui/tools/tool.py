@@ -22,14 +22,14 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.errors import InputError
-from labapp.gui.messages import PROBLEM, ElidedLabel
+from labapp.files import write_whole
+from labapp.gui.shell.messages import PROBLEM, ElidedLabel
 from labapp.gui.tasks import Control, Task, Tasks
-from labapp.gui.views.fields import FieldForm
-from labapp.session.files import write_whole
+from labapp.gui.widgets.fields import FieldForm
 from labapp.simulation.parallel import Progress, behind_a_window
 
 if TYPE_CHECKING:
-    from labapp.gui.window import MainWindow
+    from labapp.gui.shell.window import MainWindow
 
 SIZE_PX = (1120, 700)
 PART_OF_SCREEN = 0.9

@@ -71,10 +71,10 @@ def tour(
 
     from PySide6.QtCore import QSettings, Qt
 
+    from labapp.export.drawing import can_draw
     from labapp.gui.tour.bench import lay_out
     from labapp.gui.tour.hands import Hands, TourFailed
     from labapp.gui.tour.way import go_through
-    from labapp.session.drawing import can_draw
 
     if not can_draw():
         raise InputError("the tour", "3-D", "nothing can be drawn here", "OpenGL, or Mesa's")

@@ -39,10 +39,10 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.pages.page import Page
-from labapp.gui.views.fields import ChoiceField, Field
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.picture import PictureView
 from labapp.gui.views.view3d import InteractiveView, View3d
-from labapp.gui.window import MainWindow
+from labapp.gui.widgets.fields import ChoiceField, Field
 
 LONGEST_MS = 300_000
 """What takes longer than this has gone wrong."""

@@ -9,8 +9,8 @@ from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox, QTabBar, QToolButton
 
+from labapp.gui.live.canvas import PARTS
 from labapp.gui.pages.capture import CapturePage
-from labapp.gui.pages.capture.live_canvas import PARTS
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.plane import PlanePage

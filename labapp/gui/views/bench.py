@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout
 from labapp.core.values import FloatArray
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Drawn
-from labapp.gui.views.labels import plain_label
+from labapp.gui.widgets.labels import plain_label
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}

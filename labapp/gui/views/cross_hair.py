@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QVBoxLayout
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Drawn
-from labapp.gui.views.labels import plain_label
+from labapp.gui.widgets.labels import plain_label
 
 
 class CrossHairView(Drawn):

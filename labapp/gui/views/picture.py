@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
 from labapp.core.values import BoolArray
 from labapp.gui.views.canvas import Drawn
 from labapp.gui.views.drag_point import ALT, CONTROL, SHIFT, DragPoint, arrow_step
-from labapp.gui.views.labels import plain_label
+from labapp.gui.widgets.labels import plain_label
 from labapp.media import GreyImage
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)

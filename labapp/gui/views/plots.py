@@ -28,7 +28,7 @@ from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
-from labapp.gui.views.labels import plain_label, plain_tip
+from labapp.gui.widgets.labels import plain_label, plain_tip
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from PySide6.QtWidgets import QHBoxLayout, QWidget
 
-from labapp.gui.views.fields import Field, NumberField
+from labapp.gui.widgets.fields import Field, NumberField
 
 
 class RangeField(Field):

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from PySide6.QtCore import QObject, QPointF, QTimer
 
 from labapp.gui.views.view3d import View3d
+from labapp.media.devices.space_mouse import SixAxes, SpaceMouse
 from labapp.media.events import Event
-from labapp.media.space_mouse import SixAxes, SpaceMouse
 
 TICK_MS = 33
 

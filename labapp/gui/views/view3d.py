@@ -30,9 +30,9 @@ from PySide6.QtGui import (
 )
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
+from labapp.export.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
+from labapp.export.scene import Scene
 from labapp.gui.views.canvas import Drawn
-from labapp.session.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
-from labapp.session.scene import Scene
 
 TURN_DEG = 10.0
 """An arrow key turns the scene so far."""

@@ -12,7 +12,6 @@ import scipy
 
 from labapp.errors import InputError
 from labapp.media.base import rate_in_words
-from labapp.session.error_budget import laser_in_use, plane_in_use
 from labapp.session.report import data, figures
 from labapp.session.report.data import Told, number, with_unit
 from labapp.session.report.layout import Story
@@ -23,6 +22,7 @@ from labapp.session.report.results import (
     tell_results,
 )
 from labapp.session.session import Session
+from labapp.studies.error_budget import laser_in_use, plane_in_use
 from labapp.version import VERSION
 
 POOL_MM = (7.0, 0.3)

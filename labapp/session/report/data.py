@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from labapp.config.setup import Setup
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.session.error_budget import SIZES, Contribution, together
+from labapp.export.summary import runs_text
 from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
 from labapp.session.session import Session
-from labapp.session.setup import Setup
-from labapp.session.summary import runs_text
+from labapp.studies.error_budget import SIZES, Contribution, together
 
 DOUBTFUL_MARGIN = 5.0
 """A frame is doubtful where another correspondence comes within this factor of the residual."""

@@ -16,10 +16,10 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import surface_mesh
 from labapp.core.values import FloatArray
+from labapp.export.meshes import drawn_spacing
 from labapp.media import GreyImage
-from labapp.session.meshes import drawn_spacing
 from labapp.session.report.layout import DPI
-from labapp.simulation.plotting import INCHES, STYLE, as_bytes, new_figure, row_colour
+from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure, row_colour
 
 STATES = {
     "measured": {"marker": "o", "color": "#1b4f8a", "markerfacecolor": "#1b4f8a"},

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from labapp.config.setup import parse_setup
 from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.session.error_budget import calibration_budget
 from labapp.session.report import data, figures
 from labapp.session.report.data import FrameLine, Told
 from labapp.session.report.layout import Story
-from labapp.session.setup import parse_setup
-from labapp.simulation.parameter_deviation import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX
+from labapp.studies.error_budget import calibration_budget
+from labapp.studies.parameter_deviation import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX
 from labapp.words import SIGMA_OF
 
 LATEST_CHANGES = 40

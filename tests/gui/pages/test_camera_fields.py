@@ -10,17 +10,17 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from labapp.errors import InputError
-from labapp.gui.pages.capture import live_view
-from labapp.gui.pages.capture.camera_fields import CameraFields, region_in_words, region_of
+from labapp.gui.live import view as live_view
+from labapp.gui.live.camera_fields import CameraFields, region_in_words, region_of
+from labapp.gui.live.plan_fields import cost_in_words
 from labapp.gui.pages.capture.page import CapturePage
-from labapp.gui.pages.capture.plan_fields import cost_in_words
-from labapp.gui.views.fields import Field
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.fields import Field
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import CameraSettings, Limits, Range, SimulatedDevice
 from labapp.media.cameras.base import check_settings
 from labapp.media.cameras.simulated import SimulatedCamera
-from labapp.media.recorder import Plan
+from labapp.media.recording.recorder import Plan
 from tests.gui.hand import Hand
 
 SHAPE = (48, 64)

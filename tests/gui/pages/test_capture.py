@@ -18,26 +18,25 @@ from labapp.core.images.exposure import judge_exposure
 from labapp.core.rows.detection import DotSettings
 from labapp.errors import InputError
 from labapp.gui import dialogs
+from labapp.gui.live.camera_fields import calibrated_px, other_size
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
-    bars,
-    calibrated_px,
     choice_in_words,
     look,
     missing_in_words,
-    other_size,
     recording_in_words,
     refusal,
-    size_in_words,
 )
-from labapp.gui.steps import Mark, State
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.steps import Mark, State
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.widgets.exposure import bars
 from labapp.gui.workspace import Workspace
 from labapp.session.copies import next_session
 from labapp.session.record import Record
 from labapp.session.session import Session
+from labapp.words import size_in_words
 from tests.gui.conftest import KEPT, CopySample
 from tests.gui.hand import Hand
 from tests.waiting import PATIENCE_S

@@ -19,8 +19,8 @@ from labapp.core.rows.correction import Correction, add_dot, delete_dots, shift_
 from labapp.errors import InputError
 from labapp.gui.pages.dots import DotsPage, presenter
 from labapp.gui.pages.dots.fitting import Processes, Refit
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.tasks import Control
-from labapp.gui.window import MainWindow
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, let_draw

@@ -9,6 +9,7 @@ import pytest
 from PySide6.QtWidgets import QAbstractButton
 from pytestqt.qtbot import QtBot
 
+from labapp.export.folder import ExportChoice, verify_export
 from labapp.gui.pages.export.page import ExportPage
 from labapp.gui.pages.export.presenter import (
     GROUPS,
@@ -21,7 +22,6 @@ from labapp.gui.pages.export.presenter import (
     schemes,
 )
 from labapp.gui.workspace import Workspace
-from labapp.session.export import ExportChoice, verify_export
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT
 

@@ -14,7 +14,7 @@ from pytestqt.qtbot import QtBot
 from labapp.core.calibration.laser_calibration import calibrate_laser
 from labapp.gui.pages.laser import LaserPage, presenter
 from labapp.gui.pages.laser.presenter import ENDS, SCALE, Readings
-from labapp.gui.steps import states
+from labapp.gui.shell.steps import states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT

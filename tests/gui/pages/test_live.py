@@ -17,19 +17,19 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QAbstractButton, QApplication, QLabel, QMessageBox
 from pytestqt.qtbot import QtBot
 
+from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings
-from labapp.gui.pages.capture import live_view
-from labapp.gui.pages.capture.live import SIMULATED, STATES, WAITS, Live, choices
-from labapp.gui.pages.capture.live_figures import Figure, figures
+from labapp.gui.live import view as live_view
+from labapp.gui.live.figures import Figure, figures
+from labapp.gui.live.live import SIMULATED, STATES, WAITS, Live, choices
 from labapp.gui.pages.capture.page import CapturePage
-from labapp.gui.window import MainWindow
+from labapp.gui.shell.window import MainWindow
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import CameraInfo, CameraSettings, Faults, SimulatedDevice
-from labapp.media.recorder import Plan
-from labapp.session.live_watch import Followed
+from labapp.media.recording.recorder import Plan
+from labapp.run.live_watch import Followed
 from labapp.session.session import Session
-from labapp.session.setup import read_setup
-from labapp.session.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
+from labapp.simulated.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
 from tests.gui.conftest import SAMPLES, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round

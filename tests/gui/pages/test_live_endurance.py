@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.pages.capture import live, live_view
-from labapp.gui.window import MainWindow
-from labapp.media import GreyImage, recorder
+from labapp.gui.live import live
+from labapp.gui.live import view as live_view
+from labapp.gui.shell.window import MainWindow
+from labapp.media import GreyImage
 from labapp.media.cameras import Faults, feed
-from labapp.media.nut import NutWriter
-from labapp.media.recorder import Recorder
+from labapp.media.recording import recorder
+from labapp.media.recording.nut import NutWriter
+from labapp.media.recording.recorder import Recorder
 from tests.benchmarks.filming import Disk, FilmedDevice, compare, how_many, times_told
 
 pytestmark = pytest.mark.soak

@@ -22,8 +22,9 @@ from pytestqt.qtbot import QtBot
 from labapp.core.images.exposure import Exposure
 from labapp.core.quality import Quality, Remark
 from labapp.core.surface.measures import Measures
-from labapp.gui.pages.capture import live_view
-from labapp.gui.pages.capture.live_figures import (
+from labapp.export.scene import HEIGHT, Scene
+from labapp.gui.live import view as live_view
+from labapp.gui.live.figures import (
     FIRST,
     NO_SETUP,
     OLD_S,
@@ -31,18 +32,17 @@ from labapp.gui.pages.capture.live_figures import (
     figures,
     pace_in_words,
 )
-from labapp.gui.pages.capture.live_surface import steady_limits
-from labapp.gui.pages.capture.live_trends import trend_curves
+from labapp.gui.live.surface import steady_limits
+from labapp.gui.live.trends import trend_curves
 from labapp.gui.pages.capture.page import CapturePage
+from labapp.gui.shell.window import MainWindow
 from labapp.gui.theme import RED, is_dark
-from labapp.gui.window import MainWindow
 from labapp.media.cameras import SimulatedDevice
-from labapp.session import live_watch
-from labapp.session.alarms import Alarm
-from labapp.session.limits import Limits
-from labapp.session.live_measuring import LiveMeasurement
-from labapp.session.live_watch import Followed, Pace, Trend
-from labapp.session.scene import HEIGHT, Scene
+from labapp.run import live_watch
+from labapp.run.alarms import Alarm
+from labapp.run.limits import Limits
+from labapp.run.live_measuring import LiveMeasurement
+from labapp.run.live_watch import Followed, Pace, Trend
 from tests.gui.conftest import SAMPLES
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round

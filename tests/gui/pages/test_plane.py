@@ -18,7 +18,7 @@ from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.gui.pages.plane import PlanePage, presenter
-from labapp.gui.steps import states
+from labapp.gui.shell.steps import states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.simulation.target import Target, target_svg

@@ -9,12 +9,12 @@ import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
+from labapp.config.setup import read_setup
 from labapp.errors import InputError
 from labapp.gui.pages.setup import SetupPage, presenter
 from labapp.gui.pages.setup.presenter import RIG, SAFETY
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from labapp.session.setup import read_setup
 from labapp.simulation.positioning import Fate
 from tests.gui.conftest import KEPT
 

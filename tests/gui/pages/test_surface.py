@@ -21,9 +21,9 @@ from PySide6.QtWidgets import (
 )
 from pytestqt.qtbot import QtBot
 
+from labapp.export.heights import profile
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.workspace import Workspace
-from labapp.session.heights import profile
 from tests.gui.conftest import KEPT, CopySample
 from tests.waiting import PATIENCE_S
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from labapp.core.values import CannotMeasure
+from labapp.export.heights import profile
 from labapp.gui.pages.surface import comparison, presenter
 from labapp.gui.pages.surface.presenter import Options
-from labapp.session.heights import profile
 from labapp.session.measured import scheme_name
 from labapp.session.session import Session
 from tests.gui.conftest import CopySample

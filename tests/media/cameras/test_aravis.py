@@ -26,7 +26,7 @@ from labapp.media.cameras import (
     genicam,
     open_camera,
 )
-from labapp.media.recorder import Plan, Recorder
+from labapp.media.recording.recorder import Plan, Recorder
 from tests.conftest import lacks
 from tests.media.cameras.watching import Heard
 from tests.waiting import wait_until

@@ -15,8 +15,8 @@ import tifffile
 import labapp
 from labapp.core.pipeline import Settings, start_correction
 from labapp.core.rows.correction import set_reference
+from labapp.session.file.schema import VERSION
 from labapp.session.record import Record
-from labapp.session.schema import VERSION
 from labapp.session.session import Session
 
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "thumb_tack"

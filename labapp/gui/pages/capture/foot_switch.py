@@ -9,11 +9,11 @@ from PySide6.QtGui import QGuiApplication, QTextOption
 from PySide6.QtWidgets import QHBoxLayout, QLabel, QPlainTextEdit, QVBoxLayout, QWidget
 
 from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
-from labapp.gui.pages.capture.parts import button, wrapped
-from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import headed
-from labapp.media.foot_switch import Action
-from labapp.media.hid import commands
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.fields import ChoiceField, FieldForm
+from labapp.gui.widgets.labels import headed, wrapped
+from labapp.media.devices.foot_switch import Action
+from labapp.media.devices.hid import commands
 
 NOTHING = "nothing"
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QVBoxLayout, QWidget
 
-from labapp.gui.pages.capture.parts import button, whole, wrapped
 from labapp.gui.pages.capture.presenter import Choice, Preview, choice_in_words, refusal
-from labapp.gui.views.fields import FieldForm, NumberField
-from labapp.gui.views.labels import Message, headed, plain_tip
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.fields import FieldForm, NumberField, whole
+from labapp.gui.widgets.labels import Message, headed, plain_tip, wrapped
 from labapp.session.session import Session
 
 MOST_HZ = 1e7

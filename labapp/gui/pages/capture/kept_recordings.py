@@ -8,12 +8,12 @@ from pathlib import Path
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.pages.capture.import_choice import NEXT, NEXT_TIP
-from labapp.gui.pages.capture.parts import button
-from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import headed
-from labapp.media.recorder import recordings_beside
-from labapp.media.take_files import Take
-from labapp.session.database import SUFFIX
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.fields import ChoiceField, FieldForm
+from labapp.gui.widgets.labels import headed
+from labapp.media.recording.recorder import recordings_beside
+from labapp.media.recording.take_files import Take
+from labapp.session.file.database import SUFFIX
 from labapp.session.session import Session
 
 

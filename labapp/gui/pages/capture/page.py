@@ -14,28 +14,28 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.dialogs import EVERYTHING, recordings
+from labapp.gui.live.camera_fields import calibrated_px, other_size
+from labapp.gui.live.view import LiveView
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.pages.capture.import_choice import ImportChoice
 from labapp.gui.pages.capture.kept_recordings import KeptRecordings, told_of
-from labapp.gui.pages.capture.live_view import LiveView
-from labapp.gui.pages.capture.parts import ExposureBars, button, wrapped
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
     Seen,
-    calibrated_px,
     look,
     missing_in_words,
-    other_size,
     recording_in_words,
 )
 from labapp.gui.pages.page import Page
-from labapp.gui.steps import Mark, State
+from labapp.gui.shell.steps import Mark, State
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.labels import Message, headed, keep_room, plain_label
 from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.exposure import ExposureBars
+from labapp.gui.widgets.labels import Message, headed, keep_room, plain_label, wrapped
 from labapp.gui.workspace import MISSING, Workspace
-from labapp.media.take_files import Take
+from labapp.media.recording.take_files import Take
 from labapp.session.record import Recording
 from labapp.session.session import Session
 from labapp.words import several

@@ -11,13 +11,12 @@ from labapp.core.images.exposure import Exposure, judge_exposure
 from labapp.core.rows.detection import DotSettings, find_dots
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.gui.steps import calibrations_in_use, recording_gone
+from labapp.gui.shell.steps import recording_gone
 from labapp.media import GreyImage, open_source
 from labapp.media.base import rate_in_words
 from labapp.session.record import Recording
 from labapp.session.session import Session
-
-UNITS = ("bytes", "kB", "MB", "GB", "TB")
+from labapp.words import size_in_words
 
 
 @dataclass(frozen=True)
@@ -40,28 +39,6 @@ class Seen:
     image: GreyImage | None
     exposure: Exposure | None
     words: str = ""
-
-
-@dataclass(frozen=True)
-class Bar:
-    """A bar that shows how much.
-
-    Parameters
-    ----------
-    name
-        Of what.
-    part
-        From 0 to 1.
-    words
-        How much, in words.
-    tip
-        What it means.
-    """
-
-    name: str
-    part: float
-    words: str
-    tip: str
 
 
 class Preview:
@@ -126,33 +103,6 @@ def _judged(
     except CannotMeasure:
         dots = None
     return judge_exposure(image, dots, bit_depth)
-
-
-def bars(exposure: Exposure) -> tuple[Bar, Bar, Bar]:
-    """Exposure, saturation and contrast."""
-    dots = exposure.snr > 0
-    of = "dots" if dots else "pixels"
-    contrast = f"{exposure.contrast:.0%}, {exposure.snr:.0f} × the noise" if dots else "no dots"
-    return (
-        Bar(
-            "Exposure",
-            exposure.level,
-            f"{exposure.level:.0%} of full scale",
-            f"Level of the bright {of} as a part of the camera's full scale",
-        ),
-        Bar(
-            "Saturation",
-            exposure.clipped,
-            f"{exposure.clipped:.0%} of the {of} clipped",
-            f"Part of the {of} at the top of the scale: their centres cannot be told well",
-        ),
-        Bar(
-            "Contrast",
-            exposure.contrast,
-            contrast,
-            "How far the dots rise above their background, as a part of their level",
-        ),
-    )
 
 
 @dataclass(frozen=True)
@@ -234,40 +184,9 @@ def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
     )
 
 
-def calibrated_px(session: Session) -> tuple[int, int] | None:
-    """(rows, columns) of the picture that the imaging plane in use was found in; None: unknown."""
-    kept = session.plane_calibration
-    if kept is None or not calibrations_in_use(session)[1]:
-        return None
-    try:
-        rows, columns = session.picture(kept.picture_sha256).shape
-    except InputError:
-        return None
-    return rows, columns
-
-
-def other_size(calibrated: tuple[int, int] | None, shape: tuple[int, int]) -> str:
-    """That frames, shape (rows, columns), are not as the calibration picture; empty if they are."""
-    if calibrated is None or calibrated == shape:
-        return ""
-    (rows, columns), (height, width) = calibrated, shape
-    return (
-        f"The imaging plane was calibrated with a picture of {columns}×{rows} px, and frames have "
-        f"{width}×{height} px: sizes are wrong. Calibrate with a picture of the same region"
-    )
-
-
 def local_time(iso: str) -> str:
     """A time with its zone as the clock on the wall shows it."""
     return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
-
-
-def size_in_words(size: int) -> str:
-    """A file's size."""
-    value, unit = float(size), 0
-    while value >= 1000 and unit < len(UNITS) - 1:
-        value, unit = value / 1000, unit + 1
-    return f"{value:.0f} {UNITS[unit]}" if unit == 0 else f"{value:.1f} {UNITS[unit]}"
 
 
 def missing_in_words(session: Session) -> str:

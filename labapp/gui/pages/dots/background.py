@@ -7,7 +7,7 @@ from PySide6.QtCore import QObject, QTimer, Signal
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.presenter import Carried, Found, Shown
-from labapp.gui.steps import recording_gone
+from labapp.gui.shell.steps import recording_gone
 from labapp.gui.tasks import Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage

@@ -21,9 +21,9 @@ from PySide6.QtWidgets import (
 from labapp.core.pipeline import Settings
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.views.labels import Message, heading, plain_label, plain_tip, plain_words
-from labapp.gui.views.result_table import ResultTable
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.labels import Message, heading, plain_label, plain_tip, plain_words
+from labapp.gui.widgets.result_table import ResultTable
 
 MOST_ROWS = 60
 COLUMNS_OF_BUTTONS = 3

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from labapp.config.setup import parse_setup
 from labapp.core.images.dots import Dots, Image
 from labapp.core.pipeline import Measurement, Settings, start_correction
 from labapp.core.rows.correction import Correction
@@ -18,11 +19,10 @@ from labapp.core.rows.tracking import carry_on
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow, plain
-from labapp.gui.steps import recording_gone
+from labapp.gui.shell.steps import recording_gone
 from labapp.gui.tasks import Cancelled, Control
 from labapp.session.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
-from labapp.session.setup import parse_setup
 from labapp.words import SIGMA_OF, several
 
 NO_PLACES: FloatArray = np.zeros((0, 2))

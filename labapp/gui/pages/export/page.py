@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.export.meshes import SMALLEST_SPACING_MM
 from labapp.gui.pages.export.presenter import (
     GROUPS,
     SIZES,
@@ -36,11 +37,10 @@ from labapp.gui.pages.export.presenter import (
 )
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.views.labels import heading, keep_room, plain_tip, plain_words
-from labapp.gui.views.path_field import PathField
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.labels import heading, keep_room, plain_tip, plain_words
+from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
-from labapp.session.meshes import SMALLEST_SPACING_MM
 from labapp.session.session import Session
 
 WHICH = (

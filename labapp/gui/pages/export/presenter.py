@@ -10,9 +10,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from labapp.core.values import FloatArray, IntArray
-from labapp.gui.pages.capture.presenter import size_in_words
-from labapp.session.drawing import Direction
-from labapp.session.export import (
+from labapp.export.drawing import Direction
+from labapp.export.film import UNTIMED_HZ, film_times
+from labapp.export.folder import (
     FILM_FILE,
     HDF5_FILE,
     MANIFEST,
@@ -21,13 +21,12 @@ from labapp.session.export import (
     ExportedFile,
     verify_export,
 )
-from labapp.session.film import UNTIMED_HZ, film_times
+from labapp.export.meshes import FORMATS, SPACING_MM
+from labapp.export.studio import PICTURE_PX
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
-from labapp.session.meshes import FORMATS, SPACING_MM
 from labapp.session.session import Session
-from labapp.session.studio import PICTURE_PX
-from labapp.words import several
+from labapp.words import several, size_in_words
 
 REPORT_FILE = "report.pdf"
 

@@ -12,7 +12,7 @@ from labapp.core.calibration.laser_calibration import LaserCalibration, calibrat
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
-from labapp.gui.steps import calibrations_in_use
+from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage, open_source
 from labapp.session.session import Session
 

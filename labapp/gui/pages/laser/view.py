@@ -21,10 +21,10 @@ from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place
 from labapp.gui.pages.page import Page
 from labapp.gui.views.cross_hair import CrossHairView
 from labapp.gui.views.drag_point import DragPoint
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.views.labels import Message, plain_label, plain_tip
 from labapp.gui.views.picture import PictureView
-from labapp.gui.views.result_table import ResultTable
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip
+from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 

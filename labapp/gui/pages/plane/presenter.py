@@ -17,10 +17,10 @@ from labapp.core.calibration.plane_calibration import (
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
+from labapp.files import write_whole
 from labapp.gui.digits import ResultRow
-from labapp.gui.steps import calibrations_in_use
+from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage
-from labapp.session.files import write_whole
 from labapp.session.session import Session
 from labapp.simulation.target import Target, target_svg
 

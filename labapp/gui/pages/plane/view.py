@@ -15,10 +15,10 @@ from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
 from labapp.gui.tasks import Control
 from labapp.gui.views.drag_point import DragPoint
-from labapp.gui.views.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.views.labels import Message, plain_label, plain_tip
 from labapp.gui.views.picture import PictureView
-from labapp.gui.views.result_table import ResultTable
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip
+from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 

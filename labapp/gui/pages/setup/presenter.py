@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from labapp.config.setup import parse_setup, read_setup, updated_setup
+from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.rig import Rig
 from labapp.errors import InputError
+from labapp.files import write_whole
 from labapp.gui.digits import ResultRow
-from labapp.session.files import write_whole
 from labapp.session.record import Record
 from labapp.session.session import Session
-from labapp.session.setup import parse_setup, read_setup, updated_setup
-from labapp.session.setup_keys import SECTIONS
 from labapp.simulation.positioning import (
     USUAL_LENGTH_MM,
     USUAL_WIDTH_MM,

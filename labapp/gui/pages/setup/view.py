@@ -21,9 +21,9 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
 from labapp.gui.views.bench import BenchView
-from labapp.gui.views.fields import FieldForm, NumberField, TextField
-from labapp.gui.views.labels import Message, plain_label
-from labapp.gui.views.result_table import ResultTable
+from labapp.gui.widgets.fields import FieldForm, NumberField, TextField
+from labapp.gui.widgets.labels import Message, plain_label
+from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 
 SETUP_FILES = "Set-up files (*.toml)"

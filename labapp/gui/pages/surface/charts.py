@@ -12,11 +12,11 @@ from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.values import FloatArray
+from labapp.export.heights import Profile
 from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
-from labapp.gui.views.labels import plain_label
-from labapp.session.heights import Profile
+from labapp.gui.widgets.labels import plain_label
 from labapp.words import SIGMA_OF
 
 BAND_ALPHA = 70

@@ -18,10 +18,10 @@ from threadpoolctl import threadpool_limits
 from labapp.gui.pages.surface.comparison import Comparison, compared, other_scheme
 from labapp.gui.pages.surface.presenter import SCHEMES, Options
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.fields import ChoiceField
-from labapp.gui.views.labels import plain_label, plain_tip
-from labapp.gui.views.parts import PartsBar
 from labapp.gui.views.view3d import View3d, make_view3d
+from labapp.gui.widgets.fields import ChoiceField
+from labapp.gui.widgets.labels import plain_label, plain_tip
+from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 
 COLUMNS = ("", "First", "Second", "Difference", "Unit")

@@ -9,6 +9,7 @@ import numpy as np
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.surface.measures import Measures, measure
 from labapp.core.values import CannotMeasure
+from labapp.export.scene import Scene, difference_scene
 from labapp.gui.digits import rounded
 from labapp.gui.pages.surface.presenter import (
     ERRORS,
@@ -19,7 +20,6 @@ from labapp.gui.pages.surface.presenter import (
     scene,
     with_scheme,
 )
-from labapp.session.scene import Scene, difference_scene
 from labapp.session.session import Session
 
 Row = tuple[str, str, str, str, str]

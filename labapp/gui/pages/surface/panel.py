@@ -15,9 +15,9 @@ from labapp.gui.pages.surface.presenter import (
     with_scheme,
 )
 from labapp.gui.tasks import Task
-from labapp.gui.views.fields import ChoiceField, FieldForm
-from labapp.gui.views.labels import heading, keep_room, plain_label, plain_tip
-from labapp.gui.views.result_table import ResultTable
+from labapp.gui.widgets.fields import ChoiceField, FieldForm
+from labapp.gui.widgets.labels import heading, keep_room, plain_label, plain_tip
+from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
 

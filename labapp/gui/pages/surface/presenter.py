@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from labapp.config.setup import parse_setup
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings
@@ -15,13 +16,12 @@ from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
+from labapp.export.heights import Profile
+from labapp.export.scene import Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
-from labapp.gui.steps import READ_ONLY, recording_gone, setup_to_do
-from labapp.session.heights import Profile
+from labapp.gui.shell.steps import READ_ONLY, recording_gone, setup_to_do
 from labapp.session.measured import Overview, Result, scheme_name
-from labapp.session.scene import Scene, rays_of, scene_of
 from labapp.session.session import Session
-from labapp.session.setup import parse_setup
 from labapp.words import SIGMA_OF
 
 SCHEMES = {

@@ -33,6 +33,8 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.errors import InputError
+from labapp.export.drawing import Direction
+from labapp.export.heights import profile
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.surface.charts import DotsChart, PlanChart, ProfileChart
 from labapp.gui.pages.surface.compare import CompareView
@@ -46,13 +48,11 @@ from labapp.gui.pages.surface.presenter import (
     scene,
     shown,
 )
-from labapp.gui.views.fields import ChoiceField, NumberField
-from labapp.gui.views.parts import PartsBar
 from labapp.gui.views.steering import Steering
 from labapp.gui.views.view3d import View3d, make_view3d
+from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
-from labapp.session.drawing import Direction
-from labapp.session.heights import profile
 from labapp.session.measured import scheme_name
 
 LOOKS: dict[Direction, tuple[str, str]] = {

@@ -21,10 +21,10 @@ from PySide6.QtWidgets import (
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
 from labapp.gui.tasks import Control
-from labapp.gui.views.fields import ChoiceField, NumberField
-from labapp.gui.views.labels import Message, heading, keep_room, plain_label, plain_words
 from labapp.gui.views.plots import PlotStack
-from labapp.gui.views.result_table import ResultTable
+from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.labels import Message, heading, keep_room, plain_label, plain_words
+from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.signals import Signals, read_signals
 from labapp.session.trends import QUANTITIES

@@ -1,0 +1,282 @@
+"""A scenario: a pool on a bench in front of a camera, as TOML; a recording is simulated from it.
+
+It is a setup file with tables more: [pool], and [torch], [camera], [look], [recording].
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from labapp.bundled import bundled
+from labapp.config.scenario_keys import RECORDINGS, SHAPES, TABLES, TERMS, pool_rules
+from labapp.config.setup import parse_setup
+from labapp.config.setup_keys import SECTIONS
+from labapp.config.toml_keys import check_keys, unknown_key
+from labapp.core.geometry.rig import Rig
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.simulation.camera import CameraView, Lens
+from labapp.simulation.pools import Dent, Footprint, LowRear, Pool, Term, Wave
+from labapp.simulation.recording import Recording, TruePool
+from labapp.simulation.render import Look
+from labapp.simulation.surface_files import read_pool
+from labapp.simulation.torch import ConeTorch
+
+A_SCENARIO = "a scenario (TOML, UTF-8)"
+
+OPTIONAL = ("torch", "camera", "look")
+
+COURSE_HZ = (0.3, 3.0)
+"""A pool's size wanders by swings between these frequencies."""
+
+SWINGS = 6
+"""So many of them make a course."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A scenario that was found right.
+
+    Parameters
+    ----------
+    recording
+        What it describes, to be rendered.
+    setup
+        The setup file of its bench, as text.
+    text
+        The scenario as it was read.
+    """
+
+    recording: Recording
+    setup: str
+    text: str
+
+    @property
+    def title(self) -> str:
+        """What the comment says that it begins with; empty without one."""
+        first = self.text.partition("\n")[0]
+        return first.lstrip("# ").rstrip(". \r") if first.startswith("#") else ""
+
+
+def shipped_scenarios() -> list[Path]:
+    """Those that come with labapp."""
+    return sorted(bundled("resources/simulations").glob("*.toml"))
+
+
+def find_scenario(name: Path) -> Path:
+    """Scenario of a command line: a file, or the name of one that comes with labapp, "egg"."""
+    shipped = {path.stem: path for path in shipped_scenarios()}
+    return name if name.is_file() else shipped.get(str(name), name)
+
+
+def read_scenario(
+    path: str | os.PathLike[str], frames: int | None = None, seed: int | None = None
+) -> Scenario:
+    """Read and check a scenario.
+
+    Parameters
+    ----------
+    path
+        The file. A surface that it names is looked for beside it.
+    frames, seed
+        In place of its own.
+
+    Raises
+    ------
+    InputError
+        If the file, or a surface that it names, cannot be read or anything in it is unknown,
+        missing or impossible; all that was found is reported together (`InputError.problems`).
+    """
+    path = Path(path)
+    text, values = _read(path)
+    bench = {table: keys for table, keys in values.items() if table in SECTIONS}
+    setup = tomlkit.dumps(bench)
+    problems = _check(path, values)
+    try:
+        rig = parse_setup(setup, path).rig
+    except InputError as error:
+        problems = [*error.problems, *problems]
+    calibration = bench.get("image_calibration")
+    if isinstance(calibration, dict) and "homography" in calibration:
+        expected = "the three points: no other camera is simulated"
+        problems.append(InputError(path, "image_calibration", "a homography", expected))
+    if problems:
+        raise InputError.gather(problems)
+    recording = dict(values["recording"])
+    recording |= {} if frames is None else {"frames": frames}
+    recording |= {} if seed is None else {"seed": seed}
+    made = _recording(path, {**values, "recording": recording}, rig)
+    return Scenario(made, setup, text)
+
+
+def _read(path: Path) -> tuple[str, dict[str, Any]]:
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+        return text, tomllib.loads(text)
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, A_SCENARIO) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "encoding", "not UTF-8", A_SCENARIO) from error
+    except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
+        raise InputError(path, "syntax", error, A_SCENARIO) from error
+
+
+# --- what is wrong ------------------------------------------------------------------------------
+
+
+def _check(path: Path, values: dict[str, Any]) -> list[InputError]:
+    """Find unknown, missing and wrong keys of the tables that are no set-up's."""
+    known = {**SECTIONS, "pool": {}, **TABLES}
+    problems = [unknown_key(path, table, known) for table in values if table not in known]
+    problems += _check_pool(path, values.get("pool"))
+    for table, rules in TABLES.items():
+        keys = values.get(table, {} if table in OPTIONAL else None)
+        if table not in OPTIONAL or table in values:
+            problems += check_keys(path, table, keys, rules)
+    return problems
+
+
+def _check_pool(path: Path, keys: Any) -> list[InputError]:
+    rules = pool_rules(keys) if isinstance(keys, dict) else pool_rules({})
+    if isinstance(keys, dict) and str(keys.get("shape")) not in SHAPES:
+        # Without its shape nothing can be said of the other keys.
+        return check_keys(path, "pool", {k: keys[k] for k in keys if k == "shape"}, rules)
+    problems = check_keys(path, "pool", keys, rules)
+    if not isinstance(keys, dict):
+        return problems
+    for name in TERMS.keys() & rules.keys():
+        for n, term in enumerate(_several(keys.get(name))):
+            full = f"pool.{name}[{n}]" if isinstance(keys[name], list) else f"pool.{name}"
+            problems += check_keys(path, full, term, TERMS[name], f"[[pool.{name}]]")
+    return problems
+
+
+def _several(terms: Any) -> list[Any]:
+    """Tables, of which one need not be in a list; what is neither was told of already."""
+    if isinstance(terms, dict):
+        return [terms]
+    return terms if isinstance(terms, list) else []
+
+
+# --- what it describes --------------------------------------------------------------------------
+
+
+def _recording(path: Path, values: dict[str, Any], rig: Rig) -> Recording:
+    wanted = values["recording"]
+    rate, exposure_s = wanted["frame_rate_hz"], wanted.get("exposure_ms", 0) / 1000
+    if exposure_s * rate > 1:
+        expected = f"at most {1000 / rate:.6g} (ms), the time between frames"
+        raise InputError(path, "recording.exposure_ms", wanted["exposure_ms"], expected)
+    look = Look(**values.get("look", {}))
+    if look.dot_floor_mm > look.dot_ceiling_mm:
+        expected = f"a number up to look.dot_ceiling_mm, {look.dot_ceiling_mm:g} (mm)"
+        raise InputError(path, "look.dot_floor_mm", look.dot_floor_mm, expected)
+    form = wanted.get("format", "avi")
+    if form == "avi" and look.bits != 8:
+        expected = '8 in a video; recording.format = "tif" or "png" holds more'
+        raise InputError(path, "look.bits", look.bits, expected)
+    frames = wanted["frames"]
+    torches = (_torch(values["torch"]),) * frames if "torch" in values else ()
+    times_s = np.arange(frames) / rate
+    return Recording(
+        file=RECORDINGS[form],
+        rig=rig,
+        view=_view(path, values["image_calibration"], values.get("camera", {})),
+        look=look,
+        pools=_pools(path, values["pool"], times_s, wanted["seed"]),
+        seed=wanted["seed"],
+        frame_rate_hz=float(rate),
+        exposure_s=exposure_s,
+        torches=torches,
+    )
+
+
+def _torch(keys: dict[str, Any]) -> ConeTorch:
+    return ConeTorch(**{**keys, "tip_mm": tuple(keys["tip_mm"])})
+
+
+def _view(path: Path, calibration: dict[str, Any], camera: dict[str, Any]) -> CameraView:
+    size: dict[str, Any] = {key: camera[key] for key in ("width_px", "height_px") if key in camera}
+    bent = {key: camera[key] for key in camera if key not in size}
+    if bent and "focal_px" not in bent:
+        expected = "a number from 10 to 1e+06 (px): the coefficients mean nothing without"
+        raise InputError(path, "camera.focal_px", "missing", expected)
+    points: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in calibration.items()
+    }
+    try:
+        return CameraView(**points, **size, lens=Lens(**bent) if bent else None)
+    except ValueError as error:
+        raise InputError(path, "camera", error, "smaller k1, k2, p1, p2, k3") from error
+
+
+def _pools(
+    path: Path, keys: dict[str, Any], times_s: FloatArray, seed: int
+) -> tuple[TruePool, ...]:
+    """The pool of every frame."""
+    if keys["shape"] == "surface":
+        surface = read_pool(
+            path.parent / keys["file"],
+            keys.get("spacing_mm"),
+            tuple(keys.get("center_mm", (0.0, 0.0))),
+            np.array(keys["outline_mm"], float) if "outline_mm" in keys else None,
+        )
+        return (surface,) * len(times_s)
+    try:
+        pool = Pool(_footprint(keys), keys["height_mm"], _terms(keys), keys.get("fullness"))
+        sizes = 1 + keys.get("wander_percent", 0) / 100 * _course(times_s, seed)
+        return tuple(
+            _sized(pool, *size).after(time)
+            for size, time in zip(sizes.tolist(), times_s.tolist(), strict=True)
+        )
+    except ValueError as error:
+        raise InputError(path, "pool", error, "a pool that can be") from error
+
+
+def _footprint(keys: dict[str, Any]) -> Footprint:
+    width = keys["diameter_mm"] if keys["shape"] == "cap" else keys["width_mm"]
+    half = keys.get("length_mm", width) / 2
+    head, tail = keys.get("head_mm", half), keys.get("tail_mm", half)
+    return Footprint(width, head, tail, tuple(keys.get("center_mm", (0.0, 0.0))))
+
+
+def _terms(keys: dict[str, Any]) -> tuple[Term, ...]:
+    dents = [
+        Dent(**{**dent, "offset_mm": tuple(dent.get("offset_mm", (0.0, 0.0)))})
+        for dent in _several(keys.get("dent"))
+    ]
+    waves = []
+    for wave in _several(keys.get("wave")):
+        given = {key: wave[key] for key in wave if key not in ("kind", "mode")}
+        travelling = wave.get("kind") == "travelling"
+        waves.append(Wave(tuple(wave["mode"]), **given, travelling=travelling))
+    return (*dents, *(LowRear(**rear) for rear in _several(keys.get("low_rear"))), *waves)
+
+
+def _sized(pool: Pool, width: float, length: float, height: float) -> Pool:
+    """A pool with its sizes multiplied."""
+    foot = pool.footprint
+    foot = Footprint(
+        foot.width_mm * width, foot.head_mm * length, foot.tail_mm * length, foot.center_mm
+    )
+    return replace(pool, footprint=foot, peak_mm=pool.peak_mm * height)
+
+
+def _course(times_s: FloatArray, seed: int) -> FloatArray:
+    """Three smooth random courses at the times, shape (n, 3): mean 0, standard deviation 1.
+
+    A sum of slow swings: the same at a moment, however many frames there are.
+    """
+    rng = np.random.default_rng([seed, 3])
+    hertz = rng.uniform(*COURSE_HZ, (SWINGS, 3))
+    phase = rng.uniform(0, 2 * np.pi, (SWINGS, 3))
+    swings = np.sin(2 * np.pi * hertz * times_s[:, None, None] + phase)
+    return np.asarray(np.sqrt(2 / SWINGS) * swings.sum(axis=1))

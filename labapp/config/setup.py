@@ -1,0 +1,249 @@
+"""The setup file: what is bolted to the bench, and where its pixels are (TOML)."""
+
+from __future__ import annotations
+
+import functools
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from tomlkit.items import Table
+
+from labapp.config.setup_keys import SECTIONS, rules_for
+from labapp.config.toml_keys import check_keys, shown, unknown_key
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.errors import InputError
+from labapp.files import write_whole
+
+A_SETUP = "a setup file (TOML, UTF-8)"
+
+LEAST_ANGLE_DEG = 10.0
+"""Axes of the imaging plane that look closer together than this are a slip."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A setup file that was found right.
+
+    Parameters
+    ----------
+    rig
+        Laser, dot pattern, electrode, imaging plane.
+    calibration
+        Pixel ↔ imaging plane.
+    text
+        The file as it was read, for the record.
+    """
+
+    rig: Rig
+    calibration: ImageCalibration
+    text: str
+
+
+def read_setup(path: str | os.PathLike[str]) -> Setup:
+    """Read and check a setup file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or anything in it is unknown, missing or impossible; all that
+        was found is reported together (`InputError.problems`).
+    """
+    path = Path(path)
+    return parse_setup(_text(path), path)
+
+
+@functools.lru_cache(maxsize=64)
+def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
+    """Check a setup that was read from ``path``; see `read_setup`."""
+    path = Path(path)
+    try:
+        values = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
+        raise InputError(path, "syntax", error, A_SETUP) from error
+    problems = [
+        *(unknown_key(path, key, SECTIONS) for key in values if key not in SECTIONS),
+        *(
+            problem
+            for section in SECTIONS
+            for problem in check_keys(
+                path, section, values.get(section), rules_for(section, values.get(section))
+            )
+        ),
+    ]
+    # How values fit each other can be asked once each is right by itself.
+    problems = problems or _contradictions(path, values)
+    if problems:
+        raise InputError.gather(problems)
+    return Setup(_rig(values), _calibration(values["image_calibration"]), text)
+
+
+def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]) -> None:
+    """Put values into a setup file and leave everything else, comments included, as it was.
+
+    The file, and sections it lacks, are made. Values go in as they are: read the file back to
+    know what is still missing or wrong.
+
+    Parameters
+    ----------
+    path
+        The setup file.
+    values
+        Section → key → value; None takes the key out.
+
+    Raises
+    ------
+    InputError
+        If there is a file that is not TOML, or it cannot be written.
+    """
+    path = Path(path)
+    text = updated_setup(_text(path) if path.exists() else "", path, values)
+    try:
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(13, "write-protected")
+        write_whole(path, text.encode())
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "a file that can be written") from error
+
+
+def updated_setup(
+    text: str, path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]
+) -> str:
+    """Put values into a setup's text, read from ``path``; see `update_setup`."""
+    try:
+        document = tomlkit.parse(text)
+    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
+        raise InputError(path, "syntax", error, A_SETUP) from error
+    for section, keys in values.items():
+        if section not in document:
+            document.add(section, tomlkit.table())
+        table = document[section]
+        if not isinstance(table, Table):
+            raise InputError(path, section, shown(table), f"a table: [{section}]")
+        for key, value in keys.items():
+            if value is not None:
+                table[key] = value
+            elif key in table:
+                table.remove(key)
+    return tomlkit.dumps(document)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, A_SETUP) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "encoding", "not UTF-8", A_SETUP) from error
+
+
+def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
+    """Find values that are right by themselves and impossible together."""
+    pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
+    rows, columns = pattern["rows"], pattern["columns"]
+    step = pattern["inter_beam_angle_deg"]
+    problems = [
+        InputError(
+            path,
+            "pattern.absent",
+            [i, j],
+            f"rays [row, column] from [1, 1] to [{rows}, {columns}]",
+        )
+        for i, j in pattern.get("absent", [])
+        if not (1 <= i <= rows and 1 <= j <= columns)
+    ]
+    steps = max(rows, columns) - 1
+    if steps * step >= 90:
+        problems.append(
+            InputError(
+                path,
+                "pattern.inter_beam_angle_deg",
+                step,
+                f"a number below {90 / steps:.4g} (degrees), so that the fan stays below 90",
+            )
+        )
+    elif (rows - 1) / 2 * step >= angle:
+        problems.append(
+            InputError(
+                path,
+                "laser.projection_angle_deg",
+                angle,
+                f"a number above half the fan, {(rows - 1) / 2 * step:.4g} (degrees): "
+                "rays above that never reach the work piece",
+            )
+        )
+    try:
+        _calibration(values["image_calibration"])
+    except ValueError as error:
+        problems.append(
+            InputError(path, "image_calibration", error, "three points that span the plane")
+        )
+    else:
+        problems += _nearly_one_line(path, values["image_calibration"])
+    return problems
+
+
+def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
+    """Find axes that no camera in front of the plane can see so close together."""
+    if "homography" in keys:
+        return []
+    x_arm, z_arm = (
+        np.subtract(keys[f"{axis}_axis_px"], keys["origin_px"], dtype=float) for axis in "xz"
+    )
+    sine = (x_arm[0] * z_arm[1] - x_arm[1] * z_arm[0]) / np.hypot(*x_arm) / np.hypot(*z_arm)
+    if abs(sine) >= np.sin(np.radians(LEAST_ANGLE_DEG)):
+        return []
+    return [
+        InputError(
+            path,
+            "image_calibration",
+            "O′, x_axis_px and z_axis_px lie nearly on one line",
+            f"at least {LEAST_ANGLE_DEG:g} degrees between O′X′ and O′Z′ in the picture",
+        )
+    ]
+
+
+def _rig(values: dict[str, Any]) -> Rig:
+    pattern = dict(values["pattern"])
+    absent = pattern.pop("absent", None)
+    return Rig(
+        Laser(**values["laser"]),
+        DotPattern(
+            **pattern, absent=None if absent is None else frozenset((i, j) for i, j in absent)
+        ),
+        Electrode(**values["electrode"]),
+        _imaging_plane(**values["imaging_plane"]),
+    )
+
+
+def _imaging_plane(
+    distance_mm: float,
+    s_mm: float,
+    h_mm: float,
+    width_mm: float,
+    height_mm: float,
+    pitch_deg: float = 0.0,
+    yaw_deg: float = 0.0,
+) -> ImagingPlane:
+    """The plane at O′ (−s, −distance, h), its axes turned about X by pitch, then about Z by yaw."""
+    pitch, yaw = np.radians([pitch_deg, yaw_deg])
+    z_axis = np.array([np.sin(yaw) * np.sin(pitch), -np.cos(yaw) * np.sin(pitch), np.cos(pitch)])
+    return ImagingPlane(
+        origin_mm=np.array([-s_mm, -distance_mm, h_mm], float),
+        x_axis=np.array([np.cos(yaw), np.sin(yaw), 0.0]),
+        z_axis=z_axis,
+        width_mm=width_mm,
+        height_mm=height_mm,
+    )
+
+
+def _calibration(keys: dict[str, Any]) -> ImageCalibration:
+    if "homography" in keys:
+        return ImageCalibration(np.array(keys["homography"], float))
+    return ImageCalibration.from_three_points(**keys)

@@ -1,0 +1,89 @@
+"""The keys of a setup file: which there are, and what each may hold."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number
+
+_LENGTH = between(0, LARGEST_MM, "mm")
+_PLACE = between(-LARGEST_MM, LARGEST_MM, "mm")
+_COUNT = Rule(
+    "an odd whole number from 3 to 99, so that there is a centre",
+    lambda value: type(value) is int and 3 <= value <= 99 and value % 2 == 1,
+)
+_TILT = between(-90, 90, "degrees", required=False)
+
+
+def _is_rays(value: object) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(ray, list) and len(ray) == 2 and all(type(index) is int for index in ray)
+        for ray in value
+    )
+
+
+def _is_matrix(value: object) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 3
+        and all(are_numbers(row, 3) for row in value)
+        and bool(np.linalg.cond(np.array(value, float)) < 1e12)
+    )
+
+
+_PIXEL = Rule("[u, v], two numbers (px)", lambda value: are_numbers(value, 2))
+_ON_AXIS = Rule(
+    f"a number from -{LARGEST_MM:g} to {LARGEST_MM:g} (mm) that is not 0",
+    lambda value: is_number(value) and 0 < abs(value) <= LARGEST_MM,
+)
+
+THREE_POINTS = {
+    "origin_px": _PIXEL,
+    "x_axis_px": _PIXEL,
+    "x_axis_mm": _ON_AXIS,
+    "z_axis_px": _PIXEL,
+    "z_axis_mm": _ON_AXIS,
+}
+HOMOGRAPHY = {
+    "homography": Rule("3 rows of 3 numbers (px to mm) that can be inverted", _is_matrix),
+}
+SECTIONS = {
+    "laser": {
+        "projection_angle_deg": between(0, 90, "degrees"),
+        "distance_mm": _LENGTH,
+    },
+    "pattern": {
+        "rows": _COUNT,
+        "columns": _COUNT,
+        "inter_beam_angle_deg": between(0, 45, "degrees"),
+        "absent": Rule(
+            "a list of rays [row, column] within the pattern, counted from 1",
+            _is_rays,
+            required=False,
+        ),
+    },
+    "electrode": {
+        "height_mm": Rule(
+            f"a number from 0 to {LARGEST_MM:g} (mm)",
+            lambda value: is_number(value) and 0 <= value <= LARGEST_MM,
+        ),
+    },
+    "imaging_plane": {
+        "distance_mm": _LENGTH,
+        "s_mm": _PLACE,
+        "h_mm": _PLACE,
+        "width_mm": _LENGTH,
+        "height_mm": _LENGTH,
+        "pitch_deg": _TILT,
+        "yaw_deg": _TILT,
+    },
+    "image_calibration": {**THREE_POINTS, **HOMOGRAPHY},
+}
+"""Every section and key; `image_calibration` holds the keys of one of its two forms."""
+
+
+def rules_for(section: str, keys: object) -> dict[str, Rule]:
+    """Rules of a section, given the keys it holds: a homography replaces the three points."""
+    if section != "image_calibration":
+        return SECTIONS[section]
+    return HOMOGRAPHY if isinstance(keys, dict) and "homography" in keys else THREE_POINTS

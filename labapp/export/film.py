@@ -1,0 +1,232 @@
+"""A film of the pool in 3-D: every frame at its time, all in one view and on one colour scale."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import textwrap
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import cast
+
+import av
+import numpy as np
+from av.container import OutputContainer
+from av.error import FFmpegError
+from av.video.stream import VideoStream
+
+from labapp.core.pipeline import Measurement
+from labapp.core.values import FloatArray, IntArray
+from labapp.errors import InputError
+from labapp.export.scene import Scene, empty_scene, scene_of
+from labapp.export.studio import Picture, draw_there
+from labapp.files import made_whole
+
+CODEC = "mpeg4"
+QUALITY = 2
+"""Of 1, the best, to 31."""
+
+TICKS_HZ = 60_000
+"""Times in a film are whole numbers of so many to a second; MPEG-4 has no more than 65535."""
+
+UNTIMED_HZ = 10.0
+"""Frames a second where the recording has no time base and nobody said otherwise."""
+
+AHEAD = 3
+"""So many pictures are drawn while one is being written."""
+
+LINE = 60
+"""Letters in a line of the words that stand for a surface."""
+
+
+class Extent:
+    """What all frames of a film have room in: found by adding one after the other."""
+
+    def __init__(self) -> None:
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._depth, self._height = np.inf, -np.inf
+
+    def add(self, measurement: Measurement) -> None:
+        """Make room for a frame; one without a surface needs none."""
+        if measurement.reconstruction is None or measurement.measures is None:
+            return
+        outline, sizes = measurement.reconstruction.boundary.points_mm, measurement.measures
+        self._low = np.minimum(self._low, outline.min(axis=0))
+        self._high = np.maximum(self._high, outline.max(axis=0))
+        self._depth = min(self._depth, sizes.depth_mm)
+        self._height = max(self._height, sizes.height_mm)
+
+    @property
+    def known(self) -> bool:
+        """Whether any frame has a surface."""
+        return bool(np.isfinite(self._low).all())
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest point of all, mm: the colour scale."""
+        return self._depth, max(self._height, self._depth + 1e-6)
+
+    @property
+    def within_mm(self) -> FloatArray:
+        """Two corners of the box, shape (2, 3), mm."""
+        box = np.stack([self._low, self._high])
+        box[:, 2] = min(box[0, 2], self._depth), max(box[1, 2], self._height)
+        return box
+
+
+def write_film(
+    path: Path,
+    measured: Iterable[tuple[int, float | None, Measurement]],
+    times_s: FloatArray,
+    extent: Extent,
+    process: Executor,
+    progress: Callable[[int], None],
+) -> None:
+    """Write a film (MP4, MPEG-4) of frames; one without a surface says why it has none.
+
+    Parameters
+    ----------
+    path
+        Where to; written beside it and renamed.
+    measured
+        (frame, time in s, measurement) of each frame; taken a few at a time.
+    times_s
+        When each is shown: `film_times`.
+    extent
+        Of all frames; at least one of them has a surface.
+    process
+        A `studio.drawing_process`, which knows size and view.
+    progress
+        Called with the number of frames done; may raise to stop, and nothing is left then.
+
+    Raises
+    ------
+    InputError
+        If the frames follow each other too fast for a film.
+    ImportError
+        Without pyvista.
+    BrokenProcessPool
+        Where nothing can be drawn.
+    OSError
+        If it cannot be written.
+    """
+    scenes = (film_scene(*each, extent) for each in measured)
+
+    def counted() -> Iterator[Picture]:
+        for done, picture in enumerate(_drawn(scenes, process), 1):
+            yield picture
+            progress(done)
+
+    write_video(path, counted(), times_s)
+
+
+def film_scene(frame: int, time_s: float | None, measurement: Measurement, extent: Extent) -> Scene:
+    """What a film shows of a frame: its surface, or why there is none."""
+    stamp = f"frame {frame}" if time_s is None else f"frame {frame}, {time_s:.4f} s"
+    if measurement.reconstruction is None:
+        why = f"cannot be measured: {measurement.reason or measurement.status}"
+        notice = "\n".join(textwrap.wrap(why, LINE))
+        return empty_scene(extent.within_mm, extent.limits, stamp, notice)
+    scene = scene_of(measurement.reconstruction, limits=extent.limits)
+    return replace(scene, within_mm=extent.within_mm, stamp=stamp)
+
+
+def film_times(
+    frames: Sequence[tuple[int, float | None]], rate_hz: float | None = None
+) -> FloatArray:
+    """When each frame begins, and when the last ends, shape (n + 1,), s.
+
+    Frames that are left out leave their time: what is shown stays until the next.
+
+    Parameters
+    ----------
+    frames
+        Number and time, s, of each frame, ascending.
+    rate_hz
+        Frames of the film a second; None: as fast as they were recorded, or 10 a second where the
+        recording has no time base.
+    """
+    times = np.array([np.nan if time_s is None else time_s for _, time_s in frames])
+    if rate_hz is not None or not np.isfinite(times).all():
+        numbers = np.array([float(frame) for frame, _ in frames])
+        step = np.diff(numbers).min(initial=np.inf)
+        times = numbers / ((step if np.isfinite(step) else 1.0) * (rate_hz or UNTIMED_HZ))
+    least = np.diff(times).min(initial=np.inf)
+    last = times[-1] + (least if np.isfinite(least) else 1 / (rate_hz or UNTIMED_HZ))
+    return np.asarray(np.append(times, last) - times[0], np.float64)
+
+
+def write_video(path: Path, pictures: Iterable[Picture], times_s: FloatArray) -> None:
+    """Write pictures as a video, beside its place first.
+
+    Parameters
+    ----------
+    path
+        Where to, MP4.
+    pictures
+        B, G, R, each of shape (height, width, 3), both even.
+    times_s
+        When each begins and the last ends, shape (n + 1,), from 0, ascending, s.
+
+    Raises
+    ------
+    InputError
+        If they follow each other faster than 60000 a second.
+    OSError
+        If it cannot be written.
+    """
+    ticks = np.round(times_s * TICKS_HZ).astype(np.int64)
+    if (np.diff(ticks) < 1).any():
+        rate = 1 / np.diff(times_s).min()
+        most = f"at most {TICKS_HZ} frames/s: a film that is slower than the recording"
+        raise InputError("export", "film_rate_hz", f"{rate:.6g}", most)
+    # Written through Python's file, that a full disk is told as such.
+    with made_whole(path) as part, part.open("wb") as file:
+        container = av.open(file, "w", format="mp4")
+        try:
+            _encode(container, pictures, ticks)
+        except BaseException:
+            with contextlib.suppress(FFmpegError, OSError):  # what failed first is told
+                container.close()
+            raise
+        container.close()
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _encode(container: OutputContainer, pictures: Iterable[Picture], ticks: IntArray) -> None:
+    """Encode pictures into a container that is being written."""
+    stream: VideoStream | None = None
+    for picture, begin, end in zip(pictures, ticks[:-1], ticks[1:], strict=True):
+        if stream is None:
+            options = {"flags": "+qscale", "global_quality": str(QUALITY * 118)}
+            stream = cast(VideoStream, container.add_stream(CODEC, rate=TICKS_HZ, options=options))
+            stream.height, stream.width = picture.shape[:2]
+            stream.pix_fmt = "yuv420p"
+            stream.codec_context.time_base = Fraction(1, TICKS_HZ)
+        frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
+        frame.pts, frame.time_base = int(begin), Fraction(1, TICKS_HZ)
+        for packet in stream.encode(frame):  # the encoder keeps none back
+            packet.duration = int(end - begin)
+            container.mux(packet)
+
+
+def _drawn(scenes: Iterable[Scene], process: Executor) -> Iterator[Picture]:
+    """Pictures of scenes, in their order, a few of them drawn ahead."""
+    waiting: deque[Future[Picture]] = deque()
+    rest = iter(scenes)
+    try:
+        while True:
+            ahead = itertools.islice(rest, 1 + AHEAD - len(waiting))
+            waiting.extend(process.submit(draw_there, scene) for scene in ahead)
+            if not waiting:
+                return
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()

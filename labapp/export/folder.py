@@ -1,0 +1,490 @@
+"""Chosen results of many frames in one folder that is whole or not there, with a manifest.
+
+The folder is made beside its place, as ``.NAME.….part``, and renamed when all of it is there. An
+export that was there before is replaced then and not earlier, and only if it still is as it was
+written: somebody's own files are never deleted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement
+from labapp.errors import InputError
+from labapp.export.drawing import VIEWS, Direction
+from labapp.export.film import TICKS_HZ, Extent, film_times, write_film
+from labapp.export.hdf5 import Hdf5Writer
+from labapp.export.meshes import FORMATS, SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
+from labapp.export.pictures import (
+    write_frame_picture,
+    write_surface_picture,
+    write_trend_picture,
+)
+from labapp.export.results import SURFACES, now, surface_files
+from labapp.export.studio import PICTURE_PX, drawing_process, told
+from labapp.export.summary import Summary
+from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
+from labapp.files import as_bytes, beside
+from labapp.media import GreyImage
+from labapp.system import sync_folder
+from labapp.version import VERSION
+from labapp.words import SIGMA_OF
+
+MANIFEST = "manifest.json"
+HDF5_FILE = "results.h5"
+TREND_FILE = "trends.png"
+TREND = ("width", "length", "height")
+FILM_FILE = "film.mp4"
+OLD = ".old"
+PICTURES = ("frames", "surfaces", "trends", "film")
+
+SIZES_PX = range(320, 3841, 2)
+"""Widths and heights that pictures of surfaces can have: a film's are even."""
+
+UNITS = (
+    "lengths in mm, angles in degrees, times in s, places in a frame in px; see the column names"
+)
+
+LARGEST_MANIFEST = 1 << 28
+
+AN_EXPORT = "a folder that labapp exported"
+ROOM = "a folder that can be written, with room on its disk; what was there is as it was"
+OWN_FOLDER = "a new or empty folder, or an earlier export that was not changed (it is replaced)"
+
+
+@dataclass(frozen=True)
+class ExportChoice:
+    """What of the results is to be exported.
+
+    Parameters
+    ----------
+    tables
+        Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``.
+    surfaces
+        How to write each surface: some of ``csv``, ``stl``, ``stl-ascii``, ``ply``, ``vtp``.
+    solid
+        Whether to add each surface as a watertight body, in the mesh formats of `surfaces`.
+    hdf5
+        Whether to write everything into one HDF5 file.
+    pictures
+        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
+        ``film`` (the surfaces, one after the other in one view and on one colour scale).
+    spacing_mm
+        Distance of the surfaces' nodes, mm.
+    view
+        Where surfaces are looked at from, in pictures and the film: ``free`` (obliquely), ``top``,
+        ``side`` or ``front``.
+    size_px
+        Width and height of these, even, px.
+    film_rate_hz
+        Frames of the film a second; None: as fast as they were recorded (`film.film_times`).
+
+    Raises
+    ------
+    InputError
+        If there is no such choice.
+    """
+
+    tables: frozenset[str] = frozenset(TABLES)
+    surfaces: frozenset[str] = frozenset(SURFACES)
+    solid: bool = False
+    hdf5: bool = False
+    pictures: frozenset[str] = frozenset()
+    spacing_mm: float = SPACING_MM
+    view: Direction = "free"
+    size_px: tuple[int, int] = PICTURE_PX
+    film_rate_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        allowed: dict[str, Collection[str]] = {
+            "tables": TABLES,
+            "surfaces": ("csv", *FORMATS),
+            "pictures": PICTURES,
+        }
+        for field, words in allowed.items():
+            if unknown := sorted(getattr(self, field) - frozenset(words)):
+                raise InputError("export", field, unknown[0], f"some of {', '.join(words)}")
+        if self.solid and not self.surfaces & FORMATS.keys():
+            raise InputError("export", "solid", "no mesh format", f"one of {', '.join(FORMATS)}")
+        if not SMALLEST_SPACING_MM <= self.spacing_mm <= 1:
+            raise InputError(
+                "export", "spacing_mm", self.spacing_mm, f"from {SMALLEST_SPACING_MM} to 1 mm"
+            )
+        if self.view not in VIEWS:
+            raise InputError("export", "view", self.view, f"one of {', '.join(VIEWS)}")
+        if any(side not in SIZES_PX for side in self.size_px):
+            size = "{}x{}".format(*self.size_px)
+            wanted = f"even numbers from {SIZES_PX[0]} to {SIZES_PX[-1]}"
+            raise InputError("export", "size_px", size, wanted)
+        rate = self.film_rate_hz
+        if rate is not None and not 0 < rate <= TICKS_HZ:
+            raise InputError("export", "film_rate_hz", rate, f"above 0, at most {TICKS_HZ}")
+
+
+@dataclass(frozen=True)
+class ExportedFile:
+    """A file of an export, as its manifest lists it.
+
+    Parameters
+    ----------
+    name
+        Its name in the folder.
+    size
+        In bytes.
+    sha256
+        Of its content, in hex.
+    rows
+        Of a CSV file, without its header; None of any other.
+    """
+
+    name: str
+    size: int
+    sha256: str
+    rows: int | None
+
+
+def export(
+    folder: str | os.PathLike[str],
+    measured: Iterable[tuple[int, float | None, Measurement]],
+    calibration: ImageCalibration,
+    provenance: Mapping[str, object],
+    choice: ExportChoice,
+    *,
+    image_of: Callable[[int], GreyImage] | None = None,
+    extras: Mapping[str, Callable[[], bytes]] | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[ExportedFile, ...]:
+    """Write results into a folder: all of them, or nothing and what was there stays.
+
+    Parameters
+    ----------
+    folder
+        Where to: a new or an empty folder, or an earlier export, which is replaced.
+    measured
+        (frame, time in s, measurement) of each frame; taken one at a time, and once more for a
+        film.
+    calibration
+        Pixel ↔ imaging plane, for the dots' places on the plane.
+    provenance
+        What the manifest and the HDF5 file are to say of source, setup and settings; plain values.
+    choice
+        What to write.
+    image_of
+        Reads a frame's grey levels; needed for pictures of frames.
+    extras
+        Further files, name → what makes its content, once it is sure that the folder can be
+        written: a report.
+    progress
+        Called with the number of frames done, those of a film counted again; may raise to stop.
+
+    Returns
+    -------
+    tuple[ExportedFile, ...]
+        The files written, by name; the manifest, which lists them, is not among them.
+
+    Raises
+    ------
+    InputError
+        If the folder is somebody's own, or cannot be written, or a picture cannot be drawn.
+    """
+    target = Path(folder).resolve()
+    if not target.name:
+        raise InputError(target, "folder", "is the root of the disk", OWN_FOLDER)
+    if "frames" in choice.pictures and image_of is None:
+        raise InputError(target, "pictures", "frames", "a recording that can be read")
+    with _told(target, ROOM), _beside(target) as part:
+        files = _Files(part)
+        for name, content_of in (extras or {}).items():
+            files.new(name)
+            files.add(name, content_of())
+        progress = progress or (lambda _: None)
+        summary, extent = _write_results(
+            files, measured, calibration, provenance, choice, image_of, progress
+        )
+        frames = len(summary.frames)
+        if "film" in choice.pictures and extent.known:
+            times_s = film_times([each[:2] for each in summary.frames], choice.film_rate_hz)
+            path = files.new(FILM_FILE)
+            with told("film"), drawing_process(choice.size_px, choice.view) as process:
+                write_film(path, measured, times_s, extent, process, lambda k: progress(frames + k))
+        return files.finish({"frames": frames, "units": UNITS, "provenance": provenance})
+
+
+def verify_export(folder: str | os.PathLike[str]) -> list[str]:
+    """What in a folder differs from its manifest, a sentence each; empty if nothing does.
+
+    Raises
+    ------
+    InputError
+        If the folder has no manifest that can be read.
+    """
+    folder = Path(folder)
+    listed = {file.name: file for file in _manifest(folder)}
+    with _told(folder, AN_EXPORT):
+        there = {path.name: path for path in folder.iterdir() if path.name != MANIFEST}
+        problems = [f"{name} is not in the manifest" for name in sorted(there.keys() - listed)]
+        for name, file in sorted(listed.items()):
+            if name not in there:
+                problems.append(f"{name} is missing")
+            elif there[name].is_symlink() or not there[name].is_file():
+                problems.append(f"{name} is not a file")
+            elif there[name].stat().st_size != file.size:
+                size = there[name].stat().st_size
+                problems.append(f"{name} has {size} bytes instead of {file.size}")
+            elif _sha256(there[name]) != file.sha256:
+                problems.append(f"{name} was changed")
+    return problems
+
+
+class _Files:
+    """The folder in the making."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._rows: dict[str, int] = {}
+
+    def add(self, name: str, content: bytes) -> None:
+        """Write a file."""
+        self.new(name).write_bytes(content)
+        if name.endswith(".csv"):
+            self._rows[name] = content.count(b"\n") - 1
+
+    def new(self, name: str) -> Path:
+        """Where a file goes that is not there yet."""
+        path = self.folder / name
+        if path.name != name or name.startswith("."):
+            raise InputError(self.folder, "name", name, "a plain file name")
+        if path.exists():
+            raise InputError(self.folder, "name", name, "each file only once")
+        return path
+
+    def extend(self, name: str, text: str, rows: int) -> None:
+        """Add rows to a CSV file."""
+        with (self.folder / name).open("ab") as file:
+            file.write(as_bytes(text))
+        self._rows[name] += rows
+
+    def finish(self, about: Mapping[str, object]) -> tuple[ExportedFile, ...]:
+        """Write the manifest; returns what it lists: every file, by name, on the disk for good."""
+        written = tuple(
+            ExportedFile(path.name, path.stat().st_size, _synced(path), self._rows.get(path.name))
+            for path in sorted(self.folder.iterdir())
+        )
+        manifest = {**_made(), **about, "files": [asdict(file) for file in written]}
+        text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
+        self.add(MANIFEST, as_bytes(text))
+        _synced(self.folder / MANIFEST)
+        return written
+
+
+def _write_results(
+    files: _Files,
+    measured: Iterable[tuple[int, float | None, Measurement]],
+    calibration: ImageCalibration,
+    provenance: Mapping[str, object],
+    choice: ExportChoice,
+    image_of: Callable[[int], GreyImage] | None,
+    progress: Callable[[int], None],
+) -> tuple[Summary, Extent]:
+    """Everything that is chosen but a film, frame by frame; what frames there are, how large."""
+    summary, extent = Summary(), Extent()
+    for name in choice.tables:
+        files.add(f"{name}.csv", csv_header(name).encode())
+    with ExitStack() as stack:
+        hdf5 = process = None
+        if choice.hdf5:
+            about = _root_attributes(provenance)
+            writer = Hdf5Writer(files.new(HDF5_FILE), about, choice.spacing_mm)
+            hdf5 = stack.enter_context(writer)
+        if "surfaces" in choice.pictures:
+            process = stack.enter_context(drawing_process(choice.size_px, choice.view))
+        for frame, time_s, measurement in measured:
+            reconstruction = measurement.reconstruction
+            if reconstruction is not None and (choice.surfaces or choice.hdf5):
+                refuse_too_large(reconstruction, choice.spacing_mm)
+            tables = frame_tables(frame, time_s, measurement, calibration)
+            for name in choice.tables:
+                rows = csv_rows(name, tables[name])
+                files.extend(f"{name}.csv", rows, len(tables[name]["frame"]))
+            surfaces = surface_files(
+                frame, reconstruction, choice.surfaces, choice.spacing_mm, as_solid=choice.solid
+            )
+            for name, content in surfaces.items():
+                files.add(name, content)
+            if hdf5 is not None:
+                hdf5.write(frame, tables, reconstruction)
+            if image_of is not None and _has_picture(measurement, choice):
+                path = files.new(f"frame_{frame:06d}.png")
+                write_frame_picture(path, image_of(frame), measurement)
+            if process is not None and reconstruction is not None:
+                with told("surfaces"):
+                    path = files.new(f"surface_{frame:06d}.png")
+                    write_surface_picture(path, reconstruction, process)
+            summary.add(frame, time_s, measurement)
+            extent.add(measurement)
+            progress(len(summary.frames))
+    if "trends" in choice.pictures and summary.example is not None:
+        _draw_trend(files.new(TREND_FILE), summary)
+    return summary, extent
+
+
+def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
+    return "frames" in choice.pictures and measurement.status != "unreadable"
+
+
+def _made() -> dict[str, object]:
+    made = {"program": "labapp", "version": VERSION, "created": now()}
+    return {**made, "sigma_of": SIGMA_OF}
+
+
+def _root_attributes(provenance: Mapping[str, object]) -> dict[str, object]:
+    """Attributes of the HDF5 file; the setup as the TOML text it is."""
+    about = {**_made(), **provenance}
+    setup = about.get("setup")
+    if isinstance(setup, Mapping) and "toml" in setup:
+        about["setup"] = setup["toml"]
+    return about
+
+
+def _draw_trend(path: Path, summary: Summary) -> None:
+    timed = all(time_s is not None for _, time_s, _ in summary.frames)
+    axis = [time_s if timed else frame for frame, time_s, _ in summary.frames]
+    series = {name: summary.series(f"{name}_mm") for name in TREND}
+    write_trend_picture(path, axis, "time (s)" if timed else "frame", series)
+
+
+@contextmanager
+def _beside(target: Path) -> Iterator[Path]:
+    """A folder beside the target, which takes its place when all went well."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(target):
+        _check_replaceable(target)
+        part = beside(target)
+        part.mkdir()
+        try:
+            yield part
+            sync_folder(part)
+            _check_replaceable(target)
+            _swap(part, target, part.with_suffix(OLD))
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+@contextmanager
+def _alone(target: Path) -> Iterator[None]:
+    """Keep a second export to the same place out; tidy up after one that was killed."""
+    path = target.with_name(f".{target.name}.lock")
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise InputError(
+            target, "export", "is being written by another program", "to wait for it"
+        ) from error
+    except (OSError, NotImplementedError):
+        pass  # some network drives have no locks
+    try:
+        if lock.is_locked:
+            _tidy(target)
+        yield
+    finally:
+        if lock.is_locked:
+            # While it is held: who comes next makes a new one. Windows removes it at the release.
+            with suppress(OSError):
+                path.unlink()
+            lock.release()
+
+
+def _tidy(target: Path) -> None:
+    """Take away what a killed export left; put back what it was about to replace."""
+    ours = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.(part|old)")
+    for path in target.parent.iterdir():
+        if not ours.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
+            continue
+        if path.suffix == OLD and not target.exists():  # ended between the two steps of `_swap`
+            path.rename(target)
+        else:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _swap(part: Path, target: Path, old: Path) -> None:
+    """Put the folder in its place; what was there is back if that fails, and gone if not."""
+    try:
+        if target.exists():
+            target.rename(old)
+        part.rename(target)
+    except BaseException:
+        if old.exists() and not target.exists():
+            old.rename(target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _check_replaceable(target: Path) -> None:
+    """Refuse to replace a folder that holds anything but an export as it was written."""
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise InputError(target, "folder", "is a file", OWN_FOLDER)
+    names = sorted(path.name for path in target.iterdir())
+    if not names:
+        return
+    if MANIFEST not in names:
+        raise InputError(target, "folder", f"holds {names[0]} and no {MANIFEST}", OWN_FOLDER)
+    lost = [problem for problem in verify_export(target) if not problem.endswith("is missing")]
+    if lost:
+        raise InputError(target, "folder", f"{lost[0]}: it may be yours", OWN_FOLDER)
+
+
+def _manifest(folder: Path) -> tuple[ExportedFile, ...]:
+    """The files that a folder's manifest lists."""
+    path = folder / MANIFEST
+    try:
+        if not path.is_file() or path.stat().st_size > LARGEST_MANIFEST:
+            raise InputError(folder, MANIFEST, "is not there", AN_EXPORT)
+        content = json.loads(path.read_bytes())
+        if content["program"] != "labapp":
+            raise ValueError
+        entries = content["files"]
+        for entry in entries:
+            if [type(entry[key]) for key in ("name", "size", "sha256")] != [str, int, str]:
+                raise ValueError
+        return tuple(ExportedFile(**entry) for entry in entries)
+    except OSError as error:
+        raise InputError(folder, MANIFEST, error.strerror, AN_EXPORT) from error
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise InputError(folder, MANIFEST, "is not one of labapp", AN_EXPORT) from error
+
+
+def _synced(path: Path) -> str:
+    """SHA-256 of a file that is on the disk for good."""
+    with path.open("rb+") as file:  # to be written to: Windows syncs no other
+        os.fsync(file.fileno())
+    return _sha256(path)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def _told(folder: Path, expected: str) -> Iterator[None]:
+    """Turn errors of the file system into what a user can act on."""
+    try:
+        yield
+    except OSError as error:
+        what = error.strerror or str(error)
+        name = f" ({Path(error.filename).name})" if error.filename else ""
+        raise InputError(folder, "export", f"{what}{name}", expected) from error

@@ -1,0 +1,241 @@
+"""A whole run in one HDF5 file, in full precision.
+
+::
+
+    /measures/<column>            one dataset per column of measures.csv, shape (frames,)
+    /frames/000012/dots           table: the columns of dots.csv but for frame
+    /frames/000012/points         table: the columns of points.csv but for frame
+    /frames/000012/boundary       table: the columns of boundary.csv but for frame
+    /frames/000012/surface/x_mm   shape (columns,), y_mm  shape (rows,)
+    /frames/000012/surface/z_mm   shape (rows, columns); NaN outside the boundary
+
+A table is one compound dataset: ``file["frames/000012/dots"]["u_px"]`` in Python,
+``h5read(file, '/frames/000012/dots').u_px`` in MATLAB. What a frame has not is not there. Numbers
+are float64, NaN where unknown, or int64 where they never are; text is UTF-8, of fixed length in
+tables. Every dataset has the attributes ``units`` and ``description``, tables one each per column;
+the root's tell where it all comes from. The format is that of HDF5 1.8, which every reader knows.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.surface.measures import surface_grid
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.export.tables import TABLES, Column, Table
+from labapp.files import as_bytes
+
+TEXT_BYTES = 8
+"""Room for a word in a table, bytes."""
+
+LIBRARY = ("v108", "v108")
+
+AXES = (
+    Column("x_mm", "X of the grid's columns"),
+    Column("y_mm", "Y of the grid's rows, along the welding direction"),
+    Column("z_mm", "height above the work piece, [row, column]; NaN outside the boundary"),
+)
+
+
+class Hdf5Writer:
+    """Writes a run, frame by frame; use it in a ``with``. The file is whole once that ends well.
+
+    Parameters
+    ----------
+    path
+        Where to; a file that is there is replaced.
+    attributes
+        Of the root: text as it is, anything else as JSON.
+    spacing_mm
+        Distance of the surface's nodes, mm.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written, here and from every method.
+    """
+
+    def __init__(self, path: Path, attributes: Mapping[str, object], spacing_mm: float) -> None:
+        self._spacing_mm = spacing_mm
+        self._measures: list[Table] = []
+        self._disk = _Disk(path)
+        try:
+            self._file = h5py.File(self._disk, "w", libver=LIBRARY)
+            for name, value in attributes.items():
+                text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+                self._file.attrs[name] = _plain(text)
+            self._frames = self._file.create_group("frames")
+        except BaseException:
+            self._disk.close()
+            raise
+
+    def write(
+        self, frame: int, tables: Mapping[str, Table], reconstruction: Reconstruction | None
+    ) -> None:
+        """Write what `frame_tables` gives of a frame, and its surface."""
+        self._measures.append(tables["measures"])
+        group = self._frames.create_group(f"{frame:06d}")
+        for name in ("dots", "points", "boundary"):
+            if len(tables[name]["frame"]):
+                _put_table(group, name, tables[name])
+        if reconstruction is not None:
+            _put_surface(group.create_group("surface"), reconstruction, self._spacing_mm)
+        self._disk.check()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if error is None:
+                self._write_measures()
+        finally:
+            self._file.close()
+            self._disk.close()
+        if error is None:
+            self._disk.check()
+
+    def _write_measures(self) -> None:
+        group = self._file.create_group("measures")
+        for column in TABLES["measures"]:
+            values = [table[column.name] for table in self._measures]
+            cells = np.concatenate(values) if values else np.empty(0)
+            if column.digits is None:
+                plain = np.array([_plain(text) for text in cells], object)
+                _put(group, column, plain, h5py.string_dtype())
+            else:
+                _put(group, column, cells)
+
+
+def _put(group: Any, column: Column, values: npt.NDArray[Any], kind: Any = None) -> None:
+    """A dataset with its unit and description."""
+    packing = {"compression": "gzip", "shuffle": True, "chunks": values.shape}
+    dataset = group.create_dataset(
+        column.name, data=values, dtype=kind, **(packing if values.size else {})
+    )
+    dataset.attrs["units"] = column.unit
+    dataset.attrs["description"] = column.description
+
+
+def _put_table(group: Any, name: str, table: Table) -> None:
+    columns = TABLES[name][1:]
+    text = h5py.string_dtype("utf-8", TEXT_BYTES)
+    kinds = [text if column.digits is None else table[column.name].dtype for column in columns]
+    names = [column.name for column in columns]
+    rows = np.empty(len(table["frame"]), list(zip(names, kinds, strict=True)))
+    for column, kind in zip(columns, kinds, strict=True):
+        values = table[column.name]
+        rows[column.name] = [each.encode() for each in values] if kind is text else values
+    dataset = group.create_dataset(
+        name, data=rows, compression="gzip", shuffle=True, chunks=rows.shape
+    )
+    dataset.attrs["units"] = _texts([column.unit for column in columns])
+    dataset.attrs["description"] = _texts([column.description for column in columns])
+
+
+def _plain(text: str) -> str:
+    """The same as HDF5 can hold it."""
+    return as_bytes(text.replace("\0", r"\0")).decode()
+
+
+def _texts(texts: list[str]) -> npt.NDArray[Any]:
+    encoded = [text.encode() for text in texts]
+    return np.array(encoded, h5py.string_dtype("utf-8", max(map(len, encoded))))
+
+
+def _put_surface(group: Any, reconstruction: Reconstruction, spacing_mm: float) -> None:
+    """The nodes of the surface within the boundary, as a grid."""
+    x, y, z = surface_grid(reconstruction, spacing_mm)
+    columns, column = np.unique(x, return_inverse=True)
+    rows, row = np.unique(y, return_inverse=True)
+    grid = np.full((len(rows), len(columns)), np.nan)
+    grid[row, column] = z
+    for axis, values in zip(AXES, (columns, rows, grid), strict=True):
+        _put(group, axis, values)
+
+
+class _Disk(io.RawIOBase):
+    """The file that HDF5 writes to, which never fails while HDF5 looks.
+
+    HDF5 drops errors of writing that it meets while it tidies up, and then ends the process. So
+    the first error is kept for `check`; what is written from then on stays in memory, where HDF5
+    can read it back until it has closed its file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("w+b", buffering=0)
+        self._at = 0
+        self._failure: BaseException | None = None
+        self._kept: list[tuple[int, bytes]] = []
+
+    def check(self) -> None:
+        """Raise the error that writing met, if it met one."""
+        if self._failure is not None:
+            raise self._failure
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence == os.SEEK_END:
+            ends = [at + len(content) for at, content in self._kept]
+            offset += max([os.fstat(self._file.fileno()).st_size, *ends])
+        self._at = offset
+        return offset
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        view[:] = bytes(len(view))
+        self._file.seek(self._at)
+        self._file.readinto(view)
+        for at, content in self._kept:
+            first, last = max(at, self._at), min(at + len(content), self._at + len(view))
+            if first < last:
+                view[first - self._at : last - self._at] = content[first - at : last - at]
+        return len(view)
+
+    def write(self, content: Any) -> int:
+        whole = memoryview(content).cast("B")
+        if self._failure is None:
+            try:
+                self._file.seek(self._at)
+                rest = whole
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+            except BaseException as error:  # Ctrl-C too: HDF5 is not to be left half-way
+                self._failure = error
+        if self._failure is not None:
+            self._kept.append((self._at, bytes(whole)))
+        self._at += len(whole)
+        return len(whole)
+
+    def truncate(self, size: int | None = None) -> int:
+        size = self._at if size is None else size
+        if self._failure is None:
+            try:
+                self._file.truncate(size)
+            except BaseException as error:
+                self._failure = error
+        return size
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()

@@ -1,0 +1,156 @@
+"""Pictures of results: dots over their frame, the surface in 3-D, sizes over time.
+
+matplotlib and pyvista are of the extra ``gui`` and are imported when a picture is drawn.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import io
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.pipeline import Measurement
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.values import FloatArray
+from labapp.export.scene import scene_of
+from labapp.export.studio import draw_there, drawing_process
+from labapp.files import write_whole
+
+ENLARGED = 3
+"""Screen pixels per pixel of the frame, so that labels can be read."""
+
+UNKNOWN = (150, 150, 150)
+
+LEGEND = "left: row of the ray; above: its column; grey ring: in doubt, no ray"
+
+
+def frame_picture(image: npt.NDArray[Any], measurement: Measurement) -> npt.NDArray[np.uint8]:
+    """The frame with its dots ringed, rays' columns above them and rows left of the first.
+
+    Parameters
+    ----------
+    image
+        Grey levels, shape (rows, columns).
+    measurement
+        What was found in it. A dot without a ray is ringed in grey; the legend says so.
+
+    Returns
+    -------
+    npt.NDArray[np.uint8]
+        Shape (3·rows, 3·columns, 3), B, G, R; a colour per row of rays.
+    """
+    low, high = np.percentile(image, [1, 99.8])
+    grey = np.clip((image - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
+    enlarged = cv2.resize(grey, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_CUBIC)
+    picture = cv2.cvtColor(enlarged, cv2.COLOR_GRAY2BGR)
+    dots, match = measurement.dots, measurement.match
+    if dots is None:
+        return np.asarray(picture, np.uint8)
+    rays = {} if match is None else dict(zip(match.dot.tolist(), match.ray.tolist(), strict=True))
+    leftmost: dict[int, list[tuple[int, int]]] = {}
+    for k, at in enumerate(dots.image_px):
+        u, v = ((at + 0.5) * ENLARGED - 0.5).round().astype(int).tolist()
+        ray = rays.get(k)
+        colour = UNKNOWN if ray is None else _row_colour(ray[0])
+        cv2.circle(picture, (u, v), 4 * ENLARGED, colour, 1, cv2.LINE_AA)
+        if ray is not None:
+            # Dots of one row stand closest, and the number above must fit between them.
+            _write(picture, str(ray[1]), (u - 7, v - 6 * ENLARGED), colour, 0.45)
+            leftmost.setdefault(ray[0], []).append((u, v))
+    for row, places in leftmost.items():
+        u, v = min(places)
+        _write(picture, f"row {row}", (u - 70, v + 5), _row_colour(row), 0.5)
+    if rays:
+        _write(picture, LEGEND, (12, 24), (255, 255, 255), 0.5)
+    return np.asarray(picture, np.uint8)
+
+
+def _write(
+    picture: npt.NDArray[Any],
+    text: str,
+    place: tuple[int, int],
+    colour: tuple[int, int, int],
+    size: float,
+) -> None:
+    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+
+
+def _row_colour(row: int) -> tuple[int, int, int]:
+    """A colour (B, G, R) that differs most between neighbouring rows."""
+    red, green, blue = colorsys.hsv_to_rgb(row * 0.381966 % 1, 0.55, 1.0)
+    return int(blue * 255), int(green * 255), int(red * 255)
+
+
+def write_frame_picture(path: Path, image: npt.NDArray[Any], measurement: Measurement) -> None:
+    """Write `frame_picture` as PNG."""
+    _, content = cv2.imencode(".png", frame_picture(image, measurement))
+    write_whole(path, content.tobytes())
+
+
+def write_trend_picture(
+    path: Path, axis: Sequence[float | None], label: str, series: Mapping[str, FloatArray]
+) -> None:
+    """Write a PNG of one plot per series of lengths over a common axis.
+
+    NaN leaves a gap.
+
+    Raises
+    ------
+    ImportError
+        Without matplotlib.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 2.2 * len(series)), layout="constrained")
+    FigureCanvasAgg(figure)
+    plots = figure.subplots(len(series), sharex=True, squeeze=False)[:, 0]
+    for plot, (name, values) in zip(plots, series.items(), strict=True):
+        plot.plot(axis, values, "o-", markersize=3, linewidth=1)
+        known = values[np.isfinite(values)]
+        if len(known) > 1:
+            spread = f"mean {known.mean():.4f}, standard deviation {known.std():.4f} mm"
+            plot.set_title(spread, fontsize="small", loc="right")
+        plot.set_ylabel(f"{name} (mm)")
+        plot.grid(alpha=0.3)
+    plots[-1].set_xlabel(label)
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=120)
+    write_whole(path, content.getvalue())
+
+
+def write_surface_picture(
+    path: Path, reconstruction: Reconstruction, process: Executor | None = None
+) -> None:
+    """Write a PNG of the surface in 3-D, coloured by height, with the reflection points.
+
+    Parameters
+    ----------
+    path
+        Where to.
+    reconstruction
+        What to draw.
+    process
+        A `drawing_process` to draw several pictures in; None starts one for this, of the usual
+        size and view.
+
+    Raises
+    ------
+    ImportError
+        Without pyvista.
+    BrokenProcessPool
+        Where nothing can be drawn.
+    """
+    with ExitStack() as stack:
+        process = process or stack.enter_context(drawing_process())
+        drawing = process.submit(draw_there, scene_of(reconstruction))
+        _, content = cv2.imencode(".png", drawing.result())
+    write_whole(path, content.tobytes())

@@ -1,0 +1,240 @@
+"""The result files of one run: whole rows, whole surfaces, whatever happens in between."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import json
+import os
+import re
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.errors import InputError
+from labapp.export.meshes import FORMATS, SPACING_MM, solid, surface
+from labapp.export.tables import TABLES, csv_header, surface_csv, table_rows
+from labapp.files import as_bytes, write_whole
+from labapp.version import VERSION
+from labapp.words import SIGMA_OF
+
+RUN_FILE = "run.json"
+OURS = re.compile(r"(measures|dots|points|boundary|surface_\d{6,})\.csv|surface_\d{6,}\.stl")
+SURFACES = ("csv", "stl")
+"""What a run writes of each surface."""
+
+
+def surface_files(
+    frame: int,
+    reconstruction: Reconstruction | None,
+    formats: Collection[str],
+    spacing_mm: float,
+    *,
+    as_solid: bool = False,
+) -> dict[str, bytes]:
+    """The files of a frame's surface, by name; none without a surface.
+
+    Parameters
+    ----------
+    frame
+        Its number.
+    reconstruction
+        What it gave.
+    formats
+        Some of ``csv`` and those of `FORMATS`.
+    spacing_mm
+        Distance of the nodes, mm.
+    as_solid
+        Whether to add the mesh as a watertight body in each of the `FORMATS` chosen.
+    """
+    if reconstruction is None:
+        return {}
+    files = {}
+    if "csv" in formats:
+        files[f"surface_{frame:06d}.csv"] = surface_csv(reconstruction, spacing_mm)
+    chosen = [FORMATS[name] for name in FORMATS if name in formats]
+    for stem, make in (("surface", surface), ("solid", solid))[: 1 + as_solid]:
+        mesh = make(reconstruction, spacing_mm) if chosen else None
+        if mesh is not None:
+            files |= {f"{stem}_{frame:06d}{end}": write(mesh) for end, write in chosen}
+    return files
+
+
+class ResultsWriter:
+    """Writes a run's results into a folder, one frame at a time.
+
+    A frame's rows go in with one write per file, `measures.csv` last: a frame that has a row
+    there has everything else too. When a write fails or is interrupted, what was written of that
+    frame is taken back. `run.json` tells where the results come from and how the run ended.
+
+    A former run's results in the folder are replaced; a folder with files of the same names and
+    no `run.json` is refused, as they may be somebody's own.
+
+    Parameters
+    ----------
+    folder
+        Where to; made if it does not exist.
+    calibration
+        Pixel ↔ imaging plane, for the dots' places on the plane.
+    provenance
+        What `run.json` is to say of the source, the setup and the options.
+    surfaces
+        Whether to write the surface files.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be used. Every later failure to write raises it too.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        calibration: ImageCalibration,
+        provenance: Mapping[str, object],
+        surfaces: bool = True,
+    ) -> None:
+        self.folder = folder
+        self.frames = 0
+        self._calibration = calibration
+        self.surfaces = surfaces
+        self._run = {
+            "program": "labapp",
+            "version": VERSION,
+            "sigma_of": SIGMA_OF,
+            "state": "running",
+            "started": now(),
+            "ended": None,
+            "frames_done": 0,
+            **provenance,
+        }
+        self._files: dict[str, io.FileIO] = {}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            _clear(folder)
+            self._write_run()
+            for name in TABLES:
+                self._files[name] = io.FileIO(folder / f"{name}.csv", "a")
+                _append(self._files[name], csv_header(name))
+        except OSError as error:
+            self._close_files()
+            raise self._unwritable(error) from error
+
+    def write(
+        self,
+        frame: int,
+        time_s: float | None,
+        measurement: Measurement,
+        rows: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write everything about one frame; its ``rows`` of each table where they are made already.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written (disk full, folder gone); the frames before are whole.
+        """
+        before = {file: os.fstat(file.fileno()).st_size for file in self._files.values()}
+        formats = SURFACES if self.surfaces else ()
+        surfaces = {
+            self.folder / name: content
+            for name, content in surface_files(
+                frame, measurement.reconstruction, formats, SPACING_MM
+            ).items()
+        }
+        rows = rows or table_rows(frame, time_s, measurement, self._calibration)
+        try:
+            for path, content in surfaces.items():
+                write_whole(path, content)
+            for name, text in rows.items():
+                _append(self._files[name], text)
+        except BaseException as error:
+            for file, size in before.items():
+                file.truncate(size)
+            for path in surfaces:
+                path.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise self._unwritable(error) from error
+            raise
+        self.frames += 1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Say in `run.json` how the run ended."""
+        state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        self._run |= {
+            "state": state if error else "finished",
+            "ended": now(),
+            "frames_done": self.frames,
+        }
+        try:
+            self._close_files()
+            self._write_run()
+        except OSError as failure:
+            if error is None:
+                raise self._unwritable(failure) from failure
+
+    def _write_run(self) -> None:
+        text = json.dumps(self._run, indent=2, ensure_ascii=False) + "\n"
+        write_whole(self.folder / RUN_FILE, as_bytes(text))
+
+    def _close_files(self) -> None:
+        for file in self._files.values():
+            file.close()
+
+    def _unwritable(self, error: OSError) -> InputError:
+        plural = "frame before is" if self.frames == 1 else f"{self.frames} frames before are"
+        kept = f"; the {plural} whole" if self.frames else ""
+        return InputError(
+            self.folder,
+            "results",
+            f"{error.strerror} ({Path(error.filename or self.folder).name})",
+            f"a folder that can be written, with room on its disk{kept}",
+        )
+
+
+def _clear(folder: Path) -> None:
+    """Take away a former run's results, `measures.csv` first: no row without its files."""
+    if (folder / RUN_FILE).is_symlink():  # `write_whole` would write to where it points
+        raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
+    ours = [path for path in folder.iterdir() if OURS.fullmatch(path.name)]
+    if ours and not _is_run(folder / RUN_FILE):
+        raise InputError(
+            folder,
+            "results",
+            f"holds {ours[0].name} and no {RUN_FILE}",
+            "an empty folder, or one with an earlier run (it is replaced)",
+        )
+    for path in sorted(ours, key=lambda path: path.name != "measures.csv"):
+        path.unlink()
+
+
+def _is_run(path: Path) -> bool:
+    try:
+        run = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(run, dict) and run.get("program") == "labapp"
+
+
+def _append(file: io.FileIO, text: str) -> None:
+    """Write all of it: a disk that fills takes a part first, and fails at the next try."""
+    content = as_bytes(text)
+    while content:
+        content = content[file.write(content) :]
+
+
+def now() -> str:
+    """The time, ISO 8601, with the time zone."""
+    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

@@ -1,0 +1,206 @@
+"""The pool in 3-D: what is in the picture. The window, the exports and the tests draw the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
+from labapp.core.surface.measures import surface_mesh
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.export.heights import difference_at, sigma_at
+from labapp.export.meshes import drawn_spacing
+
+EXAGGERATION = 3.0
+"""Height over width by default: pools are flat."""
+
+RAY_MM = 3.0
+"""So much of each ray is drawn: laser and imaging plane are ten pools away."""
+
+SPACING_MM = 0.15
+"""Largest distance between rings of the mesh that is drawn, mm."""
+
+HEIGHT = "height (mm)"
+
+SPOKES = 120
+"""About so many vertices a ring: its sides are within a thousandth of a pool's radius."""
+
+EMPTY = np.empty((0, 3))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a 3-D picture shows, in mm, UCS; n vertices.
+
+    Parameters
+    ----------
+    vertices_mm, triangles
+        The surface, shapes (n, 3) and (k, 3).
+    values
+        What colours it, shape (n,).
+    label
+        What the values are, with their unit.
+    limits
+        The values at both ends of the colour scale.
+    diverging
+        Whether the colours run both ways from the middle.
+    points_mm
+        Reflection points, shape (p, 3).
+    lines_mm
+        Closed or open lines by name, each of shape (q, 3): ``boundary``, ``section``.
+    rays_mm
+        Both ends of rays by name, each of shape (r, 2, 3): ``incident``, ``reflected``.
+    electrode
+        Whether to mark the electrode's axis, X = Y = 0.
+    exaggeration
+        Heights are drawn so many times as high; the axes tell true ones.
+    within_mm
+        Places that the axes hold in any case, shape (k, 3): pictures of a film share them.
+    stamp
+        Said in the upper right corner.
+    notice
+        Said in the middle: why there is no surface.
+    foreground, background
+        Colours of texts and axes, and behind everything.
+    """
+
+    vertices_mm: FloatArray
+    triangles: IntArray
+    values: FloatArray
+    label: str
+    limits: tuple[float, float]
+    diverging: bool = False
+    points_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    lines_mm: dict[str, FloatArray] = field(default_factory=dict)
+    rays_mm: dict[str, FloatArray] = field(default_factory=dict)
+    electrode: bool = True
+    exaggeration: float = EXAGGERATION
+    within_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    stamp: str = ""
+    notice: str = ""
+    foreground: str = "#202020"
+    background: str = "#ffffff"
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def scene_of(
+    reconstruction: Reconstruction,
+    colour: Literal["height", "sigma"] = "height",
+    limits: tuple[float, float] | None = None,
+) -> Scene:
+    """The pool's surface, its boundary and reflection points.
+
+    Parameters
+    ----------
+    reconstruction
+        The pool.
+    colour
+        By height, or by the height's standard uncertainty; by height where the scheme gives none.
+    limits
+        Ends of the colour scale, mm; None: those of this surface.
+    """
+    vertices, triangles = _known(*_mesh(reconstruction))
+    values, label = vertices[:, 2], HEIGHT
+    if colour == "sigma":
+        sigma = sigma_at(reconstruction, vertices[:, 0], vertices[:, 1])
+        if np.isfinite(sigma).all():
+            values, label = sigma, "± height (mm)"
+            limits = (0.0, float(sigma.max())) if limits is None else limits
+    return Scene(
+        vertices,
+        triangles,
+        values,
+        label,
+        _limits(values) if limits is None else limits,
+        points_mm=reconstruction.points_mm,
+        lines_mm={"boundary": _closed(reconstruction.boundary.points_mm)},
+    )
+
+
+def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
+    """The first pool coloured by its height minus the other's, where both are."""
+    vertices, triangles = _mesh(one)
+    # Slightly within, so that the rim of one of two equal boundaries is not lost to rounding.
+    x, y = (one.boundary.center_mm + (vertices[:, :2] - one.boundary.center_mm) * (1 - 1e-9)).T
+    difference = difference_at(one, other, x, y)
+    triangles = triangles[np.isfinite(difference[triangles]).all(axis=1)]
+    used, corners = np.unique(triangles, return_inverse=True)
+    values = difference[used]
+    reach = float(np.abs(values).max(initial=1e-6))
+    return Scene(
+        vertices[used],
+        corners.reshape(-1, 3),
+        values,
+        "difference (mm)",
+        (-reach, reach),
+        diverging=True,
+        lines_mm={"boundary": _closed(one.boundary.points_mm)},
+        within_mm=one.boundary.points_mm,  # there are no vertices where the two do not overlap
+    )
+
+
+def rays_of(reconstruction: Reconstruction, match: Match, rig: Rig) -> dict[str, FloatArray]:
+    """Ends of the incident and the reflected rays near the pool, by name, shapes (n, 2, 3), mm.
+
+    The reflected rays run to where the computed dots are on the imaging plane; rays without one
+    are left out.
+    """
+    met = np.isfinite(reconstruction.residual_mm).all(axis=1)
+    points = reconstruction.points_mm[met]
+    computed = match.plane_mm[met] + reconstruction.residual_mm[met]
+    seen = rig.imaging_plane.to_universal(computed)
+    return {
+        name: np.stack([points, points + RAY_MM * way / np.linalg.norm(way, axis=1)[:, None]], 1)
+        for name, way in (
+            ("incident", rig.laser.position_mm - points),
+            ("reflected", seen - points),
+        )
+    }
+
+
+def _mesh(reconstruction: Reconstruction) -> tuple[FloatArray, IntArray]:
+    """Vertices and triangles, as few as show the surface well: the view is to be quick."""
+    boundary = reconstruction.boundary
+    some = slice(None, None, max(len(boundary.points_mm) // SPOKES, 1))
+    thinned = replace(
+        boundary, theta_deg=boundary.theta_deg[some], points_mm=boundary.points_mm[some]
+    )
+    spacing_mm = drawn_spacing(reconstruction, SPACING_MM)
+    return surface_mesh(replace(reconstruction, boundary=thinned), spacing_mm)
+
+
+def _known(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
+    """The same without what is not known (NaN)."""
+    if np.isfinite(vertices).all():
+        return vertices, triangles
+    triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
+    used, corners = np.unique(triangles, return_inverse=True)
+    return vertices[used], corners.reshape(-1, 3)
+
+
+def _closed(line: FloatArray) -> FloatArray:
+    return np.vstack([line, line[:1]])
+
+
+def _limits(values: FloatArray) -> tuple[float, float]:
+    low, high = float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
+    return (low, high) if high > low else (min(low, 0.0), max(low, 0.0) + 1e-6)
+
+
+def empty_scene(
+    within_mm: FloatArray, limits: tuple[float, float], stamp: str, notice: str
+) -> Scene:
+    """A picture without a surface among others of a film; parameters as of `Scene`."""
+    return Scene(
+        *(EMPTY, np.empty((0, 3), int), np.empty(0), HEIGHT, limits),
+        electrode=False,
+        within_mm=within_mm,
+        stamp=stamp,
+        notice=notice,
+    )

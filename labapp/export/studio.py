@@ -1,0 +1,111 @@
+"""Scenes drawn off-screen, here or in a process of their own.
+
+VTK ends the process it runs in where there is no OpenGL.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.errors import InputError
+from labapp.export.drawing import Direction, Drawing, draw_without_display
+from labapp.export.scene import Scene
+
+PICTURE_PX = (1280, 720)
+"""Width and height of a picture by default."""
+
+Picture = npt.NDArray[np.uint8]
+
+
+class Studio:
+    """Draws scenes, all of one size and from one side, in one plotter.
+
+    It ends the process where nothing can be drawn: ask `can_draw`, or use `drawing_process`.
+
+    Parameters
+    ----------
+    size
+        Width and height of the pictures, px.
+    direction
+        Where from.
+
+    Raises
+    ------
+    ImportError
+        Without pyvista.
+    """
+
+    def __init__(self, size: tuple[int, int], direction: Direction) -> None:
+        import pyvista
+
+        draw_without_display()
+        self.plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(size))
+        self._drawing = Drawing(self.plotter)
+        self._direction = direction
+
+    def draw(self, scene: Scene) -> Picture:
+        """A picture, shape (height, width, 3), B, G, R."""
+        self._drawing.update(scene)
+        self._drawing.look(self._direction)
+        self.plotter.render()  # which a screenshot does the first time only
+        picture = self.plotter.screenshot(return_img=True)
+        return np.ascontiguousarray(picture[..., ::-1])
+
+
+def draw_scene(
+    scene: Scene, size: tuple[int, int] = PICTURE_PX, direction: Direction = "free"
+) -> Picture:
+    """Draw one scene; see `Studio`."""
+    studio = Studio(size, direction)
+    picture = studio.draw(scene)
+    studio.plotter.close()
+    return picture
+
+
+def drawing_process(
+    size: tuple[int, int] = PICTURE_PX, direction: Direction = "free"
+) -> ProcessPoolExecutor:
+    """A process to draw in, by `draw_there`; parameters as of `Studio`."""
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, context, initializer=_begin, initargs=(size, direction))
+
+
+def draw_there(scene: Scene) -> Picture:
+    """What a `drawing_process` does; its studio is made for the first picture."""
+    if "studio" not in _there:
+        _there["studio"] = Studio(*_there["view"])
+    picture: Picture = _there["studio"].draw(scene)
+    return picture
+
+
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """Turn what is missing to draw pictures of an export into what a user can act on."""
+    try:
+        yield
+    except ImportError as error:
+        wanted = f"{error.name}, which is not installed (pip install 'labapp[gui]')"
+        raise InputError("export", "pictures", what, wanted) from error
+    except BrokenProcessPool as error:
+        wanted = "a system on which OpenGL can be used; it cannot be used here"
+        raise InputError("export", "pictures", what, wanted) from error
+
+
+_there: dict[str, Any] = {}
+"""What a drawing process holds."""
+
+
+def _begin(*view: Any) -> None:
+    """Keep VTK's warnings off the terminal, and note what pictures are wanted."""
+    _there["view"] = view
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)

@@ -1,0 +1,1 @@
+"""A camera that is live: its picture, figures, surface, trends and limits."""

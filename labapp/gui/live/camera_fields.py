@@ -1,0 +1,278 @@
+"""What a live camera is set to: fields of the recording page, as many as the camera has."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
+from typing import Any
+
+from PySide6.QtCore import QObject, Signal
+from PySide6.QtWidgets import QHBoxLayout, QWidget
+
+from labapp.errors import InputError
+from labapp.gui.shell.steps import calibrations_in_use
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
+from labapp.gui.widgets.labels import wrapped
+from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
+from labapp.media.cameras.uvc import KIND
+from labapp.session.session import Session
+
+NUMBERS = {
+    "exposure_us": ("Exposure", "µs", 1, 100.0, "How long light is gathered for a frame"),
+    "gain_db": ("Gain", "dB", 1, 1.0, "Amplification: it brightens the noise, too"),
+    "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames a second"),
+}
+"""Label, unit, decimals, step and tip of what is set by a number."""
+
+TRIGGERS = {
+    "free": "by itself, at its rate",
+    "software": "when told: Take a frame",
+    "line": "at a signal on its input",
+}
+
+APPART = 1e-3
+"""What the camera takes is said where it is so far, as a part, from what was asked for."""
+
+PART_WORDS = (
+    "Sizes are right only where the imaging plane was calibrated with a picture of this very "
+    "region: dots are counted from its upper left corner"
+)
+
+Apply = Callable[[CameraSettings], "Future[CameraSettings] | None"]
+
+
+class CameraFields(QObject):
+    """Exposure, gain, rate, trigger and region, where the camera lets them be set.
+
+    Parameters
+    ----------
+    form
+        Where they stand.
+    apply
+        Sets the camera, between two frames; None: there is none.
+
+    Signals
+    -------
+    reset
+        Rate, trigger or region is another: frames are no longer as those before.
+    """
+
+    reset = Signal()
+
+    def __init__(self, form: FieldForm, apply: Apply) -> None:
+        super().__init__(form)
+        self._apply = apply
+        self._feed: Feed | None = None
+        self._calibrated: tuple[int, int] | None = None
+        self._answers: list[tuple[str, object, Future[CameraSettings]]] = []
+        self.fields: dict[str, Field] = {}
+        for name, (label, unit, decimals, step, tip) in NUMBERS.items():
+            self.fields[name] = NumberField(
+                label, unit, lowest=0, highest=1e9, decimals=decimals, step=step, tooltip=tip
+            )
+        self.trigger = self.fields["trigger"] = ChoiceField(
+            "Frames are taken", tooltip="What the camera waits for before it takes a frame"
+        )
+        self.region = self.fields["region"] = TextField(
+            "Region, px",
+            tooltip="The part of the sensor that is read: left, top, width, height. A smaller one "
+            "lets many cameras be faster",
+        )
+        for name, field in self.fields.items():
+            field.edited.connect(partial(self._set, name))
+            form.add(field)
+        self._make_buttons(form)
+
+    def _make_buttons(self, form: FieldForm) -> None:
+        self.whole_button = button(
+            "All of the sensor", "Read the whole sensor again", self._set_whole
+        )
+        self.shoot_button = button(
+            "Take a frame", "Have the camera take a frame now", self._take_frame
+        )
+        row = QWidget()
+        line = QHBoxLayout(row)
+        line.setContentsMargins(0, 0, 0, 0)
+        for each in (self.shoot_button, self.whole_button):
+            line.addWidget(each)
+        form.add_wide(row)
+        self.part_words = wrapped()
+        form.add_wide(self.part_words)
+
+    # --- what the camera is set to ------------------------------------------------------------
+
+    def show_camera(self, feed: Feed, calibrated: tuple[int, int] | None = None) -> None:
+        """Show what a camera that was opened is set to, and only what it lets be set.
+
+        Parameters
+        ----------
+        feed
+            The camera's.
+        calibrated
+            (rows, columns) of the picture that the imaging plane was calibrated with, px; None:
+            not known.
+        """
+        self._feed, self._calibrated = feed, calibrated
+        self._answers.clear()
+        for field in self.fields.values():
+            field.refuse("")  # what another camera refused
+        own_steps = feed.camera.info.kind == KIND  # which its driver does not tell in dB
+        self.fields["gain_db"].unit.setText("" if own_steps else NUMBERS["gain_db"][1])
+        self._show(feed.settings, feed.camera.limits)
+
+    def set_recording(self, recording: bool) -> None:
+        """Keep the size of the frames as it is while they are recorded."""
+        why = "Not while it records: a recording's frames are of one size"
+        for each in (self.region.editor, self.whole_button):
+            each.setEnabled(not recording)
+        self.region.editor.setToolTip(why if recording else self.region.label.toolTip())
+
+    def _show(self, settings: CameraSettings, limits: Limits) -> None:
+        there = {name: getattr(limits, name) is not None for name in NUMBERS}
+        there["trigger"] = len(limits.triggers) > 1
+        there["region"] = limits.least_region is not None
+        for name in NUMBERS:
+            field, span = self.fields[name], getattr(limits, name)
+            assert isinstance(field, NumberField)
+            if span is not None:
+                field.lowest, field.highest = span.lowest, span.highest
+            field.set_value(getattr(settings, name))
+        self.trigger.set_choices([(name, TRIGGERS[name]) for name in limits.triggers])
+        self.trigger.set_value(settings.trigger or "free")
+        whole = (0, 0, *limits.sensor)
+        self.region.set_value(region_in_words(settings.region or whole))
+        for name, field in self.fields.items():
+            for part in (field, field.label):
+                part.setVisible(there[name])
+        is_part = settings.region not in (None, whole)
+        self.whole_button.setVisible(there["region"] and is_part)
+        _, _, width, height = settings.region or whole
+        unlike = other_size(self._calibrated, (height, width))
+        if not unlike and is_part:
+            unlike = PART_WORDS
+        self.part_words.setText(f"⚠ {unlike}")
+        self.part_words.setVisible(bool(unlike))
+        self.shoot_button.setVisible(settings.trigger == "software")
+
+    # --- to set it ----------------------------------------------------------------------------
+
+    def _set(self, name: str, value: Any) -> None:
+        """Ask for another value; what comes of it is told by `take_answers`."""
+        if name == "region":
+            try:
+                value = region_of(value)
+            except InputError as error:
+                kept = None if self._feed is None else self._feed.settings.region
+                self.region.set_value("" if kept is None else region_in_words(kept))
+                self.region.refuse(f"“{error.value}” is not {error.expected}")
+                return
+        self._ask(name, value)
+
+    def _set_whole(self) -> None:
+        if self._feed is not None:
+            self._ask("region", (0, 0, *self._feed.camera.limits.sensor))
+
+    def _ask(self, name: str, value: Any) -> None:
+        answer = None if value is None else self._apply(CameraSettings(**{name: value}))
+        if answer is not None:
+            self._answers.append((name, value, answer))
+
+    def _take_frame(self) -> None:
+        if self._feed is not None:
+            self._feed.trigger()
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the camera has still to answer."""
+        return bool(self._answers)
+
+    def take_answers(self) -> None:
+        """Show what was really set, or why it was refused."""
+        for each in [each for each in self._answers if each[2].done()]:
+            self._answers.remove(each)
+            if self._feed is not None:
+                self._take(self._feed, *each)
+
+    def _take(self, feed: Feed, name: str, wanted: object, answer: Future[CameraSettings]) -> None:
+        try:
+            settings = answer.result()
+        except (CameraError, InputError) as error:
+            self._show(feed.settings, feed.camera.limits)
+            self._refuse(name, error)
+            return
+        self._show(settings, feed.camera.limits)
+        now = getattr(settings, name)
+        if isinstance(wanted, float | int) and now is not None:
+            differs = abs(now - wanted) > APPART * abs(wanted)
+        else:
+            differs = now != wanted
+        if differs and now is not None:
+            words = f"The camera takes {in_words(now)}, not {in_words(wanted)}"
+            self.fields[name].refuse(words)
+        if name in ("rate_hz", "trigger", "region"):
+            self.reset.emit()
+
+    def _refuse(self, name: str, error: CameraError | InputError) -> None:
+        """Say beside each field what is wrong with its value, and what would be right."""
+        if isinstance(error, CameraError):
+            self.fields[name].refuse(str(error))
+            return
+        for problem in error.problems:
+            words = f"{in_words(problem.value)} is refused; right is {problem.expected}"
+            self.fields.get(problem.field, self.fields[name]).refuse(words)
+
+
+def region_of(text: str) -> Region:
+    """The region that four numbers in a text tell.
+
+    Raises
+    ------
+    InputError
+        If they are not four whole numbers.
+    """
+    found = re.fullmatch(r"\s*(\d{1,6})" + r"[\s,;]+(\d{1,6})" * 3 + r"\s*", text)
+    if found is None:
+        expected = "four whole numbers: left, top, width, height (px)"
+        raise InputError("camera", "region", text.strip(), expected)
+    u, v, width, height = map(int, found.groups())
+    return u, v, width, height
+
+
+def region_in_words(region: Region) -> str:
+    """A region as it is typed."""
+    return ", ".join(map(str, region))
+
+
+def in_words(value: object) -> str:
+    """A value of a setting, for people."""
+    if isinstance(value, tuple):
+        return region_in_words(value)
+    if isinstance(value, str):
+        return f"“{TRIGGERS.get(value, value)}”"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def calibrated_px(session: Session) -> tuple[int, int] | None:
+    """(rows, columns) of the picture that the imaging plane in use was found in; None: unknown."""
+    kept = session.plane_calibration
+    if kept is None or not calibrations_in_use(session)[1]:
+        return None
+    try:
+        rows, columns = session.picture(kept.picture_sha256).shape
+    except InputError:
+        return None
+    return rows, columns
+
+
+def other_size(calibrated: tuple[int, int] | None, shape: tuple[int, int]) -> str:
+    """That frames, shape (rows, columns), are not as the calibration picture; empty if they are."""
+    if calibrated is None or calibrated == shape:
+        return ""
+    (rows, columns), (height, width) = calibrated, shape
+    return (
+        f"The imaging plane was calibrated with a picture of {columns}×{rows} px, and frames have "
+        f"{width}×{height} px: sizes are wrong. Calibrate with a picture of the same region"
+    )

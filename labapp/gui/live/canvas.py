@@ -1,0 +1,118 @@
+"""What is seen of a live camera: its picture, the surface, the trends, or who is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QFrame, QScrollArea, QStackedWidget, QTabBar, QVBoxLayout, QWidget
+
+from labapp.gui.live.figures import AlarmStrip
+from labapp.gui.live.streams import LiveStreams
+from labapp.gui.live.surface import LiveSurface
+from labapp.gui.live.trends import LiveTrends
+from labapp.gui.views.picture import PictureView
+from labapp.gui.workspace import Workspace
+from labapp.run.live_watch import Followed, LiveWatch
+
+PARTS = {
+    "picture": ("Picture", "What the camera sees"),
+    "surface": ("Surface", "The pool in 3-D as it is measured"),
+    "trends": ("Trends and limits", "Sizes of the last seconds, and the limits that raise alarms"),
+    "streams": ("Control software", "Tell other programs what is measured"),
+}
+
+
+class LiveCanvas(QWidget):
+    """A page's picture, beside which other parts can be chosen while a camera is measured.
+
+    Parameters
+    ----------
+    workspace
+        What is open.
+    picture
+        Where frames are shown.
+    watch
+        Gives what measures now; None while nothing does.
+    acknowledge
+        Called when the operator has seen the alarms.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        picture: PictureView,
+        watch: Callable[[], LiveWatch | None],
+        acknowledge: Callable[[], None],
+    ) -> None:
+        super().__init__()
+        self._watch = watch
+        self.alarms = AlarmStrip(acknowledge)
+        self.surface = LiveSurface()
+        self.trends = LiveTrends(workspace)
+        self.streams = LiveStreams(workspace, watch)
+        self.tabs = QTabBar()
+        self.tabs.setAccessibleName("What is seen of the live camera")
+        self.tabs.setDrawBase(False)
+        for k, (words, tip) in enumerate(PARTS.values()):
+            self.tabs.addTab(words)
+            self.tabs.setTabToolTip(k, tip)
+        self.stack = QStackedWidget()
+        for part in (picture, self.surface, _scrolled(self.trends), _scrolled(self.streams)):
+            self.stack.addWidget(part)
+        self.tabs.currentChanged.connect(self._choose)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setSpacing(2)
+        layout.addWidget(self.tabs)
+        layout.addWidget(self.stack, 1)
+        layout.addWidget(self.alarms)  # below: what is above stays under the hand
+        self.set_live(False)
+
+    @property
+    def part(self) -> str:
+        """What is seen: a key of `PARTS`."""
+        return list(PARTS)[self.stack.currentIndex()]
+
+    def set_live(self, live: bool) -> None:
+        """Offer all parts while a camera is measured, else the picture alone."""
+        self.tabs.setVisible(live)
+        if live:
+            self.trends.refresh()
+            self.streams.begin()
+        else:
+            self.tabs.setCurrentIndex(0)
+            self.surface.let_go()
+            self.alarms.keep_unseen()
+            self.streams.show_state()
+
+    def follow(self, followed: Followed | None, watch: LiveWatch) -> bool:
+        """Show what was measured, at the camera's pace; whether anything was."""
+        return self.surface.isVisible() and self.surface.follow(followed, watch)
+
+    def tell(self, watch: LiveWatch) -> None:
+        """Show what is renewed a few times a second."""
+        self.alarms.show_alarms(watch.alarms.shown)
+        if self.trends.isVisible():
+            self.trends.show_trend(watch)
+        elif self.streams.isVisible():
+            self.streams.show_state()
+
+    def _choose(self, index: int) -> None:
+        if self.part == "surface":
+            self.surface.clear()
+        self.stack.setCurrentIndex(index)
+        watch = self._watch()
+        if watch is not None:
+            self.tell(watch)
+
+
+def _scrolled(part: QWidget) -> QScrollArea:
+    """A part that scrolls where the screen is small."""
+    area = QScrollArea()
+    area.setWidget(part)
+    area.setWidgetResizable(True)
+    area.setFrameShape(QFrame.Shape.NoFrame)
+    area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+    area.setMinimumWidth(part.minimumSizeHint().width())
+    return area

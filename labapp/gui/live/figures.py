@@ -1,0 +1,270 @@
+"""Large figures of a live pool: its sizes, how they stand to their limits, and how old they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from PySide6.QtCore import QEvent, Qt
+from PySide6.QtGui import QAccessible, QAccessibleEvent, QPalette
+from PySide6.QtWidgets import QFrame, QGridLayout, QHBoxLayout, QLabel, QVBoxLayout, QWidget
+
+from labapp.gui.digits import NOTHING, plain
+from labapp.gui.theme import RED, is_dark
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.labels import Message, plain_label, wrapped
+from labapp.run.alarms import Alarm
+from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
+from labapp.run.live_watch import Followed, Pace
+
+DECIMALS = 3
+"""Of live figures, mm."""
+
+OLD_S = 2.0
+"""A figure that is older is not of the pool that is seen: it is not in order, whatever it is."""
+
+LARGE = 1.9
+"""A figure that is read from afar is so many times as large as others."""
+
+ACKNOWLEDGE_PX = 40
+"""Least height of a button that is pressed in gloves."""
+
+Look = Literal["plain", "alarm", "old"]
+
+FIRST = "Measuring the first frame: that takes some seconds …"
+NO_SETUP = "Sizes stand here, too, when the set-up is complete (steps 1 to 3)"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A size as it is shown.
+
+    Parameters
+    ----------
+    name, value, sigma, unit
+        Texts.
+    told
+        How it stands to its limits, in words after a sign; empty where it has none.
+    look
+        In red, or pale.
+    """
+
+    name: str
+    value: str
+    sigma: str
+    unit: str
+    told: str = ""
+    look: Look = "plain"
+
+
+def figures(
+    followed: Followed | None, limits: Limits | None = None, age_s: float = 0.0
+) -> tuple[Figure, ...]:
+    """Width, length and height, of a hollow pool the depth.
+
+    All with as many decimals, whatever the ±: nothing jumps as they change.
+
+    Parameters
+    ----------
+    followed
+        The frame measured last; None before one was.
+    limits
+        Of the sizes; None: there are none.
+    age_s
+        How old the frame is, s.
+    """
+    sizes = sizes_of(None) if followed is None else followed.sizes
+    return tuple(_figure(size, limits or Limits(), age_s > OLD_S) for size in sizes)
+
+
+def _figure(size: Size, limits: Limits, is_old: bool) -> Figure:
+    known = np.isfinite(size.value_mm)
+    stands = standing(size, limits.of(size.name))
+    if stands and is_old:
+        stands = "unknown"
+    return Figure(
+        size.name.capitalize(),
+        plain(size.value_mm, DECIMALS) if known else NOTHING,
+        f"± {plain(size.sigma_mm, DECIMALS)}" if np.isfinite(size.sigma_mm) else "",
+        "mm",
+        standing_in_words(stands, limits, size.name),
+        "alarm" if stands in ("low", "high") else "old" if is_old else "plain",
+    )
+
+
+def standing_in_words(stands: Standing, limits: Limits, name: str) -> str:
+    """How a size stands, in a few words after a sign."""
+    low, high = limits.of(name)
+    if stands == "low":
+        return f"▲ below {low:g}"
+    if stands == "high":
+        return f"▲ above {high:g}"
+    return {
+        "": "",
+        "unknown": "? not known",
+        "in order": "✓ in order",
+        "in doubt": "◆ at its limit",
+    }[stands]
+
+
+def pace_in_words(
+    followed: Followed | None, pace: Pace, came_hz: float | None, age_s: float
+) -> str:
+    """How measuring keeps up, and why there is no figure where there is none."""
+    if followed is None:
+        return FIRST
+    told = []
+    if followed.found.measures is None:
+        told.append(f"▲ Not measured ({followed.found.status}): {followed.found.reason}.")
+    elif pace.failed:
+        told.append(f"◆ {pace.failed} of the last {pace.tried} frames could not be measured.")
+    if age_s > OLD_S:
+        told.append(f"▲ The figures are {age_s:.0f} s old.")
+    came = f" of {came_hz:.1f}" if came_hz is not None else ""
+    told.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
+    if age_s <= OLD_S:
+        told[-1] += f"; {age_s:.2f} s old"
+    return " ".join(told)
+
+
+class LiveFigures(QWidget):
+    """Results in large figures, to be read from where the work is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        self._grid = QGridLayout()
+        self._grid.setColumnStretch(1, 1)
+        column.addLayout(self._grid)
+        self.words = Message(3)
+        column.addWidget(self.words)
+        self._labels: dict[tuple[int, int], QLabel] = {}
+        self._looks: dict[QLabel, tuple[Look, bool]] = {}
+
+    def show_figures(self, shown: Sequence[Figure]) -> None:
+        """Show figures, each in a row, and no others."""
+        for (row, _), label in self._labels.items():
+            label.setVisible(row < len(shown))
+        for row, figure in enumerate(shown):
+            name = f"{figure.name}\n{figure.told}" if figure.told else figure.name
+            texts = (name, figure.value, figure.sigma, figure.unit)
+            for column, text in enumerate(texts):
+                label = self._label(row, column)
+                label.setText(text)
+                self._dress(label, figure.look)
+
+    def show_words(self, words: str) -> None:
+        """Say how measuring keeps up."""
+        self.words.setText(words)
+
+    def _label(self, row: int, column: int) -> QLabel:
+        if (row, column) not in self._labels:
+            label = self._labels[row, column] = plain_label()
+            if column in (1, 2):
+                label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+            if column == 1:
+                font = label.font()
+                font.setPointSizeF(LARGE * font.pointSizeF())
+                font.setBold(True)
+                label.setFont(font)
+            self._grid.addWidget(label, row, column)
+        return self._labels[row, column]
+
+    def _dress(self, label: QLabel, look: Look) -> None:
+        """Colour a label; only where that changes, for it is dear."""
+        dark = is_dark(self.palette())
+        if self._looks.get(label, ("plain", dark)) == (look, dark):
+            return
+        self._looks[label] = look, dark
+        colours = QPalette()
+        if look == "alarm":
+            colours.setColor(QPalette.ColorRole.WindowText, RED[dark])
+        elif look == "old":
+            pale = self.palette().color(QPalette.ColorRole.PlaceholderText)
+            colours.setColor(QPalette.ColorRole.WindowText, pale)
+        label.setPalette(colours)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_looks"):
+            for label, (look, _) in list(self._looks.items()):
+                self._dress(label, look)
+
+
+class AlarmStrip(QFrame):
+    """What the operator must see, below the picture, and the button that says it was seen.
+
+    Parameters
+    ----------
+    acknowledge
+        Called when it was.
+    """
+
+    def __init__(self, acknowledge: Callable[[], None]) -> None:
+        super().__init__()
+        self.setFrameShape(QFrame.Shape.Box)
+        self.words = wrapped()
+        font = self.words.font()
+        font.setBold(True)
+        self.words.setFont(font)
+        self.button = button(
+            "Acknowledge", "Say that the alarms were seen (A); those that hold stay", acknowledge
+        )
+        self.button.setMinimumHeight(ACKNOWLEDGE_PX)
+        row = QHBoxLayout(self)
+        row.setContentsMargins(6, 2, 6, 2)
+        row.addWidget(self.words, 1)
+        row.addWidget(self.button)
+        self._alarms: tuple[Alarm, ...] = ()
+        self._kept: tuple[Alarm, ...] = ()
+        self._paint()
+        self.hide()
+
+    def _paint(self) -> None:
+        colours = QPalette()
+        colours.setColor(QPalette.ColorRole.WindowText, RED[is_dark(colours)])
+        for widget in (self, self.words):
+            widget.setPalette(colours)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_kept"):
+            self._paint()
+
+    def show_alarms(self, alarms: Sequence[Alarm]) -> None:
+        """Show alarms, after those that are kept; none hides it."""
+        alarms = (*self._kept, *alarms)
+        told = alarms_in_words(alarms)
+        if told != self.words.text():
+            self.words.setText(told)
+            # A screen reader says it at once.
+            alert = QAccessibleEvent(self.words, QAccessible.Event.Alert)
+            QAccessible.updateAccessibility(alert)
+        self.button.setEnabled(not all(alarm.acknowledged for alarm in alarms))
+        self.setVisible(bool(alarms))
+        self._alarms = alarms
+
+    def keep_unseen(self) -> None:
+        """Keep what was not acknowledged until it is: the camera is watched no more."""
+        unseen = (alarm for alarm in self._alarms if not alarm.acknowledged)
+        self._kept = tuple(replace(alarm, holds=False) for alarm in unseen)
+        self.show_alarms(())
+
+    def let_go(self) -> None:
+        """Keep none any longer, and show none."""
+        self._kept = ()
+        self.show_alarms(())
+
+
+def alarms_in_words(alarms: Sequence[Alarm]) -> str:
+    """Alarms, a line each."""
+    lines = []
+    for alarm in alarms:
+        sign = "▲ ALARM" if alarm.holds else "△ over"
+        lines.append(f"{sign}: {alarm.told}{', acknowledged' * alarm.acknowledged}")
+    return "\n".join(lines)

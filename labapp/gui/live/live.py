@@ -1,0 +1,494 @@
+"""A camera that is watched and recorded from, without widgets; its frames come in threads."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import shutil
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from labapp.config.setup import Setup
+from labapp.core.images.band_pass import Exposure, quick_dots
+from labapp.core.images.dots import Dots
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.quality import UNMEASURED, Quality, judge_quality
+from labapp.core.rows.detection import find_dots
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.errors import InputError
+from labapp.log import NAME
+from labapp.media import GreyImage
+from labapp.media.cameras import Camera, CameraFrame, CameraInfo, CameraSettings, Feed
+from labapp.media.events import Event
+from labapp.media.recording.recorder import Plan, Recorder
+from labapp.media.recording.take_files import Take
+from labapp.run.limits import Limits
+from labapp.run.live_measuring import LiveMeasuringEnded
+from labapp.run.live_queue import newest_of
+from labapp.run.live_watch import RATE_S, LiveWatch
+from labapp.session.session import Session
+from labapp.words import several, size_in_words
+
+SIMULATED = "simulated"
+"""Id of the simulated camera."""
+
+SHOW_S, LOOK_S = 0.025, 0.25
+"""Dots are looked for in a frame, and a frame is judged no more often."""
+
+LIGHT_S = 1.0
+"""Noise and size of the dots are told anew so often: it takes a seventh of a second."""
+
+IDLE_S = 0.005
+
+STATES = {
+    "opening": ("○", "Opening the camera …"),
+    "running": ("●", "Live"),
+    "stalled": ("▲", "No frame comes, though it is connected: what is missing is not recorded"),
+    "lost": ("▲", "Not connected: it is tried again and again. What was recorded is kept"),
+    "ended": ("▲", "It has ended: start it again"),
+}
+
+WAITS = {
+    "software": "Live, takes a frame when it is told to",
+    "line": "Live, takes a frame at a signal on its input",
+}
+"""Of a camera that takes none by itself, by its trigger."""
+
+_Work = tuple[str, Callable[[], CameraFrame | None], Callable[[CameraFrame], None], float, float]
+"""What a thread does: its name, which frame is next, what is done with it, how often at most, and
+how long it rests, of what that took."""
+
+
+def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
+    """(id, words) of the cameras to choose from: those that are connected, and the simulated."""
+    named = [(info.id, f"{info.name} ({info.kind})") for info in found]
+    return [*named, (SIMULATED, "Simulated camera")]
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What was found in a frame.
+
+    Parameters
+    ----------
+    dots_px
+        (u, v) of its dots, shape (n, 2); None where they come with the frames that are shown.
+    quality
+        Whether it is fit to be measured.
+    room_byte
+        Free on the disk; None where that cannot be told.
+    """
+
+    dots_px: FloatArray | None
+    quality: Quality
+    room_byte: int | None
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A frame to be shown.
+
+    Parameters
+    ----------
+    frame
+        As the camera gave it.
+    dots_px
+        (u, v) of its dots, shape (n, 2); None where it is not known how to find them quickly.
+    """
+
+    frame: CameraFrame
+    dots_px: FloatArray | None
+
+
+class Live:
+    """A camera at work: its newest frame to look at, and what is recorded of it.
+
+    Made at once; `open` and `close` wait, and belong into a task. The other methods are quick.
+
+    Parameters
+    ----------
+    name
+        Of the camera.
+    place
+        Gives the file of a recording that begins.
+    plan
+        What is recorded.
+    wanted
+        What the camera is set to.
+    settings
+        Of the measurement.
+    setup
+        Rig and image calibration that frames are measured by; None: they are only looked at.
+    limits
+        Of the sizes that are measured.
+
+    Attributes
+    ----------
+    watch
+        Measures the frames; None where there is no set-up, and before the camera is open.
+    takes
+        The recordings made, in their order.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        place: Callable[[], Path],
+        plan: Plan,
+        wanted: CameraSettings,
+        settings: Settings,
+        setup: Setup | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        self.name = name
+        self.plan = plan
+        self.takes: list[Take] = []
+        self.feed: Feed | None = None
+        self.watch: LiveWatch | None = None
+        self._place, self._folder, self._wanted = place, place().parent, wanted
+        self._settings, self._setup, self._limits = settings, setup, limits or Limits()
+        self._dots = settings.dots
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._to_show: deque[CameraFrame] = deque(maxlen=1)
+        self._to_judge: deque[CameraFrame] = deque(maxlen=1)
+        self._newest: deque[Shown] = deque(maxlen=1)
+        self._judged: deque[Looked] = deque(maxlen=1)
+        self._recorders: list[Recorder] = []
+        self._told: set[Path] = set()
+        self._discarded: list[Take] = []
+        self._counted: deque[tuple[float, int]] = deque()
+        self._frame_byte = 0
+        self._is_stale = False
+        self._closing = threading.Event()
+        self._turn = threading.Lock()
+        self._light: Exposure | None = None
+        self._light_s = 0.0
+        self._workers: list[threading.Thread] = []
+
+    # --- begin and end ------------------------------------------------------------------------
+
+    def open(self, opened: Callable[[], Camera]) -> None:
+        """Open the camera and let frames come, unless it was closed meanwhile.
+
+        Raises
+        ------
+        InputError, CameraError
+            If it cannot be opened, or set so.
+        """
+        feed = Feed(self.name, opened, self._take, self._say, self._wanted)
+        with self._turn:
+            if not self._closing.is_set():
+                self.feed = feed
+                self._recorders = [self._recorder(feed)]
+                if self._setup is not None:
+                    given = (self._setup, self._settings, feed.bit_depth, self._limits)
+                    self.watch = LiveWatch(self.name, *given, self._say)
+                self._begin_work()
+                return
+        feed.stop()
+
+    def close(self) -> None:
+        """End the recording, write all of it, and let go of the camera. Twice does no harm."""
+        with self._turn:
+            self._closing.set()
+        if self.feed is not None:
+            self.feed.stop()
+            if self.watch is not None:
+                self.watch.close()
+            for worker in self._workers:
+                worker.join()
+        for recorder in self._recorders:
+            recorder.close()
+        self._delete_discarded()
+
+    def _delete_discarded(self) -> None:
+        while self._discarded:
+            take = self._discarded.pop()
+            for path in (take.path, take.notes):
+                try:
+                    path.unlink(missing_ok=True)
+                except OSError as error:
+                    words = f"cannot be deleted: {error.strerror}"
+                    self._events.put(Event(path.name, "warning", words))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether frames come, or will when the camera is back."""
+        return self.feed is not None and not self._closing.is_set()
+
+    def _recorder(self, feed: Feed) -> Recorder:
+        self._is_stale = False
+        return Recorder(
+            self._place, self.plan, feed.bit_depth, feed.settings.rate_hz, self._events.put
+        )
+
+    # --- in the camera's thread ---------------------------------------------------------------
+
+    def _take(self, frame: CameraFrame) -> None:
+        self._renew()
+        for recorder in self._recorders[-1:]:
+            recorder.take(frame)
+        self._to_show.append(frame)
+        self._to_judge.append(frame)
+        if self.watch is not None:
+            self.watch.take(frame)
+
+    def _say(self, event: Event, time_s: float | None = None) -> None:
+        self._events.put(event)
+        for recorder in self._recorders[-1:]:
+            recorder.note(event, time_s)
+
+    # --- in threads of their own --------------------------------------------------------------
+
+    def _begin_work(self) -> None:
+        works: list[_Work] = [
+            ("dots", partial(newest_of, self._to_show), self._find_quickly, SHOW_S, 1.0),
+            ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
+        ]
+        if self.watch is not None:
+            # That is done elsewhere, and what is left out makes the steps longer: no rest.
+            works.append(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
+        for work in works:
+            name = f"live {work[0]}"
+            worker = threading.Thread(target=self._work_on, args=work, name=name, daemon=True)
+            self._workers.append(worker)
+            worker.start()
+
+    def _work_on(
+        self,
+        what: str,
+        following: Callable[[], CameraFrame | None],
+        work: Callable[[CameraFrame], None],
+        every_s: float,
+        rest: float,
+    ) -> None:
+        """Do something with one frame after the other, and nothing in between."""
+        try:
+            while not self._closing.is_set():
+                frame = following()
+                if frame is None:
+                    self._closing.wait(IDLE_S)
+                    continue
+                began_s = time.monotonic()
+                work(frame)
+                took_s = time.monotonic() - began_s
+                self._closing.wait(max(every_s - took_s, rest * took_s))
+        except Exception as error:
+            if self._closing.is_set() and isinstance(error, LiveMeasuringEnded):
+                return
+            logging.getLogger(NAME).exception("live %s", what)
+            words = f"a fault in the program has ended its {what}: {error!r}"
+            self._events.put(Event(self.name, "warning", words))
+
+    def _find_quickly(self, frame: CameraFrame) -> None:
+        light, places = self._light, None
+        if light is not None and _fits(light, frame.image):
+            places = _places_px(self._dots_in(frame.image, light))
+        self._newest.append(Shown(frame, places))
+
+    def _dots_in(self, image: GreyImage, light: Exposure | None) -> Dots | None:
+        """Dots of a frame, quickly where its light is known; None if there is none."""
+        try:
+            if light is not None:
+                return quick_dots(image, light, self._dots.band_pass)
+            return find_dots(image, self._dots)
+        except CannotMeasure:
+            return None
+
+    def _judge(self, frame: CameraFrame) -> None:
+        quick = self._dots.method == "band-pass"
+        now_s, known = time.monotonic(), self._light
+        if quick and (known is None or now_s > self._light_s or not _fits(known, frame.image)):
+            self._light = Exposure.of(frame.image, self._dots.band_pass)
+            self._light_s = now_s + LIGHT_S
+        dots = self._dots_in(frame.image, self._light)
+        found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
+        depth = None if self.feed is None else self.feed.bit_depth
+        quality = judge_quality(frame.image, found, depth, rays_of(self._setup))
+        self._frame_byte = frame.image.nbytes
+        try:
+            room_byte = shutil.disk_usage(self._folder).free
+        except OSError:
+            room_byte = None
+        places = None if quick else _places_px(dots)
+        self._judged.append(Looked(places, quality, room_byte))
+
+    # --- to look at ---------------------------------------------------------------------------
+
+    def newest(self) -> Shown | None:
+        """The newest frame; None if it was given already."""
+        return self._newest.popleft() if self._newest else None
+
+    def looked(self) -> Looked | None:
+        """What was found in the frame judged last; None if it was given already."""
+        return self._judged.popleft() if self._judged else None
+
+    def events(self) -> list[Event]:
+        """What has happened since it was asked last."""
+        return [self._events.get() for _ in range(self._events.qsize())]
+
+    def ended_takes(self) -> list[Take]:
+        """Recordings that are written to their end, each given once."""
+        ended = [t for t in self.takes if t.finished.is_set() and t.path not in self._told]
+        self._told |= {take.path for take in ended}
+        return ended
+
+    @property
+    def running(self) -> Take | None:
+        """The recording that frames go into now."""
+        return self._recorders[-1].running if self._recorders else None
+
+    def rate_hz(self) -> float | None:
+        """Frames a second that came of late; None while that is not known."""
+        now_s, counted = time.monotonic(), self._counted
+        counted.append((now_s, 0 if self.feed is None else self.feed.counts.frames))
+        while len(counted) > 2 and counted[1][0] < now_s - RATE_S:
+            counted.popleft()
+        (first_s, first), (last_s, last) = counted[0], counted[-1]
+        return (last - first) / (last_s - first_s) if last_s - first_s > RATE_S / 2 else None
+
+    def state_in_words(self) -> str:
+        """Whether frames come, and how many."""
+        state = "opening" if self.feed is None else self.feed.state
+        rate = self.rate_hz()
+        sign, words = STATES[state]
+        if state == "running" and self.feed is not None:
+            words = WAITS.get(self.feed.settings.trigger or "", words)
+        fast = f", {rate:.1f} frames/s" if state == "running" and rate is not None else ""
+        return f"{sign} {words}{fast}"
+
+    def counts_in_words(self) -> str:
+        """What came, and what did not."""
+        if self.feed is None:
+            return ""
+        counts = self.feed.counts
+        told = [several(counts.frames, "frame")]
+        told += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
+        told += [f"lost {several(counts.lost, 'time')}"] * (counts.lost > 0)
+        return ", ".join(told)
+
+    def ring(self) -> tuple[float, str]:
+        """How full the memory of what comes before a trigger is, 0 … 1, and that in words."""
+        recorder = self._recorders[-1] if self._recorders else None
+        wanted_s = (recorder or self).plan.before_s
+        if not wanted_s:
+            return 0.0, "nothing before the trigger"
+        kept_s = 0.0 if recorder is None else min(wanted_s, recorder.ring_s)
+        return kept_s / wanted_s, f"{kept_s:.1f} of {wanted_s:g} s"
+
+    def recording_in_words(self, room_byte: int | None) -> str:
+        """What is being recorded, or what became of the last recording, and for how long is room.
+
+        Parameters
+        ----------
+        room_byte
+            Free on the disk; None: not known yet.
+        """
+        take, told = self.running, []
+        if take is not None:
+            told = [f"● Recording: {several(take.frames, 'frame')} written, {take.lost} lost"]
+            told += [f"▲ {take.trouble}"] * bool(take.trouble)
+        elif self.takes and not self.takes[-1].finished.is_set():
+            told = [f"Writing the rest of {self.takes[-1].path.name}"]
+        elif self.takes:
+            told = [f"{self.takes[-1].path.name}: {self.takes[-1].summary.words}"]
+        rate = self.rate_hz()
+        if room_byte is not None and rate:
+            room_s = room_byte / (self._frame_byte * rate / self.plan.every)
+            told.append(f"room for {_lasting(room_s)} ({size_in_words(room_byte)})")
+        return "; ".join(told)
+
+    # --- to do --------------------------------------------------------------------------------
+
+    def trigger(self) -> None:
+        """Begin a recording, or end the one that runs.
+
+        Raises
+        ------
+        InputError
+            If there is a file of that name already.
+        """
+        if not self.is_open:
+            return
+        with self._turn:
+            recorder = self._recorders[-1]
+            if recorder.running is not None:
+                recorder.stop()
+                return
+            self.takes.append(recorder.trigger())
+        if self.watch is not None:
+            for event, time_s in self.watch.standing():
+                recorder.note(event, time_s)
+
+    def discard(self, take: Take) -> bool:
+        """End a recording and have `close` delete it; False if it had ended before: it is kept."""
+        with self._turn:
+            if self.running is not take:
+                return False
+            self._recorders[-1].stop()
+        self._told.add(take.path)
+        self._discarded.append(take)
+        return True
+
+    def mark(self) -> None:
+        """Note the present frame beside the recording that runs."""
+        self._say(Event(self.name, "note", "marked by hand"))
+
+    def set_plan(self, plan: Plan) -> None:
+        """Record otherwise, and forget frames of before: from now on, or from a recording's end."""
+        self.plan = plan
+        self._is_stale = True
+        self._renew()
+
+    def _renew(self) -> None:
+        """Give what follows to another recorder where one is wanted and nothing is recorded."""
+        if not self._is_stale:
+            return
+        with self._turn:
+            if self.feed is None or self.running is not None or self._closing.is_set():
+                return
+            former = self._recorders[-1]
+            self._recorders.append(self._recorder(self.feed))
+        # What it has still to write is waited for elsewhere; `close` waits for it, too.
+        threading.Thread(target=former.close, name="recorder ends", daemon=True).start()
+
+    def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
+        """Set the camera between two frames; what it is set to is answered when it is."""
+        return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
+
+
+def _fits(light: Exposure, image: GreyImage) -> bool:
+    return light.noise.shape == image.shape
+
+
+def _places_px(dots: Dots | None) -> FloatArray:
+    return np.zeros((0, 2)) if dots is None else dots.image_px
+
+
+def rays_of(setup: Setup | None) -> int | None:
+    """How many rays the lens makes; None where the set-up is not complete."""
+    return None if setup is None else setup.rig.pattern.rows * setup.rig.pattern.columns
+
+
+def setup_of(session: Session) -> Setup | None:
+    """The set-up of a session; None where it is not complete."""
+    try:
+        return session.setup
+    except InputError:
+        return None
+
+
+def _lasting(seconds: float) -> str:
+    """A time in words: the larger, the coarser."""
+    for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"

@@ -1,0 +1,126 @@
+"""What of a camera's frames is recorded: fields of the recording page."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import QObject, Signal
+
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.labels import wrapped
+from labapp.media.recording.nut import Codec
+from labapp.media.recording.recorder import Plan
+from labapp.words import size_in_words
+
+BEFORE_S = 2.0
+
+CODECS: dict[Codec, str] = {"raw": "Raw: large, quick", "ffv1": "FFV1: small, slow"}
+
+COSTS: dict[Codec, tuple[float, float]] = {"raw": (1.0, 2.3e-9), "ffv1": (0.42, 15e-9)}
+"""Part of a frame's bytes that is written, and seconds of a core a byte (docs/cameras.md)."""
+
+SHARE = 0.5
+"""Work for more of a core than this is warned of: the rest is wanted for measuring live."""
+
+
+class PlanFields(QObject):
+    """Fields for a `Plan`.
+
+    Parameters
+    ----------
+    form
+        Where they stand.
+
+    Signals
+    -------
+    edited
+        Another plan was entered.
+    """
+
+    edited = Signal()
+
+    def __init__(self, form: FieldForm) -> None:
+        super().__init__(form)
+        form.add_heading("Recording")
+        self.before = NumberField(
+            "Before the trigger",
+            "s",
+            lowest=0,
+            highest=600,
+            decimals=1,
+            tooltip="So much from before the trigger is recorded, too: it is kept in memory",
+        )
+        self.before.set_value(BEFORE_S)
+        self.after = NumberField(
+            "After it",
+            "s",
+            lowest=0.1,
+            highest=86_400,
+            decimals=1,
+            optional=True,
+            tooltip="The recording ends so long after the trigger; empty: when you end it",
+        )
+        self.every = NumberField(
+            "Every n-th frame",
+            lowest=1,
+            highest=10_000,
+            decimals=0,
+            tooltip="1: every frame is recorded; 2: every second one …",
+        )
+        self.every.set_value(1)
+        self.codec = ChoiceField(
+            "Written as",
+            list(CODECS.items()),
+            tooltip="Both are without loss. Raw takes what the disk takes; FFV1 is less than half "
+            "the size, for six times the work",
+        )
+        for field in (self.before, self.after, self.every, self.codec):
+            field.edited.connect(lambda _: self.edited.emit())
+            form.add(field)
+        self.cost = wrapped()
+        form.add_wide(self.cost)
+
+    def plan(self) -> Plan:
+        """What they hold."""
+        return Plan(
+            before_s=self.before.value() or 0.0,
+            after_s=self.after.value(),
+            every=int(self.every.value() or 1),
+            codec="ffv1" if self.codec.value() == "ffv1" else "raw",
+        )
+
+    def show_cost(self, frame_byte: int, rate_hz: float | None) -> None:
+        """Say what recording so costs; nothing while size or rate of the frames is not known."""
+        words = ""
+        if frame_byte and rate_hz:
+            words = cost_in_words(self.plan(), frame_byte, rate_hz)
+        if words != self.cost.text():
+            self.cost.setText(words)
+
+    def set_enabled(self, enabled: bool) -> None:
+        """Let another plan be entered, or not."""
+        for field in (self.before, self.after, self.every, self.codec):
+            field.setEnabled(enabled)
+
+
+def cost_in_words(plan: Plan, frame_byte: int, rate_hz: float) -> str:
+    """What recording by a plan costs, about: disk and work.
+
+    Parameters
+    ----------
+    plan
+        What is recorded.
+    frame_byte
+        Size of a frame in memory.
+    rate_hz
+        Frames a second of the camera.
+    """
+    part, core_s = COSTS[plan.codec]
+    byte_s = frame_byte * rate_hz / plan.every
+    core = core_s * byte_s
+    told = (
+        f"About {size_in_words(round(part * byte_s))} a second, {max(1, round(100 * core))} % of a "
+        "core"
+    )
+    if plan.codec == "ffv1" and core > SHARE:
+        lost = "frames will be lost" if core > 1 else "little is left to measure live"
+        return f"⚠ {told}: {lost}. Raw takes {max(1, round(100 * COSTS['raw'][1] * byte_s))} %"
+    return told

@@ -1,0 +1,89 @@
+"""The bar below a live picture: how the camera is, and what records from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from PySide6.QtGui import QPalette
+from PySide6.QtWidgets import QHBoxLayout, QProgressBar, QVBoxLayout, QWidget
+
+from labapp.gui.live.live import Live
+from labapp.gui.theme import RED, is_dark
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.labels import Message, plain_label
+
+BUTTON_PX, RING_BAR_PX = 44, 130
+"""Least height of the buttons that are pressed in gloves; width of the bar beside them."""
+
+
+class RecordBar(QWidget):
+    """Records, marks and stops; tells whether frames come and what becomes of them.
+
+    Parameters
+    ----------
+    trigger
+        Begins a recording, or ends the one that runs.
+    mark
+        Notes this moment beside it.
+    stop
+        Lets go of the camera.
+    """
+
+    def __init__(
+        self,
+        trigger: Callable[[], object],
+        mark: Callable[[], object],
+        stop: Callable[[], object],
+    ) -> None:
+        super().__init__()
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(8, 2, 8, 4)
+        self.state = Message(1)
+        self.ring = QProgressBar()
+        self.ring.setRange(0, 100)
+        self.ring.setFixedWidth(RING_BAR_PX)
+        self.ring.setToolTip("How much from before the trigger is in memory")
+        line = QHBoxLayout()
+        line.addWidget(self.state, 1)
+        line.addWidget(plain_label("Before the trigger:"))
+        line.addWidget(self.ring)
+        layout.addLayout(line)
+        self.recording = Message(2)
+        layout.addWidget(self.recording)
+        row = QHBoxLayout()
+        self.record_button = button(
+            "● Record",
+            "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
+            trigger,
+        )
+        self.mark_button = button(
+            "Mark", "Note this moment beside the recording that runs (M)", mark
+        )
+        stop_button = button(
+            "Stop the camera", "Let go of the camera; a recording is written first", stop
+        )
+        for each, wide in ((self.record_button, 3), (self.mark_button, 1), (stop_button, 2)):
+            each.setMinimumHeight(BUTTON_PX)
+            row.addWidget(each, wide)
+        layout.addLayout(row)
+
+    def tell(self, live: Live, room_byte: int | None) -> None:
+        """Tell how a camera is, and what is recorded; ``room_byte`` is free on the disk."""
+        self.state.setText(live.state_in_words())
+        part, told = live.ring()
+        self.ring.setValue(round(100 * part))
+        self.ring.setFormat(told)
+        self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
+        self.recording.setText(live.recording_in_words(room_byte))
+
+    def show_recording(self, recording: bool) -> None:
+        """Let the button that records say whether it does: by its words, its sign, and in red."""
+        self.mark_button.setEnabled(recording)
+        pressed = self.record_button
+        pressed.setText("■ End the recording" if recording else "● Record")
+        palette, font = QPalette(), pressed.font()
+        if recording:
+            palette.setColor(QPalette.ColorRole.ButtonText, RED[is_dark(palette)])
+        font.setBold(True)
+        pressed.setPalette(palette)
+        pressed.setFont(font)

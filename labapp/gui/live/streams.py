@@ -1,0 +1,187 @@
+"""Telling live measures to control software: switched on, and what became of it in words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from PySide6.QtWidgets import QCheckBox, QGridLayout, QVBoxLayout, QWidget
+
+from labapp.errors import InputError
+from labapp.gui.tasks import Control, Task
+from labapp.gui.widgets.fields import NumberField
+from labapp.gui.widgets.labels import Message, headed, wrapped
+from labapp.gui.workspace import Workspace
+from labapp.run.live_watch import LiveWatch
+from labapp.run.streams import Stream, open_stream
+from labapp.words import several
+
+KINDS = {
+    "lines": (
+        "Lines of JSON over TCP",
+        5020,
+        "A line a frame, to every program that connects",
+    ),
+    "opcua": (
+        "OPC UA",
+        4840,
+        "The newest frame as variables in Objects/Pool, some twenty times a second",
+    ),
+}
+"""What can be switched on: words, usual port, tip."""
+
+OWN, ANY = "127.0.0.1", "0.0.0.0"
+
+WARNING = (
+    "⚠ Any machine that reaches this one can read the measures then: nobody is asked who they are, "
+    "and nothing is hidden. Keep a firewall round it."
+)
+
+PORT_PX = 140
+
+IN_USE = "Choose another port, or end the program that has this one."
+
+
+class LiveStreams(QWidget):
+    """What is told while a camera is watched; all of it is off at every start.
+
+    Parameters
+    ----------
+    workspace
+        Where work is done and problems are said.
+    watch
+        Gives what measures now; None while nothing does.
+    """
+
+    def __init__(self, workspace: Workspace, watch: Callable[[], LiveWatch | None]) -> None:
+        super().__init__()
+        self._workspace, self._watch = workspace, watch
+        self.boxes: dict[str, QCheckBox] = {}
+        self.ports: dict[str, NumberField] = {}
+        self.words = {kind: Message(2) for kind in KINDS}
+        self._problems: dict[str, str] = {}
+        self._tasks: dict[str, Task] = {}
+        outer = QVBoxLayout(self)
+        outer.setContentsMargins(8, 8, 8, 8)
+        group, layout = headed("Tell control software every frame that is measured")
+        outer.addWidget(group)
+        grid = QGridLayout()
+        grid.setColumnStretch(3, 1)
+        layout.addLayout(grid)
+        for row, (kind, (words, port, tip)) in enumerate(KINDS.items()):
+            box = self.boxes[kind] = QCheckBox(words)
+            box.setToolTip(tip)
+            box.toggled.connect(partial(self._switch, kind))
+            field = self.ports[kind] = NumberField(
+                "port", lowest=1024, highest=65_535, decimals=0, tooltip=f"Port of {words}"
+            )
+            field.editor.setAccessibleName(f"Port of {words}")
+            field.set_value(port)
+            field.setFixedWidth(PORT_PX)
+            field.edited.connect(partial(self._bring_about, kind))
+            for column, widget in enumerate((box, field.label, field)):
+                grid.addWidget(widget, 2 * row, column)
+            grid.addWidget(self.words[kind], 2 * row + 1, 0, 1, 4)
+        self.anywhere = QCheckBox("Other machines may connect")
+        self.anywhere.setToolTip("Otherwise only programs on this machine can")
+        self.anywhere.toggled.connect(lambda _: self._open_to_all())
+        self.warning = wrapped()
+        layout.addWidget(self.anywhere)
+        layout.addWidget(self.warning)
+        outer.addStretch(1)
+        self.show_state()
+
+    # --- what is done -------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Switch on what is ticked: a camera has been started."""
+        for kind, box in self.boxes.items():
+            if box.isChecked():
+                self._bring_about(kind)
+
+    def _wanted(self, kind: str) -> tuple[LiveWatch | None, str, bool]:
+        """What is to be: who tells, where (empty: nowhere), and whether others may listen."""
+        anywhere, port = self.anywhere.isChecked(), int(self.ports[kind].value() or 0)
+        place = f"{ANY if anywhere else OWN}:{port}"
+        return self._watch(), place if self.boxes[kind].isChecked() else "", anywhere
+
+    def _bring_about(self, kind: str, _: object = None) -> None:
+        """Open a stream in the background, or end it, as is wanted; one thing after the other."""
+        watch, place, anywhere = wanted = self._wanted(kind)
+        if watch is None or self._is_at_work(kind):
+            return
+        words, is_open = KINDS[kind][0], watch.stream(kind) is not None
+        if not place and not is_open:
+            return
+
+        def work(_: Control) -> str:
+            watch.tell_by(kind, None)  # it may have this very port
+            if place:
+                try:
+                    watch.tell_by(kind, open_stream(kind, place, anywhere))
+                except InputError as error:
+                    return problem_in_words(error)
+            return ""
+
+        def done(problem: str) -> None:
+            if self._wanted(kind) != wanted:
+                self._bring_about(kind)  # something else is wanted by now
+            elif problem:
+                self._problems[kind] = problem
+                self.boxes[kind].setChecked(False)
+                self._workspace.said.emit(f"{words}: {problem}", True)
+            elif place:
+                self._workspace.said.emit(f"{words}: measures are told at {place}", False)
+            self.show_state()
+
+        title = f"Opening {words}" if place else f"Ending {words}"
+        self._tasks[kind] = self._workspace.tasks.start(title, work, done)
+
+    def _is_at_work(self, kind: str) -> bool:
+        return self._tasks.get(kind) in self._workspace.tasks.active
+
+    def _switch(self, kind: str, on: bool) -> None:
+        if on:
+            self._problems.pop(kind, None)
+        self._bring_about(kind)
+        self.show_state()
+
+    def _open_to_all(self) -> None:
+        for kind, box in self.boxes.items():
+            if box.isChecked():
+                self._bring_about(kind)
+        self.show_state()
+
+    # --- what it shows ------------------------------------------------------------------------
+
+    def show_state(self) -> None:
+        """Show who listens and how much was told."""
+        watch = self._watch()
+        for kind in KINDS:
+            stream = None if watch is None else watch.stream(kind)
+            told = stream_in_words(stream, self._is_at_work(kind), self._problems.get(kind, ""))
+            if told != self.words[kind].text():
+                self.words[kind].setText(told)
+        warning = WARNING if self.anywhere.isChecked() else ""
+        if warning != self.warning.text():
+            self.warning.setText(warning)
+        self.warning.setVisible(bool(warning))
+
+
+def stream_in_words(stream: Stream | None, at_work: bool, problem: str) -> str:
+    """Where a stream is heard, by how many, and what was told."""
+    if problem:
+        return f"⚠ {problem}"
+    if stream is None:
+        return "○ One moment …" if at_work else "○ Off"
+    listen = "program listens" if stream.listeners == 1 else "programs listen"
+    told = several(stream.told, "frame")
+    where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
+    return f"● {where or stream.address}: {stream.listeners} {listen}, {told} told"
+
+
+def problem_in_words(error: InputError) -> str:
+    """Why a stream cannot be opened, and what to do."""
+    if error.field == "port":
+        return f"{error.value}. {IN_USE}"
+    return f"{error.value}: it needs {error.expected}."

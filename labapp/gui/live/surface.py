@@ -1,0 +1,105 @@
+"""The live pool in 3-D: drawn as often as the window bears."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import partial
+
+from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout, QWidget
+
+from labapp.export.drawing import Direction
+from labapp.export.scene import Scene
+from labapp.gui.live.figures import OLD_S
+from labapp.gui.views.view3d import make_view3d
+from labapp.gui.widgets.buttons import button
+from labapp.run.live_watch import Followed, LiveWatch
+
+LOOKS: dict[Direction, tuple[str, str]] = {
+    "top": ("Top", "Look from the top (1 in the view)"),
+    "side": ("Side", "Look from the side, along −X (2 in the view)"),
+    "front": ("Front", "Look as the camera does, along Y (3 in the view)"),
+    "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
+}
+
+LASTS_S = 1.0
+"""A surface is shown so long where the frames after it cannot be measured; `OLD_S`, where no more
+are measured: it is not of the pool that is seen."""
+
+ROOMY = 1.5
+"""A colour scale stays while a surface fills this part of it: colours do not change at once."""
+
+WAITING = "The surface stands here as soon as the next frame is measured"
+
+
+class LiveSurface(QWidget):
+    """The surface of the newest frame, and from where it is looked at."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.view = make_view3d("The live pool in 3-D")
+        self.view.set_words(WAITING)
+        self._shown_s = 0.0
+        self._limits: tuple[float, float] | None = None
+        row = QHBoxLayout()
+        row.setContentsMargins(8, 0, 8, 0)
+        for direction, (words, tip) in LOOKS.items():
+            row.addWidget(button(words, tip, partial(self.view.look, direction)))
+        row.addStretch(1)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addLayout(row)
+        layout.addWidget(self.view, 1)
+
+    def follow(self, followed: Followed | None, watch: LiveWatch) -> bool:
+        """Show the newest surface that was drawn, and ask for the next; whether there was one.
+
+        Parameters
+        ----------
+        followed
+            What was measured since the last call; None: nothing.
+        watch
+            Which measures.
+        """
+        scene = watch.scene()
+        watch.ask_for_scene()
+        if scene is not None:
+            self._limits = steady_limits(self._limits, scene.limits)
+            self._show(replace(scene, limits=self._limits))
+            self._shown_s = time.monotonic()
+            return True
+        age_s = time.monotonic() - self._shown_s
+        found = None if followed is None else followed.found
+        if found is not None and found.measures is None and age_s > LASTS_S:
+            self.view.set_words(f"No surface ({found.status}): {found.reason}")
+            self._show(None)
+        elif self.view.scene is not None and age_s > OLD_S:
+            self.clear()
+        return False
+
+    def clear(self) -> None:
+        """Show nothing until a surface comes."""
+        self.view.set_words(WAITING)
+        self._show(None)
+        self._limits = None
+
+    def let_go(self) -> None:
+        """Show nothing, and let go of OpenGL."""
+        self.clear()
+        self.view.close_view()
+
+    def _show(self, scene: Scene | None) -> None:
+        self.view.show_scene(scene)
+        self.view.repaint()  # at once: how long it takes tells how soon the next may come
+
+
+def steady_limits(
+    former: tuple[float, float] | None, wanted: tuple[float, float]
+) -> tuple[float, float]:
+    """Ends of a colour scale for the next surface: the former ones while it fills them well."""
+    if former is not None:
+        holds = former[0] <= wanted[0] and wanted[1] <= former[1]
+        if holds and former[1] - former[0] <= ROOMY * (wanted[1] - wanted[0]):
+            return former
+    room = (ROOMY - 1) / 4 * (wanted[1] - wanted[0])
+    return wanted[0] - room, wanted[1] + room

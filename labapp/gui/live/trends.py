@@ -1,0 +1,208 @@
+"""Sizes of the live pool over the last seconds, with their limits, which are entered here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QResizeEvent
+from PySide6.QtWidgets import QBoxLayout, QGridLayout, QVBoxLayout, QWidget
+
+from labapp.errors import InputError
+from labapp.gui.curves import PLAIN, Axis, Curve, Mark
+from labapp.gui.views.plots import PlotStack
+from labapp.gui.widgets.fields import FieldForm, NumberField
+from labapp.gui.widgets.labels import plain_label
+from labapp.gui.workspace import Workspace
+from labapp.run.limits import LARGEST_MM, NAMES, Ends, Limits
+from labapp.run.live_watch import TREND_S, LiveWatch, Trend
+from labapp.words import SIGMA_OF
+
+LAST_S = 30.0
+"""So much is seen at first."""
+
+GAP_S = 0.5
+"""Over a longer time without a frame no line is drawn."""
+
+MARKS = PLAIN, Mark("▪", "beyond its limit")
+
+ROOM_PX = 40
+"""All fields stand beside each other where so much is left beside them."""
+
+RULE = (
+    f"An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ± "
+    f"({SIGMA_OF}), or when so many frames in a row cannot be measured. For a hollow pool, height "
+    "is its depth, which is negative."
+)
+
+
+def trend_curves(trend: Trend, limits: Limits, names: tuple[str, ...]) -> tuple[Curve, ...]:
+    """Width, length and height over the time from now, with their limits.
+
+    Parameters
+    ----------
+    trend
+        What was measured.
+    limits
+        Of the sizes.
+    names
+        What the sizes are called.
+    """
+    # Nothing was measured in a gap: a frame in it, without values, keeps a line from crossing it.
+    gap = np.flatnonzero(np.diff(trend.since_s) > GAP_S) + 1
+    since_s = np.insert(trend.since_s, gap, trend.since_s[gap - 1] + GAP_S / 2)
+    number = np.insert(trend.number, gap, trend.number[gap - 1] + 1)
+    return tuple(
+        Curve(
+            name.capitalize(),
+            "mm",
+            since_s,
+            np.insert(trend.value_mm[k], gap, np.nan),
+            sigma=np.insert(trend.sigma_mm[k], gap, np.nan),
+            key=number,
+            mark=np.insert(trend.beyond[k].astype(int), gap, 0),
+            marks=MARKS,
+            limits=limits.of(name),
+            quick=True,
+        )
+        for k, name in enumerate(names)
+    )
+
+
+class LiveTrends(QWidget):
+    """Plots of the last seconds, and below them fields for the limits.
+
+    Parameters
+    ----------
+    workspace
+        Whose session keeps the limits.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__()
+        self._workspace = workspace
+        self.plots = PlotStack("Trends of the live pool")
+        self.last = NumberField(
+            "Shown, the last",
+            "s",
+            lowest=2,
+            highest=TREND_S,
+            decimals=0,
+            step=10,
+            tooltip="So much of the trend is seen",
+        )
+        self.last.set_value(LAST_S)
+        self.unmeasured = NumberField(
+            "Alarm after, not measured",
+            "frames",
+            lowest=1,
+            highest=10_000,
+            decimals=0,
+            tooltip="So many frames in a row that cannot be measured are an alarm, where there is "
+            "any limit",
+        )
+        self.unmeasured.edited.connect(lambda value: self._keep(unmeasured=int(value)))
+        self.fields = {
+            (name, end): NumberField(
+                f"{name.capitalize()}, {'lowest' if end == 0 else 'highest'}",
+                lowest=-LARGEST_MM,
+                highest=LARGEST_MM,
+                decimals=3,
+                step=0.1,
+                optional=True,
+                tooltip=f"{'Lowest' if end == 0 else 'Highest'} {name} that is in order; empty: "
+                f"there is no limit. {RULE}",
+            )
+            for name in NAMES
+            for end in (0, 1)
+        }
+        for (name, end), field in self.fields.items():
+            field.edited.connect(partial(self._enter, name, end))
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.addWidget(self.plots, 1)
+        self._below = QBoxLayout(QBoxLayout.Direction.TopToBottom)
+        self._below.setContentsMargins(8, 0, 8, 0)
+        self._parts = limits, others = self._limits(), self._others()
+        self._below.addLayout(limits, 3)
+        self._below.addWidget(others, 2, Qt.AlignmentFlag.AlignTop)
+        layout.addLayout(self._below)
+        workspace.changed.connect(self.refresh)
+
+    def _limits(self) -> QGridLayout:
+        grid = QGridLayout()
+        for column, words in enumerate(("Limits (mm)", "lowest", "highest")):
+            label = plain_label(words)
+            label.setToolTip(RULE)
+            grid.addWidget(label, 0, column)
+            grid.setColumnStretch(column, int(column > 0))
+        for row, name in enumerate(NAMES, 1):
+            grid.addWidget(plain_label(name.capitalize()), row, 0)
+            for end in (0, 1):
+                grid.addWidget(self.fields[name, end], row, 1 + end)
+        return grid
+
+    def _others(self) -> FieldForm:
+        form = FieldForm()
+        for field in (self.last, self.unmeasured):
+            form.add(field)
+        form.setMinimumWidth(form.minimumSizeHint().width())
+        return form
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Put all fields beside each other where there is room."""
+        super().resizeEvent(event)
+        way = QBoxLayout.Direction
+        is_wide = self.width() >= sum(part.minimumSize().width() for part in self._parts) + ROOM_PX
+        self._below.setDirection(way.LeftToRight if is_wide else way.TopToBottom)
+
+    def heightForWidth(self, _width: int) -> int:
+        """Be as low as there is room for: the plots scroll in themselves."""
+        return self.minimumSizeHint().height()
+
+    # --- what it shows ------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Show the session's limits."""
+        session = self._workspace.session
+        if session is None:
+            return
+        limits = session.limits
+        for (name, end), field in self.fields.items():
+            field.set_value(limits.of(name)[end])
+            field.setEnabled(not session.read_only)
+        self.unmeasured.set_value(limits.unmeasured)
+        self.unmeasured.setEnabled(not session.read_only)
+
+    def show_trend(self, watch: LiveWatch) -> None:
+        """Show what was measured of late."""
+        last_s = self.last.value() or LAST_S
+        trend, limits = watch.trend(last_s), watch.alarms.limits
+        axis = Axis("From now", "s", decimals=1, span=(-last_s, 0.0))
+        self.plots.show_curves(trend_curves(trend, limits, trend.names), axis)
+
+    # --- what is done -------------------------------------------------------------------------
+
+    def _enter(self, name: str, end: int, value: float | None) -> None:
+        session = self._workspace.session
+        if session is None:
+            return
+        low, high = session.limits.of(name)
+        ends: Ends = (value, high) if end == 0 else (low, value)
+        self._keep(**{f"{name}_mm": ends}, field=(name, end))
+
+    def _keep(self, field: tuple[str, int] | None = None, **changed: object) -> None:
+        """Keep limits in the session; those that cannot be are refused below their field."""
+        session = self._workspace.session
+        if session is None:
+            return
+        try:
+            limits = replace(session.limits, **changed)  # type: ignore[arg-type]
+        except InputError as error:
+            if field is not None:
+                self.fields[field].set_value(session.limits.of(field[0])[field[1]])
+                self.fields[field].refuse(f"It is to be {error.expected}")
+            return
+        self._workspace.attempt(lambda session: session.set_limits(limits))

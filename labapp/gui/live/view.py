@@ -1,0 +1,467 @@
+"""The camera on the recording page: chosen, set, watched; and the bar that records."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import pyqtgraph as pg
+from PySide6.QtCore import QObject, Qt, QTimer, Signal
+from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout, QWidget
+
+from labapp.core.quality import Quality
+from labapp.core.values import FloatArray
+from labapp.gui.live.camera_fields import CameraFields, calibrated_px
+from labapp.gui.live.canvas import LiveCanvas
+from labapp.gui.live.figures import (
+    NO_SETUP,
+    OLD_S,
+    LiveFigures,
+    figures,
+    pace_in_words,
+)
+from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
+from labapp.gui.live.plan_fields import PlanFields
+from labapp.gui.live.record_bar import RecordBar
+from labapp.gui.tasks import Control, Task
+from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.exposure import ExposureBars
+from labapp.gui.widgets.fields import ChoiceField, FieldForm
+from labapp.gui.widgets.labels import Message, headed
+from labapp.gui.workspace import Workspace
+from labapp.media.cameras import (
+    Camera,
+    CameraError,
+    CameraInfo,
+    CameraSettings,
+    SimulatedDevice,
+    find_cameras,
+    open_camera,
+)
+from labapp.media.events import Event
+from labapp.media.recording.recorder import recording_path
+from labapp.media.recording.take_files import Take
+from labapp.run.live_watch import Followed, LiveWatch
+from labapp.session.session import Session
+from labapp.simulated.simulated_pool import pool_camera, simulated_pool
+from labapp.words import several
+
+TICK_MS = 33
+"""The picture is renewed no more often; less often where that takes long."""
+
+SLOW_MS = 300
+"""It is renewed so often in any case."""
+
+TELL_S = 0.2
+"""Figures are renewed no more often."""
+
+RING, RING_PX = "#2fd39b", 15
+"""Round the dots that are found: a colour of the dots page; points of the screen."""
+
+
+class LiveView(QObject):
+    """A camera that is watched in the page's picture and recorded from.
+
+    Parameters
+    ----------
+    workspace
+        What is open.
+    picture
+        Where live frames are shown.
+    exposure
+        Where the verdict on them is.
+
+    Signals
+    -------
+    changed
+        A camera was started, or let go.
+    recorded
+        A recording was written to its end: a `Take`.
+
+    Attributes
+    ----------
+    group
+        Choice and settings, for the panel.
+    canvas
+        The picture and what else is seen of the camera.
+    bar
+        What records, below the canvas; seen while live.
+    live
+        The camera that runs; None without one.
+    measured_s
+        `time.monotonic` when the figures were renewed; 0 before they are there.
+    """
+
+    changed = Signal()
+    recorded = Signal(object)
+
+    def __init__(self, workspace: Workspace, picture: PictureView, exposure: ExposureBars) -> None:
+        super().__init__(picture)
+        self.workspace = workspace
+        self.live: Live | None = None
+        self.updates = 0
+        """How often a live frame was shown, as a picture or as a surface."""
+        self._picture, self._exposure = picture, exposure
+        self._ending: list[Live] = []
+        self._pools: dict[str, SimulatedDevice] = {}
+        self._opening: Task | None = None
+        self._finding: Task | None = None
+        self._told_s = self.measured_s = 0.0
+        self._followed: Followed | None = None
+        self._room_byte: int | None = None
+        self._timer = QTimer(self)
+        self._timer.setInterval(TICK_MS)
+        self._timer.timeout.connect(self._tick)
+        self._rings = pg.ScatterPlotItem(
+            size=RING_PX, pxMode=True, pen=pg.mkPen(RING, width=1.2), brush=None
+        )
+        self._rings.hide()
+        picture.add(self._rings)
+        self.canvas = LiveCanvas(workspace, picture, self._watch, self.acknowledge)
+        self._make_group()
+        self.bar = RecordBar(self.trigger, self.mark, self.stop)
+        workspace.changed.connect(self._set_limits)
+        workspace.closing.connect(self._session_closes)
+        workspace.tasks.changed.connect(self._show_state)
+        self._show_state()
+
+    # --- cameras ------------------------------------------------------------------------------
+
+    def find(self) -> None:
+        """Look for the cameras that are connected, in the background."""
+
+        def done(answer: tuple[list[CameraInfo], list[str]]) -> None:
+            found, problems = answer
+            self._choices = choices(found)
+            self.camera.set_choices(self._choices)
+            told = f"{several(len(found), 'camera')} found"
+            self.workspace.said.emit(". ".join([told, *problems]), False)
+
+        if self._finding not in self.workspace.tasks.active:
+            self._finding = self.workspace.tasks.start(
+                "Looking for cameras", lambda _: find_cameras(), done
+            )
+
+    def start(self) -> None:
+        """Show what the chosen camera sees."""
+        session = self.workspace.session
+        if session is None or self.live is not None:
+            return
+        chosen = self.camera.value()
+        name = dict(self._choices)[chosen]
+        folder, stem = session.path.parent, session.path.stem
+        live = Live(
+            name,
+            lambda: recording_path(folder, stem),
+            self.plan_fields.plan(),
+            CameraSettings(),
+            session.settings,
+            setup_of(session),
+            session.limits,
+        )
+        opener = self._opener(chosen, session)
+
+        def work(control: Control) -> None:
+            try:
+                live.open(opener(control))
+            except CameraError as error:
+                raise ValueError(str(error)) from error
+
+        self._opening = self.workspace.tasks.start(
+            f"Opening {name}",
+            work,
+            lambda _: self._opened(live),
+            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+            kind="Opening the camera",
+        )
+        self.refused.setText("")
+        self.live = live
+        self._show_state()
+        self.changed.emit()
+
+    def _opener(self, chosen: str, session: Session) -> Callable[[Control], Callable[[], Camera]]:
+        """What makes what opens a camera; the pool is rendered at the first time only."""
+        if chosen != SIMULATED:
+            return lambda _: partial(open_camera, chosen)
+        text = simulated_pool(session)
+
+        def rendered(control: Control) -> Callable[[], Camera]:
+            if text not in self._pools:
+                self._pools[text] = pool_camera(text, control.progress)
+            return self._pools[text].open
+
+        return rendered
+
+    def _opened(self, live: Live) -> None:
+        if self.live is not live or live.feed is None:
+            return
+        session = self.workspace.session
+        self.camera_fields.show_camera(
+            live.feed, None if session is None else calibrated_px(session)
+        )
+        self._room_byte = None
+        self._rings.setData([])
+        self.measured_s, self._followed = 0.0, None
+        self.figures.show_figures(figures(None) if live.watch is not None else ())
+        self.figures.show_words(NO_SETUP if live.watch is None else "")
+        self.canvas.set_live(live.watch is not None)
+        self._rings.show()
+        self._timer.start(TICK_MS)
+        self._show_state()
+        # Where Space records even as the key of what has the focus.
+        self.bar.record_button.setFocus()
+
+    def stop(self) -> None:
+        """Let go of the camera; what is being recorded is written to its end first."""
+        live, self.live = self.live, None
+        if live is None:
+            return
+        self._timer.stop()
+        self._rings.hide()
+        if live.watch is not None:
+            self.canvas.tell(live.watch)  # alarms, to the last
+        self.canvas.set_live(False)
+        self._ending.append(live)
+        title = "Stopping the camera" if live.running is None else "Finishing the recording"
+
+        def done(_: object) -> None:
+            self._ending.remove(live)
+            self._hear(live)
+
+        self.workspace.tasks.start(title, lambda _: live.close(), done)
+        self._show_state()
+        self.changed.emit()
+
+    def _session_closes(self) -> None:
+        """Write what is being recorded to its end before anything else goes."""
+        for live in (*self._ending, *([self.live] if self.live is not None else [])):
+            live.close()
+            for event in live.events():
+                self._tell(event, live)
+            for take in live.ended_takes():
+                self.workspace.said.emit(f"Recorded beside the session: {take.path.name}", False)
+        self._ending.clear()
+        self.refused.setText("")
+        self.live = None
+        self.canvas.set_live(False)
+        self.canvas.alarms.let_go()
+        self._timer.stop()
+        self._rings.hide()
+        self._show_state()
+
+    # --- recording ----------------------------------------------------------------------------
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames come, or will when the camera is back."""
+        return self.live is not None and self.live.is_open
+
+    def trigger(self) -> None:
+        """Begin a recording, or end the one that runs."""
+        live = self.live
+        if live is not None and live.is_open:
+            self.workspace.tried(live.trigger)
+            self._tell_figures(live)
+            self._show_state()
+
+    def discard(self, take: Take) -> None:
+        """Delete a recording that runs as soon as the camera is let go."""
+        if self.live is not None and not self.live.discard(take):
+            self.workspace.said.emit(f"{take.path.name} had ended and is kept", False)
+
+    def mark(self) -> bool:
+        """Note the present frame beside the recording that runs; False if none does."""
+        recorded = self.live is not None and self.live.running is not None
+        if self.live is not None and recorded:
+            self.live.mark()
+        return recorded
+
+    def acknowledge(self) -> None:
+        """Take it that the operator has seen the alarms."""
+        watch = self._watch()
+        self.canvas.alarms.let_go()
+        if watch is not None:
+            watch.acknowledge()
+            self.canvas.tell(watch)
+
+    def _watch(self) -> LiveWatch | None:
+        return None if self.live is None else self.live.watch
+
+    def _set_limits(self) -> None:
+        """Watch the session's limits: they may have been changed."""
+        session, watch = self.workspace.session, self._watch()
+        if session is not None and watch is not None:
+            watch.set_limits(session.limits)
+            self._show_figures(watch)
+            self.canvas.tell(watch)
+
+    def _replan(self) -> None:
+        plan = self.plan_fields.plan()
+        if self.live is not None and plan != self.live.plan:
+            self.live.set_plan(plan)
+
+    def _begin_anew(self) -> None:
+        """Keep no frames from before the camera was set otherwise."""
+        if self.live is not None:
+            self.live.set_plan(self.live.plan)
+
+    # --- while it runs ------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        live, began_s = self.live, time.perf_counter()
+        if live is None:
+            return
+        shown = live.newest()
+        if shown is not None and self._picture.isVisible():
+            self._picture.show_picture(shown.frame.image)
+            self._ring_dots(shown.dots_px)
+            self.updates += 1
+        looked = live.looked()
+        if looked is not None:
+            self._room_byte = looked.room_byte
+            self._ring_dots(looked.dots_px)
+            if self._followed is None or self._age_s > OLD_S:
+                self._show_quality(looked.quality)
+        if live.watch is not None:
+            self._follow(live.watch)
+        if time.monotonic() - self._told_s > TELL_S:
+            self._tell_figures(live)
+        self._hear(live)
+        self.camera_fields.take_answers()
+        took_ms = (time.perf_counter() - began_s) * 1000
+        wanted = min(max(TICK_MS, round(2 * took_ms)), SLOW_MS)
+        if abs(wanted - self._timer.interval()) > TICK_MS / 4:
+            self._timer.setInterval(wanted)
+
+    def _follow(self, watch: LiveWatch) -> None:
+        """Show what was measured since it was asked last."""
+        followed = watch.newest()
+        if followed is not None:
+            former, was_old = self._followed, self._age_s > OLD_S
+            self._followed, self.measured_s = followed, time.monotonic()
+            self._show_figures(watch)
+            if was_old or former is None or former.found.status != followed.found.status:
+                self._told_s = 0.0  # what is said of the figures goes with them
+            if self._age_s <= OLD_S:  # else it is not of what is in view
+                self._show_quality(followed.found.quality)
+        self.updates += self.canvas.follow(followed, watch)
+
+    def _show_figures(self, watch: LiveWatch) -> None:
+        self.figures.show_figures(figures(self._followed, watch.alarms.limits, self._age_s))
+
+    @property
+    def _age_s(self) -> float:
+        """How old the figures are, s."""
+        followed = self._followed
+        return 0.0 if followed is None else time.monotonic() - followed.arrived_s
+
+    def _show_quality(self, quality: Quality) -> None:
+        self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
+        self._exposure.show()
+
+    def _ring_dots(self, dots_px: FloatArray | None) -> None:
+        if dots_px is not None:
+            self._rings.setData(pos=dots_px)
+
+    def _hear(self, live: Live) -> None:
+        """Tell what happened, and hand on what is recorded."""
+        for event in live.events():
+            self._tell(event, live)
+        for take in live.ended_takes():
+            self.recorded.emit(take)
+
+    def _tell(self, event: Event, live: Live) -> None:
+        """Tell of an event; frames that are lost are a problem only where they are recorded."""
+        recorded = live.running is not None or event.source != live.name
+        problem = event.kind == "warning" or (event.kind == "loss" and recorded)
+        self.workspace.said.emit(str(event), problem)
+
+    def _tell_figures(self, live: Live) -> None:
+        self._told_s = time.monotonic()
+        self.bar.tell(live, self._room_byte)
+        self.counts.setText(live.counts_in_words())
+        if live.watch is not None:
+            pace, came_hz = live.watch.pace(), live.rate_hz()
+            self._show_figures(live.watch)
+            self.figures.show_words(pace_in_words(self._followed, pace, came_hz, self._age_s))
+            self.canvas.tell(live.watch)
+        picture = self._picture.picture
+        if live.feed is not None and picture is not None:
+            set_to = live.feed.settings
+            rate_hz = set_to.rate_hz if set_to.trigger == "free" else None
+            self.plan_fields.show_cost(picture.nbytes, rate_hz or live.rate_hz())
+        if self._shown != (live.running is not None):
+            self._show_state()
+
+    # --- widgets ------------------------------------------------------------------------------
+
+    def _show_state(self) -> None:
+        """Show what can be done now."""
+        active = self.workspace.tasks.active
+        if self.live is not None and self.live.feed is None and self._opening not in active:
+            self.live = None  # it could not be opened, or that was cancelled
+            self.changed.emit()
+        live = self.live
+        runs = live is not None and live.is_open
+        self._shown = recording = live is not None and live.running is not None
+        self.camera.setEnabled(live is None)
+        for each in (self.start_button, self.find_button):
+            each.setVisible(live is None)
+        self.start_button.setEnabled(self.workspace.session is not None and not self._ending)
+        self.settings.setVisible(runs)
+        self.bar.setVisible(runs)
+        self.plan_fields.set_enabled(not recording)
+        self.camera_fields.set_recording(recording)
+        self.bar.show_recording(recording)
+
+    def _make_group(self) -> None:
+        self.group, layout = headed("Capture")
+        form = FieldForm()
+        self._choices = choices([])
+        self.camera = ChoiceField(
+            "Camera",
+            self._choices,
+            tooltip="Which camera to watch; the simulated one films a pool on this bench",
+        )
+        form.add(self.camera)
+        layout.addWidget(form)
+        row = QHBoxLayout()
+        self.start_button = button("Start", "Show live what the camera sees", self.start)
+        self.find_button = button(
+            "Look for cameras", "Find the cameras that are connected", self.find
+        )
+        row.addWidget(self.start_button)
+        row.addWidget(self.find_button)
+        layout.addLayout(row)
+        self.refused = Message(2)
+        layout.addWidget(self.refused)
+        self.settings = QWidget()
+        inner = QVBoxLayout(self.settings)
+        inner.setContentsMargins(0, 0, 0, 0)
+        self.figures = LiveFigures()
+        self.counts = Message(2)
+        inner.addWidget(self.figures)
+        inner.addWidget(self.counts)
+        fields = FieldForm()
+        self.camera_fields = CameraFields(
+            fields, lambda wanted: None if self.live is None else self.live.apply(wanted)
+        )
+        self.camera_fields.reset.connect(self._begin_anew)
+        self.plan_fields = PlanFields(fields)
+        self.plan_fields.edited.connect(self._replan)
+        inner.addWidget(fields)
+        layout.addWidget(self.settings)
+
+    def take_key(self, key: Qt.Key) -> bool:
+        """Do what a plain key means while live; whether it means anything."""
+        works = {
+            Qt.Key.Key_Space: self.trigger,
+            Qt.Key.Key_M: self.mark,
+            Qt.Key.Key_A: self.acknowledge,
+        }
+        if not self.is_live or key not in works:
+            return False
+        works[key]()
+        return True

@@ -1,0 +1,1 @@
+"""The window: its steps, menus, actions and messages."""

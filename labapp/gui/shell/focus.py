@@ -1,0 +1,53 @@
+"""Where the keys go: from one part of the window to the next, and into a part."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QApplication, QWidget
+
+if TYPE_CHECKING:
+    from labapp.gui.shell.window import MainWindow
+
+
+def go_to_part(window: MainWindow, by: int) -> None:
+    """Give the keys to the next part of the window that takes any, or the one before (-1)."""
+    line = window.status_line
+    parts = [window.step_list, window.stack, window.side_panel, window.timeline]
+    parts = [part for part in (*parts, window.log_panel, line) if part.isVisibleTo(window)]
+    focus = QApplication.focusWidget()
+    here = [k for k, part in enumerate(parts) if focus is not None and _holds(part, focus)]
+    start = here[0] if here else (-1 if by > 0 else 0)
+    for k in range(1, len(parts) + 1):
+        if give_keys(parts[(start + k * by) % len(parts)]):
+            return
+
+
+def give_keys(part: QWidget) -> bool:
+    """Give a part the keys, where it had them last or at its first widget; False if it has none."""
+    chain = [part]
+    while (following := chain[-1].nextInFocusChain()) not in (None, part):
+        chain.append(following)
+    last: QWidget | None = part.focusWidget()  # None for a part that never had them
+    found = next((each for each in (last, *chain) if each and takes_keys(each, part)), None)
+    if found is not None:
+        found.setFocus(Qt.FocusReason.TabFocusReason)
+    return found is not None
+
+
+def takes_keys(widget: QWidget, part: QWidget) -> bool:
+    """Whether Tab would stop at a widget of a part."""
+    stops = bool(widget.focusPolicy() & Qt.FocusPolicy.TabFocus) and widget.focusProxy() is None
+    return stops and _holds(part, widget) and widget.isEnabled() and widget.isVisible()
+
+
+def finish_edit(*parts: QWidget) -> None:
+    """Take the keys from what has them in some parts: a field is finished when it is left."""
+    focus = QApplication.focusWidget()
+    if focus is not None and any(_holds(part, focus) for part in parts):
+        focus.clearFocus()
+
+
+def _holds(part: QWidget, widget: QWidget) -> bool:
+    return part is widget or part.isAncestorOf(widget)

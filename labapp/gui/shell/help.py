@@ -1,0 +1,138 @@
+"""The guide, the keys and what the program is: made from what the window is made from."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from html import escape
+
+import numpy
+import PySide6
+from PySide6.QtCore import QSize, Qt
+from PySide6.QtGui import QAction, QKeySequence
+from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
+
+from labapp.gui.shell.action import MENUS
+from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.standing import Standing
+from labapp.gui.shell.steps import STEPS
+from labapp.log import log_file
+from labapp.version import VERSION
+
+PART_OF_SCREEN = 0.85
+"""No text takes more of the screen; the rest is for the frame around it."""
+
+TITLES = {"guide": "Guide", "keys": "Keys", "about": "About labapp"}
+
+INTRODUCTION = """
+<p>The steps at the left lead from the bench to the results. Take them from the top; a mark shows
+how far each is, and the pointer on it why: ○ to do, ▶ ready, ✓ done, ▲ needs attention. You may go
+back at any time.</p>
+<p>Everything is saved as you do it: there is no Save. Every change of set-up, calibration,
+settings, dots and rows can be undone (Ctrl+Z), also after the session was closed.</p>
+"""
+CLOSING = """
+<p>Drop a video, an image, a folder of images or a session on the window to open it. Long work runs
+in the background: the status line shows how far it is, Cancel stops it, and what was finished is
+kept. A problem stays in the status line until you have read it; F4 shows all messages.</p>
+"""
+
+
+def guide() -> str:
+    """What to do, step by step; HTML."""
+    steps = "".join(
+        f"<h3>{number} {escape(step.title)}</h3><p>{escape(step.hint)}</p>"
+        for number, step in enumerate(STEPS, 1)
+    )
+    ticks = "".join(f"<li>{escape(standing.words)}</li>" for standing in Standing)
+    frames = (
+        "<h3>The frames</h3><p>The bar at the bottom has a tick for every frame. Its colour, its "
+        f"height and its tip tell how the frame stands:</p><ul>{ticks}</ul>"
+    )
+    return f"<h2>Guide</h2>{INTRODUCTION}{steps}{frames}{CLOSING}"
+
+
+def keys(page: QWidget | None = None) -> str:
+    """Every action that has a key, those of the page in view first; HTML."""
+    from labapp.gui.views import picture, plots, view3d
+
+    parts = []
+    if page is not None:
+        own = [(_key(action), action.text(), action.toolTip()) for action in page.actions()]
+        rows = [(key, text, tip.removesuffix(f" ({key})")) for key, text, tip in own if key]
+        parts += [_table(f"This page: {page.accessibleName()}", rows)] if rows else []
+    in_views = (("Pictures", picture.KEYS), ("3-D views", view3d.KEYS_TOLD), ("Plots", plots.KEYS))
+    told = "".join(f"<p><b>{name}</b>: {escape(words)}.</p>" for name, words in in_views)
+    parts.append(f"<h3>In what is drawn</h3>{told}")
+    for menu in MENUS:
+        rows = [(_shown(a.key), a.text, a.tip) for a in ACTIONS if a.menu == menu and a.key]
+        parts.append(_table(menu.replace("&", ""), rows))
+    return f"<h2>Keys</h2>{''.join(parts)}"
+
+
+def _table(heading: str, rows: list[tuple[str, str, str]]) -> str:
+    lines = "".join(
+        f"<tr><td width='110'>{escape(key)}</td>"
+        f"<td width='190'><b>{escape(text.replace('&', ''))}</b></td><td>{escape(tip)}</td></tr>"
+        for key, text, tip in rows
+    )
+    return f"<h3>{escape(heading)}</h3><table cellpadding='2'>{lines}</table>"
+
+
+def about() -> str:
+    """What the program is; HTML."""
+    import scipy
+
+    built_on = (
+        f"Python {sys.version.split()[0]}, numpy {numpy.__version__}, scipy {scipy.__version__}, "
+        f"Qt for Python {PySide6.__version__}"
+    )
+    return (
+        f"<h2>labapp {VERSION}</h2>"
+        "<p>The three-dimensional surface of a molten weld pool, measured from a reflected laser "
+        "dot matrix.</p>"
+        f"<p>BSD 3-Clause licence. {built_on}.</p><p>The log is {escape(str(log_file()))}.</p>"
+    )
+
+
+TEXTS: dict[str, Callable[[], str]] = {"guide": guide, "keys": keys, "about": about}
+
+
+class HelpDialog(QDialog):
+    """One of the help texts, beside the window.
+
+    Parameters
+    ----------
+    kind
+        ``guide``, ``keys`` or ``about``.
+    page
+        The page in view, whose keys are told too.
+    """
+
+    def __init__(
+        self, kind: str, parent: QWidget | None = None, page: QWidget | None = None
+    ) -> None:
+        super().__init__(parent)
+        self.setObjectName(f"help-{kind}")
+        self.setWindowTitle(TITLES[kind])
+        self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        self.browser = QTextBrowser()
+        self.browser.setAccessibleName(TITLES[kind])
+        self.browser.setAccessibleDescription("Arrow keys and Page Up and Down move the text")
+        self.browser.setHtml(keys(page) if kind == "keys" else TEXTS[kind]())
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
+        buttons.button(QDialogButtonBox.StandardButton.Close).setToolTip("Close this text (Esc)")
+        buttons.rejected.connect(self.reject)
+        layout = QVBoxLayout(self)
+        layout.addWidget(self.browser)
+        layout.addWidget(buttons)
+        wanted = QSize(520, 300) if kind == "about" else QSize(720, 600)
+        self.resize(wanted.boundedTo(self.screen().availableSize() * PART_OF_SCREEN))
+
+
+def _key(action: QAction) -> str:
+    return action.shortcut().toString(QKeySequence.SequenceFormat.NativeText)
+
+
+def _shown(key: str) -> str:
+    return QKeySequence(key).toString(QKeySequence.SequenceFormat.NativeText)

@@ -1,0 +1,140 @@
+"""The menus, made from the actions that are declared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QKeyCombination, Qt
+from PySide6.QtGui import QAction, QActionGroup, QKeyEvent, QKeySequence
+from PySide6.QtWidgets import QMenu
+
+from labapp.gui.shell.action import MENUS, Action
+from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.filming import live_page
+from labapp.gui.shell.steps import read_only
+from labapp.gui.widgets.labels import plain_tip
+
+if TYPE_CHECKING:
+    from labapp.gui.shell.window import MainWindow
+    from labapp.session.session import Session
+
+
+class Menus:
+    """The window's menus, and which of their actions are of use now.
+
+    Attributes
+    ----------
+    actions
+        The Qt actions by their names.
+    """
+
+    def __init__(self, window: MainWindow, shown: frozenset[str]) -> None:
+        self._window = window
+        self.actions: dict[str, QAction] = {}
+        self._plain: dict[QKeyCombination, str] = {}
+        self._menus = {title: window.menuBar().addMenu(title) for title in MENUS}
+        groups: dict[str, QActionGroup] = {}
+        for action in ACTIONS:
+            if action.name in shown:
+                made = self._made(action)
+                if action.group:
+                    group = groups.setdefault(action.group, QActionGroup(window))
+                    group.addAction(made)
+        self.recent = QMenu("Open &recent", window)
+        self.recent.setToolTipsVisible(True)
+        self._menus["&File"].insertMenu(self.actions["sample"], self.recent)
+        self.refresh()
+
+    def _made(self, action: Action) -> QAction:
+        window, menu = self._window, self._menus[action.menu]
+        made = QAction(action.text, window)
+        made.setObjectName(action.name)
+        made.setToolTip(f"{action.tip} ({action.key})" if action.key else action.tip)
+        made.setStatusTip(action.tip)
+        made.setMenuRole(QAction.MenuRole.NoRole)
+        made.setCheckable(action.checked is not None)
+        made.triggered.connect(lambda *_: self.do(action.name))
+        keys = QKeySequence(action.key)
+        combination = QKeyCombination() if keys.isEmpty() else keys[0]  # type: ignore[index]
+        if action.key and is_plain(combination):
+            self._plain[combination] = action.name
+            made.setText(f"{action.text}\t{keys.toString(QKeySequence.SequenceFormat.NativeText)}")
+        elif action.key:
+            made.setShortcut(keys)
+        if action.begins:
+            menu.addSeparator()
+        menu.setToolTipsVisible(True)
+        menu.addAction(made)
+        self.actions[action.name] = made
+        return made
+
+    def do(self, name: str) -> None:
+        """Do an action."""
+        BY_NAME[name].call(self._window)
+        self.refresh()
+
+    def key(self, event: QKeyEvent) -> bool:
+        """Do the action of a plain key that nothing else has taken; whether there is one."""
+        name = self._plain.get(event.keyCombination())
+        if name is None or not self.actions[name].isEnabled():
+            return False
+        self.do(name)
+        return True
+
+    def refresh(self) -> None:
+        """Enable what is of use now, check what is on, say what undo and redo would do."""
+        window = self._window
+        session = window.workspace.session
+        undo, redo = steps_of(session)
+        there = {
+            "": True,
+            "session": session is not None,
+            "frames": len(window.standings) > 0,
+            "measuring": len(window.standings) > 0 and not read_only(session),
+            "undo": bool(undo),
+            "redo": bool(redo),
+            "work": bool(window.workspace.tasks.active),
+            "live": live_page(window) is not None,
+        }
+        for name, made in self.actions.items():
+            action = BY_NAME[name]
+            made.setEnabled(there[action.needs])
+            if action.checked is not None:
+                made.setChecked(action.checked(window))
+        self.actions["undo"].setText(f"&Undo {undo}".rstrip())
+        self.actions["redo"].setText(f"&Redo {redo}".rstrip())
+
+    def show_recent(self, paths: tuple[str, ...]) -> None:
+        """List the sessions opened before."""
+        self.recent.clear()
+        self.recent.setEnabled(bool(paths))
+        for number, name in enumerate(paths, 1):
+            path = Path(name)
+            text = f"{path.stem} — {path.parent}".replace("&", "&&")
+            made = self.recent.addAction(f"&{number} {text}" if number < 10 else text)
+            made.setToolTip(plain_tip(name))
+            made.triggered.connect(lambda *_, chosen=path: self._window.files.open(chosen))
+
+
+BY_NAME = {action.name: action for action in ACTIONS}
+
+
+def is_plain(key: QKeyCombination) -> bool:
+    """Whether a key belongs first to what has the focus: no Ctrl, no Alt, and not F1 … F12."""
+    held = key.keyboardModifiers()
+    function = Qt.Key.Key_F1 <= key.key() <= Qt.Key.Key_F12
+    return not function and held in (
+        Qt.KeyboardModifier.NoModifier,
+        Qt.KeyboardModifier.ShiftModifier,
+    )
+
+
+def steps_of(session: Session | None) -> tuple[str, str]:
+    """Labels of the changes that undo and redo would take back and make again; or nothing."""
+    if session is None or session.read_only:
+        return "", ""
+    history = session.history
+    standing = [change.label for change in history if not change.undone]
+    undone = [change.label for change in history if change.undone]
+    return (standing[-1] if standing else ""), (undone[0] if undone else "")

@@ -1,0 +1,216 @@
+"""What the app tells: the status line, which keeps a problem until it is read, and the log."""
+
+from __future__ import annotations
+
+import datetime
+
+from PySide6.QtCore import QSize, Qt, Signal
+from PySide6.QtGui import QKeyEvent, QKeySequence, QPainter, QPaintEvent, QResizeEvent
+from PySide6.QtWidgets import (
+    QAbstractItemView,
+    QApplication,
+    QHBoxLayout,
+    QLabel,
+    QListWidget,
+    QListWidgetItem,
+    QProgressBar,
+    QPushButton,
+    QSizePolicy,
+    QWidget,
+)
+
+from labapp.gui.tasks import Tasks
+from labapp.gui.widgets.labels import plain_label, plain_tip
+
+KEPT_MESSAGES = 1000
+
+PROBLEM = "▲"
+"""Before a problem: what is wrong is told by shape too."""
+
+TOLD = Qt.ItemDataRole.UserRole
+"""Of a line of the log: what it tells, since when, and how often it was said."""
+
+
+class ElidedLabel(QLabel):
+    """A line of text that ends in … where there is no room for all of it; the tip has it all."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+        self.setTextFormat(Qt.TextFormat.PlainText)
+
+    def minimumSizeHint(self) -> QSize:
+        """Room for a word."""
+        return QSize(40, self.sizeHint().height())
+
+    def sizeHint(self) -> QSize:
+        """One line, however many the text has."""
+        return QSize(super().sizeHint().width(), self.fontMetrics().height())
+
+    def paintEvent(self, _event: QPaintEvent) -> None:
+        """Draw as much as there is room for."""
+        line = " ".join(self.text().split())
+        shown = self.fontMetrics().elidedText(line, Qt.TextElideMode.ElideRight, self.width())
+        with QPainter(self) as painter:
+            painter.setPen(self.palette().color(self.foregroundRole()))
+            painter.drawText(self.rect(), Qt.AlignmentFlag.AlignVCenter, shown)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Tell all of it where not all is shown."""
+        super().resizeEvent(event)
+        self._tell()
+
+    def setText(self, text: str) -> None:
+        """Show another text."""
+        super().setText(text)
+        self._tell()
+
+    def _tell(self) -> None:
+        line = " ".join(self.text().split())
+        too_long = self.fontMetrics().horizontalAdvance(line) > self.width()
+        self.setToolTip(plain_tip(self.text() if too_long else ""))
+
+
+class LogPanel(QListWidget):
+    """Everything that was said, the last at the end."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setAccessibleName("Messages")
+        self.setToolTip("What the app has said since it was started; Ctrl+C copies")
+        self.setSelectionMode(QAbstractItemView.SelectionMode.ExtendedSelection)
+        self.setWordWrap(True)
+        self.setTextElideMode(Qt.TextElideMode.ElideNone)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setMinimumHeight(self.fontMetrics().height() * 2)
+
+    def sizeHint(self) -> QSize:
+        """Some lines; the operator may drag it higher, or lower."""
+        return QSize(400, self.fontMetrics().height() * 6)
+
+    def add(self, text: str, problem: bool) -> None:
+        """Add what was said; the same again in the same line, with how often."""
+        now = datetime.datetime.now().strftime("%H:%M:%S")
+        told = f"{PROBLEM + ' ' if problem else ''}{text}"
+        last = self.item(self.count() - 1) if self.count() else None
+        if last is not None and last.data(TOLD)[0] == told:
+            _, first, times = last.data(TOLD)
+            last.setData(TOLD, (told, first, times + 1))
+            last.setText(f"{now}  {told} ({times + 1} times since {first})")
+            return
+        item = QListWidgetItem(f"{now}  {told}")
+        item.setData(TOLD, (told, now, 1))
+        font = item.font()
+        font.setBold(problem)
+        item.setFont(font)
+        self.addItem(item)
+        if self.count() > KEPT_MESSAGES:
+            self.takeItem(0)
+        self.scrollToBottom()
+
+    def texts(self) -> list[str]:
+        """What it shows, message by message."""
+        return [self.item(row).text() for row in range(self.count())]
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:
+        """Copy the messages that are selected."""
+        if event.matches(QKeySequence.StandardKey.Copy):
+            chosen = sorted(self.selectedItems(), key=self.row)
+            QApplication.clipboard().setText("\n".join(item.text() for item in chosen))
+        else:
+            super().keyPressEvent(event)
+
+
+class StatusLine(QWidget):
+    """The last message, and how far the work under way is.
+
+    A problem stays until it was read, or is over, whatever is said after it.
+
+    Signals
+    -------
+    read
+        The operator has read the problems, and wants to see them all.
+    """
+
+    read = Signal()
+
+    def __init__(self, tasks: Tasks, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._tasks = tasks
+        self.unread: list[str] = []
+        self.message = ElidedLabel()
+        self.message.setAccessibleName("Last message")
+        self.read_button = QPushButton("Read")
+        self.read_button.setToolTip("Show all messages, and take the problem off this line (F4)")
+        self.read_button.setAccessibleName("Read the problem")
+        self.read_button.clicked.connect(self.read)
+        self.title = plain_label()
+        self.bar = QProgressBar()
+        self.bar.setFixedWidth(180)
+        self.bar.setFormat("%v of %m")
+        self.bar.setAccessibleName("Progress")
+        self.cancel_button = QPushButton("Cancel")
+        self.cancel_button.setToolTip("Stop the work under way; what is finished is kept (Ctrl+.)")
+        self.cancel_button.setAccessibleName("Cancel the work under way")
+        self.cancel_button.clicked.connect(self.cancel)
+        layout = QHBoxLayout(self)
+        layout.setContentsMargins(6, 0, 6, 0)
+        layout.addWidget(self.read_button)
+        layout.addWidget(self.message, 1)
+        for widget in (self.title, self.bar, self.cancel_button):
+            layout.addWidget(widget)
+        # What comes and goes must not move the window's other parts.
+        self.setMinimumHeight(layout.sizeHint().height())
+        tasks.changed.connect(self.show_progress)
+        tasks.progressed.connect(self.show_progress)
+        self.show_progress()
+        self._show_message("")
+
+    def say(self, text: str, problem: bool) -> None:
+        """Show a message, unless a problem is there that nobody has read; each counts once."""
+        if problem:
+            self.unread[:] = [*(each for each in self.unread if each != text), text]
+        elif self.unread:
+            return
+        self._show_message(text)
+
+    def settle(self, text: str) -> None:
+        """Take a problem off the line that is over, read or not; the log still has it."""
+        if text in self.unread:
+            self.unread.remove(text)
+            self._show_message(self.unread[-1] if self.unread else "")
+
+    def mark_read(self) -> None:
+        """Take the problems off the line."""
+        self.unread.clear()
+        self._show_message("")
+
+    def cancel(self) -> None:
+        """Ask all the work under way to stop."""
+        for task in self._tasks.active:
+            task.cancel()
+        self.show_progress()
+
+    def show_progress(self) -> None:
+        """Show how far the work under way is, or nothing where there is none."""
+        active = self._tasks.active
+        for widget in (self.title, self.bar, self.cancel_button):
+            widget.setVisible(bool(active))
+        if not active:
+            return
+        task = active[0]
+        stopping = task.control.cancelled.is_set()
+        others = f" (and {len(active) - 1} more)" if len(active) > 1 else ""
+        self.title.setText(f"{task.title}{', stopping …' if stopping else ''}{others}")
+        self.bar.setRange(0, task.total)
+        self.bar.setValue(task.done)
+        self.cancel_button.setEnabled(not all(each.control.cancelled.is_set() for each in active))
+
+    def _show_message(self, text: str) -> None:
+        count = len(self.unread)
+        more = f" ({count} problems)" if count > 1 else ""
+        self.message.setText(f"{PROBLEM} {text}{more}" if count else text)
+        font = self.message.font()
+        font.setBold(count > 0)
+        self.message.setFont(font)
+        self.read_button.setVisible(count > 0)

@@ -1,0 +1,84 @@
+"""How each frame of a session stands: what its tick in the timeline shows."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from labapp.core.values import BoolArray, IntArray
+from labapp.gui.widgets.scrubber import Tick
+
+if TYPE_CHECKING:
+    from labapp.session.measured import Overview
+
+
+class Standing(IntEnum):
+    """How a frame stands; where several share a pixel, the greatest shows."""
+
+    NOT_MEASURED = 0
+    MEASURED = 1
+    CORRECTED = 2
+    DOUBTFUL = 3
+    NOT_MEASURABLE = 4
+
+    @property
+    def words(self) -> str:
+        """For the operator."""
+        return WORDS[self]
+
+
+WORDS = {
+    Standing.NOT_MEASURED: "not measured",
+    Standing.MEASURED: "measured",
+    Standing.CORRECTED: "corrected by hand",
+    Standing.DOUBTFUL: "in doubt: stands out, or changed since it was measured",
+    Standing.NOT_MEASURABLE: "could not be measured",
+}
+
+TICKS = (
+    Tick(Standing.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
+    Tick(Standing.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
+    Tick(Standing.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
+    Tick(Standing.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
+    Tick(Standing.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
+)
+"""By `Standing`."""
+
+DOUBTFUL = (Standing.DOUBTFUL, Standing.NOT_MEASURABLE)
+"""What an operator has to look at."""
+
+
+def standings(seen: Overview) -> IntArray:
+    """How every frame stands, values of `Standing`, shape (n,)."""
+    from labapp.session.trends import doubtful_frames
+
+    status = np.array(seen.status, dtype=object)
+    measured, fine = status != "", status == "ok"
+    found = np.where(measured, Standing.MEASURED, Standing.NOT_MEASURED)
+    found = np.where(seen.corrected & (fine | ~measured), Standing.CORRECTED, found)
+    found = np.where(measured & ~fine, Standing.NOT_MEASURABLE, found)
+    doubtful = (measured & seen.stale) | (fine & doubtful_frames(seen))
+    return np.asarray(np.where(doubtful, Standing.DOUBTFUL, found), np.int64)
+
+
+def next_frame(
+    frames: IntArray, wanted: BoolArray, current: int, forward: bool = True
+) -> int | None:
+    """The nearest wanted frame after the current one, or before it; None if there is none.
+
+    Parameters
+    ----------
+    frames
+        Numbers of the frames, ascending, shape (n,).
+    wanted
+        Which of them are wanted, shape (n,), of bool.
+    current
+        A frame's number.
+    forward
+        Whether to look after it.
+    """
+    chosen = frames[wanted]
+    chosen = chosen[chosen > current] if forward else chosen[chosen < current][::-1]
+    return int(chosen[0]) if len(chosen) else None

@@ -1,0 +1,211 @@
+"""The steps at the left, each with its mark, and the panel at the right that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from PySide6.QtCore import QEvent, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtGui import QColor, QIcon, QPainter, QPalette, QPen, QPixmap, QPolygonF
+from PySide6.QtWidgets import (
+    QFrame,
+    QListWidget,
+    QListWidgetItem,
+    QScrollArea,
+    QSizePolicy,
+    QStackedWidget,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.shell.steps import READ_ONLY, Mark, State, Step
+from labapp.gui.theme import is_dark
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip
+
+ICON_PX = 18
+
+STATE_LINES = 2
+"""Room for how far a step is: the panel below stays where it is, whatever there is to say."""
+
+COLOURS = {
+    Mark.TODO: ("#6b7480", "#929ba6"),
+    Mark.READY: ("#0a6fc2", "#6db8f2"),
+    Mark.DONE: ("#1d7f45", "#58c783"),
+    Mark.ATTENTION: ("#b35300", "#f2a35e"),
+}
+"""On a light and on a dark ground."""
+
+SIGNS = {Mark.TODO: "○", Mark.READY: "▶", Mark.DONE: "✓", Mark.ATTENTION: "▲"}
+
+CHECK = ((0.22, 0.52), (0.42, 0.72), (0.78, 0.28))
+ARROW = ((0.32, 0.2), (0.8, 0.5), (0.32, 0.8))
+WARNING = ((0.5, 0.1), (0.93, 0.88), (0.07, 0.88))
+
+
+def mark_icon(mark: Mark, dark: bool, selected: QColor | None = None) -> QIcon:
+    """The mark's shape in its colour, and in another where its step is selected."""
+    colour = QColor(COLOURS[mark][dark])
+    icon = QIcon(_drawn(mark, colour, QColor("#22262a" if dark else "#ffffff")))
+    if selected is not None:
+        ground = QColor("#000000" if selected.lightness() > 128 else "#ffffff")
+        icon.addPixmap(_drawn(mark, selected, ground), QIcon.Mode.Selected)
+    return icon
+
+
+def _drawn(mark: Mark, colour: QColor, ground: QColor) -> QPixmap:
+    scale = 3  # sharp on a screen of any scaling
+    pixmap = QPixmap(ICON_PX * scale, ICON_PX * scale)
+    pixmap.fill(Qt.GlobalColor.transparent)
+    with QPainter(pixmap) as painter:
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.scale(ICON_PX * scale, ICON_PX * scale)
+        pen = QPen(colour, 0.1)
+        pen.setCapStyle(Qt.PenCapStyle.RoundCap)
+        pen.setJoinStyle(Qt.PenJoinStyle.RoundJoin)
+        painter.setPen(pen)
+        if mark is Mark.TODO:
+            painter.drawEllipse(QRectF(0.22, 0.22, 0.56, 0.56))
+        elif mark is Mark.DONE:
+            painter.setPen(QPen(colour, 0.16, c=Qt.PenCapStyle.RoundCap))
+            painter.drawPolyline(QPolygonF([QPointF(*point) for point in CHECK]))
+        else:
+            painter.setBrush(colour)
+            corners = ARROW if mark is Mark.READY else WARNING
+            painter.drawPolygon(QPolygonF([QPointF(*point) for point in corners]))
+            if mark is Mark.ATTENTION:
+                painter.setPen(QPen(ground, 0.1))
+                painter.drawLine(QPointF(0.5, 0.38), QPointF(0.5, 0.6))
+                painter.drawPoint(QPointF(0.5, 0.76))
+    return pixmap
+
+
+class StepList(QListWidget):
+    """The steps that have a page.
+
+    Signals
+    -------
+    chosen
+        The operator chose a step: its key.
+    """
+
+    chosen = Signal(str)
+
+    def __init__(self, steps: Sequence[Step], parent: QWidget | None = None) -> None:
+        self._states: Mapping[str, State] = {}
+        super().__init__(parent)
+        self._steps = tuple(steps)
+        self.setAccessibleName("Steps")
+        self.setToolTip("The steps from the bench to the results: ↑ and ↓ choose one")
+        self.setFrameShape(QFrame.Shape.NoFrame)
+        self.setIconSize(QSize(ICON_PX, ICON_PX))
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
+        self.setSpacing(1)
+        for number, step in enumerate(self._steps, 1):
+            item = QListWidgetItem(f"{number}  {step.title}")
+            item.setSizeHint(QSize(0, self.fontMetrics().height() + 14))
+            self.addItem(item)
+        self.setMinimumWidth(self.sizeHint().width())
+        self.currentRowChanged.connect(self._told)
+
+    def sizeHint(self) -> QSize:
+        """As wide as the longest title needs."""
+        metrics = self.fontMetrics()
+        texts = [metrics.horizontalAdvance(self.item(row).text()) for row in range(self.count())]
+        return QSize(max([60, *texts]) + ICON_PX + 36, 200)
+
+    def show_states(self, states: Mapping[str, State]) -> None:
+        """Show how far every step is."""
+        self._states = states
+        dark = is_dark(self.palette())
+        selected = self.palette().color(QPalette.ColorRole.HighlightedText)
+        for row, step in enumerate(self._steps):
+            state, item = states[step.key], self.item(row)
+            item.setIcon(mark_icon(state.mark, dark, selected))
+            item.setToolTip(plain_tip(f"{state.mark.value.capitalize()}: {state.why}"))
+            told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
+            item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and self._states:
+            self.show_states(self._states)
+
+    def show_step(self, key: str) -> None:
+        """Mark the step in view; none for the welcome page."""
+        keys = [step.key for step in self._steps]
+        self.blockSignals(True)
+        self.setCurrentRow(keys.index(key) if key in keys else -1)
+        self.blockSignals(False)
+
+    def _told(self, row: int) -> None:
+        if row >= 0:
+            self.chosen.emit(self._steps[row].key)
+
+
+class SidePanel(QWidget):
+    """What to do now, how far the step is, and the page's own panel, which scrolls."""
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        self._shown: State | None = None
+        super().__init__(parent)
+        self.title = plain_label()
+        font = self.title.font()
+        font.setPointSizeF(font.pointSizeF() * 1.25)
+        font.setBold(True)
+        self.title.setFont(font)
+        self.hint = plain_label()
+        self.state = Message(STATE_LINES)
+        self.read_only = plain_label(f"⚠ {READ_ONLY} until it is opened again for changes.")
+        self.read_only.hide()
+        for label in (self.hint, self.read_only):
+            label.setWordWrap(True)
+            label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.stack = QStackedWidget()
+        self._areas: dict[QWidget, QScrollArea] = {}
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(10, 8, 6, 6)
+        for widget in (self.title, self.hint, self.state, self.read_only):
+            layout.addWidget(widget)
+        line = QFrame()
+        line.setFrameShape(QFrame.Shape.HLine)
+        line.setForegroundRole(QPalette.ColorRole.Mid)
+        layout.addWidget(line)
+        layout.addWidget(self.stack, 1)
+        self.setMinimumWidth(320)
+
+    def sizeHint(self) -> QSize:
+        """Room for two columns of numbers."""
+        return QSize(350, 500)
+
+    def show_panel(self, panel: QWidget, step: Step) -> None:
+        """Show a page's panel."""
+        if panel not in self._areas:
+            area = QScrollArea()
+            area.setWidgetResizable(True)
+            area.setFrameShape(QFrame.Shape.NoFrame)
+            # Where it came and went, words would wrap otherwise, and what is below them move.
+            area.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOn)
+            area.setAccessibleName(f"{step.title}: parameters and results")
+            area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
+            area.setWidget(panel)
+            self._areas[panel] = area
+            self.stack.addWidget(area)
+        self.stack.setCurrentWidget(self._areas[panel])
+        self.title.setText(step.title)
+        self.hint.setText(step.hint)
+
+    def show_state(self, state: State) -> None:
+        """Show how far the step is, and why."""
+        self._shown = state
+        self.state.setText(f"{SIGNS[state.mark]}  {state.why}")
+        palette = self.state.palette()
+        colour = COLOURS[state.mark][is_dark(self.palette())]
+        palette.setColor(QPalette.ColorRole.WindowText, QColor(colour))
+        self.state.setPalette(palette)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange and self._shown is not None:
+            self.show_state(self._shown)

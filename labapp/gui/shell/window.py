@@ -1,0 +1,491 @@
+"""The window: steps at the left, the page, its panel at the right, the timeline at the bottom."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PySide6.QtCore import QByteArray, QEvent, QSize, Qt, QTimer, QUrl
+from PySide6.QtGui import QCloseEvent, QDesktopServices, QDragEnterEvent, QDropEvent, QKeyEvent
+from PySide6.QtWidgets import (
+    QApplication,
+    QDialog,
+    QDockWidget,
+    QMainWindow,
+    QStackedWidget,
+    QTableView,
+    QWidget,
+)
+
+from labapp.core.values import IntArray
+from labapp.errors import InputError
+from labapp.gui.pages import PAGES
+from labapp.gui.pages.page import Page
+from labapp.gui.pages.welcome import Welcome
+from labapp.gui.preferences import Preferences, change_preferences, recall_preferences
+from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.files import Files, title
+from labapp.gui.shell.filming import may_close
+from labapp.gui.shell.focus import finish_edit
+from labapp.gui.shell.help import HelpDialog
+from labapp.gui.shell.menus import Menus
+from labapp.gui.shell.messages import LogPanel, StatusLine
+from labapp.gui.shell.standing import DOUBTFUL, TICKS, next_frame, standings
+from labapp.gui.shell.step_list import SidePanel, StepList
+from labapp.gui.shell.steps import STEPS, first_step, states
+from labapp.gui.theme import apply_theme
+from labapp.gui.widgets.tables import table_text
+from labapp.gui.widgets.timeline import Timeline
+from labapp.gui.workspace import MEASURING, Workspace
+from labapp.log import log_file
+
+REST = 4
+"""After showing a change the window rests so many times as long as that took, for the hands."""
+
+LONGEST_REST_MS = 1000
+
+LAYOUT_VERSION = 1
+
+SIZE_PX = (1600, 1000)
+PART_OF_SCREEN = 0.92
+"""Size at the first start, and the most of the screen that it takes."""
+
+PAGE_PX = 336
+"""Least height of a page: with all panels 492, of the 512 that 768 are at 150 %."""
+
+
+class MainWindow(QMainWindow):
+    """The app's one window.
+
+    Parameters
+    ----------
+    preferences
+        What is remembered from the last start.
+    preferences_file
+        Where they are kept.
+
+    Attributes
+    ----------
+    workspace
+        What is open.
+    standings
+        How each frame stands, shape (n,).
+    page
+        The page in view; None for the welcome page.
+    """
+
+    preferences: Preferences
+    workspace: Workspace
+    files: Files
+    timeline: Timeline
+    status_line: StatusLine
+
+    def __init__(self, preferences: Preferences, preferences_file: Path) -> None:
+        super().__init__()
+        self.setObjectName("labapp")
+        self.preferences = preferences
+        self._preferences_file = preferences_file
+        self.workspace = Workspace(self)
+        self.files = Files(self)
+        self.standings: IntArray = np.zeros(0, np.int64)
+        self.page: Page | None = None
+        self._steps = tuple(step for step in STEPS if step.key in PAGES)
+        self.pages: dict[str, Page] = {}
+        self._states = states(None)
+        self._changes_due = False
+        self._rest = QTimer(self)
+        self._rest.setSingleShot(True)
+        self._rest.timeout.connect(self._rested)
+        self._make_views()
+        without = {f"step_{step.key}" for step in STEPS} - {f"step_{s.key}" for s in self._steps}
+        self.menus = Menus(self, frozenset(action.name for action in ACTIONS) - without)
+        self._connect()
+        self.setAcceptDrops(True)
+        self._plain_layout = self.saveState(LAYOUT_VERSION)
+        self._restore()
+        if preferences.foot_switches:
+            self.workspace.foot_switches.use(preferences.foot_switches)
+        self._session_opened()
+
+    def _make_views(self) -> None:
+        self.welcome = Welcome(self.workspace)
+        self.stack = QStackedWidget()
+        self.stack.setMinimumHeight(PAGE_PX)  # else hidden pages could make the window grow
+        self.stack.addWidget(self.welcome)
+        self.setCentralWidget(self.stack)
+        self.step_list = StepList(self._steps)
+        self.side_panel = SidePanel()
+        self.timeline = Timeline(TICKS)
+        self.log_panel = LogPanel()
+        self.status_line = StatusLine(self.workspace.tasks)
+        self.statusBar().setSizeGripEnabled(False)
+        self.statusBar().addWidget(self.status_line, 1)
+        left, right = Qt.DockWidgetArea.LeftDockWidgetArea, Qt.DockWidgetArea.RightDockWidgetArea
+        bottom = Qt.DockWidgetArea.BottomDockWidgetArea
+        self._wanted = {"steps": True, "panel": True, "timeline": True, "log": False}
+        self._docks = {
+            "steps": self._dock("steps", "Steps", self.step_list, left),
+            "panel": self._dock("panel", "Parameters and results", self.side_panel, right),
+            "timeline": self._dock("timeline", "Timeline", self.timeline, bottom),
+            "log": self._dock("log", "Messages", self.log_panel, bottom),
+        }
+        self.splitDockWidget(self._docks["timeline"], self._docks["log"], Qt.Orientation.Vertical)
+
+    def _dock(self, name: str, title: str, widget: QWidget, area: Qt.DockWidgetArea) -> QDockWidget:
+        dock = QDockWidget(title, self)
+        dock.setObjectName(f"dock-{name}")
+        dock.setFeatures(QDockWidget.DockWidgetFeature.NoDockWidgetFeatures)
+        dock.setTitleBarWidget(QWidget())
+        dock.setWidget(widget)
+        self.addDockWidget(area, dock)
+        return dock
+
+    def _connect(self) -> None:
+        space = self.workspace
+        space.closing.connect(self._leave)
+        space.opened.connect(self._session_opened)
+        space.changed.connect(self._changed)
+        space.measured.connect(self._show_measured)
+        space.frame_changed.connect(self._frame_changed)
+        space.said.connect(self.say)
+        space.settled.connect(self.status_line.settle)
+        space.asked.connect(self.menus.do)
+        space.next_wanted.connect(self.files.begin_next)
+        space.pedals_kept.connect(
+            lambda held: self.remember(lambda before: replace(before, foot_switches=held))
+        )
+        space.tasks.changed.connect(self.menus.refresh)
+        self.step_list.chosen.connect(self.show_step)
+        self.timeline.moved.connect(space.show_frame)
+        self.timeline.jumped.connect(self.jump)
+        self.status_line.read.connect(self.read_messages)
+        self.welcome.asked.connect(self.menus.do)
+        self.welcome.chosen.connect(self.files.open)
+        self.welcome.forgotten.connect(self.files.forget)
+
+    # --- what is in view --------------------------------------------------------------------
+
+    def say(self, text: str, problem: bool = False) -> None:
+        """Tell the operator something; a problem stays in the status line until it was read."""
+        self.log_panel.add(text, problem)
+        self.status_line.say(text, problem)
+        if problem:
+            self.timeline.set_playing(False)
+
+    def read_messages(self) -> None:
+        """Show the messages; the problems count as read."""
+        self._wanted["log"] = True
+        self.status_line.mark_read()
+        self._show_docks()
+        self.menus.refresh()
+
+    def show_step(self, key: str) -> None:
+        """Bring a step's page into view; it is made when it is first shown."""
+        if self.workspace.session is None or key not in PAGES:
+            return
+        if key not in self.pages:
+            made = self.workspace.tried(lambda: PAGES[key](self.workspace))
+            if made is None:
+                return
+            self.pages[key] = made
+            self.stack.addWidget(made)
+        page = self.pages[key]
+        if page is not self.page:
+            self._leave()
+            self.page = page
+            listed = self.step_list.hasFocus()
+            self.stack.setCurrentWidget(page)
+            step = next(step for step in STEPS if step.key == key)
+            page.setAccessibleName(step.title)
+            self.side_panel.show_panel(page.panel, step)
+            if not listed:
+                page.setFocus()  # or they stay with what is hidden now
+        self.step_list.show_step(key)
+        self._show_page()
+        self.menus.refresh()
+
+    def go_step(self, by: int) -> None:
+        """Go some steps on, or back."""
+        if self.page is not None:
+            keys = [step.key for step in self._steps]
+            place = keys.index(self.page.key) + by
+            self.show_step(keys[max(0, min(len(keys) - 1, place))])
+
+    def jump(self, kind: str, forward: bool) -> None:
+        """Go to the next frame that is ``doubtful`` or ``corrected``, or the one before."""
+        session = self.workspace.session
+        if session is None:
+            return
+        if kind == "doubtful":
+            wanted, words = np.isin(self.standings, DOUBTFUL), "in doubt"
+        else:
+            corrected = session.corrected_frames()
+            wanted, words = np.isin(session.frames, corrected), "corrected by hand"
+        found = next_frame(session.frames, wanted, self.workspace.frame, forward)
+        if found is None:
+            self.say(f"No frame {'after' if forward else 'before'} this one is {words}")
+        else:
+            self.workspace.show_frame(found)
+
+    def _leave(self) -> None:
+        if self.page is not None:
+            finish_edit(self.page, self.page.panel)
+            self.workspace.tried(self.page.leave)
+            self.page = None
+
+    def _session_opened(self) -> None:
+        """Show another session from the start, or the welcome page."""
+        session = self.workspace.session
+        self.timeline.set_playing(False)
+        self.status_line.say("", False)  # what was said of another session
+        self._leave()
+        self.side_panel.read_only.setVisible(session is not None and session.read_only)
+        self._show_session()
+        if session is None:
+            self.stack.setCurrentWidget(self.welcome)
+            self.step_list.show_step("")
+            self.files.list_recent()
+        elif self._steps:
+            keys = [step.key for step in self._steps]
+            first = self.workspace.tried(lambda: first_step(session)) or "setup"
+            self.show_step(first if first in keys else keys[0])
+        self._show_docks()
+
+    def _changed(self) -> None:
+        if self._rest.isActive():
+            self._changes_due = True
+        else:
+            self._show_session()
+
+    def _rested(self) -> None:
+        if self._changes_due:
+            self._show_session()
+
+    def _show_session(self) -> None:
+        """Show what the session holds now, everywhere."""
+        began = time.perf_counter()
+        self._changes_due = False
+        self._show_frames()
+        self._show_page()
+        self.menus.refresh()
+        self.setWindowTitle(title(self.workspace.session))
+        took_ms = (time.perf_counter() - began) * 1000
+        self._rest.start(min(LONGEST_REST_MS, round(REST * took_ms)))
+
+    def _show_frames(self) -> None:
+        """Show how all frames stand, and with them the steps."""
+        session = self.workspace.session
+        seen = self.workspace.tried(self.workspace.overview)
+        if seen is None:
+            self.standings = np.zeros(0, np.int64)
+            self.timeline.set_frames(self.standings, np.zeros(0), self.standings)
+        else:
+            self.standings = standings(seen)
+            self.timeline.set_frames(seen.frame, seen.time_s, self.standings)
+        self.timeline.set_frame(self.workspace.frame)
+        self._states = self.workspace.tried(lambda: states(session, seen)) or states(None)
+        own = {key: page.state(self._states[key]) for key, page in self.pages.items()}
+        self.step_list.show_states(self._states | own)
+
+    def _show_measured(self) -> None:
+        """Show that frames were measured that are not in view."""
+        if self._rest.isActive():
+            return  # more will follow, and the last is shown with all the rest
+        if self.page is None or self.page.shows_all_frames:
+            self._show_session()
+        else:
+            self._show_frames()
+            self.side_panel.show_state(self.page.state(self._states[self.page.key]))
+
+    def _show_page(self) -> None:
+        if self.page is not None and self.workspace.session is not None:
+            self.side_panel.show_state(self.page.state(self._states[self.page.key]))
+            self.workspace.tried(self.page.refresh)
+
+    def _frame_changed(self, frame: int) -> None:
+        self.timeline.set_frame(frame)
+        self._show_page()
+
+    # --- measuring, copying -----------------------------------------------------------------
+
+    def measure_all(self) -> None:
+        """Measure the frames that are not measured, or no longer stand."""
+        session = self.workspace.session
+        if session is not None and not len(session.stale_frames()):
+            self.say("Every frame is measured, and its measures stand")
+        elif session is not None:
+            self._measure(None)
+
+    def measure_frame(self) -> None:
+        """Measure the frame in view."""
+        self._measure([self.workspace.frame])
+
+    def _measure(self, frames: list[int] | None) -> None:
+        session = self.workspace.session
+        if session is None:
+            return
+        if any(task.title == MEASURING for task in self.workspace.tasks.active):
+            self.say("Frames are being measured already")
+            return
+        try:
+            _ = session.setup
+        except InputError as error:
+            self.workspace.say_wrong(MEASURING, f"The set-up is not complete: {error}")
+            return
+        self.workspace.measure(frames)
+
+    def copy_picture(self) -> None:
+        """Copy the picture of the page in view."""
+        if self.page is not None:
+            QApplication.clipboard().setPixmap(self.page.picture())
+            self.say("The picture is on the clipboard")
+
+    def copy_table(self) -> None:
+        """Copy the table with the focus, or the first one in view."""
+        tables = [each for each in self.findChildren(QTableView) if each.isVisibleTo(self)]
+        if not tables:
+            self.say("This step has no table")
+            return
+        table = next((each for each in tables if each.hasFocus()), tables[0])
+        QApplication.clipboard().setText(table_text(table))
+        self.say("The table is on the clipboard")
+
+    # --- look -------------------------------------------------------------------------------
+
+    def set_theme(self, theme: str) -> None:
+        """Show the app light, dark or as the desktop is."""
+        self.remember(lambda before: replace(before, theme=theme))
+        self.apply_theme()
+
+    def apply_theme(self) -> None:
+        """Apply the theme that is remembered; the desktop may have changed."""
+        app = QApplication.instance()
+        if isinstance(app, QApplication):
+            apply_theme(app, self.preferences.theme)
+        self._show_session()
+
+    def dock_is_wanted(self, name: str) -> bool:
+        """Whether a panel is to be seen while a session is open."""
+        return self._wanted[name]
+
+    def toggle_dock(self, name: str) -> None:
+        """Show or hide a panel."""
+        self._wanted[name] = not self._wanted[name]
+        if name == "log" and self._wanted[name]:
+            self.status_line.mark_read()
+        self._show_docks()
+
+    def _show_docks(self, everywhere: bool = False) -> None:
+        """Show the panels that are wanted; on the welcome page only the log."""
+        here = everywhere or self.workspace.session is not None
+        for name, dock in self._docks.items():
+            dock.setVisible(self._wanted[name] and (here or name == "log"))
+
+    def reset_layout(self) -> None:
+        """Put the panels back where they were at the first start."""
+        self.restoreState(self._plain_layout, LAYOUT_VERSION)
+        self._wanted = {name: name != "log" for name in self._wanted}
+        self._show_docks()
+
+    def toggle_full_screen(self) -> None:
+        """Use all of the screen, or go back to a window."""
+        if self.isFullScreen():
+            self.showNormal()
+        else:
+            self.showFullScreen()
+
+    def show_help(self, kind: str) -> None:
+        """Show the guide, the keys or what the program is."""
+        HelpDialog(kind, self, self.page).show()
+
+    def show_log_folder(self) -> None:
+        """Open the folder with the log."""
+        folder = log_file().parent
+        if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(folder))):
+            self.say(f"The log is in {folder}")
+
+    def _restore(self) -> None:
+        room = self.screen().availableSize()
+        self.resize(QSize(*SIZE_PX).boundedTo(room * PART_OF_SCREEN))
+        restored = (
+            (self.restoreGeometry, self.preferences.geometry),
+            (lambda held: self.restoreState(held, LAYOUT_VERSION), self.preferences.layout),
+        )
+        for restore, text in restored:
+            if text:
+                restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
+        if self.preferences.layout:
+            self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
+            self._wanted["log"] = False  # what was said then is not said now
+
+    def remember(self, change: Callable[[Preferences], Preferences]) -> None:
+        """Change what is kept for the next start, other windows' part of it included."""
+        self.preferences, problem = change_preferences(
+            self._preferences_file, self.preferences, change
+        )
+        if problem:
+            self.say(problem)
+        self.menus.show_recent(self.preferences.recent)
+
+    def recall(self) -> None:
+        """Look up what is remembered: other windows may have opened sessions meanwhile."""
+        self.preferences = recall_preferences(self._preferences_file, self.preferences)
+
+    # --- events -----------------------------------------------------------------------------
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:
+        """Do what a plain key means that nothing else has taken."""
+        taken = self.page is not None and self.page.takes_key(event)
+        if not taken and not self.menus.key(event):
+            super().keyPressEvent(event)
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Look at what other windows have remembered when this one is worked in again."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.ActivationChange and self.isActiveWindow():
+            before = self.preferences
+            self.recall()
+            if self.preferences.recent != before.recent:
+                self.files.list_recent()
+            if self.preferences.theme != before.theme:
+                self.apply_theme()
+
+    def dragEnterEvent(self, event: QDragEnterEvent) -> None:
+        """Take files."""
+        if any(url.isLocalFile() for url in event.mimeData().urls()):
+            event.acceptProposedAction()
+
+    def dropEvent(self, event: QDropEvent) -> None:
+        """Open what was dropped, once the other program has its pointer back."""
+        paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
+        event.acceptProposedAction()
+        if len(paths) > 1:
+            self.say("Drop one file, or the folder that holds the images", True)
+        elif paths:
+            QTimer.singleShot(0, self, lambda: self.files.open_path(paths[0]))
+
+    def closeEvent(self, event: QCloseEvent) -> None:
+        """Stop all work, remember the layout and close the session.
+
+        The operator is asked about a recording that runs; the program closes without a question.
+        """
+        if event.spontaneous() and not may_close(self):
+            event.ignore()
+            return
+        for beside in self.findChildren(QDialog):
+            beside.close()
+        self.timeline.set_playing(False)
+        self._show_docks(everywhere=True)
+        geometry, layout = _text(self.saveGeometry()), _text(self.saveState(LAYOUT_VERSION))
+        self.remember(lambda before: replace(before, geometry=geometry, layout=layout))
+        self.workspace.opened.disconnect(self._session_opened)
+        self.workspace.close()
+        self._rest.stop()
+        event.accept()
+
+
+def _text(held: QByteArray) -> str:
+    return bytes(held.toBase64().data()).decode("ascii")

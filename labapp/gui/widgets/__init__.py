@@ -1,0 +1,1 @@
+"""Fields, labels and tables that the pages are made of."""

@@ -1,0 +1,89 @@
+"""How a frame is exposed, as bars and in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from PySide6.QtWidgets import QFormLayout, QProgressBar, QVBoxLayout, QWidget
+
+from labapp.core.images.exposure import Exposure
+from labapp.gui.widgets.labels import Message, headed, plain_tip
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar that shows how much.
+
+    Parameters
+    ----------
+    name
+        Of what.
+    part
+        From 0 to 1.
+    words
+        How much, in words.
+    tip
+        What it means.
+    """
+
+    name: str
+    part: float
+    words: str
+    tip: str
+
+
+class ExposureBars(QWidget):
+    """Exposure, saturation and contrast of the frame in view, and a verdict in words."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        outer = QVBoxLayout(self)
+        outer.setContentsMargins(0, 0, 0, 0)
+        inner, layout = headed("Exposure of the frame in view")
+        outer.addWidget(inner)
+        form = QFormLayout()
+        self.bars = []
+        for name in ("Exposure", "Saturation", "Contrast"):
+            bar = QProgressBar()
+            bar.setRange(0, 100)
+            self.bars.append(bar)
+            form.addRow(f"{name}:", bar)
+        layout.addLayout(form)
+        self.verdict = Message(3)
+        layout.addWidget(self.verdict)
+
+    def show_exposure(self, exposure: Exposure, verdict: str, good: bool) -> None:
+        """Show how a frame is exposed, and what to do about it."""
+        for bar, widget in zip(bars(exposure), self.bars, strict=True):
+            widget.setValue(round(100 * bar.part))
+            widget.setFormat(bar.words)
+            widget.setAccessibleName(f"{bar.name}: {bar.words}")
+            widget.setToolTip(plain_tip(bar.tip))
+        self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
+
+
+def bars(exposure: Exposure) -> tuple[Bar, Bar, Bar]:
+    """Exposure, saturation and contrast."""
+    dots = exposure.snr > 0
+    of = "dots" if dots else "pixels"
+    contrast = f"{exposure.contrast:.0%}, {exposure.snr:.0f} × the noise" if dots else "no dots"
+    return (
+        Bar(
+            "Exposure",
+            exposure.level,
+            f"{exposure.level:.0%} of full scale",
+            f"Level of the bright {of} as a part of the camera's full scale",
+        ),
+        Bar(
+            "Saturation",
+            exposure.clipped,
+            f"{exposure.clipped:.0%} of the {of} clipped",
+            f"Part of the {of} at the top of the scale: their centres cannot be told well",
+        ),
+        Bar(
+            "Contrast",
+            exposure.contrast,
+            contrast,
+            "How far the dots rise above their background, as a part of their level",
+        ),
+    )

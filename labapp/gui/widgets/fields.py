@@ -1,0 +1,474 @@
+"""Fields for numbers, words and choices, and the form that lays them out.
+
+A field tells of an edit only when it is finished: Enter, leaving the field, or a pause after steps.
+What is wrong stands in words below it: why the last entry was refused, until another one is taken;
+else what is wrong with the value that it holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from PySide6.QtCore import QEvent, QObject, QSignalBlocker, Qt, QTimer, Signal
+from PySide6.QtGui import (
+    QFocusEvent,
+    QGuiApplication,
+    QKeyEvent,
+    QPalette,
+    QValidator,
+    QWheelEvent,
+)
+from PySide6.QtWidgets import (
+    QAbstractSpinBox,
+    QComboBox,
+    QGridLayout,
+    QHBoxLayout,
+    QLineEdit,
+    QPlainTextEdit,
+    QSizePolicy,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.digits import entered, parsed
+from labapp.gui.widgets.labels import heading, plain_label, plain_tip
+
+MOUSE_MS = 20
+"""How often it is asked whether the mouse is let go."""
+
+STEP_PAUSE_MS = 300
+"""Steps that follow each other faster than this are one edit."""
+
+
+class Field(QWidget):
+    """An editor with its label, its unit and room for a problem in words.
+
+    Signals
+    -------
+    edited
+        The operator has entered another value: the value, None where it was emptied.
+
+    Attributes
+    ----------
+    label
+        Stands before it; a `FieldForm` places it.
+    editor
+        The widget that takes the keys.
+    """
+
+    edited = Signal(object)
+
+    def __init__(self, label: str, editor: QWidget, tooltip: str, unit: str = "") -> None:
+        super().__init__()
+        self.label = plain_label(label)
+        self.label.setWordWrap(True)
+        self.label.setBuddy(editor)
+        self.label.setToolTip(tooltip)
+        self.editor = editor
+        editor.setToolTip(tooltip)
+        editor.setAccessibleName(f"{label}, {unit}" if unit else label)
+        self._tooltip = tooltip
+        self._refusal = self._fault = ""
+        self.unit = plain_label(unit)
+        self.problem = plain_label()
+        self.problem.setWordWrap(True)
+        self.problem.hide()
+        self.setFocusProxy(editor)
+        line = QHBoxLayout()
+        line.addWidget(editor, 1)
+        if unit:
+            line.addWidget(self.unit)
+        layout = QVBoxLayout(self)
+        layout.setContentsMargins(0, 0, 0, 0)
+        layout.setSpacing(2)
+        layout.addLayout(line)
+        layout.addWidget(self.problem)
+        self.set_problem("")
+
+    def set_problem(self, words: str) -> None:
+        """Say what is wrong with what the field holds; empty: nothing is."""
+        self._fault = words
+        self._show_problem()
+
+    def lock(self, why: str) -> None:
+        """Let nothing be entered, and say why; empty: let it."""
+        self._set_locked(bool(why))
+        self.editor.setToolTip(plain_tip(why or self._tooltip))
+        self.label.setToolTip(plain_tip(why or self._tooltip))
+
+    def _set_locked(self, locked: bool) -> None:
+        self.editor.setEnabled(not locked)
+
+    def refuse(self, words: str) -> None:
+        """Say why the last entry was refused, until this field takes or is shown another value."""
+        self._refusal = words
+        self._show_problem()
+
+    def _enter(self, value: object) -> None:
+        """Tell of an edit."""
+        self.refuse("")
+        self.edited.emit(value)
+
+    def _show_problem(self) -> None:
+        words = self._refusal or self._fault
+        described = f"{words}. {self._tooltip}" if words else self._tooltip
+        self.editor.setAccessibleDescription(described)
+        self._tell_problem()
+
+    def _tell_problem(self) -> None:
+        """Make or take its room; not while a button of the mouse is down, or a click is lost."""
+        words = self._refusal or self._fault
+        told = f"⚠ {words}" if words else ""
+        if told != self.problem.text() and QGuiApplication.mouseButtons():
+            QTimer.singleShot(MOUSE_MS, self, self._tell_problem)
+            return
+        self.problem.setText(told)
+        self.problem.setVisible(bool(told))
+
+
+class NumberField(Field):
+    """A number with its unit, right-aligned; steps by arrow keys, buttons and wheel.
+
+    What is no number, or out of range, is said below the field, and the former value stays. While
+    the operator types, `set_value` does not take the text from under the hand.
+
+    Parameters
+    ----------
+    label, unit, tooltip
+        What it is; its unit; what it does.
+    lowest, highest
+        The range, both ends included.
+    step
+        Of the arrow keys and buttons; Page Up and Down go ten.
+    decimals
+        How many are shown; 0: whole numbers, and values are int.
+    optional
+        Whether the field may be emptied.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        unit: str = "",
+        *,
+        lowest: float,
+        highest: float,
+        step: float = 1.0,
+        decimals: int = 2,
+        tooltip: str = "",
+        optional: bool = False,
+    ) -> None:
+        self._box = _NumberBox()
+        super().__init__(label, self._box, tooltip, unit)
+        self.lowest, self.highest, self.step = lowest, highest, step
+        self.decimals, self.optional = decimals, optional
+        self._value: float | None = None
+        self._told: float | None = None
+        self._typed = False
+        self._box.line.textEdited.connect(self._note_typing)
+        self._box.stepped.connect(self._step)
+        self._box.editingFinished.connect(self._commit)
+        self._pause = QTimer(self)
+        self._pause.setSingleShot(True)
+        self._pause.setInterval(STEP_PAUSE_MS)
+        self._pause.timeout.connect(self._tell)
+
+    def value(self) -> float | None:
+        """What the field holds; None if it is empty."""
+        return self._value
+
+    def set_value(self, value: float | None) -> None:
+        """Show another value; tells nobody."""
+        if self._pause.isActive():
+            return
+        typing = self._box.text() != self._shown(self._value) and self._box.line.isModified()
+        if value != self._value:
+            self.refuse("")
+        self._value = self._told = value
+        if not typing:
+            self._show()
+            self.set_problem("")
+
+    def flush(self) -> None:
+        """Finish an edit under way, as leaving the field does."""
+        self._commit()
+
+    def _shown(self, value: float | None) -> str:
+        return "" if value is None else entered(value, self.decimals)
+
+    def _show(self) -> None:
+        with QSignalBlocker(self._box):
+            self._box.line.setText(self._shown(self._value))
+
+    def _note_typing(self) -> None:
+        self._typed = True
+
+    def _commit(self) -> None:
+        text = self._box.text()
+        if text != self._shown(self._value):
+            value, problem = self._read(text)
+            if not problem:
+                self._value = value
+            self.refuse(problem)
+            self._show()
+        elif self._typed:  # what it held already, and is right
+            self.refuse("")
+        self._typed = False
+        self._tell()
+
+    def _read(self, text: str) -> tuple[float | None, str]:
+        """Value of a text, and what is wrong with it."""
+        kept = self._shown(self._value) or "nothing"
+        if not text.strip():
+            return None, "" if self.optional else f"A number is needed; {kept} stays"
+        value = parsed(text)
+        if value is None:
+            return None, f"“{text.strip()}” is not a number; {kept} stays"
+        if not self.lowest <= value <= self.highest:
+            low, high = (entered(end, 0) for end in (self.lowest, self.highest))
+            words = f"from {low} to {high} {self.unit.text()}".strip()
+            return None, f"“{text.strip()}” is not {words}; {kept} stays"
+        if self.decimals == 0:
+            if value != int(value):
+                return None, f"“{text.strip()}” is not a whole number; {kept} stays"
+            return int(value), ""
+        return value, ""
+
+    def _step(self, steps: int) -> None:
+        value, problem = self._read(self._box.text())
+        start = self._value if problem or value is None else value
+        if start is None:
+            start = min(max(0.0, self.lowest), self.highest) - steps * self.step
+        moved = min(max(start + steps * self.step, self.lowest), self.highest)
+        self._value = int(moved) if self.decimals == 0 else round(moved, 9)
+        self.refuse("")
+        self._show()
+        self._pause.start()
+
+    def _tell(self) -> None:
+        self._pause.stop()
+        if self._value != self._told:
+            self._told = self._value
+            self._enter(self._value)
+
+
+class _NumberBox(QAbstractSpinBox):
+    """The line and the arrow buttons; any text is let through, the field judges it."""
+
+    stepped = Signal(int)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.line = self.lineEdit()
+        self.setAlignment(Qt.AlignmentFlag.AlignRight)
+        self.setMinimumWidth(self.fontMetrics().horizontalAdvance("−00000.000") + 28)
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+
+    def validate(self, text: str, position: int) -> Any:
+        return QValidator.State.Acceptable, text, position
+
+    def stepEnabled(self) -> QAbstractSpinBox.StepEnabledFlag:
+        flags = QAbstractSpinBox.StepEnabledFlag
+        return flags.StepUpEnabled | flags.StepDownEnabled
+
+    def stepBy(self, steps: int) -> None:
+        self.stepped.emit(steps)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:
+        # Scrolling a panel must not change the numbers that pass under the pointer.
+        if self.hasFocus():
+            super().wheelEvent(event)
+        else:
+            event.ignore()
+
+
+class TextField(Field):
+    """Words: one line, or several.
+
+    Parameters
+    ----------
+    label, tooltip
+        What it is; what it is for.
+    lines
+        How many are shown; with more than one, Enter begins another and Ctrl+Enter finishes.
+    placeholder
+        Shown while it is empty.
+    line
+        Takes the keys if there is one line; None for a plain one.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        *,
+        tooltip: str = "",
+        lines: int = 1,
+        placeholder: str = "",
+        line: QLineEdit | None = None,
+    ) -> None:
+        self._edit: QLineEdit | _Paragraphs = (
+            line or QLineEdit() if lines == 1 else _Paragraphs(lines)
+        )
+        super().__init__(label, self._edit, tooltip)
+        self._edit.setPlaceholderText(placeholder)
+        self._told = ""
+        if isinstance(self._edit, QLineEdit):
+            self._edit.editingFinished.connect(self.flush)
+        else:
+            self._edit.finished.connect(self.flush)
+
+    def value(self) -> str:
+        """The words."""
+        edit = self._edit
+        return edit.text() if isinstance(edit, QLineEdit) else edit.toPlainText()
+
+    def set_value(self, value: str) -> None:
+        """Show other words; tells nobody, and leaves alone what is being typed."""
+        edit = self._edit
+        modified = edit if isinstance(edit, QLineEdit) else edit.document()
+        typing = modified.isModified() and self.value() != self._told
+        if value != self._told:
+            self.refuse("")
+        self._told = value
+        if typing or value == self.value():
+            return
+        if isinstance(self._edit, QLineEdit):
+            self._edit.setText(value)
+        else:
+            self._edit.setPlainText(value)
+
+    def flush(self) -> None:
+        """Finish an edit under way, as leaving the field does."""
+        if self.value() != self._told:
+            self._told = self.value()
+            self._enter(self._told)
+
+    def _set_locked(self, locked: bool) -> None:
+        if isinstance(self._edit, QLineEdit):
+            super()._set_locked(locked)
+            return
+        # It can still be scrolled and copied from; its ground says that it takes nothing.
+        self._edit.setReadOnly(locked)
+        ground = QPalette.ColorRole.Window if locked else QPalette.ColorRole.Base
+        self._edit.viewport().setBackgroundRole(ground)
+
+
+class _Paragraphs(QPlainTextEdit):
+    """Several lines, left with Tab."""
+
+    finished = Signal()
+
+    def __init__(self, lines: int) -> None:
+        super().__init__()
+        self.setTabChangesFocus(True)
+        self.setFixedHeight(self.fontMetrics().lineSpacing() * lines + 14)
+
+    def focusOutEvent(self, event: QFocusEvent) -> None:
+        super().focusOutEvent(event)
+        self.finished.emit()
+
+    def keyPressEvent(self, event: QKeyEvent) -> None:
+        enter = event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter)
+        if enter and event.modifiers() & Qt.KeyboardModifier.ControlModifier:
+            self.finished.emit()
+        else:
+            super().keyPressEvent(event)
+
+
+class ChoiceField(Field):
+    """One of several.
+
+    Parameters
+    ----------
+    label, tooltip
+        What it is; what it does.
+    choices
+        (key, words) pairs; keys are what `value` and ``edited`` give.
+    """
+
+    def __init__(
+        self, label: str, choices: Sequence[tuple[str, str]] = (), *, tooltip: str = ""
+    ) -> None:
+        self._combo = QComboBox()
+        super().__init__(label, self._combo, tooltip)
+        self._combo.setSizeAdjustPolicy(
+            QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon
+        )
+        self._combo.setMinimumContentsLength(8)
+        self._combo.installEventFilter(self)
+        self._told = ""
+        self.set_choices(choices)
+        self._combo.activated.connect(self._activated)
+
+    def value(self) -> str:
+        """Key of the choice; empty without one."""
+        return str(self._combo.currentData() or "")
+
+    def set_value(self, key: str) -> None:
+        """Choose by key; tells nobody."""
+        self._combo.setCurrentIndex(self._combo.findData(key))
+        if self.value() != self._told:
+            self.refuse("")
+        self._told = self.value()
+
+    def set_choices(self, choices: Sequence[tuple[str, str]]) -> None:
+        """Offer other choices; the present one stays if it is among them."""
+        present = self.value()
+        self._combo.clear()
+        for key, words in choices:
+            self._combo.addItem(words, key)
+            place, tip = self._combo.count() - 1, plain_tip(words)
+            self._combo.setItemData(place, tip, Qt.ItemDataRole.ToolTipRole)
+        self.set_value(present or (choices[0][0] if choices else ""))
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+        """Keep the wheel from changing a choice that does not have the focus."""
+        if event.type() == QEvent.Type.Wheel and not self._combo.hasFocus():
+            event.ignore()
+            return True
+        return super().eventFilter(watched, event)
+
+    def _activated(self, _: int) -> None:
+        if self.value() != self._told:
+            self._told = self.value()
+            self._enter(self._told)
+
+
+class FieldForm(QWidget):
+    """Fields under each other: labels at the left, editors and units in columns."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._grid = QGridLayout(self)
+        self._grid.setContentsMargins(0, 0, 0, 0)
+        self._grid.setColumnStretch(0, 2)
+        self._grid.setColumnStretch(1, 3)
+        self._fields: list[Field] = []
+
+    def add(self, field: Field) -> None:
+        """Put a field below the others."""
+        row = self._grid.rowCount()
+        self._grid.addWidget(field.label, row, 0, Qt.AlignmentFlag.AlignTop)
+        self._grid.addWidget(field, row, 1)
+        # Level with the editor's first line.
+        height = field.editor.fontMetrics().lineSpacing() + 12
+        field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))
+        self._fields.append(field)
+        units = [other.unit for other in self._fields if other.unit.text()]
+        width = max((unit.sizeHint().width() for unit in units), default=0)
+        for unit in units:
+            unit.setMinimumWidth(width)
+
+    def add_heading(self, words: str) -> None:
+        """Begin a group of fields."""
+        self._grid.addWidget(heading(words), self._grid.rowCount(), 0, 1, 2)
+
+    def add_wide(self, widget: QWidget) -> None:
+        """Put something else below the fields, over the whole width."""
+        self._grid.addWidget(widget, self._grid.rowCount(), 0, 1, 2)
+
+
+def whole(label: str, lowest: int, tip: str) -> NumberField:
+    """A field for a whole number."""
+    return NumberField(label, lowest=lowest, highest=1, decimals=0, tooltip=tip)

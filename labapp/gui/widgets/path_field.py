@@ -1,0 +1,67 @@
+"""A field for a path, of which both ends are seen while nobody edits it."""
+
+from __future__ import annotations
+
+from PySide6.QtCore import QRect, Qt
+from PySide6.QtGui import QPainter, QPaintEvent
+from PySide6.QtWidgets import QLineEdit, QStyle, QStyleOptionFrame
+
+from labapp.gui.widgets.fields import TextField
+from labapp.gui.widgets.labels import plain_tip
+
+TEXT_MARGIN_PX = 2
+"""Between the frame's contents and the text: QLineEdit's own, which Qt does not tell."""
+
+
+class PathField(TextField):
+    """A file's or folder's path; its tooltip has it whole.
+
+    Parameters
+    ----------
+    label, tooltip
+        What it is; what it is for.
+    """
+
+    def __init__(self, label: str, *, tooltip: str = "") -> None:
+        line = PathLine()
+        super().__init__(label, tooltip=tooltip, line=line)
+        self._purpose = tooltip
+        line.textChanged.connect(self._tell_whole)
+
+    def _tell_whole(self, path: str) -> None:
+        self._tooltip = f"{path}\n{self._purpose}" if path else self._purpose
+        self.editor.setToolTip(plain_tip(self._tooltip))
+        self._show_problem()
+
+
+class PathLine(QLineEdit):
+    """A line whose text, too long and without the focus, is painted without its middle."""
+
+    def shown(self) -> str:
+        """The text as it is painted."""
+        if self.hasFocus():
+            return self.text()
+        width = self._contents().width()
+        return self.fontMetrics().elidedText(self.text(), Qt.TextElideMode.ElideMiddle, width)
+
+    def paintEvent(self, event: QPaintEvent) -> None:
+        """Paint the two ends of a text that is too long; as any line otherwise."""
+        shown = self.shown()
+        if shown == self.text():
+            super().paintEvent(event)
+            return
+        with QPainter(self) as painter:
+            panel = QStyle.PrimitiveElement.PE_PanelLineEdit
+            self.style().drawPrimitive(panel, self._option(), painter, self)
+            painter.setPen(self.palette().text().color())
+            painter.drawText(self._contents(), Qt.AlignmentFlag.AlignVCenter, shown)
+
+    def _option(self) -> QStyleOptionFrame:
+        option = QStyleOptionFrame()
+        self.initStyleOption(option)
+        return option
+
+    def _contents(self) -> QRect:
+        inner = QStyle.SubElement.SE_LineEditContents
+        room = self.style().subElementRect(inner, self._option(), self)
+        return room.adjusted(TEXT_MARGIN_PX, 0, -TEXT_MARGIN_PX, 0)

@@ -1,0 +1,74 @@
+"""The table of results: name, value, ± and unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QGuiApplication
+from PySide6.QtWidgets import QHeaderView, QTableWidgetItem
+
+from labapp.gui.digits import ResultRow, as_csv, as_text
+from labapp.gui.widgets.labels import plain_tip
+from labapp.gui.widgets.tables import ReadTable
+
+
+class ResultTable(ReadTable):
+    """Results: name, value, ±, unit. Copied as text (Ctrl+C) or CSV (its menu).
+
+    Parameters
+    ----------
+    name
+        What it shows, for a screen reader.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, "Ctrl+C copies it; right click to copy it as CSV")
+        self.rows: tuple[ResultRow, ...] = ()
+        self.setColumnCount(4)
+        self.setHorizontalHeaderLabels(["", "Value", "±", "Unit"])
+        self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        # The header tells of a width before the cells have it.
+        self._narrowed = QTimer(self, singleShot=True, interval=0)
+        self._narrowed.timeout.connect(self._fit_height)
+        self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
+        self.offer(("Copy table", self.copy_text), ("Copy table as CSV", self.copy_csv))
+        self.set_rows(())
+
+    def set_rows(self, rows: Iterable[ResultRow]) -> None:
+        """Show results; cells are changed in place, so that nothing jumps."""
+        self.rows = tuple(rows)
+        self.setRowCount(len(self.rows))
+        for k, row in enumerate(self.rows):
+            for column, text in enumerate(row.texts):
+                item = self.item(k, column)
+                if item is None:
+                    item = QTableWidgetItem()
+                    right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+                    if column in (1, 2):
+                        item.setTextAlignment(right)
+                    self.setItem(k, column, item)
+                item.setText(text)
+                item.setToolTip(plain_tip(row.note or " ".join(row.texts)))
+        self._fit_height()
+
+    def _fit_height(self) -> None:
+        """Give long names the lines that they take, and the table the height of all rows."""
+        self.resizeRowsToContents()
+        height = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
+        height += sum(self.rowHeight(k) for k in range(len(self.rows)))
+        self.setFixedHeight(height)
+
+    def copy_text(self) -> None:
+        """Put the selected rows, or all, on the clipboard, in tabs."""
+        QGuiApplication.clipboard().setText(as_text(self._chosen()))
+
+    def copy_csv(self) -> None:
+        """Put all rows on the clipboard as CSV, numbers in full."""
+        QGuiApplication.clipboard().setText(as_csv(self.rows))
+
+    def _chosen(self) -> list[ResultRow]:
+        chosen = sorted({index.row() for index in self.selectedIndexes()})
+        return [self.rows[k] for k in chosen] or list(self.rows)

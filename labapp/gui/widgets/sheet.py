@@ -1,0 +1,116 @@
+"""A printed picture (PNG, black on white) to read through; on a dark ground, white on black."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEvent, Qt
+from PySide6.QtGui import QAction, QGuiApplication, QImage, QKeySequence, QPixmap, QResizeEvent
+from PySide6.QtWidgets import QFrame, QScrollArea
+
+from labapp.gui.theme import is_dark
+from labapp.gui.widgets.labels import plain_label
+
+MOST_SCALE = 1.25
+"""Larger than so many times as it was printed it is not shown."""
+
+
+class Sheet(QScrollArea):
+    """A picture as wide as there is room, up to a little more than it was printed.
+
+    Parameters
+    ----------
+    name
+        What it shows, for a screen reader.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        self._printed = QImage()
+        self._paper = plain_label()
+        self._paper.setAlignment(Qt.AlignmentFlag.AlignHCenter | Qt.AlignmentFlag.AlignTop)
+        self.setWidget(self._paper)
+        self.setWidgetResizable(True)
+        self.setFrameShape(QFrame.Shape.NoFrame)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOn)
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setAccessibleName(name)
+        self.describe("")
+        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
+        copy = QAction("Copy picture", self)
+        copy.setShortcut(QKeySequence.StandardKey.Copy)
+        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+        copy.triggered.connect(self.copy_picture)
+        self.addAction(copy)
+
+    def describe(self, words: str) -> None:
+        """Say what is to be seen."""
+        keys = "Arrow keys and Page Up and Down move it; Ctrl+C copies it"
+        self.setAccessibleDescription(f"{words}. {keys}" if words else keys)
+
+    def show_png(self, content: bytes, words: str) -> None:
+        """Show a picture; the words are what a screen reader says."""
+        self._printed = QImage.fromData(content).convertToFormat(QImage.Format.Format_RGB32)
+        self.describe(words)
+        self._show()
+
+    def copy_picture(self) -> None:
+        """Put it on the clipboard, as it was printed."""
+        if not self._printed.isNull():
+            QGuiApplication.clipboard().setImage(self._printed)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Follow the width."""
+        super().resizeEvent(event)
+        self._show()
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)
+        if event.type() == QEvent.Type.PaletteChange:
+            self._show()
+
+    def _show(self) -> None:
+        if self._printed.isNull():
+            return
+        ratio = self.devicePixelRatioF()
+        wide = min(self.viewport().width(), round(MOST_SCALE * self._printed.width()))
+        image = self._printed
+        if is_dark(self.palette()):
+            image = _as_image(turned(_levels(image), self.palette().base().color().lightness()))
+        scaled = image.scaledToWidth(
+            round(wide * ratio), Qt.TransformationMode.SmoothTransformation
+        )
+        scaled.setDevicePixelRatio(ratio)
+        self._paper.setPixmap(QPixmap.fromImage(scaled))
+
+
+def turned(levels: npt.NDArray[np.uint8], ground: int) -> npt.NDArray[np.uint8]:
+    """A picture with light and dark exchanged, its hues kept; white becomes grey level ``ground``.
+
+    Parameters
+    ----------
+    levels
+        Shape (height, width, 3).
+    ground
+        0 … 255.
+    """
+    whole = levels.astype(np.int32)
+    turned_over = (
+        whole + 255 - whole.max(axis=-1, keepdims=True) - whole.min(axis=-1, keepdims=True)
+    )
+    return np.asarray(ground + turned_over * (255 - ground) // 255, np.uint8)
+
+
+def _levels(image: QImage) -> npt.NDArray[np.uint8]:
+    lines = np.frombuffer(image.constBits(), np.uint8).reshape(image.height(), -1, 4)
+    return lines[:, : image.width(), :3]
+
+
+def _as_image(levels: npt.NDArray[np.uint8]) -> QImage:
+    height, width, _ = levels.shape
+    whole = np.full((height, width, 4), 255, np.uint8)
+    whole[..., :3] = levels
+    held = whole.tobytes()  # until it is copied
+    return QImage(held, width, height, 4 * width, QImage.Format.Format_RGB32).copy()

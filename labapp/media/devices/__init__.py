@@ -1,0 +1,1 @@
+"""Foot switches and controllers: USB devices that are pressed and turned."""

@@ -1,0 +1,290 @@
+"""Foot switches: which pedal was pressed, learned by pressing it, and what it does."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from labapp.errors import InputError
+from labapp.media.devices.hid import (
+    LONGEST,
+    Find,
+    HidDevice,
+    HidError,
+    HidInfo,
+    HidReader,
+    Open,
+    find_hid,
+    has_numbers,
+    open_hid,
+)
+from labapp.media.events import Say, silent
+
+Action = Literal["trigger", "mark", "next"]
+"""Begin a recording; mark the frame; go to the next step."""
+
+ACTIONS: tuple[Action, ...] = ("trigger", "mark", "next")
+
+BOUNCE_S = 0.05
+"""A pedal that is down again within this time of having been down was pressed once."""
+
+GLANCE_MS = 10
+"""So long each device is listened to in turn while one is learned."""
+
+MODIFIERS = 0xE0
+"""The first of the keys that a keyboard tells by bits (Ctrl, Shift …)."""
+
+
+@dataclass(frozen=True)
+class PedalMap:
+    """A foot switch and what its pedals do.
+
+    Parameters
+    ----------
+    device
+        Its `HidInfo.key`.
+    name
+        What to call it.
+    keyboard
+        Whether it tells of keys.
+    actions
+        Pedal's number → what it does.
+    """
+
+    device: str
+    name: str
+    keyboard: bool
+    actions: Mapping[int, Action] = field(default_factory=dict)
+
+    def with_action(self, pedal: int, action: Action | None) -> PedalMap:
+        """The same with a pedal that does something else; None: nothing."""
+        actions = {key: value for key, value in self.actions.items() if key != pedal}
+        if action is not None:
+            actions[pedal] = action
+        return replace(self, actions=actions)
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, to be kept."""
+        actions = {str(pedal): action for pedal, action in self.actions.items()}
+        return {**vars(self), "actions": actions}
+
+    @classmethod
+    def from_dict(cls, values: Any) -> PedalMap:
+        """Take what `as_dict` gave.
+
+        Raises
+        ------
+        InputError
+            If it is anything else.
+        """
+        try:
+            actions = {int(pedal): action for pedal, action in values["actions"].items()}
+            texts = str(values["device"]), str(values["name"])
+            keyboard = bool(values["keyboard"])
+        except (TypeError, KeyError, ValueError, AttributeError) as error:
+            raise InputError("foot switch", "settings", values, "device and actions") from error
+        for action in actions.values():
+            if action not in ACTIONS:
+                expected = f"one of {', '.join(ACTIONS)}"
+                raise InputError("foot switch", "action", action, expected)
+        return cls(*texts, keyboard, actions)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A pedal that was pressed: on which device, and its number there."""
+
+    info: HidInfo
+    pedal: int
+
+    def mapped(self, action: Action) -> PedalMap:
+        """A foot switch of which this pedal does something."""
+        info = self.info
+        return PedalMap(info.key, info.name, info.is_keyboard, {self.pedal: action})
+
+
+class Pedals:
+    """Which pedals of a device are down, told by its reports.
+
+    A keyboard's report lists its keys; of any other device every bit may be a pedal, and those
+    that are set without one, as by a joystick's axes, count for nothing.
+
+    Parameters
+    ----------
+    keyboard
+        Whether the device is a keyboard.
+    """
+
+    def __init__(self, keyboard: bool) -> None:
+        self._keyboard = keyboard
+        self._down: dict[int, frozenset[int]] = {}
+
+    @property
+    def down(self) -> frozenset[int]:
+        """Pedals that are down, as told last."""
+        return frozenset().union(*self._down.values())
+
+    def pressed(self, number: int, report: bytes) -> frozenset[int]:
+        """Pedals that a report tells to be down, and that were not before.
+
+        Parameters
+        ----------
+        number
+            Number of the kind of report; 0 where there is one kind; −1: the device is gone.
+        report
+            What follows it.
+        """
+        if number < 0:
+            self._down.clear()
+            return frozenset()
+        down = _keys(report) if self._keyboard else _bits(number, report)
+        before = self._down.get(number, frozenset())
+        self._down[number] = down
+        return down - before
+
+
+def _keys(report: bytes) -> frozenset[int]:
+    """Keys that are down: a byte of modifiers, one that is unused, then keys by their numbers."""
+    modifiers = {MODIFIERS + bit for bit in range(8) if report[:1] and report[0] >> bit & 1}
+    # 1 to 3 tell of errors, such as too many keys.
+    return frozenset(modifiers | {key for key in report[2:] if key > 3})
+
+
+def _bits(number: int, report: bytes) -> frozenset[int]:
+    places = (8 * k + bit for k in range(len(report)) for bit in range(8) if report[k] >> bit & 1)
+    return frozenset(number * 8 * LONGEST + place for place in places)
+
+
+class FootSwitch:
+    """A foot switch in use: what is pressed is done, whenever it is plugged in.
+
+    Parameters
+    ----------
+    pedals
+        Which it is, and what its pedals do; what they do may be set otherwise at any time.
+    do
+        Called with what is to be done, in a thread of the foot switch.
+    say
+        Called with what happens.
+    find, opened
+        In tests others.
+    """
+
+    def __init__(
+        self,
+        pedals: PedalMap,
+        do: Callable[[Action], None],
+        say: Say = silent,
+        find: Find = find_hid,
+        opened: Open = open_hid,
+    ) -> None:
+        self.pedals = pedals
+        self._do = do
+        self._known = Pedals(pedals.keyboard)
+        self._down_s: dict[int, float] = {}
+        self._reader = HidReader(
+            lambda info: info.key == pedals.device, pedals.name, self._hear, say, find, opened
+        )
+
+    @property
+    def connected(self) -> bool:
+        """Whether it is plugged in and can be read."""
+        return self._reader.connected
+
+    def stop(self) -> None:
+        """Do nothing any more. Twice does no harm."""
+        self._reader.stop()
+
+    def __enter__(self) -> FootSwitch:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _hear(self, number: int, report: bytes) -> None:
+        now_s, before = time.monotonic(), self._known.down
+        new = self._known.pressed(number, report)
+        first = [p for p in sorted(new) if now_s - self._down_s.get(p, -math.inf) >= BOUNCE_S]
+        # One that is let go now was down until now: contacts bounce then, too.
+        self._down_s |= dict.fromkeys(before | new, now_s)
+        if number < 0:
+            self._down_s.clear()
+        for pedal in first:
+            action = self.pedals.actions.get(pedal)
+            if action is not None:
+                self._do(action)
+
+
+def learn(
+    ending: threading.Event,
+    find: Find = find_hid,
+    opened: Open = open_hid,
+    told: Callable[[list[str]], None] = lambda _: None,
+) -> Learned | None:
+    """Wait until a pedal is pressed, on whatever device but 3-D controllers and mice.
+
+    Parameters
+    ----------
+    ending
+        Set to wait no longer.
+    find, opened
+        In tests others.
+    told
+        Called once with why some devices cannot be listened to.
+
+    Returns
+    -------
+    Learned
+        What was pressed; None if ``ending`` was set first.
+
+    Raises
+    ------
+    HidError
+        If no device can be listened to: why, and what to do.
+    """
+    problems: list[str] = []
+    with ExitStack() as devices:
+        listening = list(_listen(find(), opened, devices, problems))
+        if not listening:
+            raise HidError("; ".join(problems) or "no foot switch is connected: plug it in")
+        told(problems)
+        while not ending.is_set():
+            for info, device, numbered, pedals in tuple(listening):
+                try:
+                    report = bytes(device.read(LONGEST, GLANCE_MS))
+                except (OSError, ValueError):
+                    listening.remove((info, device, numbered, pedals))
+                    continue
+                if not report:
+                    continue
+                new = pedals.pressed(report[0] if numbered else 0, report[numbered:])
+                if new:
+                    return Learned(info, min(new))
+            if not listening:
+                raise HidError("the foot switch was unplugged: plug it in")
+    return None
+
+
+def _listen(
+    infos: Iterable[HidInfo], opened: Open, devices: ExitStack, problems: list[str]
+) -> Iterable[tuple[HidInfo, HidDevice, bool, Pedals]]:
+    for info in infos:
+        if info.is_3d or (info.is_mouse and not info.is_pedal):
+            continue
+        try:
+            device = opened(info)
+        except HidError as error:
+            problems.append(str(error))
+            continue
+        devices.callback(device.close)
+        try:
+            numbered = has_numbers(device.get_report_descriptor())
+        except (OSError, ValueError) as error:
+            problems.append(f"{info.name} cannot be listened to: {error}")
+            continue
+        yield info, device, numbered, Pedals(info.is_keyboard)

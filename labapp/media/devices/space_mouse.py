@@ -1,0 +1,113 @@
+"""3Dconnexion's controllers: six axes, to turn what is seen in 3-D."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from labapp.media.devices.hid import AWAY, MISSING, Find, HidReader, Open, find_hid, open_hid
+from labapp.media.events import Event, Say, silent
+
+RETRY_S = 2.0
+"""Pause between looks for one: most benches have none."""
+
+FULL = 350.0
+"""What an axis gives at its stop."""
+
+TRANSLATION, ROTATION, BUTTONS = 1, 2, 3
+"""Numbers of the reports; newer devices send the rotation with the translation."""
+
+
+@dataclass(frozen=True)
+class SixAxes:
+    """How a controller is held; each axis −1 … 1.
+
+    Parameters
+    ----------
+    right, near, down
+        Pushed to the right, towards the operator, down.
+    pitch, roll, yaw
+        Turned about the first, the second, the third of these, right-handed.
+    buttons
+        Those that are down, by number from 0.
+    """
+
+    right: float = 0.0
+    near: float = 0.0
+    down: float = 0.0
+    pitch: float = 0.0
+    roll: float = 0.0
+    yaw: float = 0.0
+    buttons: frozenset[int] = frozenset()
+
+    def after(self, number: int, report: bytes) -> SixAxes:
+        """How it is held after a report of this number; as before where it tells nothing.
+
+        Number −1, the device is gone: let go of.
+        """
+        if number < 0:
+            return SixAxes()
+        move, turn = (self.right, self.near, self.down), (self.pitch, self.roll, self.yaw)
+        buttons = self.buttons
+        if number == TRANSLATION and len(report) >= 6:
+            move = _axes(report)
+            if len(report) >= 12:
+                turn = _axes(report[6:])
+        elif number == ROTATION and len(report) >= 6:
+            turn = _axes(report)
+        elif number == BUTTONS:
+            bits = int.from_bytes(report, "little")
+            buttons = frozenset(k for k in range(8 * len(report)) if bits >> k & 1)
+        return SixAxes(*move, *turn, buttons)
+
+
+class SpaceMouse:
+    """The controller that is plugged in, if one is, read in a thread.
+
+    Parameters
+    ----------
+    hold
+        Called with how it is held whenever that changes, in the reader's thread.
+    say
+        Called with what happens; that there is none is not told.
+    find, opened
+        In tests others.
+    """
+
+    def __init__(
+        self,
+        hold: Callable[[SixAxes], None],
+        say: Say = silent,
+        find: Find = find_hid,
+        opened: Open = open_hid,
+    ) -> None:
+        self._hold, self._say = hold, say
+        self._held = SixAxes()
+        self._reader = HidReader(
+            lambda info: info.is_3d, "3-D controller", self._hear, self._tell, find, opened, RETRY_S
+        )
+
+    @property
+    def connected(self) -> bool:
+        """Whether one is plugged in and can be read."""
+        return self._reader.connected
+
+    def stop(self) -> None:
+        """Read no more. Twice does no harm."""
+        self._reader.stop()
+
+    def _tell(self, event: Event) -> None:
+        if event.words not in (AWAY, MISSING):
+            self._say(event)
+
+    def _hear(self, number: int, report: bytes) -> None:
+        held = self._held.after(number, report)
+        if held != self._held:
+            self._held = held
+            self._hold(held)
+
+
+def _axes(report: bytes) -> tuple[float, float, float]:
+    x, y, z = (max(-1.0, min(1.0, value / FULL)) for value in struct.unpack("<3h", report[:6]))
+    return x, y, z

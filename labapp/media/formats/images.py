@@ -1,0 +1,149 @@
+"""Frames from image files: one picture, or a folder of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from labapp.errors import InputError
+from labapp.media.base import GreyImage, to_grey
+from labapp.media.formats.stored import StoredFrames, finite, regular_size
+from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
+from labapp.pixels import MOST_PIXELS
+
+IMAGE_SUFFIXES = frozenset(
+    ".png .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()
+) | set(TIFF_SUFFIXES)
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+AN_IMAGE = f"a whole image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PGM"
+
+
+class ImageSequence(StoredFrames):
+    """Pictures of one shape, read one at a time.
+
+    Parameters
+    ----------
+    path
+        The file or folder, for its name.
+    pictures
+        The files in order, at least one.
+
+    Raises
+    ------
+    InputError
+        If not one of them can be read.
+    """
+
+    def __init__(self, path: Path, pictures: Sequence[Path]) -> None:
+        self._pictures = tuple(pictures)
+        image = self._first_whole()
+        kinds = sorted({picture.suffix.lstrip(".").upper() for picture in self._pictures} - {""})
+        kind = " and ".join(kinds) or "image"
+        super().__init__(
+            path,
+            kind if len(self._pictures) == 1 else f"{len(self._pictures)} pictures, {kind}",
+            len(self._pictures),
+            (image.shape[0], image.shape[1]),
+            8 * image.dtype.itemsize,
+        )
+
+    def _first_whole(self) -> GreyImage:
+        refused: list[InputError] = []
+        for picture in self._pictures:
+            try:
+                return read_image(picture)
+            except InputError as error:
+                refused.append(error)
+        raise refused[0]
+
+    def _grey(self, index: int) -> GreyImage:
+        picture = self._pictures[index]
+        image = read_image(picture)
+        if image.shape != self.shape:
+            rows, columns = self.shape
+            raise InputError(
+                picture,
+                "size",
+                f"{image.shape[1]}×{image.shape[0]} px",
+                f"{columns}×{rows} px like the pictures before it",
+            )
+        return image
+
+
+def images_in(path: Path) -> list[Path]:
+    """The image files in a folder, in natural order (``2.png`` before ``10.png``)."""
+    return [entry for entry in files_in(path) if entry.suffix.lower() in IMAGE_SUFFIXES]
+
+
+def files_in(path: Path) -> list[Path]:
+    """What is in a folder, in natural order, without hidden files."""
+    try:
+        entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+    except OSError as error:
+        raise InputError(path, "folder", error.strerror, "a folder that may be read") from error
+    return sorted(entries, key=lambda entry: natural_key(entry.name))
+
+
+def read_image(path: Path) -> GreyImage:
+    """Grey levels of one picture in a file, shape (rows, columns).
+
+    Raises
+    ------
+    InputError
+        If it cannot be opened, is not a whole image, holds several, or NaN or infinity.
+    """
+    # Read here rather than by OpenCV: it says why a file cannot be opened.
+    try:
+        regular_size(path)
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, "a file that may be read") from error
+    if not content:
+        raise InputError(path, "size", "0 bytes", AN_IMAGE)
+    if content[:4] in TIFF_MAGICS:
+        with TiffStack(path) as stack:
+            if len(stack) > 1:
+                raise InputError(
+                    path, "pages", len(stack), "one picture a file, or open the stack itself"
+                )
+            return stack.frame(0).image
+    image = decoded(content)
+    if image is None:
+        raise InputError(path, "content", "cannot be decoded", AN_IMAGE)
+    return finite(path, to_grey(image))
+
+
+def decoded(content: bytes) -> npt.NDArray[Any] | None:
+    """The picture that an encoded one holds; None if it is damaged, or too large."""
+    if not content or _is_cut_off(content):
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError):
+        return None
+    return image if image is not None and image.size else None
+
+
+def _is_cut_off(content: bytes) -> bool:
+    """Whether a chunk of a PNG is longer than what is there; OpenCV makes room for all of it."""
+    at = len(PNG_MAGIC)
+    if content[:at] != PNG_MAGIC:
+        return False
+    while content[at + 4 : at + 8] not in (b"", b"IEND"):
+        at += 12 + int.from_bytes(content[at : at + 4], "big")
+    return at >= len(content)
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that takes digits as numbers: ``frame2`` before ``frame10``."""
+    return [
+        (0, int(part), "") if part.isdecimal() else (1, 0, part.casefold())
+        for part in re.split(r"(\d+)", name)
+        if part
+    ]

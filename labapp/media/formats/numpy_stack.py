@@ -1,0 +1,291 @@
+"""Frames from NumPy's files: a stack in a .npy, or one in a .npz with its times."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.media.base import GreyImage, to_grey
+from labapp.media.formats.stored import (
+    StoredFrames,
+    ends_early,
+    file_size,
+    finite,
+    increasing,
+    plausible_rate,
+)
+
+NPY_MAGIC = b"\x93NUMPY"
+ZIP_MAGIC = b"PK\x03\x04"
+
+A_STACK = "an array of shape (frames, rows, columns) or (frames, rows, columns, 3 or 4)"
+A_NPZ = f"a .npz that holds {A_STACK} named frames"
+
+BIT_DEPTHS = {"bool": 8, "uint8": 8, "uint16": 16}
+
+MAX_HEADER = 2**16
+"""Headers are about a hundred bytes."""
+
+NAMED = {"descr": "type"}
+EXPECTED = {
+    "descr": "an array of numbers (uint8, uint16, float32 …), no Python objects",
+    "fortran_order": "True or False",
+    "shape": A_STACK,
+}
+"""What an entry of the header is called in a message, and what it should be."""
+
+MOST_HELD = 2**30
+"""A compressed array is held in memory whole, unpacked: no more bytes than this."""
+
+NOT_HELD = f"at most {MOST_HELD} bytes, or an array saved as it is (numpy.savez)"
+
+A_DEFLATED = "an array as numpy.savez or numpy.savez_compressed writes it"
+
+READ_BYTES = 2**20
+
+AS_NUMPY_DOES = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""How arrays are kept. Of other kinds zipfile unpacks all it has read at once, without bounds."""
+
+DEFLATE_RATIO = 1032
+"""Deflate makes data at most so many times smaller."""
+
+
+class NumpyStack(StoredFrames):
+    """An array (frames, rows, columns), grey, or (frames, rows, columns, 3 or 4), R, G, B, alpha.
+
+    An array that is stored as it is (.npy, and .npz as `numpy.savez` writes it) stays in the
+    file, mapped; a compressed one is held in memory. Booleans become 0 and 255; types other than
+    uint8 and uint16 become float32. A .npz may give ``time_s`` or ``frame_rate_hz``.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Raises
+    ------
+    InputError
+        If it holds no such array, Python objects, or not one whole frame.
+    """
+
+    def __init__(self, path: Path, *, archive: bool) -> None:
+        time_s, rate, claimed = None, None, 0
+        try:
+            if archive:
+                self._frames, time_s, rate = _from_archive(path)
+            else:
+                with path.open("rb") as file:
+                    self._frames, claimed = _map_array(path, file, 0, file_size(path))
+        except OSError as error:
+            raise InputError(path, "file", error, "a file that may be read") from error
+        count, rows, columns = self._frames.shape[:3]
+        self.warnings = ends_early(path.name, claimed, count)
+        kind = self._frames.dtype
+        super().__init__(
+            path,
+            "NumPy archive" if archive else "NumPy stack",
+            count,
+            (rows, columns),
+            BIT_DEPTHS.get(kind.newbyteorder("=").name, 32),
+            colour=self._frames.ndim == 4,
+            frame_rate_hz=rate,
+            time_s=time_s,
+        )
+
+    def close(self) -> None:
+        """Let go of the file, which is mapped as long as its array is there."""
+        self._frames = self._frames[:0].copy()
+
+    def _grey(self, index: int) -> GreyImage:
+        image = np.asarray(self._frames[index])
+        if image.dtype == bool:
+            image = image.astype(np.uint8) * np.uint8(255)
+        else:
+            image = image.astype(image.dtype.newbyteorder("="))
+        return finite(self._path, to_grey(image if image.ndim == 2 else image[..., 2::-1]))
+
+
+def _header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether it is in Fortran order, and type of the array that begins in ``file``.
+
+    The header is the text of a Python dict. It is searched rather than evaluated: of a damaged
+    one Python's parser says the most different things.
+    """
+    head = file.read(12)
+    if len(head) < 12 or head[:6] != NPY_MAGIC or head[6] not in (1, 2, 3):
+        raise InputError(path, "header", "not that of an array", "a NumPy array, version 1 to 3")
+    counted = 2 if head[6] == 1 else 4
+    length = int.from_bytes(head[8 : 8 + counted], "little") - (4 - counted)
+    text = (head[8 + counted :] + file.read(min(max(length, 0), MAX_HEADER))).decode("latin-1")
+
+    def entry(key: str, form: str) -> str:
+        found = re.search(rf"""['"]{key}['"]\s*:\s*{form}""", text)
+        if found is None:
+            said = re.search(rf"""['"]{key}['"]\s*:\s*(\S[^,]*)""", text)
+            value = said[1] if said else "missing"
+            raise InputError(path, NAMED.get(key, key), value, EXPECTED[key])
+        return found[1]
+
+    kind = np.dtype(entry("descr", r"""['"]([<>|=]?(?:[bui]1|[ui][248]|f(?:2|4|8)))['"]"""))
+    columns_first = entry("fortran_order", "(True|False)") == "True"
+    shape = tuple(int(side) for side in re.findall(r"\d+", entry("shape", r"\(([\d\s,]{,200})\)")))
+    return shape, columns_first, kind
+
+
+def _is_stack(path: Path, shape: tuple[int, ...]) -> None:
+    if not (len(shape) == 3 or (len(shape) == 4 and shape[3] in (3, 4))) or min(shape) < 1:
+        raise InputError(path, "shape", shape, A_STACK)
+
+
+def _map_array(path: Path, file: IO[bytes], start: int, end: int) -> tuple[npt.NDArray[Any], int]:
+    """The whole frames of the array at bytes ``start`` … ``end``, and how many it claims."""
+    file.seek(start)
+    shape, columns_first, kind = _header(path, file)
+    _is_stack(path, shape)
+    room = end - file.tell()
+    frame_bytes = math.prod(shape[1:]) * kind.itemsize
+    whole = min(shape[0], max(room, 0) // frame_bytes)
+    if whole < 1 or (columns_first and whole < shape[0]):
+        needed = frame_bytes * (shape[0] if columns_first else 1)
+        raise InputError(path, "size", f"{room} bytes of levels", f"{needed} bytes or more")
+    mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    frames = np.ndarray(
+        (whole, *shape[1:]), kind, mapped, file.tell(), order="F" if columns_first else "C"
+    )
+    return frames, shape[0]
+
+
+def _from_archive(
+    path: Path,
+) -> tuple[npt.NDArray[Any], FloatArray | None, float | None]:
+    """Frames, times and frame rate of a .npz."""
+    with path.open("rb") as file:
+        try:
+            archive = zipfile.ZipFile(file)
+        except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
+            raise InputError(path, "content", error, A_NPZ) from error
+        members = {
+            entry.filename.removesuffix(".npy"): entry
+            for entry in archive.infolist()
+            if entry.filename.endswith(".npy")
+        }
+        for entry in members.values():
+            if entry.compress_type not in AS_NUMPY_DOES:
+                raise InputError(path, entry.filename, "packed by another program", A_DEFLATED)
+        frames = _archived_frames(path, file, archive, members)
+        time_s = rate = None
+        if "time_s" in members:
+            time_s = _load(
+                path,
+                archive,
+                members["time_s"],
+                lambda at, shape: _is_times(at, shape, len(frames)),
+            )
+            if not increasing(time_s.astype(np.float64)):
+                raise InputError(path, "time_s", "times that do not", _times_of(len(frames)))
+            time_s = time_s.astype(np.float64) - float(time_s[0])
+            if len(frames) > 1:
+                rate = plausible_rate(float(1 / np.median(np.diff(time_s))))
+        if "frame_rate_hz" in members:
+            said = _load(path, archive, members["frame_rate_hz"], _is_one)
+            rate = plausible_rate(float(said.ravel()[0]))
+            if rate is None:
+                raise InputError(path, "frame_rate_hz", said, "frames a second, above 0")
+        return frames, time_s, rate
+
+
+def _archived_frames(
+    path: Path, file: IO[bytes], archive: zipfile.ZipFile, members: dict[str, zipfile.ZipInfo]
+) -> npt.NDArray[Any]:
+    entry = members.get("frames")
+    if entry is None:
+        stacks = [name for name in members if name not in ("time_s", "frame_rate_hz")]
+        if len(stacks) != 1:
+            raise InputError(path, "arrays", ", ".join(sorted(members)) or "none", A_NPZ)
+        entry = members[stacks[0]]
+    if entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1:
+        # The array follows the member's own header, whose name and extra field vary in length.
+        file.seek(entry.header_offset)
+        head = file.read(30)
+        if len(head) == 30 and head[:4] == ZIP_MAGIC:
+            _check_sum(path, archive, entry)
+            lengths = int.from_bytes(head[26:28], "little") + int.from_bytes(head[28:], "little")
+            start = entry.header_offset + 30 + lengths
+            frames, claimed = _map_array(
+                path, file, start, min(start + entry.file_size, file_size(path))
+            )
+            if len(frames) == claimed:
+                return frames
+        raise InputError(path, entry.filename, "cut off", A_NPZ)
+    return _load(path, archive, entry, _is_stack)
+
+
+def _check_sum(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
+    """Read a member through: at its end its checksum must fit."""
+    try:
+        with archive.open(entry) as file:
+            while file.read(READ_BYTES):
+                pass
+    except Exception as error:  # as in `_load`
+        raise InputError(path, entry.filename, error, "a whole array") from error
+
+
+def _is_times(path: Path, shape: tuple[int, ...], count: int) -> None:
+    if shape != (count,):
+        raise InputError(path, "time_s", f"shape {shape}", _times_of(count))
+
+
+def _times_of(count: int) -> str:
+    """What times are expected to be."""
+    return f"{count} times that grow, a time for every frame, s"
+
+
+def _is_one(path: Path, shape: tuple[int, ...]) -> None:
+    if math.prod(shape) != 1:
+        raise InputError(path, "frame_rate_hz", f"shape {shape}", "one number")
+
+
+def _load(
+    path: Path,
+    archive: zipfile.ZipFile,
+    entry: zipfile.ZipInfo,
+    check: Callable[[Path, tuple[int, ...]], None],
+) -> npt.NDArray[Any]:
+    """Read a member whose shape passes ``check``; nothing larger than it can hold."""
+    try:
+        with archive.open(entry) as file:
+            shape, columns_first, kind = _header(path, file)
+            check(path, shape)
+            needed = math.prod(shape) * kind.itemsize
+            if needed > min(entry.file_size, entry.compress_size * DEFLATE_RATIO + 1024):
+                raise InputError(
+                    path, entry.filename, f"{entry.file_size} bytes", f"{needed} bytes"
+                )
+            if needed > MOST_HELD:
+                raise InputError(path, entry.filename, f"{needed} bytes, compressed", NOT_HELD)
+            content = np.empty(needed, np.uint8)
+            done = 0
+            # To the end, where the checksum is looked at.
+            while part := file.read(READ_BYTES):
+                start, done = done, done + len(part)
+                if done > needed:
+                    break
+                content[start:done] = np.frombuffer(part, np.uint8)
+    except InputError:
+        raise
+    except Exception as error:
+        # Damage, a password, a compression that is not there: each raises a kind of its own.
+        raise InputError(path, entry.filename, error, "a whole array") from error
+    if done != needed:
+        raise InputError(path, entry.filename, f"{done} bytes", f"{needed} bytes")
+    return np.ndarray(shape, kind, content, order="F" if columns_first else "C")

@@ -1,0 +1,1 @@
+"""Recordings that are made: what a camera gives, on the disk."""

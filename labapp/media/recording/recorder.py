@@ -1,0 +1,396 @@
+"""Records what a camera gives: from some seconds before the trigger on, without waiting for a disk.
+
+Frames go through a queue to a thread that writes; queue and ring buffer share a bounded memory.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import os
+import re
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from labapp.errors import InputError
+from labapp.media.cameras.base import CameraFrame
+from labapp.media.events import Event, Kind, Say, Tally, silent
+from labapp.media.recording.nut import TICKS_HZ, Codec, NutWriter, WrongFrame
+from labapp.media.recording.take_files import Note, Take, TakeFiles, notes_of
+from labapp.words import several
+
+FRAME_BYTE = 200
+"""What a frame takes in memory besides its levels, about."""
+
+SWITCH_S = 5e-4
+"""So soon a thread of Python gives way to another; after its own 5 ms a frame would be written
+slower than 200 of them come a second, while a window draws."""
+
+STALL_S = 1.0
+"""A disk that takes longer for a frame is said to stall."""
+
+RATE_HZ = 25.0
+"""Stands in the video's header where the camera does not say its rate."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What of a camera's frames is recorded.
+
+    Parameters
+    ----------
+    before_s
+        So much from before the trigger, s.
+    after_s
+        So long from the first frame after it on, s; None: until it is stopped.
+    every
+        Every n-th frame.
+    codec
+        ``raw``, or ``ffv1``: less than half the size, for some 4 ms of a core a frame of 640×480.
+    memory_mb
+        What frames that wait may take, MB: those from before the trigger, and those that the disk
+        had no time for yet.
+
+    Raises
+    ------
+    InputError
+        If one is out of range.
+    """
+
+    before_s: float = 0.0
+    after_s: float | None = None
+    every: int = 1
+    codec: Codec = "raw"
+    memory_mb: float = 512.0
+
+    def __post_init__(self) -> None:
+        problems = [
+            InputError("recording", name, value, expected)
+            for name, value, right, expected in (
+                ("before_s", self.before_s, 0 <= self.before_s <= 3600, "0 to 3600 (s)"),
+                ("after_s", self.after_s, (self.after_s or 0) >= 0, "0 or more (s), or None"),
+                ("every", self.every, self.every >= 1, "1 or more"),
+                ("codec", self.codec, self.codec in ("ffv1", "raw"), "ffv1 or raw"),
+                ("memory_mb", self.memory_mb, self.memory_mb >= 1, "1 or more (MB)"),
+            )
+            if not right
+        ]
+        if problems:
+            raise InputError.gather(problems)
+
+
+_Item = tuple[Take, CameraFrame | Note | None]
+"""What is to be done for a recording: write a frame or a note, or end it."""
+
+
+class Recorder:
+    """Takes every frame of a camera and records those that are wanted.
+
+    `take` never waits; what the disk has no time for yet waits in memory, and only when that is
+    full frames are left out, which is said. The methods may be called from any thread.
+
+    Parameters
+    ----------
+    place
+        Gives the file of a recording that begins; it and its notes must not be there yet.
+    plan
+        What is recorded.
+    bit_depth, rate_hz
+        Of the camera.
+    say
+        Called with what happens.
+    writer
+        Opens the file of a recording: (path, shape, bit_depth, rate_hz, codec).
+    """
+
+    def __init__(
+        self,
+        place: Callable[[], Path],
+        plan: Plan,
+        bit_depth: int,
+        rate_hz: float | None,
+        say: Say = silent,
+        writer: Callable[..., NutWriter] = NutWriter,
+    ) -> None:
+        self.plan = plan
+        self.takes: list[Take] = []
+        self._place = place
+        self._bit_depth = bit_depth
+        self._rate_hz = (rate_hz or RATE_HZ) / plan.every
+        self._say = say
+        self._open = writer
+        self._memory_byte = round(plan.memory_mb * 1e6)
+        self._turn = threading.Condition()
+        self._ring: deque[CameraFrame] = deque()
+        self._queue: deque[_Item] = deque()
+        self._held_byte = 0
+        self._newest_s = 0.0
+        self._running: Take | None = None
+        self._closing = self._is_short = self._is_behind = False
+        self._writing_since_s = float("inf")
+        self._lost = Tally(self._tell_lost)
+        sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))
+        self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
+        self._thread.start()
+
+    # --- what is wanted -----------------------------------------------------------------------
+
+    @property
+    def running(self) -> Take | None:
+        """The recording that frames go into now."""
+        return self._running
+
+    @property
+    def waiting_mb(self) -> float:
+        """Memory that frames take now, MB."""
+        return self._held_byte / 1e6
+
+    @property
+    def ring_s(self) -> float:
+        """How many seconds are kept for before a trigger."""
+        with self._turn:
+            return self._ring[-1].time_s - self._ring[0].time_s if self._ring else 0.0
+
+    def take(self, frame: CameraFrame) -> None:
+        """Take a frame of the camera; never waits."""
+        told: list[tuple[Kind, str]] = []
+        with self._turn:
+            self._newest_s = frame.time_s
+            if frame.number % self.plan.every or self._closing:
+                return
+            size = _size(frame)
+            while self._ring and (
+                self._ring[0].time_s < frame.time_s - self.plan.before_s
+                or self._held_byte + size > self._memory_byte
+            ):
+                if self._ring[0].time_s >= frame.time_s - self.plan.before_s:
+                    told += self._ring_is_short(frame)
+                self._held_byte -= _size(self._ring.popleft())
+            running = self._running
+            has_room = self._held_byte + size <= self._memory_byte
+            if running is None and has_room and self.plan.before_s > 0:
+                self._ring.append(frame)
+                self._held_byte += size
+            elif running is not None:
+                told += self._record(running, frame, size if has_room else None)
+        for kind, words in told:
+            self._tell(kind, words)
+        self._lost.flush()
+
+    def trigger(self) -> Take:
+        """Begin a recording, with the frames of the seconds before; the one that runs if one does.
+
+        Raises
+        ------
+        InputError
+            If there is such a file, or its notes, already; or the recorder was closed.
+        """
+        with self._turn:
+            if self._closing:
+                raise InputError("recording", "trigger", "closed", "one before it is closed")
+            if self._running is not None:
+                return self._running
+            path = self._apart(self._place())
+            take = self._running = Take(path, triggered_s=self._newest_s)
+            self.takes.append(take)
+            self._queue.extend((take, frame) for frame in self._ring)
+            count = len(self._ring)
+            self._ring.clear()
+            self._add_note(
+                take, Event("recording", "note", f"trigger, {several(count, 'frame')} before it")
+            )
+            self._turn.notify()
+        self._say(Event(path.name, "note", "recording"))
+        return take
+
+    def stop(self) -> None:
+        """End the recording that runs; what waits is still written."""
+        self._lost.flush(now=True)
+        with self._turn:
+            if self._running is not None:
+                self._end(self._running)
+
+    def note(self, event: Event, time_s: float | None = None) -> None:
+        """Keep what happened beside the recording that runs, by the camera's clock; None: now."""
+        with self._turn:
+            if self._running is not None:
+                self._add_note(self._running, event, time_s)
+                self._turn.notify()
+
+    def close(self) -> None:
+        """End the recording, and wait until all of it is written. Twice does no harm."""
+        self.stop()
+        with self._turn:
+            self._closing = True
+            if self._running is not None:  # triggered meanwhile
+                self._end(self._running)
+            self._held_byte -= sum(_size(frame) for frame in self._ring)
+            self._ring.clear()
+            self._turn.notify()
+        self._thread.join()
+        self._lost.flush(now=True)
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # --- in the camera's thread ---------------------------------------------------------------
+
+    def _record(self, take: Take, frame: CameraFrame, size: int | None) -> list[tuple[Kind, str]]:
+        """Queue a frame of the recording that runs; ``size`` None: there is no room for it."""
+        told: list[tuple[Kind, str]] = []
+        if take.ends_s is None and self.plan.after_s is not None:
+            # Not from the newest frame at the trigger on: the camera may have been away since.
+            take.ends_s = frame.time_s + self.plan.after_s
+        if take.ends_s is not None and frame.time_s > take.ends_s - 1 / TICKS_HZ:
+            self._end(take)
+            return told
+        if take.trouble or size is None:
+            take.lost += 1
+            if not take.trouble:
+                self._lost.count()
+            return told
+        self._queue.append((take, frame))
+        self._held_byte += size
+        told += self._falls_behind()
+        self._turn.notify()
+        return told
+
+    def _falls_behind(self) -> list[tuple[Kind, str]]:
+        """Say that frames wait, the first time that they do."""
+        writing_s = time.monotonic() - self._writing_since_s
+        if self._is_behind or (self._held_byte <= self._memory_byte / 2 and writing_s < STALL_S):
+            return []
+        self._is_behind = True
+        stalls = f", the disk has taken nothing for {writing_s:.1f} s" * (writing_s >= STALL_S)
+        megabytes = self._held_byte / 1e6
+        return [("warning", f"writing does not keep up{stalls}: {megabytes:.0f} MB wait in memory")]
+
+    def _ring_is_short(self, frame: CameraFrame) -> list[tuple[Kind, str]]:
+        if self._is_short:
+            return []
+        self._is_short = True
+        kept_s = frame.time_s - self._ring[0].time_s
+        words = (
+            f"only {kept_s:.2f} s before the trigger are kept, not {self.plan.before_s:g} s: "
+            f"{self.plan.memory_mb:g} MB hold no more"
+        )
+        return [("warning", words)]
+
+    def _apart(self, path: Path) -> Path:
+        """Give a path, or one beside it where a recording of ours is about to be."""
+        own, wanted = {take.path for take in self.takes}, path
+        for number in itertools.count(2):
+            if path not in own:
+                break
+            path = wanted.with_stem(f"{wanted.stem}-{number}")
+        for there in (path, notes_of(path)):
+            if os.path.lexists(there):
+                raise InputError(there, "recording", "is there already", "another name")
+        return path
+
+    def _end(self, take: Take) -> None:
+        self._queue.append((take, None))
+        self._running = None
+        self._turn.notify()
+
+    def _add_note(self, take: Take, event: Event, time_s: float | None = None) -> None:
+        self._queue.append((take, Note(self._newest_s if time_s is None else time_s, event)))
+
+    def _tell(self, kind: Kind, words: str) -> None:
+        event = Event("recording", kind, words)
+        self._say(event)
+        self.note(event)
+
+    def _tell_lost(self, count: int) -> None:
+        faster = "; raw is written faster" * (self.plan.codec == "ffv1")
+        lost = several(count, "frame")
+        self._tell("loss", f"{lost} lost: writing does not keep up, and memory is full{faster}")
+
+    # --- in the writer's thread ---------------------------------------------------------------
+
+    def _write_on(self) -> None:
+        video: TakeFiles | None = None
+        while True:
+            with self._turn:
+                self._turn.wait_for(lambda: self._queue or self._closing)
+                if not self._queue:
+                    break
+                take, item = self._queue.popleft()
+                self._writing_since_s = time.monotonic()
+            if video is None or video.take is not take:
+                video = TakeFiles(take, self._new_video, self._say)
+            try:
+                video.do(item)
+            except Exception as error:
+                if isinstance(item, CameraFrame):
+                    with self._turn:
+                        take.lost += 1
+                if isinstance(error, WrongFrame):
+                    video.wrong.add()
+                elif not take.trouble:
+                    self._give_up(take, error)
+            if item is None:
+                take.finished.set()
+            self._forget(item, take)
+
+    def _new_video(self, take: Take, shape: tuple[int, int]) -> NutWriter:
+        return self._open(take.path, shape, self._bit_depth, self._rate_hz, self.plan.codec)
+
+    def _forget(self, item: CameraFrame | Note | None, take: Take) -> None:
+        """Give the memory of what was written free; say when all was caught up with."""
+        caught_up = False
+        with self._turn:
+            self._writing_since_s = float("inf")
+            if isinstance(item, CameraFrame):
+                self._held_byte -= _size(item)
+            if self._is_behind and not self._queue:
+                self._is_behind, caught_up = False, True
+        if caught_up:
+            self._tell("note", "writing has caught up")
+        if item is None:
+            self._lost.flush(now=True)
+            self._say(take.summary)
+
+    def _give_up(self, take: Take, error: Exception) -> None:
+        """Say why no more of a recording can be written; what is there stays."""
+        if not isinstance(error, OSError | InputError):
+            logging.getLogger("labapp").exception("recording %s", take.path)
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        take.trouble = f"cannot be written: {reason}"
+        words = f"{take.trouble}; what was written is whole: {several(take.frames, 'frame')}"
+        self._say(Event(take.path.name, "loss", words))
+
+
+def _size(frame: CameraFrame) -> int:
+    """What a frame takes in memory, bytes."""
+    return frame.image.nbytes + FRAME_BYTE
+
+
+def recording_path(folder: Path, stem: str) -> Path:
+    """A file, not there yet, for a recording that begins now: its name ends in date and time."""
+    begun = time.strftime("%Y-%m-%d-%H%M%S")
+    path, count = folder / f"{stem}-{begun}.nut", 1
+    while os.path.lexists(path) or os.path.lexists(notes_of(path)):
+        count += 1
+        path = folder / f"{stem}-{begun}-{count}.nut"
+    return path
+
+
+def recordings_beside(folder: Path, stem: str) -> list[Path]:
+    """The files in a folder that `recording_path` has named with this stem, the oldest first.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be read.
+    """
+    named = re.compile(rf"{re.escape(stem)}-\d{{4}}-\d\d-\d\d-\d{{6}}(-\d{{1,3}}){{0,2}}\.nut")
+    return sorted(path for path in folder.iterdir() if named.fullmatch(path.name))

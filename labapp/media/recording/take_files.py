@@ -1,0 +1,179 @@
+"""What is beside each other on the disk of one recording: its video, and notes of what happened."""
+
+from __future__ import annotations
+
+import csv
+import io
+import threading
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from labapp.media.cameras.base import CameraFrame
+from labapp.media.events import Event, Say, Tally
+from labapp.media.recording.nut import NutWriter
+from labapp.words import as_cell, several
+
+NOTES = ("time_s", "frame", "source", "kind", "what")
+"""Columns of the notes beside a recording; the frame is the one that was next at that time."""
+
+NOTED_LATE = 10_000
+"""A note may be of so many frames ago: what is measured by itself is told seconds later."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """A row of the notes; its time by the camera's clock, s."""
+
+    time_s: float
+    event: Event
+
+
+def notes_of(path: Path) -> Path:
+    """The notes beside a recording."""
+    return path.with_name(f"{path.stem}-notes.csv")
+
+
+@dataclass(eq=False)
+class Take:
+    """One recording, from its trigger on.
+
+    Parameters
+    ----------
+    path
+        The video. Notes are beside it, see `notes`.
+
+    Attributes
+    ----------
+    frames
+        Written so far.
+    lost
+        Left out for want of room in memory, or of a disk; or not as the others are.
+    trouble
+        Why writing ended early; empty if it did not.
+    finished
+        Set when nothing more is written.
+    triggered_s, ends_s
+        When it was triggered and when it ends by itself, by the camera's clock, s; None: not known
+        yet, or never.
+    """
+
+    path: Path
+    frames: int = 0
+    lost: int = 0
+    trouble: str = ""
+    finished: threading.Event = field(default_factory=threading.Event)
+    triggered_s: float = 0.0
+    ends_s: float | None = None
+
+    @property
+    def summary(self) -> Event:
+        """What became of it."""
+        words = f"{several(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
+            self.lost > 0
+        )
+        return Event(self.path.name, "loss" if self.lost else "note", words)
+
+    @property
+    def notes(self) -> Path:
+        """Table of what happened meanwhile: trigger, marks, frames lost (CSV)."""
+        return notes_of(self.path)
+
+
+class TakeFiles:
+    """Video and notes of a recording, while they are written; used by one thread.
+
+    Parameters
+    ----------
+    take
+        The recording; what is written is counted there.
+    opened
+        Opens its video, for frames of a shape.
+    say
+        Called with what goes wrong.
+
+    Attributes
+    ----------
+    wrong
+        Frames that are not as the others are.
+    """
+
+    def __init__(
+        self, take: Take, opened: Callable[[Take, tuple[int, int]], NutWriter], say: Say
+    ) -> None:
+        self.take = take
+        self.wrong = Tally(self._tell_wrong)
+        self._opened = opened
+        self._say = say
+        self._has_notes = True
+        self._video: NutWriter | None = None
+        self._early: list[Note] = []
+        """Notes from before the first frame, whose time they are told by."""
+        self._first_s = self._last_s = take.triggered_s
+        self._times_s: deque[float] = deque(maxlen=NOTED_LATE)
+
+    def do(self, item: CameraFrame | Note | None) -> None:
+        """Write a frame or a note; None: end it."""
+        if isinstance(item, CameraFrame):
+            self._write(item)
+        elif item is None:
+            try:
+                self.wrong.flush(now=True)
+                self._note_early()
+                if self._video is not None:
+                    self._note(Note(self._last_s, self.take.summary))
+            finally:
+                if self._video is not None:
+                    self._video.close()
+        elif not self.take.frames:
+            self._early.append(item)
+        else:
+            self._note(item)
+
+    def _write(self, frame: CameraFrame) -> None:
+        if self.take.trouble:
+            raise OSError(0, self.take.trouble)
+        if self._video is None:
+            rows, columns = frame.image.shape
+            self._video = self._opened(self.take, (rows, columns))
+        if not self.take.frames:
+            self._first_s = frame.time_s
+        self._video.write(frame.image, frame.time_s - self._first_s)
+        self._note_early()
+        self.wrong.flush()
+        self.take.frames += 1
+        self._last_s = frame.time_s
+        self._times_s.append(frame.time_s)
+
+    def _tell_wrong(self, count: int) -> None:
+        frames = several(count, "frame")
+        words = f"{frames} left out: of another size, or brighter than the camera's bits allow"
+        event = Event(self.take.path.name, "loss", words)
+        self._say(event)
+        self.do(Note(self._last_s, event))
+
+    def _note_early(self) -> None:
+        early, self._early = self._early, []
+        for note in early:
+            self._note(note)
+
+    def _note(self, note: Note) -> None:
+        """Add a row to the notes; the video goes on where that cannot be, which is said once."""
+        time_s = note.time_s - self._first_s
+        event = note.event
+        later = len(self._times_s) - bisect_right(self._times_s, note.time_s)
+        frame = self.take.frames - later
+        row = (f"{time_s:.6f}", frame, as_cell(event.source), event.kind, as_cell(event.words))
+        text = io.StringIO(newline="")
+        try:
+            began = not self.take.notes.exists()  # or a link to nowhere, which `x` does not follow
+            csv.writer(text, lineterminator="\n").writerows([NOTES, row] if began else [row])
+            with self.take.notes.open("x" if began else "a", encoding="utf-8", newline="") as file:
+                file.write(text.getvalue())
+        except OSError as error:
+            if self._has_notes:
+                self._has_notes = False
+                words = f"not all notes can be written beside it: {error.strerror}"
+                self._say(Event(self.take.path.name, "warning", words))

@@ -1,0 +1,206 @@
+"""Alarms while a pool is filmed: raised, over, and acknowledged by the operator.
+
+One is raised when a size is beyond its limit by more than chance, when so many frames in a row
+cannot be measured, or when none is for long; it is over when the size has been within its limits,
+or frames have been measured, for a second: a pool that swings about a limit is one alarm. It is
+shown until it is both over and acknowledged: none goes by unseen.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+
+from labapp.core.surface.measures import Measures
+from labapp.run.limits import NAMES, Limits, Size, Standing, sizes_of, standing
+from labapp.words import several
+
+CALM_S = 1.0
+"""An alarm is over when its cause has been away for so long, by the camera's clock."""
+
+NOT_MEASURED, SILENT = "not-measured", "silent"
+"""Codes of the alarms of frames that cannot be measured, and of none that is; others are as
+``width-high``."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Something that the operator must see.
+
+    Parameters
+    ----------
+    code
+        ``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``.
+    words
+        What is wrong, in a sentence without its end.
+    frame, time_s
+        The camera's number of the frame that raised it, and its time by the camera's clock, s.
+    holds
+        Whether it is so still.
+    acknowledged
+        Whether the operator has said that it was seen.
+    at
+        When it was raised.
+    """
+
+    code: str
+    words: str
+    frame: int
+    time_s: float
+    holds: bool = True
+    acknowledged: bool = False
+    at: datetime = field(default_factory=lambda: datetime.now().astimezone())
+
+    @property
+    def told(self) -> str:
+        """What is wrong, since which frame."""
+        return f"{self.words} (frame {self.frame}, {self.at:%H:%M:%S})"
+
+
+class Alarms:
+    """Watches the sizes of one frame after the other. May be used from several threads.
+
+    Parameters
+    ----------
+    limits
+        What is watched; without any limit nothing is.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._shown: dict[str, Alarm] = {}
+        self._held_s: dict[str, float] = {}
+        """When the cause of each alarm was last there, or may have been."""
+        self._unmeasured = 0
+        self._newest = (0, 0.0)
+        """Number and time of the frame that was looked at last."""
+        self._turn = threading.Lock()
+
+    @property
+    def limits(self) -> Limits:
+        """What is watched."""
+        return self._limits
+
+    def set_limits(self, limits: Limits) -> list[Alarm]:
+        """Watch other limits from the next frame on; gives the alarms that are over with it."""
+        with self._turn:
+            former, self._limits = self._limits, limits
+            changed = [name for name in NAMES if former.of(name) != limits.of(name)]
+            codes = [f"{name}-{end}" for name in changed for end in ("low", "high")]
+            if not limits.are_set:
+                self._unmeasured = 0
+                codes += [NOT_MEASURED, SILENT]
+            return [alarm for code in codes for alarm in self._end(code)]
+
+    @property
+    def shown(self) -> tuple[Alarm, ...]:
+        """Those that hold, or were not acknowledged; the oldest first."""
+        return tuple(self._shown.values())
+
+    def judge(
+        self, frame: int, time_s: float, measures: Measures | None, reason: str
+    ) -> list[Alarm]:
+        """Look at the next frame.
+
+        Parameters
+        ----------
+        frame, time_s
+            The camera's number of it, and its time, s.
+        measures
+            Sizes; None where it could not be measured.
+        reason
+            Why not.
+
+        Returns
+        -------
+        list of Alarm
+            Those that it raised, and those that are over (they hold no more).
+        """
+        with self._turn:
+            if not self._limits.are_set:
+                return []
+            self._newest = (frame, time_s)
+            if measures is not None and self._misses(measures):
+                measures, reason = None, "a size that is watched is not known"
+            self._unmeasured = self._unmeasured + 1 if measures is None else 0
+            causes = self._causes(measures, reason)
+            for code, words in causes.items():
+                if words is not None or code in self._shown:
+                    self._held_s[code] = time_s
+            changed = [
+                alarm
+                for code, words in causes.items()
+                if words is not None
+                for alarm in self._raise(code, words, frame, time_s)
+            ]
+            for code in [code for code in self._shown if code not in causes]:
+                if time_s - self._held_s[code] >= CALM_S:
+                    changed += self._end(code)
+            return changed
+
+    def silence(self, words: str) -> list[Alarm]:
+        """Take it that no frame is measured, which words say; gives the alarm if it is new."""
+        with self._turn:
+            if not self._limits.are_set:
+                return []
+            self._held_s[SILENT] = self._newest[1]
+            return self._raise(SILENT, words, *self._newest)
+
+    def acknowledge(self) -> list[Alarm]:
+        """Take it that the operator has seen all that is shown; gives those not seen before."""
+        with self._turn:
+            seen = [alarm for alarm in self._shown.values() if not alarm.acknowledged]
+            kept = (alarm for alarm in self._shown.values() if alarm.holds)
+            self._shown = {alarm.code: replace(alarm, acknowledged=True) for alarm in kept}
+            return seen
+
+    def _misses(self, measures: Measures) -> bool:
+        """Whether a size that has limits is not known."""
+        return any(
+            standing(size, self._limits.of(size.name)) == "unknown" for size in sizes_of(measures)
+        )
+
+    def _causes(self, measures: Measures | None, reason: str) -> dict[str, str | None]:
+        """Codes of what is wrong in a frame, in words; None: it may be, but cannot be told."""
+        if measures is None:
+            unknown: dict[str, str | None] = dict.fromkeys(self._shown)
+            unknown.pop(SILENT, None)
+            if self._unmeasured < self._limits.unmeasured:
+                return unknown
+            words = f"{several(self._unmeasured, 'frame')} in a row could not be measured: {reason}"
+            return {**unknown, NOT_MEASURED: words}
+        found: dict[str, str | None] = {}
+        for name, size in zip(NAMES, sizes_of(measures), strict=True):
+            stands = standing(size, self._limits.of(name))
+            if stands in ("low", "high"):
+                found[f"{name}-{stands}"] = in_words(size, stands, self._limits)
+            elif stands == "in doubt":
+                found |= {f"{name}-low": None, f"{name}-high": None}
+        return found
+
+    def _raise(self, code: str, words: str, frame: int, time_s: float) -> list[Alarm]:
+        """Raise an alarm; none if it holds already."""
+        held = self._shown.get(code)
+        if held is not None and held.holds:
+            return []
+        alarm = self._shown[code] = Alarm(code, words, frame, time_s)
+        return [alarm]
+
+    def _end(self, code: str) -> list[Alarm]:
+        """Take it that an alarm holds no more; none if it did not."""
+        held = self._shown.get(code)
+        if held is None or not held.holds:
+            return []
+        over = self._shown[code] = replace(held, holds=False)
+        if held.acknowledged:
+            del self._shown[code]
+        return [over]
+
+
+def in_words(size: Size, stands: Standing, limits: Limits) -> str:
+    """A size that is beyond its limit: "Width 7.051 ± 0.028 mm is above 6.9 mm"."""
+    low, high = limits.of(size.name)
+    limit, way = (low, "below") if stands == "low" else (high, "above")
+    sigma = f" ± {size.sigma_mm:.3f}" if size.sigma_mm == size.sigma_mm else ""
+    return f"{size.name.capitalize()} {size.value_mm:.3f}{sigma} mm is {way} {limit:g} mm"

@@ -1,0 +1,73 @@
+"""Dots of one image without a setup: what `labapp detect` writes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from labapp.core.images.dots import BandPassSettings, Dots
+from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.rows.lattice import Lattice
+from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
+from labapp.export.tables import PX_DIGITS, as_csv, number
+from labapp.files import write_whole
+from labapp.media import open_source
+
+COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".split()
+
+
+def detect_dots(
+    path: str | os.PathLike[str], size_px: float | None = None
+) -> tuple[Dots, Lattice | None, str]:
+    """Find the dots of a source's first frame, their rows and columns, and what is in doubt.
+
+    ``size_px`` is the standard deviation of a dot's light; None: it is estimated.
+
+    Returns
+    -------
+    dots, lattice, doubt
+        The lattice is None, and the doubt a sentence, where rows and columns cannot be told.
+
+    Raises
+    ------
+    InputError
+        If the source cannot be read.
+    """
+    with open_source(path) as source:
+        image = source.frame(0).image
+    settings = DotSettings(band_pass=BandPassSettings(size_px=size_px))
+    dots = Dots(*np.empty((7, 0)))
+    try:
+        dots = find_dots(image, settings)
+        return dots, find_lattice(dots, (image.shape[0], image.shape[1]), LatticeSettings()), ""
+    except CannotMeasure as answer:
+        return dots, None, str(answer)
+
+
+def write_detected(path: Path, dots: Dots, lattice: Lattice | None) -> None:
+    """Write the dots as CSV, in one piece.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    rows: list[list[object]] = [
+        [
+            number(dots.u_px[k], PX_DIGITS),
+            number(dots.v_px[k], PX_DIGITS),
+            *(("", "") if lattice is None else (lattice.row[k] or "", lattice.column[k] or "")),
+            number(dots.snr[k], PX_DIGITS),
+            number(dots.u_sigma_px[k], PX_DIGITS),
+            number(dots.v_sigma_px[k], PX_DIGITS),
+        ]
+        for k in range(len(dots))
+    ]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, as_csv([COLUMNS, *rows]).encode())
+    except OSError as error:
+        raise InputError(path, "--out", error.strerror, "a file that can be written") from error

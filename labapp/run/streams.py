@@ -1,0 +1,350 @@
+"""Measures told to control software while they are made: lines of JSON over TCP, or OPC UA.
+
+Each stream has an event loop in a thread of its own: telling never waits for who listens. They are
+heard on this machine only unless told otherwise, as neither asks who connects.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import ipaddress
+import json
+import logging
+import math
+import os
+import threading
+from collections.abc import Coroutine, Iterable, Mapping
+from functools import partial
+from typing import Any, Protocol
+
+from labapp.core.pipeline import Measurement
+from labapp.errors import InputError
+from labapp.export.tables import SIZES, sigma_of
+from labapp.log import NAME
+from labapp.run.alarms import Alarm
+from labapp.version import VERSION
+
+MOST_LISTENERS, AT_ONCE = 32, 16
+"""Each takes an open file, of which the measurement needs some itself."""
+
+MOST_WAITING = 1_000_000
+"""Bytes that may wait for a listener; one that does not read misses lines, and is told so."""
+
+OPCUA_S = 0.05
+"""The variables of OPC UA take the newest frame so often: clients sample them."""
+
+ALARMS = ("alarm", "unacknowledged")
+"""What is told of alarms, while a camera is live."""
+
+NAMESPACE = "urn:labapp:measures"
+
+STARTING_S = 20.0
+
+PATIENCE_S = 1.0
+"""At the end a listener has so long to read what waits for it."""
+
+Values = Mapping[str, int | float | str | None]
+
+
+def told_values(frame: int, time_s: float | None, measurement: Measurement) -> Values:
+    """What is told of a frame, with the names and units of ``measures.csv``; None: not known."""
+
+    def number(name: str) -> float | None:
+        value = float(getattr(measurement.measures, name, math.nan))
+        return value if math.isfinite(value) else None
+
+    return {
+        "frame": frame,
+        "time_s": time_s,
+        "status": measurement.status,
+        "reason": measurement.reason,
+        "scheme": measurement.scheme,
+        **{name: number(name) for name in SIZES},
+        "sigma_of": sigma_of(measurement),
+    }
+
+
+def live_values(
+    frame: int, time_s: float | None, measurement: Measurement, alarms: Iterable[Alarm]
+) -> Values:
+    """The same of a frame of a live camera, and the alarms by their codes, with spaces between.
+
+    ``alarm``: what is so now; ``unacknowledged``: what the operator has not said to have seen.
+    """
+    shown = tuple(alarms)
+    return {
+        **told_values(frame, time_s, measurement),
+        ALARMS[0]: " ".join(each.code for each in shown if each.holds),
+        ALARMS[1]: " ".join(each.code for each in shown if not each.acknowledged),
+    }
+
+
+class Stream(Protocol):
+    """Somebody to tell measures to."""
+
+    address: str
+    """Where it is heard, for who connects."""
+
+    told: int
+    """How many frames were told while somebody listened."""
+
+    @property
+    def listeners(self) -> int:
+        """How many programs are connected."""
+
+    def publish(self, values: Values) -> None:
+        """Tell a frame; does not wait."""
+
+    def close(self) -> None:
+        """Tell what is waiting, and end."""
+
+
+class LineStream:
+    """A line of JSON a frame, to every program that connects by TCP.
+
+    The first line says what sends: ``{"labapp": "0.1.0"}``. A line has ``missed`` where lines
+    before it were not sent because the listener did not read. Beyond `MOST_LISTENERS` the first
+    line says ``refused``, and is the last.
+
+    Parameters
+    ----------
+    host, port
+        Where to listen; port 0 takes a free one.
+    anywhere
+        Whether other machines may connect.
+
+    Raises
+    ------
+    InputError
+        If the host is another machine's way in and ``anywhere`` is not said, or the port is taken.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0, anywhere: bool = False) -> None:
+        check_host(host, anywhere)
+        self.told = 0
+        self._missed: dict[asyncio.StreamWriter, int] = {}
+        self._loop = _Loop("labapp line stream")
+        try:
+            # So many are taken in at once, those to be refused among them.
+            serving = asyncio.start_server(self._connected, host, port, backlog=MOST_LISTENERS)
+            self._server = self._loop.run(serving)
+        except OSError as error:
+            self._loop.close()
+            raise _taken(host, port, error) from error
+        self.port: int = self._server.sockets[0].getsockname()[1]
+        self.address = f"{host}:{self.port}"
+
+    @property
+    def listeners(self) -> int:
+        """How many programs are connected."""
+        return len(self._missed)
+
+    def publish(self, values: Values) -> None:
+        """Tell a frame; does not wait."""
+        line = json.dumps(values, allow_nan=False).encode()
+        self._loop.soon(lambda: self._send(line))
+
+    def close(self) -> None:
+        """Send what is waiting for those who read, and end."""
+        self._loop.run(self._close())
+        self._loop.close()
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        about = {"labapp": VERSION}
+        if len(self._missed) >= MOST_LISTENERS:
+            refusal = {**about, "refused": f"{MOST_LISTENERS} programs are connected"}
+            writer.write(json.dumps(refusal).encode() + b"\n")
+            writer.close()
+            return
+        writer.write(json.dumps(about).encode() + b"\n")
+        self._missed[writer] = 0
+        try:
+            while await reader.read(1024):
+                pass  # what listeners say is not for us
+            await writer.wait_closed()  # one that says no more may still read
+        except OSError:
+            pass  # it is gone
+        finally:
+            self._missed.pop(writer, None)
+            writer.close()
+
+    def _send(self, line: bytes) -> None:
+        self.told += bool(self._missed)
+        for writer, missed in self._missed.items():
+            if writer.transport.get_write_buffer_size() > MOST_WAITING:
+                self._missed[writer] += 1
+                continue
+            told = line[:-1] + b', "missed": %d}' % missed if missed else line
+            self._missed[writer] = 0
+            writer.write(told + b"\n")
+
+    async def _close(self) -> None:
+        self._server.close()
+        for writer, missed in self._missed.items():
+            if missed:
+                writer.write(b'{"missed": %d}\n' % missed)
+            writer.transport.close()  # when all is sent
+        for _ in range(round(PATIENCE_S / 0.01)):
+            if not self._missed:
+                return
+            await asyncio.sleep(0.01)
+        for writer in list(self._missed):
+            writer.transport.abort()
+        while self._missed:
+            await asyncio.sleep(0.01)
+
+
+class OpcuaStream:
+    """Measures as variables of an OPC UA server, the newest frame some twenty times a second.
+
+    They are ``Objects/Pool/NAME`` in the namespace ``urn:labapp:measures``; NaN is what is not
+    known. It needs asyncua, which the extra ``control`` brings.
+
+    Parameters
+    ----------
+    host, port
+        Where to listen.
+    anywhere
+        Whether other machines may connect.
+
+    Raises
+    ------
+    InputError
+        If asyncua is not there, the host is another machine's way in and ``anywhere`` is not said,
+        or the port is taken.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 4840, anywhere: bool = False) -> None:
+        check_host(host, anywhere)
+        try:
+            from asyncua import ua
+            from asyncua.server.server import Server
+        except ImportError as error:
+            expected = "asyncua, which pip install 'labapp[control]' brings"
+            raise InputError("OPC UA", "library", "missing", expected) from error
+        # What it says of security policies and ports is said here in words of our own.
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+        self._ua = ua
+        self._newest: Values | None = None
+        self._variables: dict[str, Any] = {}
+        self._ended = False
+        self.told = 0
+        self._loop = _Loop("labapp OPC UA stream")
+        self.address = f"opc.tcp://{host}:{port}/labapp"
+        try:
+            self._server = self._loop.run(self._start(Server()))
+        except OSError as error:
+            self._loop.close()
+            raise _taken(host, port, error) from error
+        self._telling = self._loop.start(self._tell())
+
+    @property
+    def listeners(self) -> int:
+        """How many programs are connected."""
+        return len(self._server.bserver.clients)
+
+    def publish(self, values: Values) -> None:
+        """Tell a frame; does not wait. A frame that another follows at once may be left out."""
+        self._newest = values
+
+    def close(self) -> None:
+        """Tell the newest frame, and end."""
+        self._ended = True
+        self._telling.result(STARTING_S)
+        self._loop.run(self._server.stop())
+        self._loop.close()
+
+    async def _start(self, server: Any) -> Any:
+        # All that are accepted at once take a file each, before the first is refused.
+        loop: Any = asyncio.get_running_loop()
+        loop.create_server = partial(loop.create_server, backlog=AT_ONCE)
+        await server.init()
+        server.iserver.max_connections = MOST_LISTENERS
+        server.set_endpoint(self.address)
+        server.set_server_name("labapp")
+        server.set_security_policy([self._ua.SecurityPolicyType.NoSecurity])
+        server.allow_remote_admin(False)  # or anybody could write, and take variables away
+        space = await server.register_namespace(NAMESPACE)
+        pool = await server.nodes.objects.add_object(space, "Pool")
+        words = dict.fromkeys(("status", "reason", "scheme", "sigma_of", *ALARMS), "")
+        sizes = dict.fromkeys(SIZES, math.nan)
+        for name, empty in {"frame": -1, "time_s": math.nan, **words, **sizes}.items():
+            self._variables[name] = await pool.add_variable(space, name, empty)
+        await server.start()
+        return server
+
+    async def _tell(self) -> None:
+        while not self._ended or self._newest is not None:
+            values, self._newest = self._newest, None
+            try:
+                for name, value in (values or {}).items():
+                    await self._variables[name].write_value(math.nan if value is None else value)
+                self.told += values is not None and self.listeners > 0
+            except Exception as error:  # what one frame does must not end the telling
+                logging.getLogger(NAME).error("not told by OPC UA", exc_info=error)
+            if not self._ended:
+                await asyncio.sleep(OPCUA_S)
+
+
+def open_stream(kind: str, place: str, anywhere: bool) -> Stream:
+    """Open a stream by its kind, ``lines`` or ``opcua``, at ``PORT`` or ``HOST:PORT``.
+
+    Raises
+    ------
+    InputError
+        If the place is none, or cannot be listened at.
+    """
+    host, _, port = place.rpartition(":")
+    if not (port.isdecimal() and int(port) < 65536):
+        raise InputError("stream", kind, place, "PORT or HOST:PORT, a port from 0 to 65535")
+    at = (host.strip("[]") or "127.0.0.1", int(port), anywhere)
+    return LineStream(*at) if kind == "lines" else OpcuaStream(*at)
+
+
+def check_host(host: str, anywhere: bool) -> None:
+    """Refuse a way in for other machines, unless it was asked for.
+
+    Raises
+    ------
+    InputError
+        If it is one.
+    """
+    try:
+        is_own = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        is_own = False
+    if not is_own and not anywhere:
+        expected = "127.0.0.1, ::1 or localhost: others may connect only if that is asked for"
+        raise InputError("stream", "host", host, expected)
+
+
+def _taken(host: str, port: int, error: OSError) -> InputError:
+    """What to tell when nobody can be heard at a place: the port is taken, or the host not here."""
+    if error.errno in (errno.EADDRINUSE, errno.EACCES):
+        why = os.strerror(error.errno)
+        return InputError("stream", "port", f"{host}:{port}: {why}", "a free one, from 1024 on")
+    return InputError("stream", "host", f"{host}: {error.strerror}", "an address of this machine")
+
+
+class _Loop:
+    """An event loop in a thread of its own."""
+
+    def __init__(self, name: str) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name=name, daemon=True)
+        self._thread.start()
+
+    def start(self, work: Coroutine[Any, Any, Any]) -> Any:
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def run(self, work: Coroutine[Any, Any, Any]) -> Any:
+        return self.start(work).result(STARTING_S)
+
+    def soon(self, call: Any) -> None:
+        self._loop.call_soon_threadsafe(call)
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()

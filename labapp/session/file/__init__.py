@@ -1,0 +1,1 @@
+"""The session file: a database, its schema, and values as bytes."""

@@ -1,0 +1,260 @@
+"""Values of the measurement as bytes, exactly, and back: what the session file holds.
+
+A blob is ``LAB1``, the crc32 of what follows, and the compressed value: a JSON tree of plain
+values in which arrays are named by their place behind it. Nothing in a blob is ever run, and bytes
+that were changed are noticed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.surface.interpolation import CloughTocherSurface, ThinPlateSurface
+from labapp.core.surface.reconstruction import BoundedSurface
+from labapp.core.surface.surface import FlatSurface
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.errors import InputError
+from labapp.session.file.kinds import check_fields, is_a
+from labapp.session.file.stored import NAMES, STORED
+
+MAGIC = b"LAB1"
+HEAD = struct.Struct("<4sI")
+
+SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
+    "CloughTocherSurface": (CloughTocherSurface, "points_mm", FloatArray, (3,)),
+    "ThinPlateSurface": (ThinPlateSurface, "points_mm", FloatArray, (3,)),
+    "FlatSurface": (FlatSurface, "level_mm", float, ()),
+}
+"""Surfaces that are not dataclasses; the one thing each is made from, what it is, its shape."""
+
+SURFACE_NAMES = {made: name for name, (made, *_) in SURFACES.items()}
+
+LARGEST = 100_000_000
+"""No value takes more bytes, unpacked, nor do all its arrays: few bytes cannot fill the memory.
+
+An array that is kept once may be named a thousand times; each is an array of its own when read.
+"""
+
+LARGEST_TREE = 8_000_000
+"""Of these, bytes of JSON: every two of them may become a list of sixty bytes."""
+
+MOST_SURFACE_POINTS = 4000
+"""The surfaces of a value are made from so many: a thin plate's system grows with their square."""
+
+UNREADABLE = (
+    *(zlib.error, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError),
+    *(RecursionError, MemoryError, CannotMeasure),
+)
+
+CONTAINERS: dict[str, Any] = {kind.__name__: kind for kind in (list, tuple, frozenset)}
+
+
+class Damaged(ValueError):
+    """These bytes are not what was once written."""
+
+
+def pack(value: object) -> bytes:
+    """Bytes of a value: plain values, arrays, containers of them, and the classes above.
+
+    Raises
+    ------
+    TypeError
+        If a value of another class is in it.
+    InputError
+        If it is larger than `LARGEST`, or what is no array of it than `LARGEST_TREE`.
+    """
+    content = _canonical(value)
+    tree = int.from_bytes(content[:4], "little")
+    for size, most in ((len(content), LARGEST), (tree, LARGEST_TREE)):
+        if size > most:
+            raise InputError("session", "value", f"{size} bytes", f"{most} bytes or less")
+    body = zlib.compress(content, 1)
+    return HEAD.pack(MAGIC, zlib.crc32(body)) + body
+
+
+def unpack(blob: object, kind: Any = Any) -> Any:
+    """The value that was packed; numbers and arrays bit for bit, arrays read-only.
+
+    Parameters
+    ----------
+    blob
+        What `pack` gave.
+    kind
+        What it must be: a class or a type hint.
+
+    Raises
+    ------
+    Damaged
+        If the bytes were changed, cut off, hold something else, a class that this version does
+        not know, or one whose fields are not what it says.
+    """
+    if not isinstance(blob, bytes):
+        raise Damaged("it is no blob")
+    if len(blob) < HEAD.size or HEAD.unpack_from(blob) != (MAGIC, zlib.crc32(blob[HEAD.size :])):
+        raise Damaged("its checksum does not fit")
+    try:
+        content = _decompressed(blob[HEAD.size :])
+        length = int.from_bytes(content[:4], "little")
+        if length > LARGEST_TREE:
+            raise ValueError("it is too large")
+        tree = json.loads(content[4 : 4 + length])
+        value = _Reader(memoryview(content)[4 + length :]).read(tree)
+    except UNREADABLE as error:
+        raise Damaged(f"it cannot be read: {error}") from error
+    if not is_a(value, kind):
+        raise Damaged(f"it is a {type(value).__name__}")
+    return value
+
+
+def unpack_from(path: Path, named: str, blob: object, kind: Any) -> Any:
+    """`unpack` what a session file holds under a name.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    try:
+        return unpack(blob, kind)
+    except Damaged as error:
+        raise InputError(path, named, error, "what was written there") from error
+
+
+def _decompressed(content: bytes) -> bytes:
+    unpacker = zlib.decompressobj()
+    plain = unpacker.decompress(content, LARGEST)
+    if not unpacker.eof or unpacker.unused_data:
+        raise ValueError("it is cut off, or too large")
+    return plain
+
+
+def fingerprint(value: object) -> str:
+    """SHA-256 of a value: equal for equal values, whatever bytes they were read from."""
+    return hashlib.sha256(_canonical(value)).hexdigest()
+
+
+def fingerprint_of(blob: bytes) -> str:
+    """`fingerprint` of the value that was packed, as it was then: no field added since changes it.
+
+    Raises
+    ------
+    Damaged
+        If the bytes were changed.
+    """
+    unpack(blob)
+    return hashlib.sha256(_decompressed(blob[HEAD.size :])).hexdigest()
+
+
+def _canonical(value: object) -> bytes:
+    arrays: dict[bytes, int] = {}
+    tree = json.dumps(_tree(value, arrays), separators=(",", ":")).encode()
+    return b"".join([len(tree).to_bytes(4, "little"), tree, *arrays])
+
+
+def _tree(value: object, arrays: dict[bytes, int]) -> object:
+    """JSON of a value; its arrays go into ``arrays``, bytes → place, equal ones once."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return {"array": [value.dtype.str, list(value.shape), _place(value, arrays)]}
+    if isinstance(value, bytes):
+        return {"bytes": [_place(np.frombuffer(value, np.uint8), arrays), len(value)]}
+    if isinstance(value, list | tuple | frozenset):
+        items = sorted(value) if isinstance(value, frozenset) else value
+        return {type(value).__name__: [_tree(item, arrays) for item in items]}
+    if isinstance(value, dict):
+        return {"dict": [[key, _tree(item, arrays)] for key, item in value.items()]}
+    if isinstance(value, BoundedSurface):
+        value = value.whole  # the boundary is kept beside it, in the reconstruction
+    if type(value) in SURFACE_NAMES:
+        name = SURFACE_NAMES[type(value)]
+        return {name: _tree(getattr(value, SURFACES[name][1]), arrays)}
+    if type(value) not in NAMES:
+        raise TypeError(f"a {type(value).__qualname__} cannot be kept in a session")
+    name = NAMES[type(value)]
+    fields = STORED[name].names().items()
+    return {name: {theirs: _tree(getattr(value, ours), arrays) for theirs, ours in fields}}
+
+
+def _place(array: npt.NDArray[Any], arrays: dict[bytes, int]) -> int:
+    if array.dtype.hasobject:
+        raise TypeError("an array of objects cannot be kept in a session")
+    content = array.tobytes()
+    if content not in arrays:
+        arrays[content] = sum(map(len, arrays))
+    return arrays[content]
+
+
+class _Reader:
+    """Makes a value from its JSON tree and the bytes of its arrays, of which it builds no end."""
+
+    def __init__(self, content: memoryview) -> None:
+        self._content = content
+        self._left = LARGEST
+        self._points_left = MOST_SURFACE_POINTS
+
+    def read(self, tree: Any) -> Any:
+        if not isinstance(tree, dict):
+            if isinstance(tree, list):
+                raise TypeError("a bare list")
+            return tree
+        ((kind, held),) = tree.items()
+        if kind == "array":
+            return self._array(*held)
+        if kind == "bytes":
+            place, length = held
+            found = self._content[place : place + length]
+            self._take(len(found))
+            return bytes(found)
+        if kind in CONTAINERS:
+            return CONTAINERS[kind](self.read(item) for item in held)
+        if kind == "dict":
+            return {key: self.read(item) for key, item in held}
+        if kind in SURFACES:
+            return self._surface(kind, self.read(held))
+        stored = STORED[kind]
+        fields = {
+            stored.renamed.get(name, name): self.read(item)
+            for name, item in held.items()
+            if name not in stored.retired
+        }
+        value = stored.kind(**fields)
+        check_fields(value, stored.shapes)
+        if not stored.fits(value):
+            raise TypeError(f"the fields of {kind} do not fit each other")
+        return value
+
+    def _take(self, size: int) -> None:
+        self._left -= size
+        if self._left < 0:
+            raise ValueError(f"its arrays take more than {LARGEST} bytes")
+
+    def _array(self, dtype: Any, shape: Any, place: Any) -> npt.NDArray[Any]:
+        if not (isinstance(dtype, str) and all(isinstance(n, int) and n >= 0 for n in shape)):
+            raise TypeError(f"an array of {dtype}, {shape}")
+        count = math.prod(shape)
+        self._take(count * np.dtype(dtype).itemsize)
+        found = np.frombuffer(self._content, dtype, count, place) if count else np.empty(0, dtype)
+        array = found.reshape(shape).copy()  # aligned, and free of the rest
+        array.flags.writeable = False
+        return array
+
+    def _surface(self, kind: str, from_what: Any) -> Any:
+        surface, _, hint, shape = SURFACES[kind]
+        if not is_a(from_what, hint) or (shape and np.shape(from_what)[1:] != shape):
+            raise TypeError(f"a {kind} of a {type(from_what).__name__}")
+        self._points_left -= len(from_what) if shape else 0
+        if self._points_left < 0:
+            raise ValueError(f"its surfaces are made from more than {MOST_SURFACE_POINTS} points")
+        return surface(from_what)

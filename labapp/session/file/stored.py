@@ -1,0 +1,166 @@
+"""The names that values have in session files: a format of its own (docs/session-file.md).
+
+A class or a field of the program may be renamed without a change to any file: here stands what it
+is called there, for ever. `tests/session/data/stored_names.json` holds every name that was ever
+written; a test fails where one can no longer be read, or a new one is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from labapp.core.calibration.laser_calibration import LaserCalibration
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.images import dots, threshold_dots
+from labapp.core.match import Match, Trial
+from labapp.core.matching.decision import MatchSettings
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.rows import detection, lattice, row_search
+from labapp.core.rows.correction import Correction
+from labapp.core.schemes import ers, irs
+from labapp.core.surface import pool_fit
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.measures import Measures
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.spline import SplineBasis, SplineSurface
+from labapp.run.limits import Limits
+from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
+from labapp.session.signals import Signals
+
+
+@dataclass(frozen=True)
+class Stored:
+    """How values of a class are kept.
+
+    Parameters
+    ----------
+    kind
+        The class, a dataclass.
+    renamed
+        Names of fields in files, and those of the class, where the two differ.
+    retired
+        Names of fields that files of earlier versions have: left out when they are read.
+    shapes
+        Shape of every array; equal letters are equal lengths.
+    fits
+        Whether the fields of a value fit each other.
+    """
+
+    kind: Any
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    retired: Collection[str] = ()
+    shapes: Mapping[str, str] = field(default_factory=dict)
+    fits: Callable[[Any], bool] = lambda _: True
+
+    def names(self) -> dict[str, str]:
+        """Names of the fields in files, and those of the class."""
+        in_files = {ours: theirs for theirs, ours in self.renamed.items()}
+        names = (own.name for own in fields(self.kind))
+        return {in_files.get(name, name): name for name in names}
+
+
+def _measurement_fits(value: Any) -> bool:
+    count = 0 if value.dots is None else len(value.dots)
+    return (value.lattice is None or len(value.lattice.row) == count) and (
+        value.match is None or _all_within(value.match.dot, 0, count - 1)
+    )
+
+
+def _match_fits(value: Any) -> bool:
+    return _all_within(value.ray[:, 0], 1, value.witness.shape[0]) and _all_within(
+        value.ray[:, 1], 1, value.witness.shape[1]
+    )
+
+
+def _spline_fits(value: Any) -> bool:
+    knots = (value.basis.x_knots, value.basis.y_knots)
+    return (
+        min(value.basis.shape) > 0
+        and len(value.coefficients) == value.basis.count
+        and all(np.isfinite(each).all() and (np.diff(each) > 0).all() for each in knots)
+    )
+
+
+def _all_within(numbers: Any, least: int, most: int) -> bool:
+    return bool(((numbers >= least) & (numbers <= most)).all())
+
+
+STORED = {
+    # The bench and its calibrations
+    "Laser": Stored(Laser),
+    "DotPattern": Stored(DotPattern),
+    "Electrode": Stored(Electrode),
+    "ImagingPlane": Stored(ImagingPlane, shapes={"origin_mm": "3", "x_axis": "3", "z_axis": "3"}),
+    "Rig": Stored(Rig),
+    "ImageCalibration": Stored(ImageCalibration, shapes={"matrix": "3 3"}),
+    "LaserReadings": Stored(LaserReadings),
+    "LaserCalibration": Stored(LaserCalibration),
+    "PlanePicture": Stored(PlanePicture),
+    "PlaneCalibration": Stored(PlaneCalibration),
+    # The experiment
+    "Record": Stored(Record),
+    "Recording": Stored(Recording),
+    "Limits": Stored(Limits),
+    "Signals": Stored(Signals, shapes=dict.fromkeys(("time_s", "current_a", "voltage_v"), "n")),
+    # Settings
+    "Settings": Stored(Settings),
+    "DotSettings": Stored(detection.DotSettings),
+    "BandPassSettings": Stored(dots.BandPassSettings),
+    "BlockThresholdSettings": Stored(threshold_dots.BlockThresholdSettings),
+    "WaveletSettings": Stored(threshold_dots.WaveletSettings),
+    "LatticeSettings": Stored(detection.LatticeSettings),
+    "GrowSettings": Stored(lattice.GrowSettings),
+    "RowSearchSettings": Stored(row_search.RowSearchSettings),
+    "MaskRowsSettings": Stored(row_search.MaskRowsSettings),
+    "MatchSettings": Stored(MatchSettings),
+    "FitSettings": Stored(pool_fit.FitSettings),
+    "IrsSettings": Stored(irs.IrsSettings),
+    "ErsSettings": Stored(ers.ErsSettings),
+    # Results
+    "Dots": Stored(
+        dots.Dots,
+        shapes=dict.fromkeys(
+            ("u_px", "v_px", "u_sigma_px", "v_sigma_px", "size_px", "peak", "snr"), "n"
+        ),
+    ),
+    "Lattice": Stored(lattice.Lattice, shapes={"row": "n", "column": "n"}),
+    "Correction": Stored(Correction),
+    "Trial": Stored(Trial),
+    "Match": Stored(
+        Match,
+        shapes={
+            "dot": "n",
+            "ray": "n 2",
+            "reflected": "n 2",
+            "plane_mm": "n 2",
+            "plane_covariance_mm2": "n 2 2",
+            "witness": "rows columns",
+        },
+        fits=_match_fits,
+    ),
+    "SplineBasis": Stored(SplineBasis, shapes={"x_knots": "x", "y_knots": "y"}),
+    "SplineSurface": Stored(SplineSurface, shapes={"coefficients": "n"}, fits=_spline_fits),
+    "Boundary": Stored(Boundary, shapes={"center_mm": "2", "theta_deg": "m", "points_mm": "m 3"}),
+    "Reconstruction": Stored(
+        Reconstruction,
+        retired=("variants",),
+        shapes={
+            "ray": "n 2",
+            "points_mm": "n 3",
+            "residual_mm": "n 2",
+            "sigma_mm": "n",
+            "size_sigma": "6",
+        },
+    ),
+    "Measures": Stored(Measures),
+    "Measurement": Stored(Measurement, fits=_measurement_fits),
+}
+"""What a session may hold, by its name there."""
+
+NAMES = {stored.kind: name for name, stored in STORED.items()}

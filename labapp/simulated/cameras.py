@@ -1,0 +1,160 @@
+"""Cameras by their ids, the simulated one among them, and a recording from one of them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from labapp.config.scenario import read_scenario
+from labapp.errors import InputError
+from labapp.media import GreyImage, open_source
+from labapp.media.cameras import (
+    Camera,
+    CameraFrame,
+    CameraSettings,
+    Faults,
+    Feed,
+    SimulatedDevice,
+    open_camera,
+    there_and_back,
+)
+from labapp.media.events import Event, Say, logged, silent
+from labapp.media.recording.recorder import Plan, Recorder
+from labapp.media.recording.take_files import Take
+from labapp.simulated.simulate import simulate
+from labapp.simulation.parallel import Progress
+
+SIMULATED = "simulated:"
+
+FRAMES = 48
+"""So many frames of a scenario are rendered, and played there and back."""
+
+MOST_BYTE = 400_000_000
+"""Frames of a recording that a simulated camera holds; it plays the first of a longer one."""
+
+USUAL_HZ = 60.0
+
+
+def camera_opener(
+    id: str,
+    progress: Progress | None = None,
+    faults: Faults | None = None,
+) -> Callable[[], Camera]:
+    """What opens a camera, again and again: for `Feed`.
+
+    Parameters
+    ----------
+    id
+        As `find_cameras` has it; or "simulated:FILE", a scenario or any recording that is played
+        as if a camera filmed it, there and back without end.
+    progress
+        Told of each frame of a scenario that is rendered.
+    faults
+        Of a simulated camera.
+
+    Raises
+    ------
+    InputError
+        If there is no such kind of camera, or a file cannot be played.
+    """
+    if id.startswith(SIMULATED):
+        return simulated_device(Path(id.removeprefix(SIMULATED)), progress, faults).open
+    return partial(open_camera, id)
+
+
+def simulated_device(
+    path: Path,
+    progress: Progress | None = None,
+    faults: Faults | None = None,
+) -> SimulatedDevice:
+    """Make a camera that plays a file; see `camera_opener`."""
+    if path.suffix == ".toml":
+        images, depth, rate_hz = _rendered(path, progress)
+    else:
+        images, depth, rate_hz = _recorded(path)
+    return SimulatedDevice(
+        str(path),
+        there_and_back(images),
+        bit_depth=depth,
+        rate_hz=rate_hz or USUAL_HZ,
+        faults=faults,
+    )
+
+
+def _rendered(path: Path, progress: Progress | None) -> tuple[list[GreyImage], int, float | None]:
+    scenario = read_scenario(path, frames=FRAMES)
+    with tempfile.TemporaryDirectory(prefix="labapp-") as folder:
+        simulate(scenario, Path(folder) / "run", progress=progress)
+        return _recorded(Path(folder) / "run" / scenario.recording.file)
+
+
+def _recorded(path: Path) -> tuple[list[GreyImage], int, float | None]:
+    with open_source(path) as source:
+        images: list[GreyImage] = []
+        for frame in source:
+            if frame.image.dtype not in (np.uint8, np.uint16):
+                expected = "a recording of 8 or 16 bit, as cameras give"
+                raise InputError(path, "grey levels", frame.image.dtype, expected)
+            images.append(frame.image)
+            if len(images) * frame.image.nbytes > MOST_BYTE:
+                break
+        return images, source.bit_depth, source.frame_rate_hz
+
+
+def record(
+    id: str,
+    opened: Callable[[], Camera],
+    place: Callable[[], Path],
+    plan: Plan,
+    settings: CameraSettings,
+    wait: Callable[[Feed, Take], None],
+    say: Say = silent,
+) -> Take:
+    """Record from a camera, at once.
+
+    Parameters
+    ----------
+    id, opened
+        The camera, and what opens it: `camera_opener`.
+    place
+        Gives the recording's file.
+    plan, settings
+        What is recorded, and what the camera is set to.
+    wait
+        Returns when enough is recorded; what was recorded is kept if it raises.
+    say
+        Called with what happens; it is noted beside the recording, too.
+
+    Raises
+    ------
+    InputError, CameraError
+        If the camera cannot be opened or set, or the file is there already.
+    """
+    recorders: list[Recorder] = []
+
+    def hand_on(frame: CameraFrame) -> None:
+        for recorder in recorders:
+            recorder.take(frame)
+
+    told = logged(say)
+
+    def tell(event: Event) -> None:
+        told(event)
+        for recorder in recorders:
+            recorder.note(event)
+
+    with (
+        Feed(id, opened, hand_on, tell, settings) as feed,
+        Recorder(place, plan, feed.bit_depth, feed.settings.rate_hz, told) as recorder,
+    ):
+        take = recorder.trigger()
+        recorders.append(recorder)
+        try:
+            wait(feed, take)
+        finally:
+            recorders.clear()
+    return take

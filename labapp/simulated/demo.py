@@ -1,0 +1,45 @@
+"""The sample run as a session of the user's own: what `labapp demo` measures and shows."""
+
+from __future__ import annotations
+
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.errors import InputError
+from labapp.export.pictures import write_surface_picture
+from labapp.session.samples import begin_session
+from labapp.session.session import Session
+
+
+def open_demo(folder: Path) -> Session:
+    """Open the session of the sample run in a folder; it is made there if it is not yet.
+
+    Measuring is left to the caller.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written, or the session is open elsewhere.
+    """
+    path = folder / "gtaw.labsession"
+    if path.exists():
+        return Session.open(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(folder, "folder", error.strerror, "one that can be written") from error
+    return begin_session("gtaw", path)
+
+
+def draw_surface(reconstruction: Reconstruction, path: Path) -> str:
+    """Draw a surface in 3-D; returns why it could not be, or nothing."""
+    try:
+        write_surface_picture(path, reconstruction)
+    except ImportError as error:
+        return f"{error.name} is not installed (pip install 'labapp[gui]')"
+    except BrokenProcessPool:
+        return "OpenGL cannot be used here"
+    except OSError as error:
+        return str(error.strerror)
+    return ""

@@ -1,0 +1,132 @@
+"""Simulate a recording: a folder with it, its set-up, its calibration picture and its truth.
+
+And a session of what was simulated.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from labapp.config.scenario import Scenario
+from labapp.config.scenario_keys import RECORDINGS
+from labapp.errors import InputError
+from labapp.session.record import Record
+from labapp.session.session import Session
+from labapp.simulation.parallel import Progress
+
+SCENARIO = "scenario.toml"
+"""The scenario itself, kept beside what was made of it; by it a former simulation is known."""
+
+FILES = {SCENARIO, "setup.toml", "calibration.png", "truth.csv", "dots_truth.csv"}
+
+OWN_FOLDER = "a new folder, an empty one or that of a former simulation"
+
+
+def simulate(
+    scenario: Scenario,
+    out: str | os.PathLike[str],
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Render a scenario's recording into a folder, which is whole or not there.
+
+    A former simulation in it is replaced.
+
+    Parameters
+    ----------
+    scenario
+        What is rendered.
+    out
+        The folder.
+    workers
+        How many processes render; None: one a core. The result is the same.
+    progress
+        Told of each frame, and while one is waited for; what it raises leaves nothing.
+
+    Raises
+    ------
+    InputError
+        If the folder holds anything else, or cannot be written.
+    """
+    out = Path(out).absolute()
+    _check_replaceable(out)
+    recording = scenario.recording
+    if workers is None:
+        workers = min(os.cpu_count() or 1, len(recording.pools))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as beside:
+            part = Path(beside) / out.name
+            recording.write_run(part, scenario.setup, workers, progress)
+            (part / SCENARIO).write_text(scenario.text, encoding="utf-8")
+            _check_replaceable(out)
+            if out.exists():
+                shutil.rmtree(out)
+            part.rename(out)
+    except OSError as error:
+        expected = "a folder that can be written"
+        raise InputError(out, "--out", error.strerror or error, expected) from error
+
+
+def _check_replaceable(out: Path) -> None:
+    """Refuse to replace a folder that holds anything but a former simulation."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(out, "--out", "is a file", OWN_FOLDER)
+    # The lock of a session that is no longer there is nobody's.
+    names = {path.name for path in out.iterdir() if path.suffix != ".lock"}
+    foreign = sorted(names - FILES - set(RECORDINGS.values()))
+    if names and (foreign or SCENARIO not in names):
+        found = f"holds {foreign[0]}" if foreign else f"holds no {SCENARIO}"
+        raise InputError(out, "--out", found, OWN_FOLDER)
+
+
+def begin_session(
+    scenario: Scenario,
+    folder: Path,
+    path: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Make a session of a simulation: its set-up, its recording; nothing measured yet.
+
+    Parameters
+    ----------
+    scenario
+        What was simulated.
+    folder
+        Where to.
+    path
+        The session file.
+    progress
+        Told how much of the recording is imported; what it raises leaves no session.
+
+    Raises
+    ------
+    InputError
+        If the folder lacks the recording, or the session is there already or cannot be written; no
+        session is left then.
+    """
+    made, size = scenario.recording, scenario.recording.pools[0].size
+    height_mm = size.height_mm if size.height_mm >= -size.depth_mm else size.depth_mm
+    record = Record(
+        title=scenario.title or folder.name,
+        expected_width_mm=round(size.width_mm, 2),
+        expected_length_mm=round(size.length_mm, 2),
+        expected_height_mm=round(height_mm, 3),
+        notes=f"Simulated, seed {made.seed}; the truth is in {folder.name}.",
+    )
+    rate_hz = None if made.file.endswith(".avi") else made.frame_rate_hz
+    with contextlib.ExitStack() as on_failure:
+        session = Session.create(path, record)
+        on_failure.callback(path.unlink)
+        on_failure.callback(session.close)
+        session.set_setup(scenario.setup)
+        session.import_recording(folder / made.file, frame_rate_hz=rate_hz, progress=progress)
+        on_failure.pop_all()
+    session.close()

@@ -1,0 +1,1 @@
+"""Where laser and imaging plane should stand for the pools expected."""

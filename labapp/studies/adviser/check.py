@@ -1,0 +1,169 @@
+"""The adviser's word against fresh simulation, and against every set-up of a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from labapp.core.values import FloatArray, freeze
+from labapp.simulation.parallel import Progress, in_parallel
+from labapp.studies.adviser.bench_limits import LaserPlace, Place
+from labapp.studies.adviser.expected_pools import Sample
+from labapp.studies.adviser.height_error import blocks, simulated_errors
+from labapp.studies.adviser.search import Advice, constraint_words
+
+TEXT_PLACE = Place(31.14, 31.48, 50.0, 50.8, 0.0)
+"""The set-up of §8.3.1, on the 4″ plane."""
+
+FRESH_SEED = 1_000_003
+"""Of pools that the adviser has not seen."""
+
+BLOCK = 10
+"""Pools that one process measures before it takes others."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What fresh pools say of an advice; n pools, each at k places, m set-ups of a grid.
+
+    Which rays come back hangs on where a pool lies under the torch, to a fraction of a row, and one
+    place a pool leaves the mean over 50 of them swinging by a tenth.
+
+    Parameters
+    ----------
+    advice
+        What is checked.
+    chosen, text
+        Error of the height (mm), hidden rays and rays that miss the plane, of every pool at every
+        place with the recommended set-up and with that of §8.3.1, shape (n, k, 3); infinite
+        errors where there is no surface.
+    places, errors
+        The grid's possible set-ups and their mean errors on the same pools, shape (m,), mm.
+    rematch
+        Errors of the recommended set-up and of that of the grid that did best, on n pools more,
+        shape (2, n, k), mm: on the first pools it did best by luck, too.
+    """
+
+    advice: Advice
+    chosen: FloatArray
+    text: FloatArray
+    places: tuple[Place, ...]
+    errors: FloatArray
+    rematch: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def error_mm(self) -> float:
+        """Mean error of the recommended set-up."""
+        return float(self.chosen[..., 0].mean())
+
+    @property
+    def text_error_mm(self) -> float:
+        """Mean error of the set-up of §8.3.1, over the pools that it can measure."""
+        error = self.text[..., 0]
+        return float(error[np.isfinite(error)].mean())
+
+    @property
+    def text_breaks(self) -> tuple[str, ...]:
+        """What the set-up of §8.3.1 does not keep, in words: its dots run into each other, say."""
+        angle, distance = TEXT_PLACE.projection_angle_deg, TEXT_PLACE.distance_mm
+        laser = LaserPlace(self.advice.expected, self.advice.limits, angle, distance)
+        margins = laser.margins(TEXT_PLACE)
+        return tuple(constraint_words(name, much) for name, much in margins.items() if much < 0)
+
+    @property
+    def off_prediction(self) -> float:
+        """How far the error is off the predicted one, as a share of that."""
+        return self.error_mm / self.advice.error_mm - 1
+
+
+def check(
+    advice: Advice,
+    pools: int = 50,
+    places: int = 8,
+    grid: tuple[int, int, int] = (5, 4, 3),
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> Check:
+    """Measure fresh pools with the recommended set-up, with §8.3.1's and with all of a grid.
+
+    Parameters
+    ----------
+    advice
+        A possible one.
+    pools, places
+        How many, and at how many places each, with the dots' noise and the calibration's errors
+        drawn anew.
+    grid
+        Angles, distances and plane distances, evenly over the bench's limits.
+    progress, workers
+        See `in_parallel`.
+    """
+    expected, limits = advice.expected, advice.limits
+    rivals = _possible(advice, grid)
+    fresh, more = (
+        expected.sample(pools, seed, even=False, places=places)
+        for seed in (FRESH_SEED, FRESH_SEED + 1)
+    )
+
+    def measured(some: Sequence[Place], sample: Sample, what: str) -> FloatArray:
+        tasks = blocks(limits, some, sample, BLOCK)
+        found = np.concatenate(in_parallel(simulated_errors, tasks, what, progress, workers))
+        return np.asarray(found.reshape(len(some), pools, places, -1))
+
+    own = measured([advice.best.place, TEXT_PLACE], fresh, "fresh pools")
+    errors = np.array([])
+    once_more = np.full((2, 0, places, 3), np.nan)
+    if rivals:
+        errors = measured(rivals, fresh, "every set-up of a grid")[..., 0].mean(axis=(1, 2))
+        rival = rivals[int(errors.argmin())]
+        once_more = measured([advice.best.place, rival], more, "the best two once more")
+    return Check(advice, own[0], own[1], tuple(rivals), errors, once_more[..., 0])
+
+
+def _possible(advice: Advice, grid: tuple[int, int, int]) -> list[Place]:
+    limits = advice.limits
+    ranges = (limits.angle_deg, limits.distance_mm, limits.plane_mm)
+    angles, distances, planes = (
+        np.unique(np.linspace(*span, count)).tolist()
+        for span, count in zip(ranges, grid, strict=True)
+    )
+    found = []
+    for angle, distance in product(angles, distances):
+        laser = LaserPlace(advice.expected, limits, angle, distance)
+        places = [laser.place(plane) for plane in planes]
+        found += [one for one in places if min(laser.margins(one).values()) >= 0]
+    return found
+
+
+def check_text(found: Check) -> str:
+    """What was found, in words."""
+    micro = 1000.0
+    hidden, missing = (int(found.chosen[..., k].sum()) for k in (1, 2))
+    lost = int(np.isinf(found.text[..., 0]).sum())
+    pools, places = found.chosen.shape[:2]
+    lines = [
+        f"{pools} fresh pools at {places} places each: {hidden} rays hidden, "
+        f"{missing} off the plane",
+        f"mean height error {micro * found.error_mm:.2f} µm, "
+        f"{100 * found.off_prediction:+.1f} % off the predicted "
+        f"{micro * found.advice.error_mm:.2f} µm",
+        f"set-up of §8.3.1: {micro * found.text_error_mm:.2f} µm"
+        + (f", {lost} times no surface" if lost else "")
+        + "".join(f"; {words}" for words in found.text_breaks),
+    ]
+    if found.places:
+        least = float(found.errors.min())
+        own, rival = found.rematch.mean(axis=(1, 2))
+        lines += [
+            f"best of {len(found.places)} possible set-ups of a grid: {micro * least:.2f} µm "
+            f"({100 * (least / found.error_mm - 1):+.1f} %)",
+            f"those two on as many pools more: {micro * own:.2f} and "
+            f"{micro * rival:.2f} µm ({100 * (rival / own - 1):+.1f} %)",
+        ]
+    return "\n".join(lines)

@@ -1,0 +1,59 @@
+"""What leaves the adviser: the files of an advice, and the set-up that follows from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from labapp.config.setup import updated_setup
+from labapp.studies.adviser.report import advice_picture, advice_table, advice_text, cost_table
+from labapp.studies.adviser.search import Advice
+from labapp.studies.plotting import as_bytes
+
+SETUP = "setup.toml"
+
+HEAD = """\
+# Recommended by labapp advise. Set the bench up so, then measure where it really
+# stands: labapp calibrate laser and labapp calibrate plane, both with --setup.
+# [image_calibration] is missing until calibrate plane writes it.
+
+"""
+
+
+def advice_files(advice: Advice) -> dict[str, bytes]:
+    """Words, tables, picture, and the set-up where there is one: file name → content."""
+    tables = [cost_table(advice)] if advice.possible else []
+    words = "\n\n".join([advice_text(advice), *(table.markdown() for table in tables)])
+    files = {
+        "advice.md": words.encode() + b"\n",
+        "advice.csv": advice_table(advice).csv().encode(),
+        "advice.png": as_bytes(advice_picture(advice), "png"),
+    }
+    if advice.possible:
+        files[SETUP] = updated_setup(HEAD, SETUP, advised_setup(advice)).encode()
+    return files
+
+
+def advised_setup(advice: Advice) -> dict[str, dict[str, Any]]:
+    """The recommended set-up: section → key → value, hundredths of a mm and of a degree."""
+    place, limits = advice.best.place, advice.limits
+    pattern = limits.pattern
+    return {
+        "laser": {
+            "projection_angle_deg": round(place.projection_angle_deg, 2),
+            "distance_mm": round(place.distance_mm, 2),
+        },
+        "pattern": {
+            "rows": pattern.rows,
+            "columns": pattern.columns,
+            "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
+            "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
+        },
+        "electrode": {"height_mm": limits.electrode_mm},
+        "imaging_plane": {
+            "distance_mm": round(place.plane_mm, 2),
+            "s_mm": round(place.s_mm, 2),
+            "h_mm": round(place.h_mm, 2),
+            "width_mm": limits.plate_mm[0],
+            "height_mm": limits.plate_mm[1],
+        },
+    }

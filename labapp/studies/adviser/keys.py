@@ -1,0 +1,175 @@
+"""What the adviser is asked, as TOML: the pools expected and the bench's limits."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from labapp.config.setup_keys import SECTIONS
+from labapp.config.toml_keys import Rule, are_numbers, check_keys, is_number, unknown_key
+from labapp.core.geometry.rig import DotPattern
+from labapp.errors import InputError
+from labapp.studies.adviser.bench_limits import BenchLimits
+from labapp.studies.adviser.expected_pools import ExpectedPools
+from labapp.studies.parameter_deviation import NOMINAL, QUANTITIES
+
+A_QUESTION = "a file for labapp advise (TOML, UTF-8)"
+
+CALIBRATION = (
+    "projection_angle_deg",
+    "distance_mm",
+    "plane_distance_mm",
+    "s_mm",
+    "h_mm",
+    "origin_px",
+    "x_axis_px",
+    "z_axis_px",
+)
+"""Keys of the calibration's standard uncertainties, in the order of `QUANTITIES`."""
+assert len(CALIBRATION) == len(QUANTITIES)
+
+
+def _range(low: float, high: float, unit: str, required: bool = False) -> Rule:
+    def accepts(value: object) -> bool:
+        ends = value if isinstance(value, list) else [value, value]
+        return are_numbers(ends, 2) and low <= ends[0] <= ends[1] <= high
+
+    expected = f"[least, most] or one number, {low:g} to {high:g} ({unit})"
+    return Rule(expected, accepts, required)
+
+
+def _number(low: float, high: float, unit: str) -> Rule:
+    return Rule(
+        f"a number from {low:g} to {high:g} ({unit})",
+        lambda value: is_number(value) and low <= value <= high,
+        required=False,
+    )
+
+
+POOLS = {
+    "kind": Rule('"convex" or "concave"', lambda v: v in ("convex", "concave"), False),
+    "width_mm": _range(1, 50, "mm", True),
+    "length_mm": _range(1, 50, "mm", True),
+    "height_mm": _range(0.01, 10, "mm; above 0 for concave pools, too", True),
+    "shift_mm": _number(0, 5, "mm"),
+}
+BENCH = {
+    "projection_angle_deg": _range(5, 80, "degrees"),
+    "distance_mm": _range(10, 500, "mm"),
+    "plane_distance_mm": _range(10, 1000, "mm"),
+    "s_mm": _range(-500, 500, "mm"),
+    "h_mm": _range(-500, 500, "mm"),
+    "width_mm": _number(10, 1000, "mm"),
+    "height_mm": _number(10, 1000, "mm"),
+    "edge_mm": _number(0, 50, "mm"),
+    "electrode_height_mm": _number(0, 50, "mm"),
+}
+CAMERA = {
+    "px_per_mm": _number(0.5, 200, "px/mm"),
+    "spacing_px": _number(0, 100, "px"),
+    "dot_sigma_px": _number(0.01, 10, "px"),
+}
+TABLES: dict[str, dict[str, Rule]] = {
+    "pools": POOLS,
+    "bench": BENCH,
+    "pattern": SECTIONS["pattern"],
+    "camera": CAMERA,
+    "calibration": {name: _number(0, 10, "standard uncertainty") for name in CALIBRATION},
+}
+"""Every table and key; only the pools must be told."""
+
+RANGES = {"projection_angle_deg": "angle_deg", "plane_distance_mm": "plane_mm"}
+
+
+def read_question(path: Path) -> dict[str, Any]:
+    """Read a question's tables; `parse_question` checks them.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is no TOML.
+    """
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, A_QUESTION) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(path, "syntax", error, A_QUESTION) from error
+
+
+def parse_question(
+    values: Mapping[str, Any], source: str | Path
+) -> tuple[ExpectedPools, BenchLimits]:
+    """Check what the adviser is asked.
+
+    Parameters
+    ----------
+    values
+        Table → key → value.
+    source
+        Where it comes from, for messages.
+
+    Raises
+    ------
+    InputError
+        If anything is unknown, missing or impossible; all that was found together.
+    """
+    path = Path(source)
+    problems = [unknown_key(path, key, TABLES) for key in values if key not in TABLES]
+    for name, rules in TABLES.items():
+        if name == "pools" or name in values:
+            problems += check_keys(path, name, values.get(name), rules)
+    if problems:
+        raise InputError.gather(problems)
+    limits = _limits({name: values.get(name, {}) for name in TABLES})
+    half_fan = (limits.pattern.rows - 1) / 2 * limits.pattern.inter_beam_angle_deg
+    if half_fan >= limits.angle_deg[0]:
+        raise InputError(
+            path,
+            "bench.projection_angle_deg",
+            list(limits.angle_deg),
+            f"angles above half the fan, {half_fan:.4g} (degrees)",
+        )
+    pools: dict[str, Any] = {
+        key: _span(value) if TABLES["pools"][key].required else value
+        for key, value in values["pools"].items()
+    }
+    try:
+        return ExpectedPools(**pools), limits
+    except ValueError as error:
+        key, _, why = str(error).partition(": ")
+        raise InputError(path, f"pools.{key}", values["pools"].get(key), why) from error
+
+
+def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:
+    bench = dict(tables["bench"])
+    given: dict[str, Any] = {}
+    plate = (bench.pop("width_mm", 101.6), bench.pop("height_mm", 101.6))
+    electrode = bench.pop("electrode_height_mm", 5.0)
+    edge = bench.pop("edge_mm", 1.0)
+    for key, value in bench.items():
+        given[RANGES.get(key, key)] = _span(value)
+    pattern = dict(tables["pattern"])
+    absent = pattern.pop("absent", None)
+    sigma = [
+        float(tables["calibration"].get(name, usual))
+        for name, usual in zip(CALIBRATION, NOMINAL, strict=True)
+    ]
+    return BenchLimits(
+        **given,
+        plate_mm=plate,
+        edge_mm=edge,
+        electrode_mm=electrode,
+        pattern=DotPattern(
+            **pattern, absent=None if absent is None else frozenset((i, j) for i, j in absent)
+        ),
+        sigma=tuple(sigma),
+        **tables["camera"],
+    )
+
+
+def _span(value: Any) -> tuple[float, float]:
+    low, high = value if isinstance(value, list) else (value, value)
+    return float(low), float(high)

@@ -1,0 +1,261 @@
+"""The error of a pool's height that a set-up lets expect, without measuring: fast enough to search.
+
+One linear step from the truth takes the place of the fit: the smooth surface is fitted once to the
+true slopes at the true reflection points, and what the parts of the budget do to it is worked out
+from that. Some 10 ms a pool, 50 ms with the calibration's part; the fit itself takes 100 to 200.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.geometry.optics import bisecting_gradient, meet_level, ray_directions
+from labapp.core.geometry.rig import Laser, Rig
+from labapp.core.surface.pool_fit import CORRELATED_MM2, REACH, FitSettings, landing_spacing
+from labapp.core.surface.solver import SlopeFit, fit_slopes
+from labapp.core.surface.spline import SplineBasis
+from labapp.core.values import FloatArray, freeze
+from labapp.simulation.forward import Reflections, trace
+from labapp.simulation.pools import Pool
+from labapp.studies.parameter_deviation import (
+    OFFSETS,
+    QUANTITIES,
+    AxisPoints,
+    dots_moved,
+    spread,
+)
+
+DOT_SIGMA_MM = 0.053
+"""Standard uncertainty of a dot's place on the plane: 0.3 px of a camera that sees all of it."""
+
+LEAST_DOTS = 9
+"""No surface is fitted to fewer."""
+
+RIM_POINTS = 72
+
+DECIDING = 4
+"""So many lit and dark rays nearest the boundary place the level."""
+
+
+@dataclass(frozen=True)
+class PredictedError:
+    """What a set-up lets expect of a pool's height; standard uncertainties, mm.
+
+    Parameters
+    ----------
+    boundary_mm
+        Which rays came back leaves open where the pool ends, and so its level.
+    shape_mm
+        What the smooth surface misses between and beyond the dots: exact slopes, no noise.
+    dots_mm
+        The dots' uncertainty on the plane.
+    parameters_mm
+        The calibration's uncertainties, `QUANTITIES`, shape (8,); zero where not asked for.
+    dots, blocked, off_plane, lost
+        Dots that show; rays from the pool that the torch hides; whose reflection misses the
+        plane's edges; that meet the pool again.
+    closest_mm
+        Distance of the two dots that lie closest on the plane; NaN with fewer than two.
+    """
+
+    boundary_mm: float
+    shape_mm: float
+    dots_mm: float
+    parameters_mm: FloatArray
+    dots: int
+    blocked: int
+    off_plane: int
+    lost: int
+    closest_mm: float
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def random_mm(self) -> float:
+        """All but the calibration: what varies from pool to pool and from frame to frame."""
+        return float(np.sqrt(self.boundary_mm**2 + self.shape_mm**2 + self.dots_mm**2))
+
+    @property
+    def total_mm(self) -> float:
+        """Everything together."""
+        return float(np.hypot(self.random_mm, np.linalg.norm(self.parameters_mm)))
+
+
+def predict_error(
+    pool: Pool,
+    rig: Rig,
+    *,
+    dot_sigma_mm: float = DOT_SIGMA_MM,
+    sigma: Sequence[float] | None = None,
+    axes: AxisPoints | None = None,
+) -> PredictedError:
+    """Predict the error of a pool's height by the fit, as a standard uncertainty.
+
+    Parameters
+    ----------
+    pool
+        A pool of the kind that is expected, its boundary on the work piece.
+    rig
+        The set-up.
+    dot_sigma_mm
+        Standard uncertainty of a dot's place on the plane.
+    sigma
+        Standard uncertainties of `QUANTITIES`; None leaves the calibration out.
+    axes
+        The image calibration; without it the axis points' part is zero.
+
+    Returns
+    -------
+    PredictedError
+        With infinite parts where fewer than nine dots show.
+    """
+    seen = trace(pool, rig)
+    counted = PredictedError(
+        boundary_mm=np.inf,
+        shape_mm=np.inf,
+        dots_mm=np.inf,
+        parameters_mm=np.zeros(len(QUANTITIES)),
+        dots=int(seen.visible.sum()),
+        blocked=int((seen.lit & seen.blocked).sum()),
+        off_plane=int((seen.lit & ~seen.blocked & ~seen.on_plane).sum()),
+        lost=int((seen.lit & ~seen.blocked & seen.hits_again).sum()),
+        closest_mm=_closest(seen.plane_mm[seen.visible]),
+    )
+    if counted.dots < LEAST_DOTS:
+        return counted
+    model = _Model(pool, rig, seen, dot_sigma_mm)
+    return replace(
+        counted,
+        boundary_mm=model.boundary(),
+        shape_mm=abs(model.height(model.fitted, model.rim) - abs(model.peak_mm)),
+        dots_mm=model.noise(),
+        parameters_mm=(counted.parameters_mm if sigma is None else model.parameters(sigma, axes)),
+    )
+
+
+def together(predicted: Sequence[PredictedError]) -> float:
+    """Root mean square of the whole error over pools of a kind, mm; infinite if one has none."""
+    return float(np.sqrt(np.mean([one.total_mm**2 for one in predicted])))
+
+
+class _Model:
+    """The smooth surface through the true slopes, and what it makes of changes to them."""
+
+    def __init__(self, pool: Pool, rig: Rig, seen: Reflections, dot_sigma_mm: float) -> None:
+        from labapp.core.surface import kernels
+
+        settings = FitSettings()
+        self.pool, self.rig, self.seen = pool, rig, seen
+        self.points = seen.point_mm[seen.visible]
+        self.plane = seen.plane_mm[seen.visible]
+        size = pool.size
+        convex = pool.peak_mm > 0
+        self.sign = 1 if convex else -1
+        self.peak_xy = np.array(size.peak_mm if convex else size.bottom_mm)
+        self.peak_mm = size.height_mm if convex else size.depth_mm
+        self.rim = pool.boundary_mm(RIM_POINTS)[:, :2]
+        ground = meet_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))[..., :2]
+        self.ground = ground
+        margin = REACH * landing_spacing(ground).max()
+        corners = np.vstack([self.points[:, :2], self.rim, self.peak_xy])
+        self.basis = SplineBasis.over(
+            corners.min(axis=0) - margin, corners.max(axis=0) + margin, settings.knot_mm
+        )
+        self.stiffness = CORRELATED_MM2 / settings.jerk**2
+        # The weights are those of the fit; the noise is what it will be.
+        variance = dot_sigma_mm**2 + settings.floor_mm**2
+        covariance = np.broadcast_to(variance * np.eye(2), (len(self.points), 2, 2))
+        laser, pose = rig.laser.position_mm, rig.imaging_plane.pose_mm
+        dots = rig.imaging_plane.to_universal(self.plane)
+        self.weights = kernels.slope_weights(laser, pose[1:3], self.points, dots, covariance, 0.0)
+        self.fitted = self.fit(self.points, pool.gradient(*self.points[:, :2].T))
+        self.inward = self._inward(ground)
+        self.dark = ~seen.hit & ~seen.absent & self.basis.contains(ground[..., 0], ground[..., 1])
+        self.level_at = self._deciding()
+
+    def fit(self, points: FloatArray, slopes: FloatArray) -> SlopeFit:
+        return fit_slopes(self.basis, points[:, :2], slopes, self.weights, self.stiffness)
+
+    def height(self, fitted: SlopeFit, rim: FloatArray) -> float:
+        """Of the peak over the boundary's mean, positive for either sign of pool."""
+        peak = fitted.surface.height(self.peak_xy[:1], self.peak_xy[1:])[0]
+        return self.sign * float(peak - fitted.surface.height(*rim.T).mean())
+
+    def noise(self) -> float:
+        """Standard uncertainty of `height` from the dots' noise and the unknown roughness."""
+        rows = self.basis.matrix(*self.peak_xy[:, None])[0] - self.basis.matrix(
+            *self.level_at.T
+        ).mean(0)
+        return float(self.fitted.sigma_of(rows[None])[0])
+
+    def boundary(self) -> float:
+        """Standard uncertainty of the level: uniform between the last lit and first dark ray."""
+        within = self.inward[self.seen.visible].min()
+        beyond = self.inward[self.dark].max() if self.dark.any() else -np.inf
+        return float((within - beyond) / np.sqrt(12))
+
+    def _inward(self, xy: FloatArray) -> FloatArray:
+        """Height over the work piece that the pool has, or would have if it went on, at its rim.
+
+        Shape (rows, columns) for points of shape (rows, columns, 2), mm; to first order.
+        """
+        rho = np.sqrt(self.pool.footprint.place(xy[..., 0], xy[..., 1]).rho2)
+        center = np.array(self.pool.footprint.center_mm)
+        just_inside = center + (self.rim - center) * (1 - 1e-6)
+        fall = np.sum(self.pool.gradient(*just_inside.T) * (self.rim - center), axis=-1)
+        return np.asarray((1 - rho) * np.abs(fall).mean())
+
+    def _deciding(self) -> FloatArray:
+        """Landing points of the rays that place the level: lit and dark ones nearest the rim."""
+        sides = []
+        for side in (self.seen.visible, self.dark):
+            nearest = np.argsort(np.abs(self.inward[side]))[:DECIDING]
+            sides.append(self.ground[side][nearest])
+        return np.concatenate(sides)
+
+    def parameters(self, sigma: Sequence[float], axes: AxisPoints | None) -> FloatArray:
+        """Standard uncertainty of `height` from each of `QUANTITIES`, shape (8,)."""
+        base = self.height(self.fitted, self.level_at)
+        change = np.zeros(OFFSETS)
+        for k, step in enumerate(np.diag(spread(sigma))):
+            if step.any() and (axes is not None or not step[5:].any()):
+                change[k] = self._believed(step, axes) - base
+        return np.array([np.linalg.norm(change[list(q.parts)]) for q in QUANTITIES])
+
+    def _believed(self, offset: FloatArray, axes: AxisPoints | None) -> float:
+        """Height that is measured if the bench is taken to be off by ``offset``."""
+        plane, rig = dots_moved(self.plane, self.rig, axes, offset)
+        source = rig.laser.position_mm
+        rays = ray_directions(rig.laser, rig.pattern)[self.seen.visible]
+        points = source + (self.points[:, 2:] - source[2]) / rays[:, 2:] * rays
+        dots = rig.imaging_plane.to_universal(plane)
+        slopes = bisecting_gradient(points - source, dots - points)
+        rim = _landing(self.level_at, self.rig.laser, rig.laser)
+        return self.height(self.fit(points, slopes), rim)
+
+
+def _landing(xy: FloatArray, true: Laser, believed: Laser) -> FloatArray:
+    """Where rays that land at (x, y) on z = 0 are believed to, shape (n, 2), mm."""
+    forward, across, up = _axes(true)
+    ray = np.column_stack([xy, np.zeros(len(xy))]) - true.position_mm
+    p, q = ray @ across / (ray @ forward), ray @ up / (ray @ forward)
+    forward, across, up = _axes(believed)
+    return meet_level(believed.position_mm, forward + p[:, None] * across + q[:, None] * up)[:, :2]
+
+
+def _axes(laser: Laser) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Unit vectors along the beam, along X and square to both (Fig. 4-14)."""
+    alpha = np.radians(laser.projection_angle_deg)
+    forward = np.array([0.0, -np.cos(alpha), -np.sin(alpha)])
+    return forward, np.array([1.0, 0.0, 0.0]), np.array([0.0, -np.sin(alpha), np.cos(alpha)])
+
+
+def _closest(plane_mm: FloatArray) -> float:
+    if len(plane_mm) < 2:
+        return float("nan")
+    apart = np.linalg.norm(plane_mm[:, None] - plane_mm, axis=-1)
+    return float(apart[np.triu_indices(len(plane_mm), 1)].min())

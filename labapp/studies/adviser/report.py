@@ -1,0 +1,228 @@
+"""An advice as words, tables and a picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from labapp.simulation.forward import trace
+from labapp.studies.adviser.bench_limits import CONSTRAINTS
+from labapp.studies.adviser.search import MOVED, Advice, Candidate, constraint_words
+from labapp.studies.plotting import INCHES, STYLE, new_figure
+from labapp.studies.tables import Cell, Table
+
+WORDS = {
+    "projection_angle_deg": ("laser, projection angle", "°"),
+    "distance_mm": ("laser, distance", "mm"),
+    "plane_mm": ("imaging plane, distance", "mm"),
+    "s_mm": ("imaging plane, s", "mm"),
+    "h_mm": ("imaging plane, h", "mm"),
+}
+"""A quantity of `Place` in words, and its unit."""
+
+KEPT, BROKEN = "#1b7a3d", "#b01030"
+
+
+def advice_text(advice: Advice) -> str:
+    """Tell the recommended set-up, what to expect of it and what it keeps; Markdown."""
+    best = advice.best
+    if advice.possible:
+        height = advice.expected.mean_height_mm
+        lines = [
+            "Recommended set-up:",
+            "",
+            *_place_lines(best),
+            "",
+            f"Mean height error to be expected: {_micro(advice.error_mm)} ± "
+            f"{_micro(advice.sigma_mm)} µm, {100 * advice.error_mm / height:.2g} % of "
+            f"{height:.3g} mm; {_micro(advice.random_mm)} µm with the calibration known exactly.",
+            "",
+            "It keeps:",
+            "",
+            *(f"* {constraint_words(name, margin)}" for name, margin in best.margins.items()),
+        ]
+    else:
+        lines = [
+            "No set-up within these limits keeps all it must for every pool expected.",
+            "",
+            "Nearest is:",
+            "",
+            *_place_lines(best),
+            "",
+            "What stands in the way:",
+            "",
+            *(
+                f"* {constraint_words(name, margin)}"
+                for name, margin in best.margins.items()
+                if margin < 0
+            ),
+        ]
+    return "\n".join(lines)
+
+
+def _place_lines(candidate: Candidate) -> list[str]:
+    return [
+        f"* {words}: {getattr(candidate.place, name):.2f} {unit}"
+        for name, (words, unit) in WORDS.items()
+    ]
+
+
+def _micro(value_mm: float) -> str:
+    return f"{1000 * value_mm:.2f}"
+
+
+def advice_table(advice: Advice) -> Table:
+    """The recommended set-up (first), what was compared, and each mm and degree away."""
+    rows = [
+        _row("recommended" if advice.possible else "nearest", advice.best, advice.error_mm),
+        *(_row("grid", one, one.error_mm) for one in advice.grid),
+    ]
+    for sweep in advice.sweeps:
+        for value, error, margins in zip(sweep.value, sweep.error_mm, sweep.margins, strict=True):
+            place = {name: getattr(advice.best.place, name) for name in MOVED}
+            place[sweep.name] = float(value)
+            rows.append(("away", *place.values(), float(error), *margins.values()))
+    columns = [f"{name}_margin_{unit}" for name, (_, unit) in CONSTRAINTS.items()]
+    return Table(
+        "advice",
+        "Set-ups: predicted mean height error, mm, and by how much they keep what they must",
+        ("what", *MOVED, "error_mm", *columns),
+        tuple(rows),
+    )
+
+
+def _row(what: str, one: Candidate, error_mm: float) -> tuple[Cell, ...]:
+    place = [getattr(one.place, name) for name in MOVED]
+    return (what, *place, error_mm if np.isfinite(error_mm) else None, *one.margins.values())
+
+
+def cost_table(advice: Advice) -> Table:
+    """What each mm and degree away costs on the mean, as far as all is kept, and what breaks."""
+    rows: list[tuple[Cell, ...]] = []
+    for sweep in advice.sweeps:
+        own = int(np.argmin(np.abs(sweep.value - getattr(advice.best.place, sweep.name))))
+        # From one pool to the next which rays come back changes: a short way's slope is luck.
+        short = np.ptp(sweep.value) / 2 / max(len(sweep.value) - 1, 1)
+        for way in (-1, 1):
+            path = list(range(own + way, len(sweep.value) if way > 0 else -1, way))
+            broken = [k for k in path if sweep.breaks(k)]
+            kept = path[: path.index(broken[0])] if broken else path
+            far = [k for k in path if abs(sweep.value[k] - sweep.value[own]) >= short]
+            end = next((k for k in reversed(kept) if k in far), far[0] if far else None)
+            more = None
+            if end is not None:
+                apart = abs(sweep.value[end] - sweep.value[own])
+                more = float(1000 * (sweep.error_mm[end] - sweep.error_mm[own]) / apart)
+            wrong = broken[0] if broken else None
+            rows.append(
+                (
+                    *WORDS[sweep.name],
+                    "less" if way < 0 else "more",
+                    more,
+                    float(sweep.value[kept[-1] if kept else own]),
+                    None if wrong is None else float(sweep.value[wrong]),
+                    "; ".join(CONSTRAINTS[name][0] for name in sweep.breaks(wrong))
+                    if wrong is not None
+                    else "",
+                )
+            )
+    return Table(
+        "cost",
+        "Cost of each mm and degree away from the recommended set-up, µm of error; kept and broken "
+        "where it was looked at",
+        (
+            "quantity",
+            "unit",
+            "way",
+            "more_error_um_per_unit",
+            "kept_to",
+            "broken_at",
+            "what_breaks",
+        ),
+        tuple(rows),
+    )
+
+
+def advice_picture(advice: Advice) -> Figure:
+    """Draw the bench from the side, where the laser may stand, and what a mm or degree costs."""
+    with rc_context(STYLE):
+        figure = new_figure(INCHES, INCHES * 1.15)
+        plots = figure.subplot_mosaic(
+            [["side"] * 6, ["map"] * 2 + ["a"] * 2 + ["b"] * 2, ["c"] * 2 + ["d"] * 2 + ["e"] * 2],
+            height_ratios=[1.4, 1, 1],
+        )
+        _draw_bench(plots["side"], advice)
+        _draw_map(plots["map"], advice)
+        for key, sweep in zip("abcde", advice.sweeps, strict=False):
+            _draw_sweep(plots[key], advice, sweep)
+        for key in "abcde"[len(advice.sweeps) :]:
+            plots[key].remove()
+        return figure
+
+
+def _draw_bench(plot: Any, advice: Advice) -> None:
+    place = advice.best.place
+    rig = advice.limits.rig(place)
+    pool = advice.expected.at(np.full(5, 0.5))
+    seen = trace(pool, rig)
+    laser, column = rig.laser.position_mm, (rig.pattern.columns - 1) // 2
+    for row in np.flatnonzero(seen.hit[:, column] & ~seen.absent[:, column]):
+        point = seen.point_mm[row, column]
+        end = point + 60 * seen.reflected[row, column]
+        if np.isfinite(seen.plane_mm[row, column]).all():
+            end = rig.imaging_plane.to_universal(seen.plane_mm[row, column])
+        colour = KEPT if seen.visible[row, column] else BROKEN
+        plot.plot(*np.stack([laser, point, end])[:, 1:].T, color=colour, lw=0.6)
+    y = np.linspace(-1, 1, 81) * sum(advice.expected.length_mm) / 4 * (1 - 1e-9)
+    plot.plot(y, pool.height(np.zeros_like(y), y), color="#c05a00", lw=1.8)
+    plot.axhline(0, color="0.3", lw=0.6)
+    top = place.h_mm + rig.imaging_plane.height_mm
+    plot.plot([-place.plane_mm] * 2, [place.h_mm, top], "k", lw=1.8)
+    tip = rig.electrode.height_mm
+    plot.fill([0, 1.2, 1.2, -1.2, -1.2], [tip, tip + 4, 40, 40, tip + 4], "0.7", ec="0.3", lw=0.5)
+    plot.plot(*laser[1:], "ks", ms=4)
+    plot.annotate("laser", laser[1:], (5, 3), textcoords="offset points")
+    plot.annotate("imaging plane", (-place.plane_mm, top), (5, -8), textcoords="offset points")
+    plot.set(aspect="equal", xlabel="Y (mm)", ylabel="Z (mm)", ylim=(-5, top + 5))
+    told = "recommended" if advice.possible else "nearest; not possible"
+    plot.set_title(
+        f"{told}: laser {place.projection_angle_deg:.1f}°, {place.distance_mm:.1f} mm; "
+        f"plane {place.plane_mm:.1f} mm, s {place.s_mm:.1f}, h {place.h_mm:.1f} mm",
+        loc="left",
+        fontsize=8,
+    )
+
+
+def _draw_map(plot: Any, advice: Advice) -> None:
+    """Where the laser may stand: the least error over the plane's distances, crosses for none."""
+    least: dict[tuple[float, float], float] = {}
+    for one in advice.grid:
+        at = (one.place.projection_angle_deg, one.place.distance_mm)
+        error = one.error_mm if one.possible else np.inf
+        least[at] = min(least.get(at, np.inf), error)
+    places, micro = np.array(list(least)), 1000 * np.array(list(least.values()))
+    known = np.isfinite(micro)
+    plot.plot(*places[~known].T, "x", color=BROKEN, ms=4)
+    if known.any():
+        dots = plot.scatter(*places[known].T, c=micro[known], s=45, cmap="viridis")
+        plot.figure.colorbar(dots, ax=plot, label="predicted error (µm)")
+    best = advice.best.place
+    plot.plot(best.projection_angle_deg, best.distance_mm, "*", ms=9, color="k", mfc="w")
+    plot.set(xlabel="projection angle (°)", ylabel="laser distance (mm)")
+    plot.set_title("where the laser may stand (× nowhere)", loc="left", fontsize=7.5)
+
+
+def _draw_sweep(plot: Any, advice: Advice, sweep: Any) -> None:
+    words, unit = WORDS[sweep.name]
+    wrong = np.array([bool(sweep.breaks(k)) for k in range(len(sweep.value))])
+    error = 1000 * sweep.error_mm
+    plot.plot(sweep.value, error, color="0.6")
+    plot.plot(sweep.value[~wrong], error[~wrong], "o", ms=3, color=KEPT)
+    plot.plot(sweep.value[wrong], error[wrong], "x", ms=4, color=BROKEN)
+    plot.axvline(getattr(advice.best.place, sweep.name), color="k", lw=0.6, ls=":")
+    known = error[np.isfinite(error)]
+    plot.set(xlabel=f"{words} ({unit})", ylabel="error (µm)", ylim=(0, 1.15 * known.max()))
+    plot.grid(alpha=0.25, lw=0.4)

@@ -1,0 +1,390 @@
+"""The configuration adviser: where laser and imaging plane should stand for the pools expected.
+
+Of all set-ups within a bench's limits the one that lets expect the least error of the height: every
+place of a grid is held against what it must keep (`LaserPlace`), those that are possible are
+compared by the predicted error on ever more pools, the best are moved on from there, and the pools
+are measured with the finalists in simulation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.optimize import minimize
+
+from labapp.core.values import FloatArray, freeze
+from labapp.simulation.parallel import Progress, in_parallel, shared_processes
+from labapp.studies.adviser.bench_limits import (
+    CONSTRAINTS,
+    BenchLimits,
+    Constraint,
+    LaserPlace,
+    Place,
+    broken,
+)
+from labapp.studies.adviser.expected_pools import ExpectedPools, Range, Sample
+from labapp.studies.adviser.height_error import (
+    Trial,
+    blocks,
+    predicted_errors,
+    simulated_errors,
+)
+
+MOVED: dict[str, str] = {
+    "projection_angle_deg": "angle_deg",
+    "distance_mm": "distance_mm",
+    "plane_mm": "plane_mm",
+    "s_mm": "s_mm",
+    "h_mm": "h_mm",
+}
+"""What the adviser chooses, `Place`, and the range of it in `BenchLimits`."""
+
+SEED = 4
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How thoroughly is searched; the defaults take some minutes on two cores.
+
+    Parameters
+    ----------
+    grid
+        Angles, distances and plane distances of the grid.
+    pools
+        On so many pools all possible places are compared, the best ten of them, and the finalists.
+    steps
+        Of the way on from the best.
+    finalists
+        So many set-ups are simulated.
+    sweep
+        Points of each curve of what a mm or a degree away costs.
+    """
+
+    grid: tuple[int, int, int] = (6, 6, 4)
+    pools: tuple[int, int, int] = (8, 32, 128)
+    steps: int = 24
+    finalists: int = 6
+    sweep: int = 9
+
+
+QUICK = Effort(grid=(5, 4, 3), pools=(2, 4, 12), steps=6, finalists=2, sweep=3)
+"""A tenth of the time: its expected error is known to a fifth."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A set-up that was looked at.
+
+    Parameters
+    ----------
+    place
+        Where laser and plane stand.
+    margins
+        By how much it keeps each of `CONSTRAINTS`; below 0 it does not.
+    error_mm
+        Predicted mean error of the height, infinite where not all is kept.
+    """
+
+    place: Place
+    margins: dict[Constraint, float]
+    error_mm: float = np.inf
+
+    @property
+    def possible(self) -> bool:
+        """Whether it keeps them all."""
+        return broken(self.margins) == 0
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What it costs to have one quantity elsewhere, the others as recommended; n places.
+
+    Parameters
+    ----------
+    name
+        Of the quantity in `Place`.
+    value
+        Where it is, mm or degrees, shape (n,).
+    error_mm
+        Predicted mean error there, whatever is broken, shape (n,).
+    margins
+        Margins there, n of them.
+    """
+
+    name: str
+    value: FloatArray
+    error_mm: FloatArray
+    margins: tuple[dict[Constraint, float], ...]
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    def breaks(self, number: int) -> tuple[Constraint, ...]:
+        """What is not kept there."""
+        return tuple(name for name, margin in self.margins[number].items() if margin < 0)
+
+
+@dataclass(frozen=True)
+class Advice:
+    """The recommended set-up, what to expect of it, and what was looked at on the way.
+
+    Parameters
+    ----------
+    expected, limits
+        What was asked.
+    best
+        The recommended set-up; where none is possible, the one that breaks least.
+    error_mm, sigma_mm
+        Mean error of the height to be expected of it, and the standard uncertainty of that mean;
+        NaN where none is possible.
+    random_mm
+        The same mean with the calibration known exactly.
+    grid
+        The places of the grid, laser place by laser place.
+    sweeps
+        The cost of each mm and degree away.
+    """
+
+    expected: ExpectedPools
+    limits: BenchLimits
+    best: Candidate
+    error_mm: float
+    sigma_mm: float
+    random_mm: float
+    grid: tuple[Candidate, ...]
+    sweeps: tuple[Sweep, ...]
+
+    @property
+    def possible(self) -> bool:
+        """Whether any set-up within the limits keeps all it must."""
+        return self.best.possible
+
+
+def advise(
+    expected: ExpectedPools,
+    limits: BenchLimits,
+    effort: Effort | None = None,
+    seed: int = SEED,
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> Advice:
+    """Find the set-up with the least predicted error of the height.
+
+    Parameters
+    ----------
+    expected, limits
+        The pools, and the bench's limits.
+    effort
+        How thoroughly.
+    seed
+        Of the pools and errors that set-ups are compared on: the same one gives the same advice.
+    progress, workers
+        See `in_parallel`. What ``progress`` raises ends the search.
+    """
+    search = _Search(expected, limits, effort or Effort(), seed, progress, workers)
+    with shared_processes(workers):
+        return _found(search)
+
+
+def _found(search: _Search) -> Advice:
+    expected, limits = search.expected, search.limits
+    grid = search.grid()
+    possible = [one for one in grid if one.possible]
+    if not possible:
+        nearest = search.nearest(min(grid, key=lambda one: broken(one.margins)))
+        if not nearest.possible:
+            unknown = float("nan")
+            return Advice(expected, limits, nearest, unknown, unknown, unknown, grid, ())
+        possible = [nearest]
+    scored = search.scored(possible, 0)
+    told = {one.place: one for one in scored}
+    grid = tuple(told.get(one.place, one) for one in grid)
+    finalists = search.refined(search.scored(_best(scored, 10), 1))
+    best, error, sigma, random = search.decided(finalists)
+    scale = error / best.error_mm
+    sweeps = search.sweeps(best, scale)
+    return Advice(expected, limits, best, error, sigma, random, grid, sweeps)
+
+
+def _best(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+    return sorted(candidates, key=lambda one: one.error_mm)[:count]
+
+
+class _Search:
+    """The steps of `advise`."""
+
+    def __init__(
+        self,
+        expected: ExpectedPools,
+        limits: BenchLimits,
+        effort: Effort,
+        seed: int,
+        progress: Progress | None,
+        workers: int | None,
+    ) -> None:
+        self.expected, self.limits, self.effort = expected, limits, effort
+        self.progress, self.workers = progress, workers
+        few, some, many = effort.pools
+        self.samples = (
+            expected.sample(few, seed),
+            expected.sample(some, seed),
+            expected.sample(many, seed + 1),
+        )
+
+    def grid(self) -> tuple[Candidate, ...]:
+        ranges = (self.limits.angle_deg, self.limits.distance_mm, self.limits.plane_mm)
+        angles, distances, planes = (
+            np.unique(np.linspace(*span, count))
+            for span, count in zip(ranges, self.effort.grid, strict=True)
+        )
+        tasks = [
+            (self.expected, self.limits, float(angle), float(distance), planes)
+            for angle, distance in product(angles, distances)
+        ]
+        found = in_parallel(_at_planes, tasks, "which are possible", self.progress, self.workers)
+        return tuple(one for some in found for one in some)
+
+    def scored(self, candidates: Sequence[Candidate], stage: int) -> list[Candidate]:
+        """Predict their errors on the pools of a stage."""
+        sample = self.samples[stage]
+        tasks = blocks(self.limits, [one.place for one in candidates], sample, len(sample.pools))
+        what = ("predicted errors", "the best")[stage]
+        found = in_parallel(predicted_errors, tasks, what, self.progress, self.workers)
+        return [
+            replace(one, error_mm=float(errors.mean()))
+            for one, errors in zip(candidates, found, strict=True)
+        ]
+
+    def refined(self, candidates: list[Candidate]) -> list[Candidate]:
+        """The best, and where the way on from the best two of them leads."""
+        best = _best(candidates, max(self.effort.finalists - 2, 1))
+        tasks = [
+            (self.expected, self.limits, one, self.samples[1], self.effort.steps)
+            for one in best[:2]
+        ]
+        found = in_parallel(_way_on, tasks, "local search", self.progress, self.workers)
+        return list({one.place: one for one in [*found, *best]}.values())
+
+    def nearest(self, start: Candidate) -> Candidate:
+        """The set-up that breaks least, from the grid's."""
+        return _way_on((self.expected, self.limits, start, None, 3 * self.effort.steps))
+
+    def decided(self, finalists: list[Candidate]) -> tuple[Candidate, float, float, float]:
+        """Simulate the finalists; the best, its mean error, that one's σ, its random part.
+
+        Each simulated mean still swings by a tenth with the luck of its pools. The prediction, set
+        right by one factor for all finalists, does not; but it does not see everything. So the mean
+        of both, on a logarithmic scale, is what counts.
+        """
+        sample, count = self.samples[2], len(finalists)
+        tasks = blocks(self.limits, [one.place for one in finalists], sample, 8)
+        tell = (self.progress, self.workers)
+        found = in_parallel(simulated_errors, tasks, "measuring pools", *tell)
+        errors = np.concatenate(found)[:, 0].reshape(count, -1)
+        predicted = np.array([one.error_mm for one in finalists])
+        simulated = errors.mean(axis=1)
+        kept = np.isfinite(simulated)
+        if not kept.any():
+            # Some pool gave no surface whatever the set-up: the prediction is all there is.
+            best = int(predicted.argmin())
+            return finalists[best], float(predicted[best]), float("inf"), float("nan")
+        factor = np.exp(np.log(simulated[kept] / predicted[kept]).mean())
+        both = np.where(kept, np.sqrt(simulated * factor * predicted), np.inf)
+        best = int(both.argmin())
+        sigma = errors[best].std(ddof=1) / np.sqrt(errors.shape[1])
+        exact = blocks(self.limits, [finalists[best].place], sample, 8, calibrated=False)
+        random = np.concatenate(in_parallel(simulated_errors, exact, "exact calibration", *tell))
+        return finalists[best], float(both[best]), float(sigma), float(random[:, 0].mean())
+
+    def sweeps(self, best: Candidate, scale: float) -> tuple[Sweep, ...]:
+        tasks = [
+            (self.expected, self.limits, best, name, self.samples[1], self.effort.sweep)
+            for name in MOVED
+        ]
+        found = in_parallel(_swept, tasks, "a mm or a degree away", self.progress, self.workers)
+        return tuple(replace(one, error_mm=scale * one.error_mm) for one in found)
+
+
+def _at_planes(
+    task: tuple[ExpectedPools, BenchLimits, float, float, FloatArray],
+) -> list[Candidate]:
+    expected, limits, angle, distance, planes = task
+    laser = LaserPlace(expected, limits, angle, distance)
+    places = [laser.place(float(plane)) for plane in planes]
+    return [Candidate(place, laser.margins(place)) for place in places]
+
+
+def _way_on(
+    task: tuple[ExpectedPools, BenchLimits, Candidate, Sample | None, int],
+) -> Candidate:
+    """Walk to less predicted error, or, without a sample, to less that is broken (Nelder–Mead)."""
+    expected, limits, start, sample, steps = task
+    ranges = np.array([limits.angle_deg, limits.distance_mm, limits.plane_mm])
+    span = np.maximum(ranges[:, 1] - ranges[:, 0], 1e-9)
+    best = start
+
+    def cost(share: FloatArray) -> float:
+        nonlocal best
+        at = ranges[:, 0] + np.clip(share, 0, 1) * span
+        laser = LaserPlace(expected, limits, float(at[0]), float(at[1]))
+        place = laser.place(float(at[2]))
+        one = Candidate(place, laser.margins(place))
+        if sample is None:
+            best = min(best, one, key=lambda each: broken(each.margins))
+            return broken(one.margins)
+        if not one.possible:
+            return 1.0 + broken(one.margins)
+        trial = Trial(limits, place, sample, 0, len(sample.pools))
+        one = replace(one, error_mm=float(predicted_errors(trial).mean()))
+        best = min(best, one, key=lambda each: each.error_mm)
+        return one.error_mm
+
+    place = start.place
+    at = np.array([place.projection_angle_deg, place.distance_mm, place.plane_mm])
+    first = (at - ranges[:, 0]) / span
+    simplex = first + np.vstack([np.zeros(3), np.diag(np.where(first > 0.5, -0.12, 0.12))])
+    minimize(
+        cost, first, method="Nelder-Mead",
+        options={"maxfev": steps, "initial_simplex": simplex, "xatol": 2e-3, "fatol": 1e-6},
+    )  # fmt: skip
+    return best
+
+
+def _swept(task: tuple[ExpectedPools, BenchLimits, Candidate, str, Sample, int]) -> Sweep:
+    expected, limits, best, name, sample, count = task
+    low, high = spans(limits)[name]
+    values = np.unique(np.append(np.linspace(low, high, count), getattr(best.place, name)))
+    margins, errors = [], []
+    trial = Trial(limits, best.place, sample, 0, len(sample.pools))
+    for value in values:
+        place = replace(best.place, **{name: float(value)})
+        laser = LaserPlace(expected, limits, place.projection_angle_deg, place.distance_mm)
+        margins.append(laser.margins(place))
+        # Where the plate stands along itself changes what is seen, not how well.
+        moved = best.error_mm
+        if name not in ("s_mm", "h_mm"):
+            wide = replace(limits, plate_mm=(4 * limits.plate_mm[0], 4 * limits.plate_mm[1]))
+            free = replace(place, s_mm=2 * limits.plate_mm[0], h_mm=-2 * limits.plate_mm[1])
+            open_bench = replace(trial, limits=wide, place=free)
+            moved = float(predicted_errors(open_bench).mean())
+        errors.append(moved)
+    # The open bench's wider plate has its axis points farther out: only ratios are taken from it.
+    ratio = np.array(errors) / errors[int(np.argmin(np.abs(values - getattr(best.place, name))))]
+    return Sweep(name, values, best.error_mm * ratio, tuple(margins))
+
+
+def spans(limits: BenchLimits) -> dict[str, Range]:
+    """The range of each quantity of a `Place`."""
+    return {name: getattr(limits, field) for name, field in MOVED.items()}
+
+
+def constraint_words(name: Constraint, margin: float) -> str:
+    """A margin in words: by how much a set-up keeps, or breaks, a constraint."""
+    words, unit = CONSTRAINTS[name]
+    much = f"{abs(margin):.3g} {unit}"
+    if name == "once":
+        return f"{words}: {much} do" if margin < 0 else words
+    return f"{words}: {much} {'too little' if margin < 0 else 'to spare'}"

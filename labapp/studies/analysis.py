@@ -1,0 +1,244 @@
+"""The error analysis of chapter 8 part by part, and the error budget of a set-up.
+
+What a part gives are tables and pictures, by the names of their files: the command writes them, the
+window shows them first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from labapp.config.setup import Setup
+    from labapp.core.surface.reconstruction import Scheme
+    from labapp.simulation.parallel import Progress
+    from labapp.simulation.pools import Pool
+    from labapp.studies.error_analysis import ErrorSurvey
+    from labapp.studies.setup_budget import Bench
+    from labapp.studies.tables import Table
+
+PARTS = ("CE", "LE", "ME", "measurement", "images", "parameters")
+"""What can be worked out."""
+
+FIGURES = {"CE": (6, 7), "LE": (8, 9), "ME": (10, 11)}
+"""Numbers in chapter 8 of the figures that show errors and ARE."""
+
+SCHEMES: tuple[Scheme, ...] = ("irs", "ers", "fit")
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is to be worked out of chapter 8.
+
+    Parameters
+    ----------
+    parts
+        Some of `PARTS`.
+    schemes
+        By which schemes.
+    step
+        Between the laser's places, degrees and mm (LE, ME).
+    frames
+        So many frames are rendered of each surface (measurement, images).
+    draws
+        Of the calibration, by Monte Carlo (parameters).
+    picture
+        ``png`` or ``svg``.
+    """
+
+    parts: tuple[str, ...] = PARTS
+    schemes: tuple[Scheme, ...] = SCHEMES
+    step: float = 2.0
+    frames: int = 3
+    draws: int = 400
+    picture: str = "png"
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a part gave.
+
+    Parameters
+    ----------
+    tables
+        Its tables.
+    pictures
+        File name → content.
+    told
+        Those of the tables that are printed: they are short, and grow no more.
+    """
+
+    tables: tuple[Table, ...]
+    pictures: Mapping[str, bytes]
+    told: tuple[Table, ...]
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """Everything as it is written: name → content."""
+        return {
+            **{f"{table.name}.csv": table.csv().encode() for table in self.tables},
+            **{f"{table.name}.md": table.markdown().encode() for table in self.tables},
+            **self.pictures,
+        }
+
+
+def analyze_errors(question: Question, progress: Progress | None = None) -> Iterator[Made]:
+    """Work out the parts asked for, one after the other.
+
+    The tables of CE, LE and ME are the same ones, which grow with each. What ``progress`` raises
+    ends it.
+    """
+    yield from _surveys(question, progress)
+    for name, part in (
+        ("measurement", _measurement),
+        ("images", _images),
+        ("parameters", _parameters),
+    ):
+        if name in question.parts:
+            yield part(question, progress)
+
+
+def _surveys(question: Question, progress: Progress | None) -> Iterator[Made]:
+    from labapp.studies import error_analysis, pictures
+
+    done: list[ErrorSurvey] = []
+    kinds = [kind for kind in FIGURES if kind in question.parts]
+    for kind in kinds:
+        found = error_analysis.survey(kind, question.schemes, question.step, progress=progress)
+        done.append(found)
+        short = (error_analysis.error_table(done), error_analysis.are_table(done))
+        errors, ares = FIGURES[kind]
+        drawn = {
+            f"figure_8_{errors}_{kind}": pictures.error_picture(found),
+            f"figure_8_{ares}_{kind}_are": pictures.are_picture(found),
+        }
+        tables = (*short, error_analysis.cap_table(done))
+        yield Made(tables, _drawn(drawn, question.picture), short if kind == kinds[-1] else ())
+
+
+def _measurement(question: Question, progress: Progress | None) -> Made:
+    from labapp.studies import image_error, pictures
+
+    found = image_error.frame_errors(
+        [image_error.TACK],
+        image_error.TACK_RIG,
+        question.frames,
+        schemes=question.schemes,
+        progress=progress,
+    )
+    frame = image_error.rendered(image_error.TACK, image_error.TACK_RIG, 0)
+    drawn = {"figure_8_2_thumb_tack": pictures.frame_picture(frame)}
+    table = image_error.thumb_tack_table(found[0], question.schemes)
+    return Made((table,), _drawn(drawn, question.picture), (table,))
+
+
+def _images(question: Question, progress: Progress | None) -> Made:
+    from labapp.simulation.pools import caps_8_3_1
+    from labapp.studies import image_error
+
+    caps = caps_8_3_1()
+    found = image_error.frame_errors(
+        caps,
+        image_error.BENCH,
+        question.frames,
+        schemes=question.schemes,
+        progress=progress,
+    )
+    table = image_error.image_error_table(caps, found, question.schemes)
+    return Made((table,), {}, (table,))
+
+
+def _parameters(question: Question, progress: Progress | None) -> Made:
+    from labapp.simulation.pools import spherical_cap
+    from labapp.studies import image_error, pictures
+    from labapp.studies import parameter_deviation as deviation
+
+    found, drawn = {}, {}
+    for surface, height in (("convex", 0.3), ("concave", -0.3)):
+        known = image_error.exactly_seen(spherical_cap(6.0, height), image_error.BENCH)
+        for scheme in question.schemes:
+            found[surface, scheme] = deviation.parameter_deviation(
+                known, scheme, draws=question.draws, progress=progress
+            )
+        names = [quantity.name for quantity in deviation.QUANTITIES]
+        values = {
+            str(one): 100 * found[surface, one].contribution[:, 0] for one in question.schemes
+        }
+        label = f"standard uncertainty of the height, {surface} 6 mm × 0.3 mm (%)"
+        drawn[f"parameter_deviation_{surface}"] = pictures.bars_picture(names, values, label)
+    table = deviation.deviation_table(found)
+    return Made((table,), _drawn(drawn, question.picture), (table,))
+
+
+def _drawn(figures: Mapping[str, Figure], kind: str) -> dict[str, bytes]:
+    from labapp.studies.plotting import as_bytes
+
+    return {f"{name}.{kind}": as_bytes(figure, kind) for name, figure in figures.items()}
+
+
+# --- the budget of a set-up -----------------------------------------------------------------------
+
+
+def analyze_budget(setup: Setup | None, pool: Pool, progress: Progress | None = None) -> Made:
+    """Work out the error budget of a set-up for a kind of pool: predicted and simulated.
+
+    Parameters
+    ----------
+    setup
+        None: that of §8.3.1 with a 4″ plane.
+    pool
+        The kind: see `expected_pool`.
+    progress
+        What it raises ends the analysis.
+    """
+    import numpy as np
+
+    from labapp.studies.pictures import bars_picture
+    from labapp.studies.setup_budget import budget_table, setup_budget
+
+    table = budget_table(setup_budget(_bench(setup), pool, progress))
+    names, *columns = zip(*table.rows, strict=True)
+    predicted, simulated = (np.array(column, float) for column in columns)  # None becomes NaN
+    values = {"predicted": predicted, "simulated": simulated}
+    label = f"standard uncertainty of the height, fit (% of {abs(pool.peak_mm):g} mm)"
+    drawn = {table.name: bars_picture(names, values, label)}
+    return Made((table,), _drawn(drawn, "png"), (table,))
+
+
+def _bench(setup: Setup | None) -> Bench:
+    from labapp.studies.image_error import BENCH, VIEW, axes_of
+    from labapp.studies.parameter_deviation import AxisPoints
+    from labapp.studies.setup_budget import Bench
+
+    if setup is None:
+        return Bench(BENCH, axes_of(VIEW))
+    plane = setup.rig.imaging_plane
+    return Bench(setup.rig, AxisPoints(setup.calibration, plane.width_mm / 2, plane.height_mm / 2))
+
+
+def expected_pool(width: float, length: float, height: float) -> Pool:
+    """A pool of a width, length and height, mm; a hollow's height is below 0.
+
+    Raises
+    ------
+    InputError
+        If there is no such pool.
+    """
+    from labapp.simulation.pools import ellipsoidal_cap
+
+    for name, value, low in (("width", width, 1), ("length", length, 1), ("height", height, 0.01)):
+        if not low <= abs(value) <= 30 or (low == 1 and value < 0):
+            expected = f"{low} to 30 mm" + " or the same below 0" * (name == "height")
+            raise InputError("the expected pool", name, value, expected)
+    try:
+        return ellipsoidal_cap(width, length, height)
+    except ValueError as error:
+        raise InputError(
+            "the expected pool", "height", height, f"a pool that can be: {error}"
+        ) from error

@@ -1,0 +1,275 @@
+"""Errors of the schemes on surfaces of known shape (ch. 8).
+
+Non-optimal configuration error CE (§8.3.1), system limitation error LE (§8.3.2) and
+reconstruction methodology error ME (§8.3.3): exact reflections of known caps are reconstructed
+with the rig and the correspondence known, so that nothing but configuration, pattern and scheme
+can err. As in the text no ray is blocked, every reflection is followed to the plane's level even
+if it would meet the pool a second time on its way, and the boundary model of IRS and ERS is the
+circle.
+
+Caps exactly under the middle of the pattern are odd: there slopes are 0, and Eq. 6-1 takes the
+sign of one. So caps lie a little beside it, as they would on a bench.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.geometry.rig import DotPattern, Laser, Rig
+from labapp.core.match import Match
+from labapp.core.pipeline import Settings, reconstruct
+from labapp.core.schemes import ers, irs
+from labapp.core.surface.measures import Measures, measure
+from labapp.core.surface.reconstruction import Scheme
+from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace
+from labapp.simulation.parallel import Progress, in_parallel
+from labapp.simulation.pools import Pool, caps_8_3_1
+from labapp.studies.correspondence_table import OPEN_BENCH
+from labapp.studies.tables import Cell, Table
+
+SCHEMES: tuple[Scheme, ...] = ("irs", "ers", "fit")
+
+ERRORS = ("depth", "boundary", "are_mm", "actual_are_mm")
+"""CE-D, CE-B (Eq. 8-2, 8-3), computed and actual ARE (Eq. 6-3, 8-4)."""
+
+ANGLES_DEG, DISTANCES_MM = (25.0, 35.0), (25.0, 35.0)
+"""Where §8.3.2 moves the laser."""
+
+ASIDE_MM = 0.1
+"""How far at most the caps' centres are from the origin, each way: a fifth of a step of dots."""
+
+CENTERS = {"CE": 5, "LE": 1, "ME": 1}
+"""How many centres each cap has."""
+
+DENSE = DotPattern(39, 39, 0.385)
+"""The pattern of §8.3.3."""
+
+TEXT = {
+    ("CE", "D", "convex"): (None, 0.1085),
+    ("CE", "D", "concave"): (None, 0.269),
+    ("CE", "D", "all"): (0.080025, 0.269),
+    ("CE", "B", "all"): (None, 0.0251),
+    ("LE", "D", "all"): (None, 0.006),
+    ("LE", "B", "all"): (None, 0.001),
+    ("ME", "D", "all"): (None, 0.0),
+    ("ME", "B", "all"): (None, 0.0),
+}
+"""Mean and worst error that the text has, with ERS (Fig. 8-6, 8-8, 8-10)."""
+
+
+def circle_settings(scheme: Scheme) -> Settings:
+    """A scheme with the circle as boundary model (§8.2.1); fit has a boundary of its own."""
+    return Settings(
+        scheme=scheme,
+        ers=ers.ErsSettings(boundary="circle"),
+        irs=irs.IrsSettings(boundary="circle"),
+    )
+
+
+def followed(pool: PoolSurface, rig: Rig) -> Reflections:
+    """Follow the rays as the text does: a second meeting with the pool is not looked for."""
+    seen = trace(pool, rig)
+    return replace(seen, hits_again=np.zeros_like(seen.hits_again))
+
+
+def relative_errors(measures: Measures, cap: Pool) -> tuple[float, float]:
+    """Signed error of depth (or height) and of diameter, over the true ones (Eq. 8-2, 8-3)."""
+    depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
+    diameter = (measures.width_mm + measures.length_mm) / 2
+    return depth / abs(cap.peak_mm) - 1, diameter / cap.footprint.width_mm - 1
+
+
+def computed_are(measures: Measures) -> float:
+    """The computed ARE as the text has it, mm: of IRS and ERS that of their own points."""
+    own = measures.own_are_mm
+    return own if np.isfinite(own) else measures.are_mm
+
+
+def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: Scheme) -> FloatArray:
+    """`ERRORS` of one reconstruction, shape (4,); NaN where the scheme finds no surface."""
+    try:
+        made = reconstruct(match, rig, circle_settings(scheme))
+        measures = measure(made, match, rig)
+    except CannotMeasure:
+        return np.full(len(ERRORS), np.nan)
+    true = seen.point_mm[tuple(match.ray.T - 1)]
+    actual = np.linalg.norm(made.points_mm - true, axis=-1).mean()
+    depth, boundary = relative_errors(measures, cap)
+    return np.array([abs(depth), abs(boundary), computed_are(measures), actual])
+
+
+@dataclass(frozen=True)
+class ErrorSurvey:
+    """Errors of the schemes on caps, with the laser at one or more places.
+
+    Parameters
+    ----------
+    kind
+        ``CE``, ``LE`` or ``ME``.
+    caps
+        The known surfaces, n of them.
+    schemes
+        The schemes, s of them.
+    errors
+        `ERRORS` of each cap by each scheme, shape (n, s, 4), as fractions and mm: the least over
+        the laser's places, each on its own; NaN where no place gives a surface.
+    lost
+        How often a scheme found no surface, shape (s,).
+    """
+
+    kind: str
+    caps: tuple[Pool, ...]
+    schemes: tuple[Scheme, ...]
+    errors: FloatArray
+    lost: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    def of(self, scheme: Scheme, error: str, surface: str = "all") -> FloatArray:
+        """One of `ERRORS` of the caps: ``convex``, ``concave`` or ``all``."""
+        sign = {"convex": 1, "concave": -1, "all": 0}[surface]
+        chosen = [sign * cap.peak_mm >= 0 for cap in self.caps]
+        return self.errors[chosen, self.schemes.index(scheme), ERRORS.index(error)]
+
+
+def survey(
+    kind: str,
+    schemes: Sequence[Scheme] = SCHEMES,
+    step: float = 2.0,
+    caps: Sequence[Pool] | None = None,
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> ErrorSurvey:
+    """Errors of the schemes on the caps of §8.3.1.
+
+    Parameters
+    ----------
+    kind
+        ``CE``: the laser where it stood, 31.14°, 31.48 mm. ``LE``: the least error of all with the
+        laser at 25° to 35° and 25 to 35 mm. ``ME``: the same with 39 × 39 rays, 0.385° apart.
+    schemes
+        Which schemes.
+    step
+        Of the laser's places, degrees and mm.
+    caps
+        The surfaces; None for the 28 of §8.3.1, each at its `CENTERS`.
+    progress, workers
+        See `in_parallel`.
+    """
+    caps, schemes = tuple(caps or aside(caps_8_3_1(), CENTERS[kind])), tuple(schemes)
+    pattern = DENSE if kind == "ME" else DotPattern()
+    lasers = [OPEN_BENCH.laser] if kind == "CE" else laser_places(step)
+    rigs = [replace(OPEN_BENCH, laser=laser, pattern=pattern) for laser in lasers]
+    tasks = [(cap, rig, schemes) for rig in rigs for cap in caps]
+    found = np.array(in_parallel(_errors, tasks, kind, progress, workers))
+    found = found.reshape(len(rigs), len(caps), len(schemes), len(ERRORS))
+    lost = np.isnan(found[..., 0]).sum(axis=(0, 1))
+    least = np.where(np.isnan(found), np.inf, found).min(axis=0)
+    return ErrorSurvey(kind, caps, schemes, np.where(np.isinf(least), np.nan, least), lost)
+
+
+def aside(caps: Sequence[Pool], centers: int) -> tuple[Pool, ...]:
+    """Each cap at so many centres near the origin (`ASIDE_MM`), the same ones each time."""
+    rng = np.random.default_rng(83)
+    at = rng.uniform(-ASIDE_MM, ASIDE_MM, (len(caps), centers, 2)).tolist()
+    return tuple(
+        replace(cap, footprint=replace(cap.footprint, center_mm=tuple(center)))
+        for cap, own in zip(caps, at, strict=True)
+        for center in own
+    )
+
+
+def laser_places(step: float) -> list[Laser]:
+    """Places of the laser in §8.3.2, ``step`` degrees and mm apart, both ends included."""
+    angles, distances = (
+        np.linspace(low, high, max(round((high - low) / step), 1) + 1)
+        for low, high in (ANGLES_DEG, DISTANCES_MM)
+    )
+    return [Laser(float(angle), float(distance)) for angle in angles for distance in distances]
+
+
+def _errors(task: tuple[Pool, Rig, tuple[Scheme, ...]]) -> FloatArray:
+    cap, rig, schemes = task
+    seen = followed(cap, rig)
+    match = exact_match(seen, rig)
+    return np.array([errors_of(match, seen, rig, cap, scheme) for scheme in schemes])
+
+
+def error_table(surveys: Sequence[ErrorSurvey]) -> Table:
+    """CE, LE and ME of depth and boundary: mean and worst, beside the text's with ERS; %."""
+    rows = []
+    for one in surveys:
+        for letter, error in (("D", "depth"), ("B", "boundary")):
+            for surface in ("convex", "concave", "all"):
+                told = TEXT.get((one.kind, letter, surface), (None, None))
+                row: list[Cell] = [f"{one.kind}-{letter}", surface]
+                for scheme in one.schemes:
+                    values = 100 * one.of(scheme, error, surface)
+                    row += [float(np.nanmean(values)), float(np.nanmax(values))]
+                rows.append((*row, *(None if v is None else 100 * v for v in told)))
+    schemes = surveys[0].schemes
+    columns = [f"{scheme}_{what}_pct" for scheme in schemes for what in ("mean", "worst")]
+    return Table(
+        "errors",
+        "Errors of depth (D) and boundary (B) on the caps of §8.3.1, %; text: ERS, Fig. 8-6 … 8-10",
+        ("error", "surface", *columns, "text_mean_pct", "text_worst_pct"),
+        tuple(rows),
+    )
+
+
+def are_table(surveys: Sequence[ErrorSurvey]) -> Table:
+    """Computed and actual ARE (Eq. 6-3, 8-4; Fig. 8-7, 8-9, 8-11): mean, and their difference."""
+    rows = []
+    for one in surveys:
+        for surface in ("convex", "concave"):
+            for scheme in one.schemes:
+                computed = one.of(scheme, "are_mm", surface)
+                actual = one.of(scheme, "actual_are_mm", surface)
+                apart = np.abs(computed - actual)
+                found = [np.nanmean(computed), np.nanmean(actual), np.nanmin(apart)]
+                row = (one.kind, surface, scheme, *map(float, found), float(np.nanmax(apart)))
+                rows.append(row)
+    return Table(
+        "are",
+        "Computed ARE (Eq. 6-3) and actual ARE (Eq. 8-4), mm; text (CE, ERS): "
+        "0.0021 to 0.2543 mm apart",
+        (
+            "error",
+            "surface",
+            "scheme",
+            "are_mm",
+            "actual_are_mm",
+            "least_difference_mm",
+            "largest_difference_mm",
+        ),
+        tuple(rows),
+    )
+
+
+def cap_table(surveys: Sequence[ErrorSurvey]) -> Table:
+    """Every error of every cap by every scheme."""
+    rows: list[tuple[Cell, ...]] = [
+        (
+            *(one.kind, cap.footprint.width_mm, cap.peak_mm, scheme),
+            *map(float, one.errors[n, k]),
+            *cap.footprint.center_mm,
+        )
+        for one in surveys
+        for n, cap in enumerate(one.caps)
+        for k, scheme in enumerate(one.schemes)
+    ]
+    return Table(
+        "errors_by_cap",
+        "Errors of every cap: depth and boundary as fractions, ARE in mm",
+        (
+            *("error", "diameter_mm", "height_mm", "scheme"),
+            *ERRORS,
+            *("center_x_mm", "center_y_mm"),
+        ),
+        tuple(rows),
+    )

@@ -1,0 +1,254 @@
+"""Image processing error and measurement error: frames of known surfaces, measured (§8.1, §8.2).
+
+Frames are rendered and go through the whole measurement, from the dots on; what exact reflections
+of the same surface give by the same scheme is what is left when the image processing is perfect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.pipeline import Measurement, reconstruct
+from labapp.core.pipeline import measure as measure_frame
+from labapp.core.surface.measures import measure
+from labapp.core.surface.reconstruction import Scheme
+from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import exact_match
+from labapp.simulation.parallel import Progress, in_parallel
+from labapp.simulation.pools import Pool, spherical_cap
+from labapp.simulation.render import Frame, Look, render
+from labapp.studies.error_analysis import (
+    SCHEMES,
+    circle_settings,
+    computed_are,
+    followed,
+    relative_errors,
+)
+from labapp.studies.parameter_deviation import AxisPoints, KnownPool
+from labapp.studies.tables import Table
+from labapp.words import several
+
+TACK = spherical_cap(9.75, 0.91)
+"""The thumb tack of §8.2."""
+
+TACK_RIG = Rig(
+    Laser(30.56, 46.4),
+    DotPattern(),
+    Electrode(5.0),
+    ImagingPlane.vertical(40.69, 50.8, 0.0),
+)
+"""Its set-up. The text does not tell the electrode's height nor O′: here it is that of Table 4-1,
+and the 4″ plane stands on the paper, its middle opposite the torch."""
+
+BENCH = Rig(
+    Laser(31.14, 31.48),
+    DotPattern(),
+    Electrode(5.0),
+    ImagingPlane.vertical(50.0, 50.8, 0.0),
+)
+"""The set-up of §8.3.1, torch and 4″ plane in place."""
+
+VIEW = CameraView.rolled((24.0, 500.0), 4.7, x_axis_mm=50.8, z_axis_mm=50.8)
+VIEW = replace(VIEW, width_px=526, height_px=526)
+"""A camera that sees the whole plane."""
+
+LOOK = Look(dot_peak=60.0)
+
+WRONG_PX = 3.0
+"""A dot farther from where its ray's dot is has the wrong ray."""
+
+TACK_TEXT = {"irs": (0.1777, 0.014903, 0.220807), "ers": (0.0912, 0.014903, 0.18815)}
+"""Height error, diameter error, and ARE in mm that §8.2 has."""
+
+
+@dataclass(frozen=True)
+class FrameErrors:
+    """What one rendered frame gave, by each scheme; s of them.
+
+    Parameters
+    ----------
+    status
+        Of the frame.
+    errors
+        Relative errors of height (or depth) and diameter, signed, and ARE in mm, shape (s, 3);
+        NaN without a surface.
+    exact
+        The same of exact reflections, shape (s, 3).
+    off_px
+        Distance of each matched dot to where it truly is, shape (n,).
+    missed
+        Dots that show and were given no ray.
+    """
+
+    status: str
+    errors: FloatArray
+    exact: FloatArray
+    off_px: FloatArray
+    missed: int
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @property
+    def wrong(self) -> int:
+        """How many dots were given a wrong ray."""
+        return int((self.off_px > WRONG_PX).sum())
+
+
+def axes_of(view: CameraView) -> AxisPoints:
+    """The image calibration that fits a view, by the three points of §5.1."""
+    calibration = ImageCalibration.from_three_points(
+        view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm
+    )
+    return AxisPoints(calibration, view.x_axis_mm, view.z_axis_mm)
+
+
+def exactly_seen(cap: Pool, rig: Rig, view: CameraView = VIEW) -> KnownPool:
+    """A known pool with its dots where they truly are; those that miss the plane are lost."""
+    return KnownPool(cap, exact_match(followed(cap, rig), rig), rig, axes_of(view))
+
+
+def frame_errors(
+    caps: Sequence[Pool],
+    rig: Rig,
+    frames: int,
+    *,
+    schemes: Sequence[Scheme] = SCHEMES,
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> list[list[FrameErrors]]:
+    """Render frames of known surfaces and measure them by every scheme.
+
+    Returns
+    -------
+    list[list[FrameErrors]]
+        Of each surface, of each frame.
+    """
+    tasks = [(cap, rig, k, tuple(schemes)) for cap in caps for k in range(frames)]
+    found = in_parallel(_frame_errors, tasks, "frames", progress, workers)
+    return [found[n * frames : (n + 1) * frames] for n in range(len(caps))]
+
+
+def rendered(cap: Pool, rig: Rig, number: int) -> Frame:
+    """One of the frames of a known surface, the same each time."""
+    seed = [round(1000 * cap.footprint.width_mm), round(1000 * abs(cap.peak_mm)), number]
+    return render(followed(cap, rig), VIEW, LOOK, np.random.default_rng(seed))
+
+
+def _frame_errors(task: tuple[Pool, Rig, int, tuple[Scheme, ...]]) -> FrameErrors:
+    cap, rig, number, schemes = task
+    known = exactly_seen(cap, rig)
+    exact = np.array([_sizes(known, scheme) for scheme in schemes])
+    frame = rendered(cap, rig, number)
+    seen = measure_frame(frame.image, rig, known.axes.calibration, circle_settings(schemes[-1]))
+    off, missed = _off(seen, frame)
+    errors = np.full_like(exact, np.nan)
+    if seen.match is not None:
+        as_seen = replace(known, match=seen.match)
+        errors = np.array([_sizes(as_seen, scheme) for scheme in schemes])
+    return FrameErrors(seen.status, errors, exact, off, missed)
+
+
+def _sizes(known: KnownPool, scheme: Scheme) -> FloatArray:
+    try:
+        made = reconstruct(known.match, known.rig, circle_settings(scheme))
+    except CannotMeasure:
+        return np.full(3, np.nan)
+    measures = measure(made, known.match, known.rig)
+    return np.array([*relative_errors(measures, known.cap), computed_are(measures)])
+
+
+def _off(seen: Measurement, frame: Frame) -> tuple[FloatArray, int]:
+    """Distance of the matched dots to the truth, px, and how many shown dots have no ray."""
+    if seen.match is None or seen.dots is None:
+        return np.zeros(0), int(frame.shown.sum())
+    found = seen.dots.image_px[seen.match.dot]
+    true = frame.dot_px[tuple(seen.match.ray.T - 1)]
+    off = np.nan_to_num(np.linalg.norm(found - true, axis=-1), nan=np.inf)
+    return off, int(frame.shown.sum()) - int((off <= WRONG_PX).sum())
+
+
+def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[Scheme] = SCHEMES) -> Table:
+    """Measurement error of §8.2, of exact reflections and of rendered frames, beside the text's."""
+    rows = []
+    for k, scheme in enumerate(schemes):
+        exact = np.abs(frames[0].exact[k])
+        each = np.abs([frame.errors[k] for frame in frames])
+        told = TACK_TEXT.get(scheme, (None,) * 3)
+        for name, n, unit in (("height", 0, 100), ("diameter", 1, 100), ("ARE", 2, 1)):
+            known = each[np.isfinite(each[:, n]), n] * unit
+            text = told[n]
+            rows.append(
+                (
+                    scheme,
+                    f"{name}, {'%' if unit == 100 else 'mm'}",
+                    float(unit * exact[n]),
+                    float(known.mean()) if len(known) else None,
+                    float(known.max()) if len(known) else None,
+                    len(known),
+                    None if text is None else unit * text,
+                )
+            )
+    return Table(
+        "measurement_error",
+        f"Measurement error on the thumb tack of §8.2: exact reflections, and "
+        f"{several(len(frames), 'frame')}",
+        ("scheme", "error", "exact", "frames_mean", "frames_worst", "frames_measured", "text"),
+        tuple(rows),
+    )
+
+
+def image_error_table(
+    caps: Sequence[Pool],
+    found: Sequence[Sequence[FrameErrors]],
+    schemes: Sequence[Scheme] = SCHEMES,
+) -> Table:
+    """Image processing error: what frames add to what exact reflections give; and the dots."""
+    rows = []
+    for surface, sign in (("convex", 1), ("concave", -1)):
+        frames = [
+            frame
+            for cap, each in zip(caps, found, strict=True)
+            if cap.peak_mm * sign > 0
+            for frame in each
+        ]
+        if not frames:
+            continue
+        off = np.concatenate([frame.off_px for frame in frames])
+        right = off[off <= WRONG_PX]
+        dots = (
+            float(np.sqrt(np.mean(right**2))) if len(right) else None,
+            int(sum(frame.missed for frame in frames)),
+            int(sum(frame.wrong for frame in frames)),
+        )
+        for k, scheme in enumerate(schemes):
+            added = 100 * np.abs([frame.errors[k] - frame.exact[k] for frame in frames])
+            known = added[np.isfinite(added[:, 0])]
+            sizes: list[float | None] = [None] * 4
+            if len(known):
+                sizes = [float(v) for n in (0, 1) for v in (known[:, n].mean(), known[:, n].max())]
+            rows.append((surface, scheme, len(frames), len(known), *sizes, *dots))
+    return Table(
+        "image_processing_error",
+        "Image processing error on the caps of §8.3.1: what rendered frames add, %; dots",
+        (
+            "surface",
+            "scheme",
+            "frames",
+            "measured",
+            "height_mean_pct",
+            "height_worst_pct",
+            "diameter_mean_pct",
+            "diameter_worst_pct",
+            "dot_rms_px",
+            "dots_missed",
+            "labels_wrong",
+        ),
+        tuple(rows),
+    )

@@ -1,0 +1,213 @@
+"""Pictures of chapters 4 and 8: black on white, lengths in mm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.values import FloatArray
+from labapp.simulation.forward import Reflections
+from labapp.simulation.positioning import Fate, SideView, side_view
+from labapp.simulation.render import Frame
+from labapp.studies.error_analysis import ErrorSurvey
+from labapp.studies.plotting import INCHES, STYLE, new_figure, row_colour
+from labapp.studies.positioning_tables import Coverage
+
+COLOURS = {"irs": "#c05a00", "ers": "#1b4f8a", "fit": "#1b7a3d"}
+COLOURS |= {"predicted": "#8ab0d8", "simulated": "#1b4f8a"}
+MARKERS = {"irs": "s", "ers": "o", "fit": "^"}
+FATES = {
+    Fate.CAUGHT: "#1b7a3d",
+    Fate.PAST: "#c05a00",
+    Fate.BLOCKED: "#b01030",
+    Fate.UNUSED: "0.8",
+}
+
+
+def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: float) -> Figure:
+    """Fig. 4-7 … 4-9: the central rays by way of a flat, a convex and a concave pool, L1 and L2."""
+    with rc_context(STYLE):
+        figure = new_figure(INCHES * 0.7, 6.4)
+        plots = figure.subplots(3, sharex=True, sharey=True)
+        for plot, name, height in zip(
+            plots, ("flat", "convex", "concave"), (0.0, height_mm, -height_mm), strict=True
+        ):
+            view = side_view(rig, width_mm, length_mm, height)
+            _draw_side(plot, view)
+            c = view.clearance
+            blocked = view.tally[Fate.BLOCKED]
+            plot.set_title(
+                f"{name}: L1 = {c.l1_mm:.1f}, L2 = {c.l2_mm:.1f} mm, {blocked} rays blocked",
+                loc="left",
+                fontsize=7.5,
+            )
+        plots[-1].set_xlabel("Y (mm)")
+        plots[0].legend(loc="upper right", fontsize=6)
+        return figure
+
+
+def _draw_side(plot: Any, view: SideView) -> None:
+    told: set[Fate] = set()
+    for ray in view.rays:
+        label = None if ray.fate in told else ray.fate.value
+        told.add(ray.fate)
+        plot.plot(*ray.path_mm.T, color=FATES[ray.fate], lw=0.6, label=label)
+    plot.axhline(0, color="0.3", lw=0.6)
+    plot.plot(*view.pool_mm.T, color="#c05a00", lw=1.6)
+    plot.plot(*view.plane_mm.T, "k", lw=1.8)
+    plot.plot(*view.laser_mm, "ks", ms=4)
+    tip = view.tip_mm[1]
+    plot.fill([0, 1.2, 1.2, -1.2, -1.2], [tip, tip + 4, 40, 40, tip + 4], "0.7", ec="0.3", lw=0.5)
+    for place, name in ((-view.clearance.l1_mm, "L1"), (view.clearance.l2_mm, "L2")):
+        if np.isfinite(place):
+            plot.plot([place, place], [-1.5, 1.5], "k", lw=0.8)
+            plot.annotate(name, (place, -1.5), (0, -8), textcoords="offset points", ha="center")
+    low = view.plane_mm[:, 0].min()
+    plot.set(xlim=(low - 3, view.laser_mm[0] + 4), ylim=(-5, 40), aspect="equal", ylabel="Z (mm)")
+
+
+def coverage_picture(placements: Sequence[Coverage], plane_mm: float = 101.6) -> Figure:
+    """Fig. 4-11: the dots on the plane at several distances of it."""
+    with rc_context(STYLE):
+        figure = new_figure(INCHES, INCHES)
+        for plot, one in zip(figure.subplots(2, 2).ravel(), placements, strict=True):
+            plot.add_patch(Rectangle((0, 0), plane_mm, plane_mm, fc="none", ec="k", lw=1))
+            plot.plot(*one.plane_mm[one.on_plane].T, "o", ms=2.5, color="#1b4f8a")
+            plot.plot(*one.plane_mm[~one.on_plane].T, "x", ms=4, color="#b01030")
+            off = int((~one.on_plane).sum())
+            plot.set_title(f"plane at {one.distance_mm:g} mm: {off} of {len(one.on_plane)} off it")
+            plot.set(xlim=(-8, plane_mm + 8), ylim=(-8, 125), aspect="equal")
+            plot.set(xlabel="X′ (mm)", ylabel="Z′ (mm)")
+        return figure
+
+
+def correspondence_picture(seen: Reflections, title: str) -> Figure:
+    """Fig. 4-17, 4-18, 4-20: reflected dots, and where their rays meet the pool.
+
+    A colour a row of rays, a marker by column in turns; thin lines join neighbours in a row.
+    """
+    markers = "os^vD<>p*"
+    with rc_context(STYLE):
+        figure = new_figure(INCHES, 3.4)
+        plane, pool = figure.subplots(1, 2)
+        for row in range(len(seen.lit)):
+            columns = np.flatnonzero(seen.lit[row] & np.isfinite(seen.plane_mm[row]).all(axis=-1))
+            colour = row_colour(row)
+            for plot, places in ((plane, seen.plane_mm[row]), (pool, seen.point_mm[row, :, :2])):
+                plot.plot(*places[columns].T, "-", lw=0.4, color=colour)
+                for column in columns:
+                    marker = markers[column % len(markers)]
+                    plot.plot(*places[column], marker, ms=3, color=colour, mew=0)
+        plane.set(xlabel="X′ − s (mm)", ylabel="Z (mm)", title="dots on the imaging plane")
+        pool.set(xlabel="X (mm)", ylabel="Y (mm)", title="rays on the pool", aspect="equal")
+        _on_work_piece(plane)
+        figure.suptitle(title, fontsize=8)
+        return figure
+
+
+def _on_work_piece(plot: Any, s_mm: float = 1e4) -> None:
+    """Label an open plane's axes from the torch's middle and the work piece."""
+    for axis in (plot.xaxis, plot.yaxis):
+        axis.set_major_formatter(lambda value, _: f"{value - s_mm:g}")
+
+
+def error_picture(survey: ErrorSurvey) -> Figure:
+    """Fig. 8-6, 8-8, 8-10: errors of depth and boundary over the caps' diameter."""
+    rows = (("depth", f"{survey.kind}-D (%)", 100.0), ("boundary", f"{survey.kind}-B (%)", 100.0))
+    return _over_caps(survey, rows)
+
+
+def are_picture(survey: ErrorSurvey) -> Figure:
+    """Fig. 8-7, 8-9, 8-11: computed and actual ARE over the caps' diameter."""
+    return _over_caps(
+        survey, (("are_mm", "computed ARE (mm)", 1.0), ("actual_are_mm", "actual ARE (mm)", 1.0))
+    )
+
+
+def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> Figure:
+    """A plot for each error and each kind of surface; full lines D = B/20, dashed D = B/10.
+
+    Lines join the means over the centres of a cap; bars reach from the least to the largest.
+    """
+    size = np.array([(cap.footprint.width_mm, cap.peak_mm) for cap in survey.caps])
+    with rc_context(STYLE):
+        figure = new_figure(INCHES, 4.5)
+        plots = figure.subplots(2, 2, sharex=True, sharey="row")
+        for line, (error, label, scale) in zip(plots, rows, strict=True):
+            for plot, sign in zip(line, (1, -1), strict=True):
+                for scheme in survey.schemes:
+                    for ratio, style in ((20, "-"), (10, "--")):
+                        values = scale * survey.of(scheme, error)
+                        chosen = np.isclose(size[:, 1] * sign * ratio, size[:, 0])
+                        chosen &= np.isfinite(values)
+                        diameter, cap = np.unique(size[chosen, 0], return_inverse=True)
+                        each = [values[chosen][cap == n] for n in range(len(diameter))]
+                        mean = np.array([own.mean() for own in each])
+                        plot.errorbar(
+                            diameter,
+                            mean,
+                            [
+                                mean - [own.min() for own in each],
+                                [own.max() for own in each] - mean,
+                            ],
+                            fmt=style,
+                            elinewidth=0.5,
+                            marker=MARKERS[scheme],
+                            color=COLOURS[scheme],
+                            ms=3,
+                            label=f"{scheme}, D = B/{ratio}",
+                        )
+                plot.grid(alpha=0.25, lw=0.4)
+            line[0].set_ylabel(label)
+            _capped(line[0], survey, error, scale)
+        for plot, surface in zip(plots[0], ("convex", "concave"), strict=True):
+            plot.set_title(surface, fontsize=8)
+        for plot in plots[1]:
+            plot.set_xlabel("diameter B (mm)")
+        handles, names = plots[0, 0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=len(survey.schemes))
+        return figure
+
+
+def _capped(plot: Any, survey: ErrorSurvey, error: str, scale: float) -> None:
+    """Let ERS and fit be read where IRS is far off."""
+    shown = [survey.of(scheme, error) for scheme in survey.schemes if scheme != "irs"]
+    most = max((float(np.nanmax(values)) for values in shown), default=np.nan) * scale
+    if np.isfinite(most) and plot.get_ylim()[1] > 2 * most:
+        plot.set_ylim(0, 1.8 * most)
+        plot.annotate("IRS goes on above", (0.02, 0.92), xycoords="axes fraction", fontsize=6)
+
+
+def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str) -> Figure:
+    """Contributions of several quantities as bars, a colour for each of `COLOURS`."""
+    with rc_context(STYLE):
+        figure = new_figure(INCHES, 0.32 * len(names) + 0.8)
+        plot = figure.subplots()
+        at, thick = np.arange(len(names)), 0.8 / len(values)
+        for k, (name, each) in enumerate(values.items()):
+            where = at + (k - (len(values) - 1) / 2) * thick
+            plot.barh(where, each, thick, color=COLOURS[name], label=name)
+        plot.set_yticks(at, names)
+        plot.invert_yaxis()
+        plot.set_xlabel(label)
+        plot.grid(axis="x", alpha=0.25, lw=0.4)
+        plot.legend(fontsize=6)
+        return figure
+
+
+def frame_picture(frame: Frame) -> Figure:
+    """A rendered frame as a negative, rings where its dots truly are."""
+    with rc_context(STYLE):
+        figure = new_figure(INCHES / 2, INCHES / 2 * frame.image.shape[0] / frame.image.shape[1])
+        plot = figure.subplots()
+        low, high = np.percentile(frame.image, [1, 99.8])
+        plot.imshow(frame.image, cmap="gray_r", vmin=low, vmax=max(high, low + 1))
+        plot.plot(*frame.dot_px[frame.shown].T, "o", ms=6, mfc="none", mec="#1b4f8a", mew=0.5)
+        plot.set(xlabel="u (px)", ylabel="v (px)")
+        return figure

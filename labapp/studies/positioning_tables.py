@@ -1,0 +1,141 @@
+"""Tables 4-1 and 4-2, L1, L2 and D1, and the coverage of the plane (§4.2.1, Fig. 4-11).
+
+What the text leaves open: the electrode's tip is at 5 mm (with its 0.5 mm Table 4-1 does not come
+out), and the 4″ plane stands on the work piece, its middle opposite the torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.simulation.forward import trace
+from labapp.simulation.pools import spherical_cap
+from labapp.simulation.positioning import clearance
+from labapp.studies.tables import Cell, Table
+
+ANGLES_DEG = (20, 25, 30, 35, 40, 45)
+SIZES_MM = ((2, 0.2), (2, 0.4), (3, 0.3), (3, 0.6), (4, 0.4), (4, 0.8))
+"""Radius and depth of the caps of Tables 4-1 and 4-2."""
+
+DISTANCE_MM, TIP_MM = 30.0, 5.0
+"""Laser to origin (§4.2.1.3), and the height of the electrode's tip that gives these tables."""
+
+PLANES_MM = (30, 50, 70, 90)
+"""Distances of the imaging plane of Fig. 4-11."""
+
+
+def blocking_tables() -> tuple[Table, Table]:
+    """Tables 4-1 and 4-2: `rb` where the torch blocks a reflected ray, `ib` an incident one."""
+    made = []
+    for number, kind, sign in ((1, "convex", 1), (2, "concave", -1)):
+        rows: list[tuple[Cell, ...]] = [
+            (angle, *(_blocking(angle, radius, sign * depth) for radius, depth in SIZES_MM))
+            for angle in ANGLES_DEG
+        ]
+        made.append(
+            Table(
+                f"table_4_{number}_blocking_{kind}",
+                f"Table 4-{number}, blocking on {kind} surfaces",
+                ("projection_angle_deg", *(f"r{radius}_d{depth:g}" for radius, depth in SIZES_MM)),
+                tuple(rows),
+            )
+        )
+    return made[0], made[1]
+
+
+def _blocking(angle_deg: float, radius_mm: float, depth_mm: float) -> str:
+    seen = trace(spherical_cap(2 * radius_mm, depth_mm), positioning_rig(angle_deg))
+    if (seen.lit & seen.incident_blocked).any():
+        return "ib"
+    return "rb" if (seen.lit & seen.reflected_blocked).any() else "nb"
+
+
+def positioning_rig(angle_deg: float, plane_mm: float = 50.0) -> Rig:
+    """The bench of §4.2.1.3: laser 30 mm away, 4″ plane with O′ at half its width."""
+    return Rig(
+        Laser(angle_deg, DISTANCE_MM),
+        DotPattern(),
+        Electrode(TIP_MM),
+        ImagingPlane.vertical(plane_mm, 50.8, 0.0),
+    )
+
+
+def clearance_table() -> Table:
+    """L1, L2 and D1 (Eq. 4-14 … 4-18) for flat, convex and concave surfaces."""
+    # The slope at the edge of a cap is half the angle of its arc.
+    slopes = {f"r/{part}": float(np.degrees(2 * np.arctan(1 / part))) for part in (10, 5)}
+    surfaces = {
+        "flat": 0.0,
+        **{f"convex, d = {depth}": slope for depth, slope in slopes.items()},
+        **{f"concave, d = {depth}": -slope for depth, slope in slopes.items()},
+    }
+    rows = []
+    for angle in ANGLES_DEG:
+        for surface, slope in surfaces.items():
+            found = clearance(positioning_rig(angle), slope)
+            d1 = found.least_plane_mm + 0.0, found.most_plane_mm + 0.0
+            rows.append((angle, surface, slope, found.l1_mm, found.l2_mm, *d1))
+    return Table(
+        "l1_l2_d1",
+        "L1, L2 and D1 (Eq. 4-14 … 4-18): laser 30 mm away, electrode 5 mm, plane 0 to 101.6 mm up",
+        (
+            "projection_angle_deg",
+            "surface",
+            "head_slope_deg",
+            "l1_mm",
+            "l2_mm",
+            "d1_least_mm",
+            "d1_most_mm",
+        ),
+        tuple(rows),
+    )
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Dots of one placement of the imaging plane (Fig. 4-11).
+
+    Parameters
+    ----------
+    distance_mm
+        Of the plane to the torch.
+    plane_mm
+        The dots, its edges ignored, IPCS, shape (n, 2), mm.
+    on_plane
+        Which lie within its edges, shape (n,).
+    """
+
+    distance_mm: float
+    plane_mm: FloatArray
+    on_plane: BoolArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def coverage() -> tuple[Coverage, ...]:
+    """Fig. 4-11: the cap 3/0.3 at 30°, the plane at 30, 50, 70 and 90 mm."""
+    made = []
+    for distance in PLANES_MM:
+        seen = trace(spherical_cap(6.0, 0.3), positioning_rig(30.0, distance))
+        lit = seen.lit & ~seen.blocked
+        made.append(Coverage(distance, seen.plane_mm[lit], seen.on_plane[lit]))
+    return tuple(made)
+
+
+def coverage_table(placements: tuple[Coverage, ...]) -> Table:
+    """How many dots are on the 4″ plane and how many off it."""
+    rows = [
+        (one.distance_mm, len(one.on_plane), int(one.on_plane.sum()), int((~one.on_plane).sum()))
+        for one in placements
+    ]
+    return Table(
+        "figure_4_11_coverage",
+        "Fig. 4-11, dots on the 4″ plane: convex cap 3/0.3, laser at 30°, 30 mm",
+        ("plane_distance_mm", "reflected_dots", "on_plane", "off_plane"),
+        tuple(rows),
+    )

@@ -1,0 +1,175 @@
+"""The error budget of a set-up: what each source does to the height of a pool, fit being used.
+
+Every part is predicted (`predicted_error`) and, beside it, simulated: pools like the expected one,
+measured from dots with noise, and with the calibrated quantities moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.pipeline import Settings, reconstruct
+from labapp.core.surface.measures import measure
+from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.parallel import Progress, in_parallel
+from labapp.simulation.pools import Pool
+from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, PredictedError, predict_error
+from labapp.studies.error_analysis import relative_errors
+from labapp.studies.parameter_deviation import (
+    NOMINAL,
+    OFFSETS,
+    QUANTITIES,
+    AxisPoints,
+    KnownPool,
+    moved_errors,
+    spread,
+)
+from labapp.studies.tables import Table
+
+POOLS, MOVED_POOLS = 24, 6
+"""So many pools are simulated, and so many of them with each quantity moved."""
+
+SHIFT_MM, STRETCH = 0.3, 0.05
+"""How far pools like one lie off it along X and Y at most, and how much larger or smaller."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A set-up, and how well it is known.
+
+    Parameters
+    ----------
+    rig, axes
+        The set-up.
+    sigma
+        Standard uncertainties of `QUANTITIES`.
+    dot_sigma_mm
+        Standard uncertainty of a dot's place on the plane.
+    """
+
+    rig: Rig
+    axes: AxisPoints
+    sigma: tuple[float, ...] = NOMINAL
+    dot_sigma_mm: float = DOT_SIGMA_MM
+
+
+@dataclass(frozen=True)
+class SetupBudget:
+    """Budget of the height of a kind of pool; m pools of it.
+
+    Parameters
+    ----------
+    pool
+        The pool that is expected.
+    predicted
+        The error of each of the m pools, predicted.
+    random
+        Relative height error of each, simulated without calibration errors, shape (m,); NaN
+        where there was no surface.
+    parameters
+        Relative height error from each of `QUANTITIES`, simulated: root mean square over some of
+        the pools, shape (8,).
+    """
+
+    pool: Pool
+    predicted: tuple[PredictedError, ...]
+    random: FloatArray
+    parameters: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+def setup_budget(
+    bench: Bench, pool: Pool, progress: Progress | None = None, workers: int | None = None
+) -> SetupBudget:
+    """Predict and simulate the error budget of a set-up for a kind of pool."""
+    rng = np.random.default_rng(831)
+    pools = [like(pool, rng) for _ in range(POOLS)]
+    tasks = [(bench, one, k) for k, one in enumerate(pools)]
+    found = in_parallel(_simulated, tasks, "budget", progress, workers)
+    moved = np.array([changes for _, _, changes in found[:MOVED_POOLS]])
+    return SetupBudget(
+        pool=pool,
+        predicted=tuple(predicted for predicted, _, _ in found),
+        random=np.array([error for _, error, _ in found]),
+        parameters=np.sqrt(np.nanmean(moved**2, axis=0)),
+    )
+
+
+def like(pool: Pool, rng: np.random.Generator) -> Pool:
+    """A pool of the same shape, a little larger or smaller and a little to the side."""
+    scale = rng.uniform(1 - STRETCH, 1 + STRETCH)
+    foot = pool.footprint
+    x, y = np.array(foot.center_mm) + rng.uniform(-SHIFT_MM, SHIFT_MM, 2)
+    moved = replace(
+        foot,
+        width_mm=scale * foot.width_mm,
+        head_mm=scale * foot.head_mm,
+        tail_mm=scale * foot.tail_mm,
+        center_mm=(float(x), float(y)),
+    )
+    return replace(pool, footprint=moved, peak_mm=scale * pool.peak_mm)
+
+
+def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, FloatArray]:
+    bench, pool, number = task
+    rig, rng = bench.rig, np.random.default_rng([831, number])
+    predicted = predict_error(
+        pool, rig, dot_sigma_mm=bench.dot_sigma_mm, sigma=bench.sigma, axes=bench.axes
+    )
+    match = exact_match(trace(pool, rig), rig, sigma_mm=bench.dot_sigma_mm, rng=rng)
+    changes = np.full(len(QUANTITIES), np.nan)
+    try:
+        made = reconstruct(match, rig, Settings())
+        error = relative_errors(measure(made, match, rig), pool)[0]
+    except CannotMeasure:
+        return predicted, float("nan"), changes
+    if number < MOVED_POOLS:
+        known = KnownPool(pool, match, rig, bench.axes)
+        half = np.zeros(OFFSETS)
+        for k, step in enumerate(np.diag(spread(bench.sigma))):
+            both = [moved_errors((known, way * step, "fit"))[0] for way in (1, -1)]
+            half[k] = (both[0] - both[1]) / 2
+        changes = np.array([np.linalg.norm(half[list(q.parts)]) for q in QUANTITIES])
+    return predicted, error, changes
+
+
+def budget_table(budget: SetupBudget) -> Table:
+    """The budget, in % of the pool's height: predicted and simulated."""
+    height = abs(budget.pool.peak_mm)
+    rows: list[tuple[str | float | None, ...]] = []
+    parts = (
+        ("which rays come back", "boundary_mm"),
+        ("surface between the dots", "shape_mm"),
+        ("dots' places", "dots_mm"),
+    )
+    for name, part in parts:
+        rows.append((name, _rms([getattr(p, part) for p in budget.predicted]) / height, None))
+    random = [one.random_mm for one in budget.predicted]
+    rows.append(("these together", _rms(random) / height, _rms(budget.random)))
+    for k, quantity in enumerate(QUANTITIES):
+        each = [one.parameters_mm[k] for one in budget.predicted]
+        rows.append((quantity.name, _rms(each) / height, float(budget.parameters[k])))
+    total = [one.total_mm for one in budget.predicted]
+    simulated = float(np.hypot(_rms(budget.random), np.linalg.norm(budget.parameters)))
+    rows.append(("everything", _rms(total) / height, simulated))
+    percent = [(n, *(None if v is None else 100 * float(v) for v in values)) for n, *values in rows]
+    lost = int(np.isnan(budget.random).sum())
+    return Table(
+        "error_budget",
+        f"Error budget of the height, fit, standard uncertainties in % of {height:g} mm: "
+        f"{len(budget.random)} pools like {budget.pool.footprint.width_mm:g} mm wide"
+        + (f", {lost} without a surface" if lost else ""),
+        ("source", "predicted_pct", "simulated_pct"),
+        tuple(percent),
+    )
+
+
+def _rms(values: Sequence[float] | FloatArray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))

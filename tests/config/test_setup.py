@@ -1,0 +1,302 @@
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labapp.config.setup import read_setup, update_setup
+from labapp.errors import InputError
+
+SETUP = """\
+# bench 2
+[laser]
+projection_angle_deg = 31.14   # by the cross hair
+distance_mm = 31.48
+[pattern]
+rows = 19
+columns = 19
+inter_beam_angle_deg = 0.77
+[electrode]
+height_mm = 5.0
+[imaging_plane]
+distance_mm = 50
+s_mm = 45.0
+h_mm = 3.0
+width_mm = 101.6
+height_mm = 101.6
+[image_calibration]
+origin_px = [44.0, 590.0]
+x_axis_px = [440.0, 590.0]
+x_axis_mm = 69.85
+z_axis_px = [44.0, 410.0]
+z_axis_mm = 31.75
+"""
+HOMOGRAPHY = SETUP[: SETUP.index("origin_px")] + (
+    "homography = [[0.2, 0.0, -8.0], [0.0, -0.2, 110.0], [0.0, 0.0, 1.0]]\n"
+)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "setup.toml"
+    path.write_text(SETUP, encoding="utf-8")
+    return path
+
+
+def change(path: Path, old: str, new: str) -> Path:
+    assert path.read_text().count(old) == 1
+    path.write_text(path.read_text().replace(old, new))
+    return path
+
+
+def test_a_setup_is_read(path: Path) -> None:
+    setup = read_setup(path)
+    rig = setup.rig
+    assert (rig.laser.projection_angle_deg, rig.laser.distance_mm) == (31.14, 31.48)
+    assert (rig.pattern.rows, rig.pattern.columns) == (19, 19)
+    assert rig.pattern.absent_rays == {(10, 10)}
+    assert rig.electrode.height_mm == 5.0
+    np.testing.assert_allclose(rig.imaging_plane.origin_mm, [-45, -50, 3])
+    np.testing.assert_allclose(rig.imaging_plane.normal, [0, -1, 0])
+    assert (rig.imaging_plane.width_mm, rig.imaging_plane.height_mm) == (101.6, 101.6)
+    np.testing.assert_allclose(
+        setup.calibration.to_plane(np.array([[44, 590], [440, 410]])),
+        [[0, 0], [69.85, 31.75]],
+        atol=1e-9,
+    )
+    assert setup.text == SETUP
+
+
+def test_the_documented_setup_is_one(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "command-line.md").read_text(encoding="utf-8")
+    path = tmp_path / "setup.toml"
+    path.write_text(text.split("```toml\n")[1].split("```")[0], encoding="utf-8")
+    assert read_setup(path).rig.pattern.absent_rays == {(10, 10)}
+
+
+def test_absent_dots_can_be_named(path: Path) -> None:
+    change(path, "rows = 19\n", "rows = 19\nabsent = [[1, 2], [10, 10]]\n")
+    assert read_setup(path).rig.pattern.absent_rays == {(1, 2), (10, 10)}
+
+
+def test_a_byte_order_mark_and_crlf_do_no_harm(path: Path) -> None:
+    path.write_bytes(b"\xef\xbb\xbf" + SETUP.replace("\n", "\r\n").encode())
+    assert read_setup(path).rig.laser.distance_mm == 31.48
+
+
+def test_a_plane_can_be_tilted(path: Path) -> None:
+    change(path, "h_mm = 3.0\n", "h_mm = 3.0\npitch_deg = 10\nyaw_deg = 20\n")
+    plane = read_setup(path).rig.imaging_plane
+    pitch, yaw = np.radians([10, 20])
+    about_x = np.array(
+        [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
+    )
+    about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    np.testing.assert_allclose(plane.x_axis, about_z @ about_x @ [1, 0, 0])
+    np.testing.assert_allclose(plane.z_axis, about_z @ about_x @ [0, 0, 1])
+    np.testing.assert_allclose(plane.origin_mm, [-45, -50, 3])
+
+
+def test_a_homography_stands_for_the_three_points(path: Path) -> None:
+    path.write_text(HOMOGRAPHY)
+    found = read_setup(path).calibration.to_plane(np.array([100.0, 50.0]))
+    np.testing.assert_allclose(found, [12.0, 100.0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("distance_mm = 31.48", "distance_mm = -31.48", "laser.distance_mm: -31.48; expected a nu"),
+        ("distance_mm = 31.48", "distance_mm = nan", "laser.distance_mm: nan; expected a number"),
+        ("distance_mm = 31.48", "distance_mm = inf", "laser.distance_mm: inf; expected"),
+        ("distance_mm = 31.48", "distance_mm = true", "laser.distance_mm: true; expected a number"),
+        ("distance_mm = 31.48", "distance_mm = '31'", 'laser.distance_mm: "31"; expected a number'),
+        ("distance_mm = 31.48", f"distance_mm = 1{'0' * 400}", "expected a number above 0 and bel"),
+        ("distance_mm = 31.48\n", "", "laser.distance_mm: missing; expected a number above 0"),
+        ("distance_mm = 31.48", "distanse_mm = 31.48", "unknown key; expected distance_mm, perh"),
+        ("= 31.14", "= 0", "laser.projection_angle_deg: 0; expected a number above 0 and below 90"),
+        ("= 31.14", "= 90.0", "laser.projection_angle_deg: 90.0; expected a number above 0 and"),
+        ("= 31.14", "= 6.9", "laser.projection_angle_deg: 6.9; expected a number above half the f"),
+        ("rows = 19", "rows = 18", "pattern.rows: 18; expected an odd whole number"),
+        ("rows = 19", "rows = 0", "pattern.rows: 0; expected an odd"),
+        ("rows = 19", "rows = 19.0", "pattern.rows: 19.0; expected an odd whole number"),
+        ("rows = 19", "rows = 19\nabsent = [[0, 3]]", r"pattern.absent: \[0, 3\]; expected rays"),
+        ("rows = 19", "rows = 19\nabsent = [[20, 3]]", r"\[1, 1\] to \[19, 19\]"),
+        ("rows = 19", "rows = 19\nabsent = [10, 10]", "pattern.absent: .* expected a list of rays"),
+        (
+            "angle_deg = 0.77",
+            "angle_deg = 5",
+            "inter_beam_angle_deg: 5; expected a number below 5 ",
+        ),
+        ("h_mm = 3.0\n", "h_mm = 3.0\npitch_deg = 90\n", "imaging_plane.pitch_deg: 90; expected"),
+        ("height_mm = 5.0", "height_mm = -1", "electrode.height_mm: -1; expected a number from 0"),
+        ("[44.0, 590.0]", "[44.0]", r"image_calibration.origin_px: \[44.0\]; expected \[u, v\]"),
+        ("[44.0, 590.0]", "[44.0, nan]", r"image_calibration.origin_px: \[44.0, nan\]"),
+        ("[440.0, 590.0]", "[44.0, 590.0]", "image_calibration: .* lie on one line"),
+        ("[440.0, 590.0]", "[44.0, 500.0]", "image_calibration: .* lie on one line"),
+        ("[440.0, 590.0]", "[50.0, 500.0]", "image_calibration: .* nearly on one line; .* 10 deg"),
+        ("x_axis_mm = 69.85", "x_axis_mm = 0", "image_calibration.x_axis_mm: 0; .* not 0"),
+        ("[electrode]\nheight_mm = 5.0\n", "", r"electrode: missing; expected a table \[electrode"),
+        ("[electrode]", "[elektrode]", "elektrode: unknown key; expected electrode, perhaps"),
+        ("# bench 2", "electrode = 5", "syntax|electrode: 5"),
+        ("rows = 19", "rows = ", "syntax: "),
+        ("rows = 19", "rows = 19\nrows = 19", "syntax: "),
+    ],
+)
+def test_what_is_wrong_is_named(path: Path, old: str, new: str, said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        read_setup(change(path, old, new))
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[0.0, 0.0, 1.0]]", "[0.0, 0.0, 0.0]]"),
+        ("[0.0, 0.0, 1.0]]", "[0.0, 0.0]]"),
+        ("[0.0, 0.0, 1.0]]", "[0.0, 0.0, true]]"),
+        ("-8.0", "nan"),
+    ],
+)
+def test_a_wrong_homography_is_refused(path: Path, old: str, new: str) -> None:
+    path.write_text(HOMOGRAPHY)
+    with pytest.raises(InputError, match=r"image_calibration\.homography: .*3 rows of 3 numbers"):
+        read_setup(change(path, old, new))
+
+
+def test_both_forms_of_calibration_at_once_are_refused(path: Path) -> None:
+    path.write_text(HOMOGRAPHY + "z_axis_mm = 31.75\n")
+    with pytest.raises(InputError, match=r"image_calibration\.z_axis_mm: unknown key"):
+        read_setup(path)
+
+
+def test_everything_wrong_is_reported_at_once(path: Path) -> None:
+    change(path, "distance_mm = 31.48", "distance_mm = -1")
+    change(path, "columns = 19\n", "")
+    change(path, "height_mm = 5.0", "height_mm = 5.0\ntip = 1")
+    with pytest.raises(InputError) as caught:
+        read_setup(path)
+    assert {problem.field for problem in caught.value.problems} == {
+        "laser.distance_mm",
+        "pattern.columns",
+        "electrode.tip",
+    }
+
+
+def test_what_is_no_setup_file_is_refused(tmp_path: Path, path: Path) -> None:
+    path.write_bytes(b"\xff\xfe[\x00l\x00")
+    with pytest.raises(InputError, match="encoding: not UTF-8"):
+        read_setup(path)
+    with pytest.raises(InputError, match="No such file"):
+        read_setup(tmp_path / "missing.toml")
+    with pytest.raises(InputError, match="Is a directory"):
+        read_setup(tmp_path)
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="laser: missing"):
+        read_setup(path)
+
+
+@given(st.text())
+def test_no_text_gets_another_error_than_ours(text: str) -> None:
+    with mock.patch("labapp.config.setup._text", return_value=text), pytest.raises(InputError):
+        read_setup("setup.toml")
+
+
+toml_values = st.recursive(
+    st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda values: st.lists(values, max_size=4),
+    max_leaves=6,
+)
+
+
+@given(
+    st.sampled_from("laser pattern electrode imaging_plane image_calibration".split()),
+    st.sampled_from(
+        "distance_mm rows absent height_mm s_mm pitch_deg homography x_axis_px".split()
+    ),
+    toml_values,
+)
+def test_no_value_gets_another_error_than_ours(section: str, key: str, value: object) -> None:
+    import tomllib
+
+    values = tomllib.loads(SETUP)
+    values[section][key] = value
+    with (
+        mock.patch("labapp.config.setup._text", return_value=SETUP),
+        mock.patch("labapp.config.setup.tomllib.loads", return_value=values),
+    ):
+        try:
+            setup = read_setup("setup.toml")
+        except InputError:
+            return
+    assert np.isfinite(setup.calibration.matrix).all()
+
+
+def test_an_update_keeps_comments_and_everything_else(path: Path) -> None:
+    update_setup(path, {"laser": {"projection_angle_deg": 30.5, "distance_mm": 40.0}})
+    expected = SETUP.replace("31.14", "30.5").replace("31.48", "40.0")
+    assert path.read_text() == expected
+    assert read_setup(path).rig.laser.distance_mm == 40.0
+
+
+def test_an_update_can_replace_a_homography(path: Path) -> None:
+    path.write_text(HOMOGRAPHY)
+    three = {
+        "origin_px": [44.0, 590.0],
+        "x_axis_px": [440.0, 590.0],
+        "x_axis_mm": 69.85,
+        "z_axis_px": [44.0, 410.0],
+        "z_axis_mm": 31.75,
+    }
+    update_setup(path, {"image_calibration": {**three, "homography": None}})
+    found = read_setup(path).calibration.to_plane(np.array([440.0, 410.0]))
+    np.testing.assert_allclose(found, [69.85, 31.75])
+
+
+def test_an_update_makes_what_is_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "new.toml"
+    update_setup(path, {"laser": {"projection_angle_deg": 30.5, "distance_mm": 40.0}})
+    update_setup(path, {"electrode": {"height_mm": 5.0}})
+    assert path.read_text() == (
+        "[laser]\nprojection_angle_deg = 30.5\ndistance_mm = 40.0\n\n[electrode]\nheight_mm = 5.0\n"
+    )
+    with pytest.raises(InputError) as caught:
+        read_setup(path)
+    assert [problem.field for problem in caught.value.problems] == [
+        "pattern",
+        "imaging_plane",
+        "image_calibration",
+    ]
+
+
+def test_an_update_that_fails_changes_nothing(path: Path) -> None:
+    values = {"laser": {"distance_mm": 40.0}}
+    with (
+        mock.patch("pathlib.Path.replace", side_effect=OSError(28, "No space left on device")),
+        pytest.raises(InputError, match="No space left on device"),
+    ):
+        update_setup(path, values)
+    assert path.read_text() == SETUP
+    assert [entry.name for entry in path.parent.iterdir()] == ["setup.toml"]
+    path.write_text("rows = ")
+    with pytest.raises(InputError, match="syntax"):
+        update_setup(path, values)
+    path.write_text("laser = 3")
+    with pytest.raises(InputError, match="laser: 3; expected a table"):
+        update_setup(path, values)
+    assert path.read_text() == "laser = 3"
+
+
+def test_an_update_keeps_permissions_and_links(path: Path, tmp_path: Path) -> None:
+    path.chmod(0o640)
+    link = tmp_path / "link.toml"
+    link.symlink_to(path)
+    update_setup(link, {"laser": {"distance_mm": 40.0}})
+    assert link.is_symlink()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert read_setup(path).rig.laser.distance_mm == 40.0

@@ -1,0 +1,298 @@
+"""The film: read back by PyAV, it has every frame at its time, and is not blank."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement
+from labapp.errors import InputError
+from labapp.export.film import Extent, film_scene, film_times, write_film, write_video
+from labapp.export.folder import ExportChoice, export, verify_export
+from labapp.export.scene import Scene
+from labapp.export.studio import Picture, Studio
+
+Frames = list[tuple[int, float | None, Measurement]]
+SIZE = (480, 320)
+
+FILM = ExportChoice(
+    tables=frozenset({"measures"}),
+    surfaces=frozenset(),
+    pictures=frozenset({"film"}),
+    view="top",
+    size_px=SIZE,
+)
+
+
+@pytest.fixture
+def frames(measured: Measurement, unmeasured: Measurement) -> Frames:
+    """Frame 4 has no surface; frames 5 to 7 were not measured."""
+    assert measured.measures is not None
+    sizes = replace(measured.measures, height_mm=0.3, depth_mm=0.0)
+    pool = replace(measured, measures=sizes)
+    return [(3, 0.30, pool), (4, 0.32, unmeasured), (8, 0.40, pool)]
+
+
+@pytest.fixture
+def extent(frames: Frames) -> Extent:
+    extent = Extent()
+    for _, _, measurement in frames:
+        extent.add(measurement)
+    return extent
+
+
+class Here(Executor):
+    """Draws plain pictures at once: the first is black, each that follows lighter."""
+
+    def __init__(self) -> None:
+        self.scenes: list[Scene] = []
+
+    def submit(self, work: object, scene: Scene) -> Future[Picture]:  # type: ignore[override]
+        future: Future[Picture] = Future()
+        future.set_result(np.full((32, 48, 3), 20 * len(self.scenes) % 256, np.uint8))
+        self.scenes.append(scene)
+        return future
+
+
+def read(path: Path) -> tuple[list[float], list[float], list[np.ndarray]]:
+    """When frames begin, how long packets last, s, and the pictures."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "mpeg4"
+        lasts = [float(p.duration * p.time_base) for p in container.demux(stream) if p.size]
+    with av.open(str(path)) as container:
+        shown = list(container.decode(video=0))
+    return [f.time for f in shown], lasts, [f.to_ndarray(format="bgr24") for f in shown]
+
+
+# --- when each is shown --------------------------------------------------------------------------
+
+
+def test_frames_keep_their_times_and_what_is_left_out_leaves_its_own(frames: Frames) -> None:
+    numbered = [frame[:2] for frame in frames]
+    np.testing.assert_allclose(film_times(numbered), [0, 0.02, 0.1, 0.12])
+    np.testing.assert_allclose(film_times(numbered, 5.0), [0, 0.2, 1.0, 1.2])
+    untimed = [(3, 0.3), (4, None), (8, 0.4)]
+    np.testing.assert_allclose(film_times(untimed), [0, 0.1, 0.5, 0.6])
+    every_tenth = [(10, 1.0), (20, 1.1), (30, 1.2)]
+    np.testing.assert_allclose(film_times(every_tenth, 25.0), [0, 0.04, 0.08, 0.12])
+    np.testing.assert_allclose(film_times([(7, 0.7)]), [0, 0.1])
+    np.testing.assert_allclose(film_times([(7, 0.7)], 25.0), [0, 0.04])
+
+
+def test_the_film_has_every_frame_at_its_time(
+    frames: Frames, extent: Extent, tmp_path: Path
+) -> None:
+    path, done = tmp_path / "film.mp4", list[int]()
+    times_s = film_times([frame[:2] for frame in frames])
+    write_film(path, iter(frames), times_s, extent, Here(), done.append)
+    begins, lasts, pictures = read(path)
+    np.testing.assert_allclose(begins, [0, 0.02, 0.1], atol=1e-9)
+    np.testing.assert_allclose(lasts, [0.02, 0.08, 0.02], atol=1e-9)
+    assert [picture.shape for picture in pictures] == [(32, 48, 3)] * 3
+    levels = [float(picture.mean()) for picture in pictures]
+    np.testing.assert_allclose(levels, [0, 20, 40], atol=3)
+    assert done == [1, 2, 3]
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 29.97, 500.0, 12_345.0, 60_000.0])
+def test_any_rate_is_kept(tmp_path: Path, rate_hz: float) -> None:
+    pictures = [np.full((16, 16, 3), 9, np.uint8)] * 7
+    write_video(tmp_path / "a.mp4", pictures, np.arange(8) / rate_hz)
+    begins, lasts, _ = read(tmp_path / "a.mp4")
+    np.testing.assert_allclose(begins, np.arange(7) / rate_hz, atol=1 / 60_000)
+    assert sum(lasts) == pytest.approx(7 / rate_hz, abs=1 / 60_000)
+
+
+def test_frames_that_come_too_fast_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="export: film_rate_hz: 200000; expected at most 60000"):
+        write_video(tmp_path / "a.mp4", [], np.arange(4) / 200_000)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_beside_it_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / ".a.mp4.part").symlink_to("mine.txt")
+    write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)], np.arange(2.0))
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert len(read(tmp_path / "a.mp4")[0]) == 1
+
+
+# --- what is shown -------------------------------------------------------------------------------
+
+
+def test_all_frames_share_room_and_colours(frames: Frames, measured: Measurement) -> None:
+    assert measured.reconstruction is not None
+    assert measured.measures is not None
+    boundary = measured.reconstruction.boundary
+    aside = replace(boundary, points_mm=boundary.points_mm + np.array([2.0, 0.0, 0.0]))
+    other = replace(
+        measured,
+        reconstruction=replace(measured.reconstruction, boundary=aside),
+        measures=replace(measured.measures, height_mm=0.1, depth_mm=-0.4),
+    )
+    extent = Extent()
+    assert not extent.known
+    shown = [*frames, (9, None, other)]
+    for _, _, measurement in shown:
+        extent.add(measurement)
+    assert extent.limits == (-0.4, 0.3)
+    np.testing.assert_allclose(extent.within_mm, [[-3, -3, -0.4], [5, 3, 0.3]])
+    made = [film_scene(*frame, extent) for frame in shown]
+    assert {scene.limits for scene in made} == {(-0.4, 0.3)}
+    for scene in made:
+        np.testing.assert_array_equal(scene.within_mm, extent.within_mm)
+    assert [scene.stamp for scene in made] == [
+        "frame 3, 0.3000 s",
+        "frame 4, 0.3200 s",
+        "frame 8, 0.4000 s",
+        "frame 9",
+    ]
+    assert [scene.notice for scene in made] == [
+        "",
+        'cannot be measured: two references fit, "a" and "b"',
+        "",
+        "",
+    ]
+    assert [len(scene.triangles) > 0 for scene in made] == [True, False, True, True]
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_studio_draws_from_the_same_place_each_time(frames: Frames, extent: Extent) -> None:
+    studio = Studio(SIZE, "free")
+    first, words, again = (
+        studio.draw(film_scene(3, 0.3, measurement, extent))
+        for measurement in (frames[0][2], frames[1][2], frames[0][2])
+    )
+    studio.plotter.close()
+    assert first.shape == (320, 480, 3)
+    np.testing.assert_array_equal(first, again)
+    # The surface is gone, words are there; the colour scale, at the right, is the same.
+    blue, green, red = np.moveaxis(words[:, :380].astype(int), 2, 0)
+    assert not ((red > 180) & (green > 150) & (blue < 90)).any()
+    assert (words[60:140, 50:330] < 128).sum() > 500
+    np.testing.assert_array_equal(words[80:, 400:], first[80:, 400:])
+
+
+# --- in an export --------------------------------------------------------------------------------
+
+
+def test_an_export_has_the_film(
+    frames: Frames, calibration: ImageCalibration, tmp_path: Path
+) -> None:
+    pytest.importorskip("pyvista")
+    out, done = tmp_path / "out", list[int]()
+    choice = replace(FILM, film_rate_hz=10.0)
+    written = export(out, frames, calibration, {}, choice, progress=done.append)
+    assert [file.name for file in written] == ["film.mp4", "measures.csv"]
+    assert verify_export(out) == []
+    assert done == [1, 2, 3, 4, 5, 6]
+    begins, _, pictures = read(out / "film.mp4")
+    np.testing.assert_allclose(begins, [0, 0.1, 0.5], atol=1e-9)
+    assert {picture.shape for picture in pictures} == {(320, 480, 3)}
+    first, words, last = (picture.astype(int) for picture in pictures)
+    assert np.ptp(first) > 200
+    # Frames 3 and 8 differ in the stamp only; frame 4 lacks the surface.
+    assert np.abs(first - last)[40:].mean() < 1
+    assert np.abs(first - words)[40:].mean() > 5
+
+
+def test_without_any_surface_there_is_no_film(
+    unmeasured: Measurement, calibration: ImageCalibration, tmp_path: Path
+) -> None:
+    written = export(tmp_path / "out", [(0, None, unmeasured)], calibration, {}, FILM)
+    assert [file.name for file in written] == ["measures.csv"]
+
+
+# --- what fails on the way -----------------------------------------------------------------------
+
+
+class Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_a_film_that_is_stopped_leaves_nothing(
+    frames: Frames, extent: Extent, tmp_path: Path, at: int
+) -> None:
+    def stop(done: int) -> None:
+        if done == at:
+            raise Stopped
+
+    times_s = film_times([frame[:2] for frame in frames])
+    with pytest.raises(Stopped):
+        write_film(tmp_path / "film.mp4", frames, times_s, extent, Here(), stop)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_is_begun_before_all_frames_are_read(
+    frames: Frames, extent: Extent, tmp_path: Path
+) -> None:
+    taken = 0
+
+    def one_by_one() -> Iterator[tuple[int, float | None, Measurement]]:
+        nonlocal taken
+        for number in range(40):
+            taken += 1
+            yield number, None, frames[0][2]
+
+    ahead: list[int] = []
+    write_film(
+        tmp_path / "film.mp4",
+        one_by_one(),
+        np.arange(41) / 10,
+        extent,
+        Here(),
+        lambda done: ahead.append(taken - done),
+    )
+    assert max(ahead) <= 4
+    assert len(read(tmp_path / "film.mp4")[0]) == 40
+
+
+FULL_DISK = """
+    import resource, sys
+    import numpy as np
+    from pathlib import Path
+    from labapp.export.film import write_video
+
+    path, generator = Path(sys.argv[1]), np.random.default_rng(0)
+    path.write_bytes(b"earlier")
+    pictures = (generator.integers(0, 256, (240, 320, 3)).astype(np.uint8) for _ in range(60))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
+    try:
+        write_video(path, pictures, np.arange(61) / 10)
+    except OSError as error:
+        print(error.strerror)
+    print([found.name for found in path.parent.iterdir()], path.read_bytes())
+"""
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
+    """The real thing: the system takes no more."""
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(FULL_DISK), str(tmp_path / "film.mp4")],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PYTHONPATH": ":".join(sys.path)},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == ["File too large", "['film.mp4'] b'earlier'"]
+
+
+def test_the_clock_is_fine_enough_for_a_fraction(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)], np.array([0, 1 / 30]))
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].time_base == Fraction(1, 60_000)

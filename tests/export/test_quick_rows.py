@@ -1,0 +1,55 @@
+"""Quick rows are the rows that the slow way writes, to the last digit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from labapp.export import quick_rows
+from labapp.export.tables import TABLES, Table, csv_rows, number
+
+NUMBERS = st.one_of(
+    st.floats(-1e7, 1e7),
+    st.integers(-2000, 2000).map(lambda n: n / 16),  # ties, among others
+    st.sampled_from([0.0, -0.0, -4e-7, 4e-7, 0.5, 999999.9999995, math.nan, math.inf, -math.inf]),
+)
+
+
+@given(st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=8))
+def test_numbers_are_written_as_python_writes_them(rows: list[tuple[float, ...]]) -> None:
+    digits = np.array([0, 4, 6])
+    text, length = quick_rows.fixed(np.array(rows), digits)
+    if length >= 0:
+        wanted = [",".join(map(number, row, digits.tolist())) + "\n" for row in rows]
+        assert text[:length].tobytes().decode() == "".join(wanted)
+    else:  # some number is too near to a tie to be rounded here
+        assert any(
+            math.isfinite(x) and abs(math.modf(abs(x) * 10.0**d)[0] - 0.5) < 1e-4
+            for row in rows
+            for x, d in zip(row, digits.tolist(), strict=True)
+        )
+
+
+@pytest.mark.parametrize("sources", [["auto"] * 3, ["auto", "manual", "auto"], []])
+def test_tables_with_words_are_written_alike(sources: list[str]) -> None:
+    rng = np.random.default_rng(2)
+    table: Table = {
+        column.name: rng.integers(0, 20, len(sources)).astype(float)
+        if column.digits == 0
+        else rng.normal(0.0, 90.0, len(sources))
+        for column in TABLES["dots"][:-1]
+    }
+    table["ray_row"][:1] = np.nan
+    table["source"] = np.array(sources, object)
+    assert quick_rows._rows("dots", table) == csv_rows("dots", table)
+
+
+def test_a_number_of_many_digits_is_written_the_slow_way() -> None:
+    assert quick_rows.fixed(np.array([[1e12]]), np.array([6]))[1] == -1
+    values = np.array([2e-7, 3e12, 1.5])
+    table: Table = {column.name: values for column in TABLES["boundary"]}
+    assert quick_rows._rows("boundary", table) == csv_rows("boundary", table)

@@ -1,0 +1,340 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labapp.core.pipeline import Measurement
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.surface import FlatSurface
+from labapp.export import drawing as draws
+from labapp.export import scene as scenes
+from labapp.export.heights import difference_at, profile, sigma_at
+from labapp.export.scene import difference_scene, rays_of, scene_of
+from labapp.export.studio import draw_scene
+from tests.scenes import BENCH_RIG
+
+RADIUS_MM, HEIGHT_MM = 3.0, 0.3
+
+
+@pytest.fixture
+def pool(measured: Measurement) -> Reconstruction:
+    """A paraboloid, 0.3 mm high over a circle of 3 mm; ± grows with X."""
+    assert measured.reconstruction is not None
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(-2.0, 3.0), np.arange(-2.0, 3.0)))
+    z = HEIGHT_MM * (1 - (x**2 + y**2) / RADIUS_MM**2)
+    return replace(
+        measured.reconstruction,
+        ray=np.column_stack([np.repeat(np.arange(5), 5) + 8, np.tile(np.arange(5), 5) + 8]),
+        points_mm=np.column_stack([x, y, z]),
+        residual_mm=np.zeros((25, 2)),
+        sigma_mm=0.002 + 0.0005 * x,
+    )
+
+
+# --- heights -------------------------------------------------------------------------------------
+
+
+def test_sigma_is_linear_between_the_points_and_the_nearest_outside(pool: Reconstruction) -> None:
+    sigma = sigma_at(pool, np.array([0.5, -1.25, 2.9, -2.9]), np.array([0.5, 1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(sigma, [0.00225, 0.001375, 0.003, 0.001], atol=1e-12)
+
+
+def test_there_is_no_sigma_where_the_scheme_gives_none(pool: Reconstruction) -> None:
+    without = replace(pool, sigma_mm=np.full(25, np.nan))
+    assert np.isnan(sigma_at(without, np.zeros(2), np.zeros(2))).all()
+    assert scene_of(without, "sigma").label == "height (mm)"
+
+
+def test_surfaces_differ_only_where_both_are(pool: Reconstruction) -> None:
+    smaller = replace(pool.boundary, points_mm=pool.boundary.points_mm * [0.5, 0.5, 1.0])
+    other = replace(pool, surface=FlatSurface(0.1), boundary=smaller)
+    difference = difference_at(pool, other, np.array([0.0, 1.0, 2.0]), np.zeros(3))
+    np.testing.assert_allclose(difference, [0.2, 0.3 * (1 - 1 / 9) - 0.1, np.nan])
+
+
+@pytest.mark.parametrize("scale", [1, 1e3, 1e6])
+def test_a_huge_surface_is_drawn_with_no_more_nodes(pool: Reconstruction, scale: float) -> None:
+    """It is told in a stranger's session; what is built of it has bounds."""
+    boundary = replace(pool.boundary, points_mm=pool.boundary.points_mm * scale)
+    vertices, _ = scenes._mesh(replace(pool, boundary=boundary))
+    assert 1000 < len(vertices) < 1_000_000
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 37.0, 90.0, 180.0, -60.0])
+def test_a_section_ends_at_the_boundary(pool: Reconstruction, angle_deg: float) -> None:
+    cut = profile(pool, angle_deg, 1.5)
+    half = np.sqrt(RADIUS_MM**2 - 1.5**2)
+    # The boundary is a polygon of 72 corners: its sides are within 0.003 mm of the circle.
+    np.testing.assert_allclose(cut.edge_mm[:, 0], [-half, half], atol=0.006)
+    known = np.isfinite(cut.height_mm)
+    assert known.sum() > 0.98 * len(known)
+    radius = np.hypot(*cut.place_mm[known].T)
+    np.testing.assert_allclose(cut.height_mm[known], HEIGHT_MM * (1 - radius**2 / 9), atol=1e-12)
+    aside = cut.place_mm @ [-np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg))]
+    np.testing.assert_allclose(aside, 1.5)
+    assert np.isfinite(cut.sigma_mm[known]).all()
+
+
+def test_a_section_that_misses_the_pool_is_empty(pool: Reconstruction) -> None:
+    cut = profile(pool, 0.0, 5.0)
+    assert len(cut.edge_mm) == 0
+    assert np.isnan(cut.height_mm).all()
+
+
+# --- the scene -----------------------------------------------------------------------------------
+
+
+def test_rays_come_from_the_laser_and_go_to_the_computed_dots(pool: Reconstruction) -> None:
+    class Matched:
+        plane_mm = np.column_stack([np.linspace(20, 70, 25), np.linspace(5, 60, 25)])
+
+    matched: Any = Matched()
+    shifted = replace(pool, residual_mm=np.full((25, 2), 0.5))
+    rays = rays_of(shifted, matched, BENCH_RIG)
+    targets = {
+        "incident": np.tile(BENCH_RIG.laser.position_mm, (25, 1)),
+        "reflected": BENCH_RIG.imaging_plane.to_universal(Matched.plane_mm + 0.5),
+    }
+    for name, target in targets.items():
+        start, end = rays[name][:, 0], rays[name][:, 1]
+        np.testing.assert_array_equal(start, pool.points_mm)
+        np.testing.assert_allclose(np.linalg.norm(end - start, axis=1), scenes.RAY_MM)
+        off = np.cross(end - start, target - start)
+        np.testing.assert_allclose(off, 0, atol=1e-9)
+
+
+def test_a_difference_is_coloured_both_ways_alike(pool: Reconstruction) -> None:
+    other = replace(pool, surface=FlatSurface(0.05))
+    made = difference_scene(pool, other)
+    assert made.diverging
+    assert made.limits == pytest.approx((-0.25, 0.25))
+    np.testing.assert_allclose(made.values, made.vertices_mm[:, 2] - 0.05, atol=1e-9)
+    assert made.values.min() == pytest.approx(-0.05, abs=1e-6)
+
+
+def aside(pool: Reconstruction) -> Reconstruction:
+    """The same pool 10 mm farther along X: it does not overlap the first."""
+    way = np.array([10.0, 0.0, 0.0])
+    here = pool.boundary
+    moved = replace(here, center_mm=here.center_mm + way[:2], points_mm=here.points_mm + way)
+    return replace(pool, boundary=moved)
+
+
+def test_surfaces_that_do_not_overlap_have_no_difference_to_draw(pool: Reconstruction) -> None:
+    made = difference_scene(pool, aside(pool))
+    assert len(made.vertices_mm) == len(made.triangles) == len(made.values) == 0
+
+
+def test_what_is_not_known_of_a_surface_is_not_drawn(pool: Reconstruction) -> None:
+    class Holed(FlatSurface):
+        def height(self, x_mm: Any, y_mm: Any) -> Any:
+            return np.where(np.hypot(x_mm - 1, y_mm) < 0.5, np.nan, 0.2)
+
+    made = scene_of(replace(pool, surface=Holed()))
+    assert np.isfinite(made.vertices_mm).all()
+    centres = made.vertices_mm[made.triangles].mean(axis=1)
+    assert np.hypot(centres[:, 0] - 1, centres[:, 1]).min() > 0.35
+
+
+@pytest.mark.parametrize(
+    ("limits", "form"),
+    [((0, 0.28), "%.2f"), ((0, 0.0028), "%.4f"), ((-5, 5), "%.1f"), ((-0.025, 0.025), "%.3f")],
+)
+def test_the_labels_of_a_colour_scale_are_true(limits: tuple[float, float], form: str) -> None:
+    assert draws._label_format(limits) == form
+
+
+def test_normals_point_up_and_stand_upright_on_the_surface(pool: Reconstruction) -> None:
+    made = scene_of(pool)
+    normals = draws._normals(made.vertices_mm, made.triangles)
+    # The centre's neighbours and the rim see facets of one side only.
+    inner = np.hypot(*made.vertices_mm[:, :2].T) < 2.5
+    x, y = made.vertices_mm[inner, :2].T
+    true = np.column_stack([2 * HEIGHT_MM / 9 * x, 2 * HEIGHT_MM / 9 * y, np.ones(len(x))])
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    np.testing.assert_allclose(normals[inner], true, atol=0.01)
+
+
+# --- its picture ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plotter(opengl: None) -> Any:
+    import pyvista
+
+    made: Any = pyvista.Plotter(off_screen=True, window_size=[480, 360])
+    yield made
+    made.close()
+
+
+def seen(plotter: Any) -> np.ndarray:
+    plotter.render()
+    return np.asarray(plotter.screenshot(return_img=True)).astype(int)
+
+
+def amount(picture: np.ndarray, colour: str) -> int:
+    """How many pixels have about a colour."""
+    wanted = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    return int((np.abs(picture - wanted).max(axis=2) < 40).sum())
+
+
+def test_the_summit_is_yellow_and_the_rim_violet(plotter: Any, pool: Reconstruction) -> None:
+    draws.build_scene(plotter, scene_of(pool)).look("top")
+    picture = seen(plotter)
+    bar = 400  # the colour scale stands to the right of it
+    rows, columns = np.nonzero((picture[:, :bar].max(axis=2) - picture[:, :bar].min(axis=2)) > 60)
+    across, down = int(columns.mean()), int(rows.mean())
+    red, green, blue = picture[down, across + 6]
+    assert red > 150
+    assert green > 150
+    assert blue < 110
+    red, green, blue = picture[down, columns.min() + 8]
+    assert max(red, green) < 130
+    assert blue > 60
+
+
+def test_parts_come_and_go_with_the_scene(plotter: Any, pool: Reconstruction) -> None:
+    rays = {"incident": np.stack([pool.points_mm, pool.points_mm + np.array([0, 1, 1])], axis=1)}
+    line = np.column_stack([np.linspace(-3, 3, 50), np.zeros(50), np.full(50, 0.35)])
+    plain = replace(scene_of(pool), points_mm=np.empty((0, 3)))
+    full = replace(plain, rays_mm=rays, lines_mm={**plain.lines_mm, "section": line})
+    drawing = draws.build_scene(plotter, plain)
+    before = seen(plotter)
+    drawing.update(full)
+    between = seen(plotter)
+    drawing.update(plain)
+    after = seen(plotter)
+    for colour in (draws.COLOURS["incident"], draws.COLOURS["section"]):
+        assert amount(before, colour) < 20
+        assert amount(between, colour) > 100
+    np.testing.assert_array_equal(after, before)
+
+
+def test_a_frame_takes_the_place_of_another(plotter: Any, pool: Reconstruction) -> None:
+    """The same actors show it, and the picture is the one of a drawing made for it alone."""
+    flat = scene_of(replace(pool, surface=FlatSurface(0.21)), limits=(0.0, 0.3))
+    drawing = draws.build_scene(plotter, scene_of(pool, limits=(0.0, 0.3)))
+    first, actors = seen(plotter), list(plotter.renderer.actors)
+    drawing.update(flat)
+    assert list(plotter.renderer.actors) == actors
+    moved = seen(plotter)
+    assert (moved != first).any(axis=2).mean() > 0.05
+    plotter.clear()
+    draws.build_scene(plotter, flat)
+    np.testing.assert_allclose(seen(plotter), moved, atol=2)
+
+
+def test_the_scale_says_what_the_colours_are(plotter: Any, pool: Reconstruction) -> None:
+    drawing = draws.build_scene(plotter, scene_of(pool))
+    for label in ("± (mm)", "height (mm)", "± (mm)"):
+        drawing.update(replace(scene_of(pool), label=label))
+        assert list(plotter.scalar_bars.keys()) == [label.replace(" (", "\n(")]
+
+
+def test_a_surface_that_failed_is_made_another_time(
+    plotter: Any, pool: Reconstruction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heights = scene_of(pool)
+    drawing = draws.build_scene(plotter, heights)
+    wanted = seen(plotter)
+
+    def refused(*_: Any, **__: Any) -> None:
+        raise ValueError("refused")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(plotter, "add_mesh", refused)
+        with pytest.raises(ValueError, match="refused"):
+            drawing.update(replace(heights, label="± (mm)"))
+    drawing.update(heights)
+    assert list(plotter.scalar_bars.keys()) == ["height\n(mm)"]
+    np.testing.assert_allclose(seen(plotter), wanted, atol=2)
+
+
+def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Reconstruction) -> None:
+    """As in a film whose first frame has none, or where two surfaces do not overlap."""
+
+    def coloured() -> np.ndarray:
+        picture = seen(plotter)
+        grey = np.ptp(picture, axis=2, keepdims=True) < 40  # axes and their names
+        return np.where(grey, 255, picture)
+
+    drawing = draws.build_scene(plotter, difference_scene(pool, aside(pool)))
+    assert (coloured()[:, :380] == 255).all()
+    for scene in (difference_scene(pool, replace(pool, surface=FlatSurface(0.05))), scene_of(pool)):
+        drawing.update(scene)
+        drawing.look("free")
+        after = coloured()
+        assert (after[:, :380] != 255).any(axis=2).sum() > 10_000
+        plotter.clear()
+        drawing = draws.build_scene(plotter, scene)
+        np.testing.assert_allclose(after, coloured(), atol=45)
+
+
+@pytest.mark.parametrize(("exaggeration", "labels"), [(1.0, ["", "0.3"]), (3.0, ["0.0", "0.3"])])
+def test_numbers_upwards_do_not_overlap(
+    plotter: Any, pool: Reconstruction, exaggeration: float, labels: list[str]
+) -> None:
+    drawing = draws.build_scene(plotter, replace(scene_of(pool), exaggeration=4.0 - exaggeration))
+    drawing.update(replace(scene_of(pool), exaggeration=exaggeration))
+    seen(plotter)
+    assert plotter.renderer.cube_axes_actor.z_labels == labels
+
+
+def test_axes_stay_while_pools_fill_them(plotter: Any, pool: Reconstruction) -> None:
+    def scaled(factor: float) -> scenes.Scene:
+        made = scene_of(pool)
+        return replace(made, vertices_mm=made.vertices_mm * factor)
+
+    def bounds(drawing: draws.Drawing, factor: float) -> tuple[float, ...]:
+        drawing.update(scaled(factor))
+        return tuple(plotter.renderer.cube_axes_actor.bounds)
+
+    steady = draws.build_scene(plotter, scaled(1.0), steady=True)
+    of_all = bounds(steady, 1.0)
+    assert bounds(steady, 0.9) == of_all
+    larger = bounds(steady, 1.4)
+    assert larger != of_all
+    assert bounds(steady, 1.0) != larger  # too small a pool in them
+    plotter.clear()
+    plotter.remove_bounds_axes()
+    alone = draws.build_scene(plotter, scaled(1.0))
+    assert bounds(alone, 1.0) == of_all
+    assert bounds(alone, 0.6) != of_all
+
+
+def test_a_dark_window_has_a_dark_scene(plotter: Any, pool: Reconstruction) -> None:
+    drawing = draws.build_scene(plotter, scene_of(pool))
+    assert amount(seen(plotter), "#ffffff") > 60_000
+    drawing.update(replace(scene_of(pool), background="#202020", foreground="#e0e0e0"))
+    picture = seen(plotter)
+    assert amount(picture, "#202020") > 60_000
+    assert 50 < amount(picture, "#e0e0e0") < 10_000
+
+
+def test_heights_are_drawn_as_told_and_the_axes_stay_true(
+    plotter: Any, pool: Reconstruction
+) -> None:
+    def extent(exaggeration: float) -> float:
+        plotter.clear()
+        drawn = replace(scene_of(pool), exaggeration=exaggeration, electrode=False)
+        draws.build_scene(plotter, drawn).look("front")
+        axes = plotter.renderer.cube_axes_actor
+        assert axes.GetZAxisRange() == pytest.approx((0.0, 0.3))
+        top, bottom = np.nonzero(amount_rows(seen(plotter)))[0][[0, -1]]
+        return float(bottom - top)
+
+    def amount_rows(picture: np.ndarray) -> np.ndarray:
+        saturated = picture[:, :380].max(axis=2) - picture[:, :380].min(axis=2) > 60
+        return np.asarray(saturated.sum(axis=1) > 0)
+
+    once, thrice = extent(2.0), extent(6.0)
+    assert thrice == pytest.approx(3 * once, rel=0.2)
+
+
+def test_a_picture_is_drawn_at_its_size(plotter: Any, pool: Reconstruction) -> None:
+    picture = draw_scene(scene_of(pool), (320, 240), "side")
+    assert picture.shape == (240, 320, 3)
+    assert picture.std() > 10

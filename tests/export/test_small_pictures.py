@@ -1,0 +1,27 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.pipeline import Measurement
+from labapp.export.drawing import Direction
+from labapp.export.scene import scene_of
+from labapp.export.studio import draw_scene
+
+
+@pytest.mark.parametrize("size_px", [(367, 226), (285, 170)])
+@pytest.mark.parametrize("view", ["top", "side", "front"])
+def test_names_and_numbers_stay_within_a_small_picture(
+    measured: Measurement, view: Direction, size_px: tuple[int, int]
+) -> None:
+    pool = measured.reconstruction
+    assert pool is not None
+    picture = draw_scene(scene_of(pool), size_px, view).astype(int)
+    ink = np.abs(picture - picture[-1, 0]).max(axis=2) > 40
+    assert not ink[:, -2:].any()  # what ends at the edge is cut there
+    assert not ink[-2:].any()
+    if view == "top":
+        # Below all else: the numbers along X, and the axis's name.
+        lines = np.flatnonzero(ink[:, : size_px[0] * 2 // 3].any(axis=1))
+        bands = np.split(lines, np.flatnonzero(np.diff(lines) > 2) + 1)
+        assert [len(band) < 18 for band in bands[-3:]] == [False, True, True]

@@ -1,0 +1,3 @@
+from tests.export.conftest import calibration, measured, unmeasured, writer
+
+__all__ = ["calibration", "measured", "unmeasured", "writer"]

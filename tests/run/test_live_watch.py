@@ -1,0 +1,347 @@
+"""Live frames that are measured: their trend, how measuring keeps up, alarms, who is told."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from labapp.config.setup import Setup, read_setup
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.sequence import warm
+from labapp.core.surface.measures import Measures
+from labapp.export.scene import Scene, empty_scene
+from labapp.media import open_source
+from labapp.media.cameras import CameraFrame
+from labapp.media.events import Event
+from labapp.run import live_measuring, live_watch
+from labapp.run.limits import Limits, Size, standing
+from labapp.run.live_measuring import SOUGHT_S, LiveMeasurement, LiveMeasuring
+from labapp.run.live_watch import LiveWatch
+from labapp.run.streams import LineStream
+from tests.waiting import PATIENCE_S, connect
+
+SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
+
+MEASURES = Measures(*[0.0] * 4, 6.7, 7.5, 0.30, -0.01, *[0.0] * 6, *[0.03, 0.04, 0.003] * 2)
+
+Told = list[tuple[Event, float | None]]
+
+
+class Prepared:
+    """Measures what it is told to: a width for each frame's number, None where it cannot be."""
+
+    def __init__(self, *_: object) -> None:
+        self.widths: dict[int, float | None] = {}
+        self.asked: list[bool] = []
+
+    def measure(self, image: np.ndarray, drawn: bool) -> LiveMeasurement:
+        self.asked.append(drawn)
+        width = self.widths.get(int(image[0, 0]), 6.7)
+        found = LiveMeasurement("ok", "", None, None, True)  # type: ignore[arg-type]  # no verdict
+        if width is None:
+            return replace(found, status="no-dots", reason="it is dark")
+        scene: Scene | None = empty_scene(np.zeros((1, 3)), (0, 1), "", "") if drawn else None
+        return replace(found, measures=replace(MEASURES, width_mm=width), scene=scene)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def setup() -> Setup:
+    return read_setup(SAMPLE / "setup.toml")
+
+
+@pytest.fixture
+def told() -> Told:
+    return []
+
+
+@pytest.fixture
+def watch(setup: Setup, told: Told, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveWatch]:
+    monkeypatch.setattr(live_watch, "LiveMeasuring", Prepared)
+    limits = Limits(width_mm=(6.0, 6.9), unmeasured=2)
+    made = LiveWatch("camera", setup, Settings(), 8, limits, lambda *each: told.append(each))
+    yield made
+    made.close()
+
+
+def frame(number: int, image: np.ndarray | None = None) -> CameraFrame:
+    if image is None:
+        image = np.full((2, 2), number, np.uint8)
+    return CameraFrame(number, 10.0 + number, time.monotonic(), image)
+
+
+def prepare(watch: LiveWatch, widths: dict[int, float | None]) -> Prepared:
+    prepared: Any = watch._measuring
+    prepared.widths = widths
+    return prepared
+
+
+def test_the_trend_has_every_frame_that_was_tried(watch: LiveWatch):
+    prepare(watch, {1: 7.2, 2: None})
+    assert watch.trend(60).names == ("width", "length", "height")
+    assert watch.trend(60).value_mm.shape == (3, 0)
+    for number in range(4):
+        watch.measure(frame(number))
+    trend = watch.trend(60)
+    assert trend.number.tolist() == [0, 1, 2, 3]
+    assert np.array_equal(trend.value_mm[0], [6.7, 7.2, np.nan, 6.7], equal_nan=True)
+    assert np.array_equal(trend.sigma_mm[1], [0.04, 0.04, np.nan, 0.04], equal_nan=True)
+    assert trend.beyond.tolist() == [[False, True, False, False], *[[False] * 4] * 2]
+    assert (trend.since_s <= 0).all()
+    assert (np.diff(trend.since_s) >= 0).all()
+    assert len(watch.trend(0.0).number) == 0
+    pace = watch.pace()
+    assert (pace.tried, pace.failed) == (4, 1)
+    assert pace.measured_hz == 3 / live_watch.RATE_S
+
+
+def test_the_trend_forgets_what_is_old(watch: LiveWatch, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(live_watch, "TREND_S", 0.0)
+    for number in range(50):
+        watch.measure(frame(number))
+    assert watch.trend(60).number.tolist() == [49]
+
+
+def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: Told):
+    prepare(watch, {3: 7.2, 4: 7.2, 6: None, 7: None})
+    for number in range(9):
+        watch.measure(frame(number))
+    watch.acknowledge()
+    watch.acknowledge()
+    assert [(event.kind, time_s) for event, time_s in told] == [
+        ("warning", 13.0),
+        ("note", 15.0),
+        ("warning", 17.0),
+        ("note", 18.0),
+        ("note", None),
+        ("note", None),
+    ]
+    words = [event.words for event, _ in told]
+    assert words[0] == "ALARM: Width 7.200 ± 0.030 mm is above 6.9 mm (frame 3)"
+    assert words[1].startswith("alarm over: Width 7.200")
+    assert words[2] == "ALARM: 2 frames in a row could not be measured: it is dark (frame 7)"
+    assert words[4].startswith("alarm acknowledged: Width")
+    assert watch.alarms.shown == ()
+    for _ in range(2):
+        watch.set_limits(Limits(width_mm=(6.0, None)))
+    assert [event.words for event, _ in told[6:]] == ["limits now: width from 6 mm"]
+
+
+def test_no_figure_for_long_is_an_alarm_until_there_is_one(
+    watch: LiveWatch, told: Told, monkeypatch: pytest.MonkeyPatch
+):
+    watch.measure(frame(3))
+    assert watch.next_frame() is None
+    assert told == []
+    monkeypatch.setattr(live_watch, "SILENT_S", 0.0)
+    for _ in range(3):
+        watch.next_frame()
+    assert [event.words for event, _ in told] == [
+        "ALARM: No frame has been measured for 0 s (frame 3)"
+    ]
+    assert [(alarm.code, alarm.holds) for alarm in watch.alarms.shown] == [("silent", True)]
+    watch.measure(frame(5))
+    assert [(alarm.code, alarm.holds) for alarm in watch.alarms.shown] == [("silent", False)]
+    assert told[-1][0].words.startswith("alarm over: No frame has been measured")
+
+
+def test_measuring_that_ends_by_itself_is_an_alarm_and_is_told(watch: LiveWatch, told: Told):
+    stream = LineStream()
+    watch.tell_by("lines", stream)
+    with connect(stream.port) as heard:
+        lines = heard.makefile(encoding="utf-8")
+        lines.readline()
+
+        def broken(*_: object) -> LiveMeasurement:
+            raise OSError("the process was killed")
+
+        prepare(watch, {}).measure = broken  # type: ignore[method-assign]  # it breaks
+        with pytest.raises(OSError, match="killed"):
+            watch.measure(frame(7))
+        line = json.loads(lines.readline())
+    assert line["status"] == "silent"
+    assert line["alarm"] == "silent"
+    assert line.get("width_mm") is None
+    assert "Nothing is measured any more: the process was killed" in told[0][0].words
+
+
+def test_alarms_that_other_limits_end_are_said_to_be_over(watch: LiveWatch, told: Told):
+    prepare(watch, {1: 7.2})
+    watch.measure(frame(1))
+    watch.set_limits(Limits(width_mm=(6.0, 7.5)))
+    kinds = [event.words.partition(":")[0] for event, _ in told]
+    assert kinds == ["ALARM", "alarm over", "limits now"]
+
+
+def test_the_trend_judges_as_figures_are_judged(watch: LiveWatch):
+    rng = np.random.default_rng(3)
+    widths = {k: float(w) for k, w in enumerate(rng.uniform(5.8, 7.1, 60))}
+    prepare(watch, {**widths, 7: None})
+    for number in widths:
+        watch.measure(frame(number))
+    trend, limits = watch.trend(60), watch.alarms.limits
+    sizes = zip(trend.value_mm[0].tolist(), trend.sigma_mm[0].tolist(), strict=True)
+    stands = [standing(Size("width", *each), limits.width_mm) for each in sizes]
+    assert trend.beyond[0].tolist() == [each in ("low", "high") for each in stands]
+    assert {"low", "high", "in order", "unknown"} <= set(stands)
+
+
+def test_a_surface_is_drawn_when_it_is_asked_for_and_only_once(watch: LiveWatch):
+    prepared = prepare(watch, {1: None})
+    watch.measure(frame(0))
+    watch.ask_for_scene()
+    for number in (1, 2, 3):  # the first of them has none
+        watch.measure(frame(number))
+    assert prepared.asked == [False, True, True, False]
+    followed = watch.newest()
+    assert followed is not None
+    assert followed.number == 3
+    assert watch.newest() is None
+    # The surface that was asked for is there, though another frame was measured since.
+    assert watch.scene() is not None
+    assert watch.scene() is None
+
+
+def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
+    prepare(watch, {1: 7.2, 2: None})
+    stream = LineStream()
+    watch.tell_by("lines", stream)
+    assert watch.stream("lines") is stream
+    with connect(stream.port) as connected:
+        file = connected.makefile("rb")
+        file.readline()
+        for number in range(3):
+            watch.measure(frame(number))
+        lines = [json.loads(file.readline()) for _ in range(3)]
+        watch.acknowledge()
+        watch.measure(frame(3))
+        lines.append(json.loads(file.readline()))
+        assert (stream.told, stream.listeners) == (4, 1)
+        file.close()
+    assert [line["width_mm"] for line in lines] == [6.7, 7.2, None, 6.7]
+    assert [line["status"] for line in lines] == ["ok", "ok", "no-dots", "ok"]
+    assert [line["time_s"] for line in lines] == [frame(number).time_s for number in range(4)]
+    assert [line["alarm"] for line in lines] == ["", "width-high", "width-high", ""]
+    assert [line["unacknowledged"] for line in lines] == ["", "width-high", "width-high", ""]
+    assert lines[0]["scheme"] == "fit"
+    watch.tell_by("lines", None)
+    assert watch.stream("lines") is None
+
+
+def test_a_stream_that_comes_when_all_is_over_is_closed(watch: LiveWatch):
+    watch.close()
+    stream = LineStream()
+    watch.tell_by("lines", stream)
+    with pytest.raises(OSError, match="refused"):
+        connect(stream.port)
+
+
+def test_a_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, told: Told):
+    """Of a rendered pool whose width is known, measured in the process that measures."""
+    with (SAMPLE / "truth.csv").open() as file:
+        width = float(next(csv.DictReader(file))["width_mm"])
+    with open_source(SAMPLE / "recording.avi") as video:
+        image = video.frame(0).image
+    narrow = Limits(width_mm=(None, 0.9 * width), height_mm=(None, 5.0), unmeasured=2)
+    watch = LiveWatch("camera", setup, Settings(), 8, narrow, lambda *each: told.append(each))
+    try:
+        watch.ask_for_scene()
+        watch.measure(frame(0, image))
+        scene = watch.scene()
+        assert scene is not None
+        assert np.ptp(scene.vertices_mm[:, 0]) == pytest.approx(width, rel=0.02)
+        assert [alarm.code for alarm in watch.alarms.shown] == ["width-high"]
+        watch.alarms.set_limits(replace(narrow, width_mm=(0.9 * width, 1.1 * width)))
+        watch.acknowledge()
+        watch.measure(frame(1, image))
+        assert watch.alarms.shown == ()
+        dark = np.random.default_rng(3).integers(0, 4, image.shape).astype(np.uint8)
+        began_s = time.monotonic()
+        for number in count(2):  # the first are left out
+            watch.measure(frame(number, dark))
+            if watch.alarms.shown:
+                break
+            assert time.monotonic() < began_s + PATIENCE_S
+        assert [alarm.code for alarm in watch.alarms.shown] == ["not-measured"]
+        assert told[-1][0].words.startswith("ALARM: 2 frames in a row could not be measured: ")
+    finally:
+        watch.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "nice"), reason="the system knows no niceness")
+def test_what_measures_gives_way_to_nothing(setup: Setup):
+    """Behind other programs its figures would be a minute old; they are looked at now."""
+    with closing(LiveMeasuring(setup, Settings(), 8)) as measuring:
+        assert measuring._pool.submit(os.nice, 0).result() == os.nice(0)
+
+
+def test_a_frame_that_is_left_out_is_none_that_failed(watch: LiveWatch, told: Told):
+    prepared = prepare(watch, {})
+    watch.measure(frame(1))
+    measure = prepared.measure
+    prepared.measure = lambda *_: None  # type: ignore[method-assign, assignment]
+    for number in range(2, 9):
+        watch.measure(frame(number))
+    prepared.measure = measure  # type: ignore[method-assign]
+    watch.measure(frame(9))
+    assert watch.trend(60).number.tolist() == [1, 9]
+    assert watch.pace().failed == 0
+    assert told == []
+
+
+def test_a_frame_is_searched_for_only_when_none_was_followed_for_long(
+    setup: Setup, monkeypatch: pytest.MonkeyPatch
+):
+    now_s, found = [100.0], Measurement("ok", "", "fit", measures=MEASURES)
+    is_lost, searched = [True], []
+
+    class Chain:
+        broke: str | None = None
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def follow(self, _: np.ndarray) -> Measurement | None:
+            self.broke = "it jumped" if is_lost[0] else None
+            return None if is_lost[0] else found
+
+        def measure(self, _: np.ndarray) -> Measurement:
+            searched.append(now_s[0])
+            return found
+
+    monkeypatch.setattr(warm, "WarmChain", Chain)
+    monkeypatch.setattr(live_measuring, "judge_quality", lambda *_: None)
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(live_measuring, "_measure", [])
+    live_measuring._begin(live_measuring._Chain(setup, Settings(), 8))
+    (measure,) = live_measuring._measure
+    image = np.zeros((2, 2), np.uint8)
+    assert measure(image, False) is not None  # the first
+    assert searched == [100.0]
+    now_s[0] += 0.9 * SOUGHT_S
+    assert measure(image, False) is None
+    is_lost[0] = False
+    followed = measure(image, False)
+    assert followed is not None
+    assert followed.followed
+    is_lost[0] = True
+    now_s[0] += 0.9 * SOUGHT_S
+    assert measure(image, False) is None
+    now_s[0] += 0.2 * SOUGHT_S
+    again = measure(image, False)
+    assert again is not None
+    assert not again.followed
+    assert searched == [100.0, now_s[0]]

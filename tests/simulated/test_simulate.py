@@ -1,0 +1,73 @@
+"""A simulation as a session: what it holds, and that it is whole or not there."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from labapp.config.scenario import Scenario, read_scenario, shipped_scenarios
+from labapp.errors import InputError
+from labapp.session.session import Session
+from labapp.simulated.simulate import begin_session, simulate
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
+    """A hollow, two frames of it, and the folder of its simulation."""
+    path = next(path for path in shipped_scenarios() if path.stem == "concave")
+    folder = tmp_path_factory.mktemp("simulated") / "hollow"
+    scenario = read_scenario(path, frames=2)
+    simulate(scenario, folder, workers=1)
+    return scenario, folder
+
+
+def test_a_session_holds_the_set_up_and_what_is_expected(made: tuple[Scenario, Path]) -> None:
+    scenario, folder = made
+    path = folder / "hollow.labsession"
+    begin_session(scenario, folder, path)
+    with Session.open(path) as session:
+        assert session.setup_text == (folder / "setup.toml").read_text("utf-8")
+        assert session.record.title == "A hollow: its reflection is turned round both ways (I/I)"
+        assert session.record.expected_height_mm == pytest.approx(-0.61, abs=0.02)
+        assert session.frames.tolist() == [0, 1]
+        assert session.recording is not None
+        assert session.recording.path == "recording.avi"
+    path.unlink()  # nor its lock, which stays, keeps it from being replaced
+
+
+def test_what_progress_raises_leaves_no_session(made: tuple[Scenario, Path]) -> None:
+    scenario, folder = made
+    before = {file.name for file in folder.iterdir()}
+
+    def stop(done: int, total: int) -> None:
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        begin_session(scenario, folder, folder / "other.labsession", stop)
+    left = {file.name for file in folder.iterdir()} - before
+    assert left <= {".other.labsession.lock"}
+    simulate(scenario, folder, workers=1)  # which still may replace what is there
+
+
+def test_what_is_there_already_stays(made: tuple[Scenario, Path]) -> None:
+    scenario, folder = made
+    path = folder / "mine.labsession"
+    path.write_text("mine", "utf-8")
+    with pytest.raises(InputError, match="file"):
+        begin_session(scenario, folder, path)
+    assert path.read_text("utf-8") == "mine"
+
+
+def test_a_full_disk_is_said_and_leaves_nothing(
+    made: tuple[Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    scenario, _ = made
+    monkeypatch.setattr("labapp.simulation.recording.write_video", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        simulate(scenario, tmp_path / "out", workers=1)
+    assert list(tmp_path.iterdir()) == []
