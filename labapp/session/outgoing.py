@@ -12,14 +12,14 @@ import numpy as np
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.export.folder import ExportChoice, ExportedFile, export
+from labapp.session.contents import SessionContents
 from labapp.session.frames import Progress
 from labapp.session.measured import Result, scheme_name
 from labapp.session.report import report_pdf
-from labapp.session.session import Session
 
 
 def export_session(
-    session: Session,
+    session: SessionContents,
     folder: str | os.PathLike[str],
     choice: ExportChoice,
     frames: Sequence[int] | None,
@@ -52,7 +52,7 @@ def export_session(
 class _Measured:
     """What frames gave, read one after the other as often as it is gone through."""
 
-    def __init__(self, session: Session, scheme: str, numbers: Sequence[int]) -> None:
+    def __init__(self, session: SessionContents, scheme: str, numbers: Sequence[int]) -> None:
         self._session, self._scheme, self._numbers = session, scheme, numbers
 
     def __iter__(self) -> Iterator[tuple[int, float | None, Measurement]]:
@@ -64,7 +64,7 @@ class _Measured:
             yield number, time_s if math.isfinite(time_s) else None, measurement
 
 
-def _standing(session: Session, scheme: str, frames: Sequence[int] | None) -> list[int]:
+def _standing(session: SessionContents, scheme: str, frames: Sequence[int] | None) -> list[int]:
     """Frames whose results go out: those measured, or some of them; all must stand."""
     seen = session.overview(scheme)
     chosen = np.array([status != "" for status in seen.status], bool)
@@ -84,13 +84,13 @@ def _standing(session: Session, scheme: str, frames: Sequence[int] | None) -> li
     return [int(number) for number in seen.frame[chosen]]
 
 
-def _result(session: Session, frame: int, scheme: str) -> Result:
+def _result(session: SessionContents, frame: int, scheme: str) -> Result:
     result = session.result(frame, scheme)
     assert result is not None
     return result
 
 
-def _provenance(session: Session, scheme: str, frames: Sequence[int]) -> dict[str, object]:
+def _provenance(session: SessionContents, scheme: str, frames: Sequence[int]) -> dict[str, object]:
     """What an export tells of source, setup, settings and versions; plain values."""
     recording, first = session.recording, _result(session, frames[0], scheme)
     source = {} if recording is None else asdict(recording)

@@ -10,11 +10,9 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from labapp.config.setup import Setup, parse_setup, updated_setup
+from labapp.config.setup import parse_setup, updated_setup
 from labapp.core.calibration.laser_calibration import LaserCalibration, calibrate_laser
 from labapp.core.calibration.plane_calibration import (
     PlaneCalibration,
@@ -23,19 +21,16 @@ from labapp.core.calibration.plane_calibration import (
 )
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows.correction import Correction
-from labapp.core.values import IntArray
-from labapp.errors import InputError
-from labapp.media import Frame, GreyImage, open_source
+from labapp.media import GreyImage, open_source
 from labapp.run.limits import Limits
 from labapp.run.runner import measure_each
 from labapp.run.sequence import follow_each
-from labapp.session.documents import WHOLE, Change, Documents, KeptSignals, Key
+from labapp.session.contents import SessionContents
+from labapp.session.documents import WHOLE, Change, Key
 from labapp.session.file.blobs import fingerprint
 from labapp.session.file.database import Database
-from labapp.session.frames import Frames, Progress
-from labapp.session.kept_pictures import KeptPictures
-from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
-from labapp.session.overviews import Overviews
+from labapp.session.frames import Progress
+from labapp.session.measured import Basis
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
 from labapp.session.signals import Signals
 
@@ -43,27 +38,8 @@ if TYPE_CHECKING:
     from labapp.export.folder import ExportChoice, ExportedFile
 
 
-class Session:
-    """An open session; make it with `Session.create` or `Session.open`, use it in a ``with``.
-
-    Attributes
-    ----------
-    path
-        The session file.
-    read_only
-        Whether it was opened so.
-    """
-
-    def __init__(self, database: Database) -> None:
-        self.path = database.path
-        self.read_only = database.read_only
-        self._database = database
-        self._frames = Frames(database)
-        self._pictures = KeptPictures(database)
-        self._results = Results(database)
-        self._documents = Documents(database, self._results.bring_back)
-        self._overviews = Overviews(database, self._results)
-        self._signals = KeptSignals(self._documents)
+class Session(SessionContents):
+    """An open session; make it with `Session.create` or `Session.open`, use it in a ``with``."""
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], record: Record | None = None) -> Session:
@@ -92,44 +68,11 @@ class Session:
         """
         return cls(Database.open(path, read_only))
 
-    def close(self) -> None:
-        """Let go of the file. Closing twice does no harm."""
-        self._frames.close()
-        self._database.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     # --- what the operator says; every change can be undone ---------------------------------
-
-    @property
-    def record(self) -> Record:
-        """The experiment record."""
-        found = self._documents.get("record")
-        return Record() if found is None else found
 
     def set_record(self, record: Record) -> None:
         """Replace the experiment record."""
         self._change("experiment record", {("record", WHOLE): record})
-
-    @property
-    def setup_text(self) -> str:
-        """The setup as TOML, as far as it goes."""
-        return self._documents.get("setup") or ""
-
-    @property
-    def setup(self) -> Setup:
-        """Rig and image calibration.
-
-        Raises
-        ------
-        InputError
-            If it is not complete yet; it says what is missing.
-        """
-        return parse_setup(self.setup_text, self.path)
 
     def set_setup(self, text: str, label: str = "setup") -> None:
         """Replace the setup by that of a setup file.
@@ -154,12 +97,6 @@ class Session:
         """
         self._change(label, {("setup", WHOLE): updated_setup(self.setup_text, self.path, values)})
 
-    @property
-    def laser_calibration(self) -> LaserReadings | None:
-        """The laser calibration in use, and what it was found from; None before one."""
-        found: LaserReadings | None = self._documents.get("laser-calibration")
-        return found
-
     def calibrate_laser(
         self,
         l1_mm: Sequence[float],
@@ -183,12 +120,6 @@ class Session:
         setup = updated_setup(self.setup_text, self.path, {"laser": laser})
         values: dict[Key, Any] = {("laser-calibration", WHOLE): readings, ("setup", WHOLE): setup}
         self._change("laser calibration", values)
-        return found
-
-    @property
-    def plane_calibration(self) -> PlanePicture | None:
-        """The imaging-plane calibration in use, and what it was found from; None before one."""
-        found: PlanePicture | None = self._documents.get("plane-calibration")
         return found
 
     def calibrate_plane(self, picture: str | os.PathLike[str], unit_mm: float) -> PlaneCalibration:
@@ -230,30 +161,9 @@ class Session:
         values: dict[Key, Any] = {("plane-calibration", WHOLE): readings, ("setup", WHOLE): setup}
         self._change("imaging-plane calibration", values)
 
-    def picture(self, sha256: str) -> GreyImage:
-        """A calibration picture that the session keeps, grey levels, shape (rows, columns).
-
-        Raises
-        ------
-        InputError
-            If it does not keep it, or it is damaged.
-        """
-        return self._pictures.get(sha256)
-
-    @property
-    def settings(self) -> Settings:
-        """How frames are measured."""
-        found = self._documents.get("settings")
-        return Settings() if found is None else found
-
     def set_settings(self, settings: Settings, label: str = "settings") -> None:
         """Choose how frames are measured: the scheme, and the settings of every step."""
         self._change(label, {("settings", WHOLE): settings})
-
-    def correction(self, frame: int) -> Correction | None:
-        """A frame's dots and rows as they were corrected by hand; None where they were not."""
-        found: Correction | None = self._documents.get("correction", frame)
-        return found
 
     def correct(
         self, corrections: Mapping[int, Correction | None], label: str = "correction"
@@ -269,20 +179,9 @@ class Session:
             self._frames.time_s(frame)
         self._change(label, {("correction", frame): value for frame, value in corrections.items()})
 
-    @property
-    def signals(self) -> Signals | None:
-        """Current and voltage of the weld; None where none were read."""
-        return self._signals.get()
-
     def set_signals(self, signals: Signals | None) -> None:
         """Keep current and voltage (`read_signals`); None lets go of them."""
         self._change("current and voltage", {("signals", WHOLE): signals})
-
-    @property
-    def limits(self) -> Limits:
-        """Between what the pool's sizes are to be while it is filmed."""
-        found = self._documents.get("limits")
-        return Limits() if found is None else found
 
     def set_limits(self, limits: Limits) -> None:
         """Choose the limits of the pool's sizes; beyond one is an alarm (`alarms`)."""
@@ -295,11 +194,6 @@ class Session:
     def redo(self) -> Change | None:
         """Make the last change again that was taken back; None if there is none."""
         return self._documents.redo()
-
-    @property
-    def history(self) -> tuple[Change, ...]:
-        """Changes that can be undone or redone, the oldest first."""
-        return self._documents.history()
 
     # --- what was filmed --------------------------------------------------------------------
 
@@ -321,28 +215,9 @@ class Session:
         """Refuse any recording but the present one; see `Frames.refuse_another`."""
         self._frames.refuse_another()
 
-    @property
-    def recording(self) -> Recording | None:
-        """Where the frames come from; None before a recording was imported."""
-        return self._frames.recording
-
-    @property
-    def missing_recording(self) -> Path | None:
-        """Where the recording should be and is not; None if frames can be read."""
-        return self._frames.missing
-
     def relink(self, path: str | os.PathLike[str]) -> None:
         """Say where the recording is now; see `Frames.relink`."""
         self._frames.relink(path)
-
-    @property
-    def frames(self) -> IntArray:
-        """Numbers of the session's frames, ascending, shape (n,)."""
-        return self._frames.numbers
-
-    def frame(self, number: int) -> Frame:
-        """One frame as it was imported; see `Frames.read`."""
-        return self._frames.read(number)
 
     # --- what was measured ------------------------------------------------------------------
 
@@ -396,37 +271,6 @@ class Session:
             yield number, measurement
         self._frames.refuse_lost(lost)
 
-    def result(self, frame: int, scheme: str | None = None) -> Result | None:
-        """What a frame gave, and what it was measured from; None if it was not measured.
-
-        Parameters
-        ----------
-        frame
-            Its number.
-        scheme
-            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
-        """
-        return self._results.get(
-            frame,
-            scheme or scheme_name(self.settings),
-            self._basis(),
-            self._documents.fingerprint("correction", frame),
-        )
-
-    def overview(self, scheme: str | None = None) -> Overview:
-        """All frames at a glance: status, corrections, what no longer stands, measures."""
-        return self._overviews.get(scheme or scheme_name(self.settings), self._basis())
-
-    def corrected_frames(self) -> IntArray:
-        """Frames with a correction by hand, ascending, shape (n,)."""
-        return np.array(sorted(self._documents.fingerprints("correction")), np.int64)
-
-    def stale_frames(self) -> IntArray:
-        """Frames that are not measured, or whose measures no longer stand, shape (n,)."""
-        seen = self.overview()
-        missing = np.array([status == "" for status in seen.status], bool)
-        return np.asarray(seen.frame[seen.stale | missing], np.int64)
-
     def export(
         self,
         folder: str | os.PathLike[str],
@@ -460,40 +304,12 @@ class Session:
             If a result no longer stands, nothing was measured, or the folder cannot be written.
         """
         from labapp.export.folder import ExportChoice
-        from labapp.session.outgoing import export_session  # which reports on a `Session`
+        from labapp.session.outgoing import export_session
 
         what = choice or ExportChoice()
         return export_session(self, folder, what, frames, scheme, report, progress)
-
-    @property
-    def measured_by(self) -> dict[tuple[str, str], int]:
-        """How many results there are: (scheme, version of labapp) → count."""
-        return self._results.counts()
-
-    def problems(self, progress: Progress | None = None, recording: bool = True) -> list[str]:
-        """Check the whole session: what is wrong, a sentence each.
-
-        Parameters
-        ----------
-        progress
-            Called with frames done and frames in all.
-        recording
-            Whether to read through the recording, or the frames kept in the session, too.
-        """
-        return self._database.problems() or [
-            *self._documents.problems(),
-            *self._pictures.problems(),
-            *(self._frames.problems(progress) if recording else ()),
-            *self._results.problems(),
-        ]
 
     # --- within -----------------------------------------------------------------------------
 
     def _change(self, label: str, values: Mapping[Key, Any]) -> None:
         self._documents.change(label, values)
-
-    def _basis(self) -> Basis | None:
-        try:
-            return Basis(self.setup, self.settings)
-        except InputError:
-            return None

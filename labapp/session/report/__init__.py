@@ -12,6 +12,7 @@ import scipy
 
 from labapp.errors import InputError
 from labapp.media.base import rate_in_words
+from labapp.session.contents import SessionContents
 from labapp.session.report import data, figures
 from labapp.session.report.data import Told, number, with_unit
 from labapp.session.report.layout import Story
@@ -21,7 +22,6 @@ from labapp.session.report.results import (
     tell_example,
     tell_results,
 )
-from labapp.session.session import Session
 from labapp.studies.error_budget import laser_in_use, plane_in_use
 from labapp.version import VERSION
 
@@ -30,7 +30,7 @@ POOL_MM = (7.0, 0.3)
 
 
 def report_pdf(
-    session: Session,
+    session: SessionContents,
     scheme: str | None = None,
     frames: Sequence[int] | None = None,
     now: datetime.datetime | None = None,
@@ -132,7 +132,7 @@ def _experiment(story: Story, told: Told, title: str) -> None:
         story.text("All settings are the defaults.")
 
 
-def _recording(story: Story, session: Session) -> None:
+def _recording(story: Story, session: SessionContents) -> None:
     recording = session.recording
     if recording is None:
         story.text("No recording was imported.")

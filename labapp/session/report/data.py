@@ -18,9 +18,9 @@ from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.summary import runs_text
+from labapp.session.contents import SessionContents
 from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
-from labapp.session.session import Session
 from labapp.studies.error_budget import SIZES, Contribution, together
 
 DOUBTFUL_MARGIN = 5.0
@@ -122,7 +122,7 @@ class Told:
         What is missing or wrong in it.
     """
 
-    session: Session
+    session: SessionContents
     scheme: str
     lines: list[FrameLine]
     setup: Setup | None
@@ -131,7 +131,7 @@ class Told:
     @classmethod
     def of(
         cls,
-        session: Session,
+        session: SessionContents,
         scheme: str | None,
         frames: Sequence[int] | None,
         progress: Callable[[int], None] | None = None,
@@ -149,7 +149,7 @@ class Told:
 
 
 def frame_lines(
-    session: Session,
+    session: SessionContents,
     scheme: str,
     frames: Sequence[int] | None,
     progress: Callable[[int], None] | None = None,
@@ -181,7 +181,7 @@ def frame_lines(
     return lines
 
 
-def _frame_line(session: Session, scheme: str, number: int, time_s: float) -> FrameLine:
+def _frame_line(session: SessionContents, scheme: str, number: int, time_s: float) -> FrameLine:
     try:
         result = session.result(number, scheme)
     except InputError as error:
@@ -396,7 +396,7 @@ def _image_scale(setup: Setup) -> tuple[float, float, float]:
     return float(np.hypot(*x_arm)), float(np.hypot(*z_arm)), float(np.degrees(turn) % 360)
 
 
-def corrections_cells(session: Session, frames: Sequence[int]) -> Cells:
+def corrections_cells(session: SessionContents, frames: Sequence[int]) -> Cells:
     """Frames with a correction: dots, how many by hand, blocked rows."""
     rows = []
     seen = session.overview()

@@ -1,0 +1,213 @@
+"""What a session file holds, read: set-up, calibrations, corrections, frames and results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from labapp.config.setup import Setup, parse_setup
+from labapp.core.pipeline import Settings
+from labapp.core.rows.correction import Correction
+from labapp.core.values import IntArray
+from labapp.errors import InputError
+from labapp.media import Frame, GreyImage
+from labapp.run.limits import Limits
+from labapp.session.documents import Change, Documents, KeptSignals
+from labapp.session.file.database import Database
+from labapp.session.frames import Frames, Progress
+from labapp.session.kept_pictures import KeptPictures
+from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
+from labapp.session.overviews import Overviews
+from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
+from labapp.session.signals import Signals
+
+
+class SessionContents:
+    """What a session holds; `Session` changes it.
+
+    Attributes
+    ----------
+    path
+        The session file.
+    read_only
+        Whether it was opened so.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self.path = database.path
+        self.read_only = database.read_only
+        self._database = database
+        self._frames = Frames(database)
+        self._pictures = KeptPictures(database)
+        self._results = Results(database)
+        self._documents = Documents(database, self._results.bring_back)
+        self._overviews = Overviews(database, self._results)
+        self._signals = KeptSignals(self._documents)
+
+    def close(self) -> None:
+        """Let go of the file. Closing twice does no harm."""
+        self._frames.close()
+        self._database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # --- what the operator says ----------------------------------------------------------------
+
+    @property
+    def record(self) -> Record:
+        """The experiment record."""
+        found = self._documents.get("record")
+        return Record() if found is None else found
+
+    @property
+    def setup_text(self) -> str:
+        """The setup as TOML, as far as it goes."""
+        return self._documents.get("setup") or ""
+
+    @property
+    def setup(self) -> Setup:
+        """Rig and image calibration.
+
+        Raises
+        ------
+        InputError
+            If it is not complete yet; it says what is missing.
+        """
+        return parse_setup(self.setup_text, self.path)
+
+    @property
+    def laser_calibration(self) -> LaserReadings | None:
+        """The laser calibration in use, and what it was found from; None before one."""
+        found: LaserReadings | None = self._documents.get("laser-calibration")
+        return found
+
+    @property
+    def plane_calibration(self) -> PlanePicture | None:
+        """The imaging-plane calibration in use, and what it was found from; None before one."""
+        found: PlanePicture | None = self._documents.get("plane-calibration")
+        return found
+
+    def picture(self, sha256: str) -> GreyImage:
+        """A calibration picture that the session keeps, grey levels, shape (rows, columns).
+
+        Raises
+        ------
+        InputError
+            If it does not keep it, or it is damaged.
+        """
+        return self._pictures.get(sha256)
+
+    @property
+    def settings(self) -> Settings:
+        """How frames are measured."""
+        found = self._documents.get("settings")
+        return Settings() if found is None else found
+
+    def correction(self, frame: int) -> Correction | None:
+        """A frame's dots and rows as they were corrected by hand; None where they were not."""
+        found: Correction | None = self._documents.get("correction", frame)
+        return found
+
+    @property
+    def signals(self) -> Signals | None:
+        """Current and voltage of the weld; None where none were read."""
+        return self._signals.get()
+
+    @property
+    def limits(self) -> Limits:
+        """Between what the pool's sizes are to be while it is filmed."""
+        found = self._documents.get("limits")
+        return Limits() if found is None else found
+
+    @property
+    def history(self) -> tuple[Change, ...]:
+        """Changes that can be undone or redone, the oldest first."""
+        return self._documents.history()
+
+    # --- what was filmed --------------------------------------------------------------------
+
+    @property
+    def recording(self) -> Recording | None:
+        """Where the frames come from; None before a recording was imported."""
+        return self._frames.recording
+
+    @property
+    def missing_recording(self) -> Path | None:
+        """Where the recording should be and is not; None if frames can be read."""
+        return self._frames.missing
+
+    @property
+    def frames(self) -> IntArray:
+        """Numbers of the session's frames, ascending, shape (n,)."""
+        return self._frames.numbers
+
+    def frame(self, number: int) -> Frame:
+        """One frame as it was imported; see `Frames.read`."""
+        return self._frames.read(number)
+
+    # --- what was measured ------------------------------------------------------------------
+
+    def result(self, frame: int, scheme: str | None = None) -> Result | None:
+        """What a frame gave, and what it was measured from; None if it was not measured.
+
+        Parameters
+        ----------
+        frame
+            Its number.
+        scheme
+            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+        """
+        return self._results.get(
+            frame,
+            scheme or scheme_name(self.settings),
+            self._basis(),
+            self._documents.fingerprint("correction", frame),
+        )
+
+    def overview(self, scheme: str | None = None) -> Overview:
+        """All frames at a glance: status, corrections, what no longer stands, measures."""
+        return self._overviews.get(scheme or scheme_name(self.settings), self._basis())
+
+    def corrected_frames(self) -> IntArray:
+        """Frames with a correction by hand, ascending, shape (n,)."""
+        return np.array(sorted(self._documents.fingerprints("correction")), np.int64)
+
+    def stale_frames(self) -> IntArray:
+        """Frames that are not measured, or whose measures no longer stand, shape (n,)."""
+        seen = self.overview()
+        missing = np.array([status == "" for status in seen.status], bool)
+        return np.asarray(seen.frame[seen.stale | missing], np.int64)
+
+    @property
+    def measured_by(self) -> dict[tuple[str, str], int]:
+        """How many results there are: (scheme, version of labapp) → count."""
+        return self._results.counts()
+
+    def problems(self, progress: Progress | None = None, recording: bool = True) -> list[str]:
+        """Check the whole session: what is wrong, a sentence each.
+
+        Parameters
+        ----------
+        progress
+            Called with frames done and frames in all.
+        recording
+            Whether to read through the recording, or the frames kept in the session, too.
+        """
+        return self._database.problems() or [
+            *self._documents.problems(),
+            *self._pictures.problems(),
+            *(self._frames.problems(progress) if recording else ()),
+            *self._results.problems(),
+        ]
+
+    def _basis(self) -> Basis | None:
+        try:
+            return Basis(self.setup, self.settings)
+        except InputError:
+            return None
