@@ -8,8 +8,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from labapp.core.match import ORIENTATIONS, Orientation
@@ -179,9 +177,9 @@ def _rivals(
     ]
 
 
-PAIR, TRIPLE, BESIDE = 2, 3, 1.5
-"""So many missed rays, or dots without a ray, side by side are no row; dots are side by side where
-they are nearer to one another than so many spacings."""
+PAIR, BESIDE = 2, 1.5
+"""So many missed rays, or dots without a ray, side by side are no row; dots are where they are
+nearer to one another than so many spacings."""
 
 STRAYS_APART, MISSED_APART, EACH_STRAY = 0.25, 0.12, 3
 """Shares of the dots with a ray that are put up with where they lie apart: false dots do, and those
@@ -201,13 +199,9 @@ def _strays_lie_apart(scene: Scene, hypothesis: Hypothesis) -> bool:
     """Whether the dots without a ray are scattered."""
     dots = scene.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
     spacing = median(cKDTree(dots).query(dots, k=2)[0][:, 1])
-    pairs = cKDTree(scene.plane_mm[hypothesis.strays]).query_pairs(
-        BESIDE * spacing, output_type="ndarray"
-    )
-    count = hypothesis.stray
-    beside = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
-    group = connected_components(beside, directed=False)[1]
-    return count == 0 or int(np.bincount(group).max()) <= TRIPLE
+    strays = scene.plane_mm[hypothesis.strays]
+    beside = cKDTree(strays).query_ball_point(strays, BESIDE * spacing, return_length=True)
+    return bool((beside <= PAIR).all())
 
 
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
