@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 from urllib.parse import urlparse
 
@@ -178,6 +179,24 @@ def test_the_module_is_the_command():
 @pytest.mark.parametrize("path", MODULES, ids=relative)
 def test_every_module_says_what_it_is(path: Path):
     assert ast.get_docstring(ast.parse(path.read_text("utf-8")))
+
+
+def test_no_module_is_in_a_circle_of_imports():
+    """Imports for the types alone and within functions are counted, too."""
+    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in MODULES}
+    files = {name.removesuffix(".__init__"): path for name, path in files.items()}
+    needs: dict[str, set[str]] = {name: set() for name in files}
+    for name, path in files.items():
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                needs[name] |= {each.name for each in node.names} & set(files)
+            elif isinstance(node, ast.ImportFrom):
+                assert node.module is not None, f"{name}: imports by a relative name"
+                whole = {f"{node.module}.{each.name}" for each in node.names}
+                needs[name] |= {each if each in files else node.module for each in whole}
+                needs[name] &= set(files)
+    assert needs["labapp.gui.app"]
+    TopologicalSorter(needs).prepare()  # names the modules of a circle in its error
 
 
 def test_long_files_have_a_reason():

@@ -97,9 +97,9 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     file
         Where they are kept.
     """
-    from labapp.gui.shell.window import MainWindow
+    from labapp.gui.shell.commands import make_window
 
-    window = MainWindow(preferences, file)
+    window = make_window(preferences, file)
     window.apply_theme()
     app.styleHints().colorSchemeChanged.connect(window.apply_theme)
     faults = Faults(window.say, window)

@@ -13,6 +13,7 @@ from typing import Any
 
 import platformdirs
 from filelock import FileLock, Timeout
+from PySide6.QtCore import QObject, Signal
 
 from labapp.files import as_bytes, write_whole
 from labapp.log import NAME
@@ -76,6 +77,64 @@ class Preferences:
         return platformdirs.user_data_path(NAME, appauthor=False) / "samples"
 
 
+class PreferencesStore(QObject):
+    """The preferences of a window and their file, which other windows change, too.
+
+    Parameters
+    ----------
+    preferences
+        What is remembered from the last start.
+    path
+        The file.
+
+    Attributes
+    ----------
+    current
+        The preferences that hold now.
+
+    Signals
+    -------
+    changed
+        Something was remembered.
+    failed
+        It could not be written: why. It holds in this window all the same.
+    """
+
+    changed = Signal()
+    failed = Signal(str)
+
+    def __init__(self, preferences: Preferences, path: Path) -> None:
+        super().__init__()
+        self.current = preferences
+        self.path = path
+
+    def remember(self, change: Callable[[Preferences], Preferences]) -> None:
+        """Change what is remembered by now, one window at a time, and write it.
+
+        Parameters
+        ----------
+        change
+            Gives the preferences to write for those that are there.
+        """
+        lock = FileLock(self.path.with_name(f".{self.path.name}.lock"), timeout=LOCK_S)
+        with ExitStack() as held:
+            with suppress(OSError, Timeout):  # better written without a turn than not at all
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                held.enter_context(lock)
+            self.recall()
+            self.current = change(self.current)
+            problem = write_preferences(self.path, self.current)
+        if problem:
+            self.failed.emit(problem)
+        self.changed.emit()
+
+    def recall(self) -> None:
+        """Look up what is remembered: other windows may have added to it, or it is gone."""
+        found, problem = read_preferences(self.path)
+        if not problem and self.path.exists():
+            self.current = found
+
+
 def documents_folder() -> Path:
     """The user's documents, or the home folder where there are none."""
     documents = platformdirs.user_documents_path()
@@ -111,40 +170,6 @@ def read_preferences(path: Path) -> tuple[Preferences, str]:
         return _checked(held), ""
     except (TypeError, ValueError):
         return Preferences(), _keep_aside(path, "is damaged")
-
-
-def recall_preferences(path: Path, own: Preferences) -> Preferences:
-    """What is remembered by now: another window may have added to it; ``own`` if it is gone."""
-    found, problem = read_preferences(path)
-    return found if not problem and path.exists() else own
-
-
-def change_preferences(
-    path: Path, own: Preferences, change: Callable[[Preferences], Preferences]
-) -> tuple[Preferences, str]:
-    """Change what is remembered by now, one window at a time, and write it.
-
-    Parameters
-    ----------
-    path
-        The file.
-    own
-        What the window knows, in case nothing is remembered.
-    change
-        Gives the preferences to write for those that are there.
-
-    Returns
-    -------
-    preferences, problem
-        Those that hold now, and why they could not be written; empty if they were.
-    """
-    lock = FileLock(path.with_name(f".{path.name}.lock"), timeout=LOCK_S)
-    with ExitStack() as held:
-        with suppress(OSError, Timeout):  # better written without a turn than not at all
-            path.parent.mkdir(parents=True, exist_ok=True)
-            held.enter_context(lock)
-        preferences = change(recall_preferences(path, own))
-        return preferences, write_preferences(path, preferences)
 
 
 def write_preferences(path: Path, preferences: Preferences) -> str:

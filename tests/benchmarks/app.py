@@ -35,6 +35,7 @@ from stall_meter import StallMeter, run_for, run_until
 
 from labapp.gui.pages import PAGES
 from labapp.gui.preferences import Preferences
+from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.view3d import OffscreenView
 from labapp.session.session import Session
@@ -133,7 +134,7 @@ def fill(session: Session) -> None:
 
 
 def new_window(folder: Path) -> MainWindow:
-    window = MainWindow(Preferences(theme="dark"), folder / "preferences.json")
+    window = make_window(Preferences(theme="dark"), folder / "preferences.json")
     window.apply_theme()
     window.resize(1600, 1000)
     window.show()

@@ -50,7 +50,7 @@ from stall_meter import run_for, run_until
 from labapp.gui.live import live as live_module
 from labapp.gui.live import view as live_view
 from labapp.gui.preferences import Preferences
-from labapp.gui.shell.window import MainWindow
+from labapp.gui.shell.commands import make_window
 from labapp.media.cameras import Faults
 from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Recorder
@@ -229,7 +229,7 @@ class Run:
         self._goes.set()
         self._put_camera_in()
         shutil.copytree(sample_folder("gtaw"), folder / "run")
-        self.window = MainWindow(Preferences(theme="dark"), folder / "preferences.json")
+        self.window = make_window(Preferences(theme="dark"), folder / "preferences.json")
         self.window.apply_theme()
         self.window.resize(1366, 768)
         self.window.show()

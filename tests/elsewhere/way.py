@@ -94,7 +94,7 @@ def show(session: Path, folder: Path) -> tuple[str, ...]:
         window.measure_all()
         until("measured", lambda: not window.workspace.tasks.active)
         for key in TOOLS:  # some begin to calculate for minutes
-            until(key, show_tool(window, key).isVisible)
+            until(key, show_tool(key, window.files, window).isVisible)
         problems = [text for text in window.log_panel.texts() if "▲" in text]
         assert not problems, problems
         window.close()

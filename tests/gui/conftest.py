@@ -21,6 +21,7 @@ from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
 from labapp.gui.preferences import Preferences
+from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.window import MainWindow
 from tests.gui.leaks import Left
 from tests.waiting import PATIENCE_S
@@ -108,7 +109,7 @@ def no_windows(nothing_left: None) -> Iterator[None]:
 @pytest.fixture
 def window(qapp: QApplication, tmp_path: Path, state: Path) -> Iterator[MainWindow]:
     """The window as it is at the first start; closed after the test."""
-    made = MainWindow(Preferences(theme="dark"), tmp_path / "config" / "preferences.json")
+    made = make_window(Preferences(theme="dark"), tmp_path / "config" / "preferences.json")
     KEPT.append(made)
     made.resize(1280, 760)
     made.show()

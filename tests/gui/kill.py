@@ -40,7 +40,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
 
     from labapp.gui.app import start_app
     from labapp.gui.preferences import Preferences
-    from labapp.gui.shell.window import MainWindow
+    from labapp.gui.shell.commands import make_window
 
     def tell(number: int) -> None:
         os.write(pipe, number.to_bytes(TOLD, "little"))
@@ -62,7 +62,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
     Session.measure = measured  # type: ignore[method-assign]
     Session.import_recording = imported  # type: ignore[method-assign]
     app = start_app()
-    window = MainWindow(Preferences(), path.with_name("preferences.json"))
+    window = make_window(Preferences(), path.with_name("preferences.json"))
     window.show()
     window.workspace.open(path)
     session = window.workspace.session

@@ -26,6 +26,7 @@ from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.preferences import Preferences, read_preferences
+from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field, NumberField, TextField
 from tests.gui.conftest import KEPT
@@ -135,7 +136,7 @@ def open_window(folder: Path) -> MainWindow:
     file = folder / "preferences.json"
     preferences, problem = read_preferences(file) if file.exists() else (Preferences(), "")
     assert not problem, problem
-    window = MainWindow(preferences, file)
+    window = make_window(preferences, file)
     KEPT.append(window)
     window.resize(*SIZES[0])
     window.apply_theme()
@@ -473,7 +474,7 @@ class RandomHand:
             QTest.keyClick(run.window, KEY.Key_W, CONTROL)
             run.check()
         if run.random.random() < 0.25:
-            run.window.menus.do("new")
+            run.window.do("new")
             return "new"
         run.window.files.open(path)
         return path.name
@@ -485,7 +486,7 @@ class RandomHand:
         QApplication.processEvents()
         run.check()
         run.window = open_window(run.files.folder)
-        recent = [Path(name) for name in run.window.preferences.recent]
+        recent = [Path(name) for name in run.window.preferences.current.recent]
         if recent and recent[0].exists():
             run.window.files.open(recent[0])
         return "and start again"

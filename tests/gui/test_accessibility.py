@@ -157,7 +157,7 @@ def check_round(window: QWidget) -> list[QWidget]:
 
 @pytest.mark.parametrize("step", [step.key for step in STEPS])
 def test_a_page_by_keyboard(opened: MainWindow, step: str, qtbot: QtBot):
-    opened.menus.do(f"step_{step}")
+    opened.do(f"step_{step}")
     page = opened.page
     assert page is not None
     assert page.key == step
@@ -196,7 +196,7 @@ def test_two_schemes_compared(opened: MainWindow, qtbot: QtBot):
 
 def test_a_small_screen_at_150_percent_holds_every_page(opened: MainWindow, qtbot: QtBot):
     """1366 × 768 px are 911 × 512 of the window's own then."""
-    opened.menus.do("log")
+    opened.do("log")
     for step in STEPS:
         opened.show_step(step.key)
     opened.page.workspace.show_frame(1)  # type: ignore[union-attr]
@@ -218,7 +218,7 @@ def test_a_small_screen_at_150_percent_holds_every_page(opened: MainWindow, qtbo
 
 def test_the_welcome_page_by_keyboard(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):
     window.files.open(copy_sample("thumb_tack"))
-    window.menus.do("close")
+    window.do("close")
     qtbot.waitUntil(lambda: window.isActiveWindow() and not window.workspace.tasks.active)
     reached = check_round(window)
     assert window.welcome.list in reached
@@ -229,7 +229,7 @@ def test_the_welcome_page_by_keyboard(window: MainWindow, copy_sample: CopySampl
 
 def test_f6_goes_through_the_parts_of_the_window(opened: MainWindow, qtbot: QtBot):
     opened.show_step("dots")
-    opened.menus.do("log")
+    opened.do("log")
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
     parts = [opened.step_list, opened.page, opened.side_panel, opened.timeline, opened.log_panel]
 
@@ -253,15 +253,15 @@ def test_f6_comes_back_to_where_the_keys_were(opened: MainWindow):
     opened.show_step("trends")
     button = opened.timeline.play_button
     button.setFocus()
-    opened.menus.do("next_part")
-    opened.menus.do("previous_part")
+    opened.do("next_part")
+    opened.do("previous_part")
     assert QApplication.focusWidget() is button
 
 
 def test_a_step_by_its_key_takes_the_keys_along(opened: MainWindow):
     for step in STEPS:
         opened.side_panel.setFocus()
-        opened.menus.do(f"step_{step.key}")
+        opened.do(f"step_{step.key}")
         focus = QApplication.focusWidget()
         assert focus is opened.page or opened.page.isAncestorOf(focus)
         assert opened.page.accessibleName() == step.title
@@ -302,7 +302,7 @@ def check_letters(texts: list[str]) -> None:
 
 @pytest.mark.parametrize("kind", ["guide", "keys", "about"])
 def test_the_help_by_keyboard(window: MainWindow, kind: str, qtbot: QtBot):
-    window.menus.do(kind)
+    window.do(kind)
     dialog = next(each for each in window.findChildren(HelpDialog))
     qtbot.waitUntil(dialog.isActiveWindow)
     check_round(dialog)
@@ -313,7 +313,7 @@ def test_the_help_by_keyboard(window: MainWindow, kind: str, qtbot: QtBot):
 @pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize("key", TOOLS)
 def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
-    opened.menus.do(key)
+    opened.do(key)
     tool = opened.findChild(ToolWindow, f"tool-{key}")
     assert tool is not None
     qtbot.waitUntil(tool.isActiveWindow)

@@ -6,6 +6,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui.shell.action import MENUS
 from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.commands import commands
 from labapp.gui.shell.help import TEXTS, keys
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
@@ -22,8 +23,26 @@ def test_every_action_is_whole():
         assert action.menu in MENUS
         assert len(action.tip) > 10
         assert not action.tip.endswith(".") or action.menu == "&Steps"
-        assert callable(action.call)
     assert {f"step_{step.key}" for step in STEPS} <= set(names)
+
+
+def test_every_action_has_a_command_and_every_command_an_action(window: MainWindow):
+    assert sorted(commands(window)) == sorted(action.name for action in ACTIONS)
+
+
+def test_what_is_on_is_checked(window: MainWindow):
+    def checked() -> set[str]:
+        return {name for name, made in window.menus.actions.items() if made.isChecked()}
+
+    able = {name for name, made in window.menus.actions.items() if made.isCheckable()}
+    assert able == {action.name for action in ACTIONS if action.checkable}
+    first = {"steps", "panel", "timeline", "theme_dark"}
+    assert checked() == first
+    for name in sorted(able - first - {"play"}):  # there is nothing to play
+        window.do(name)
+        assert name in checked()
+    assert checked() >= first - {"theme_dark"}
+    assert len({name for name in checked() if name.startswith("theme_")}) == 1
 
 
 def test_the_letters_of_a_menu_are_its_own():

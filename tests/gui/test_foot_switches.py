@@ -19,6 +19,7 @@ from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
 from labapp.gui.live import view as live_view
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.preferences import Preferences, read_preferences
+from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.window import MainWindow
 from labapp.media import open_source
 from labapp.media.cameras import SimulatedDevice
@@ -60,7 +61,7 @@ def start(qapp: QApplication, tmp_path: Path, state: Path) -> Iterator[Callable[
         assert not problem
         if maps:
             preferences = Preferences(foot_switches=tuple(each.as_dict() for each in maps))
-        window = MainWindow(preferences, file)
+        window = make_window(preferences, file)
         made.append(window)
         KEPT.append(window)
         window.resize(1280, 760)
@@ -120,7 +121,7 @@ def test_a_pedal_is_learned_by_pressing_it_and_kept(
     hand.button("Use it")
     qtbot.waitUntil(connected(window, PCSENSOR))
     assert [field.value() for field in panel.pedals.values()] == ["next", "trigger"]
-    kept = read_preferences(window._preferences_file)[0].foot_switches
+    kept = read_preferences(window.preferences.path)[0].foot_switches
     maps = [PedalMap.from_dict(each) for each in kept]
     assert maps == [
         PedalMap("05f3:00ff:0", "VEC Infinity foot pedal", False, {1: "next"}),
@@ -168,7 +169,7 @@ def test_what_a_pedal_does_is_changed_and_taken_away(start, bench: Bench, copy_s
         hand.choose(panel.pedals[key, pedal], "nothing any more")
         qtbot.waitUntil(lambda pedal=pedal: (key, pedal) not in panel.pedals)
     assert window.workspace.foot_switches.in_use == {}
-    assert read_preferences(window._preferences_file)[0].foot_switches == ()
+    assert read_preferences(window.preferences.path)[0].foot_switches == ()
     assert panel.words.text().startswith("No foot switch is in use")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
@@ -183,7 +184,7 @@ def test_waiting_for_a_pedal_can_be_given_up(start, bench: Bench, copy_sample, q
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert panel.learned_words.isHidden()
     hand.button("Learn a pedal")
-    window.menus.do("close")  # the session, and with it what is under way
+    window.do("close")  # the session, and with it what is under way
     assert not window.workspace.foot_switches.learns
 
 
@@ -351,7 +352,7 @@ def test_nothing_is_looked_for_where_none_was_learned(start, copy_sample, monkey
 def test_what_was_remembered_and_is_damaged_is_said(start, bench: Bench, qtbot: QtBot):
     window = start(LEARNED)
     window.close()
-    file = window._preferences_file
+    file = window.preferences.path
     held = json.loads(file.read_text())
     assert [each["device"] for each in held["foot_switches"]] == [INFINITY.key]
     held["foot_switches"].insert(0, {"device": "x", "actions": {"0": "explode"}})

@@ -106,7 +106,7 @@ def test_what_a_session_says_is_no_html(window: MainWindow, evil: Path, qtbot: Q
         seen[step.key] = check(window)
     window.say(EVIL, True)
     assert check(window)
-    window.menus.do("close")
+    window.do("close")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     seen["welcome"] = check(window)
     for key in ("setup", "capture", "welcome"):

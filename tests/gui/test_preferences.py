@@ -13,7 +13,7 @@ from labapp.gui.preferences import (
     KEPT_RECENT,
     VERSION,
     Preferences,
-    change_preferences,
+    PreferencesStore,
     read_preferences,
     write_preferences,
 )
@@ -111,7 +111,7 @@ def test_windows_change_what_is_remembered_one_after_the_other(tmp_path: Path):
     def open_three(window: int) -> None:
         for number in range(3):
             path = tmp_path / f"{window}_{number}.labsession"
-            change_preferences(file, known, partial(Preferences.with_recent, path=path))
+            PreferencesStore(known, file).remember(partial(Preferences.with_recent, path=path))
 
     with ThreadPoolExecutor(4) as windows:
         list(windows.map(open_three, range(4)))
@@ -122,6 +122,16 @@ def test_windows_change_what_is_remembered_one_after_the_other(tmp_path: Path):
 
 def test_what_is_gone_is_written_again(tmp_path: Path):
     file = tmp_path / "preferences.json"
-    changed, problem = change_preferences(file, SOME, lambda before: before)
-    assert (changed, problem) == (SOME, "")
-    assert read_preferences(file)[0] == SOME
+    store = PreferencesStore(SOME, file)
+    store.remember(lambda before: before)
+    assert store.current == SOME
+    assert read_preferences(file) == (SOME, "")
+
+
+def test_what_cannot_be_written_holds_and_is_told(tmp_path: Path):
+    (tmp_path / "file").touch()
+    store, told = PreferencesStore(SOME, tmp_path / "file" / "preferences.json"), []
+    store.failed.connect(told.append)
+    store.remember(lambda before: replace(before, theme="dark"))
+    assert store.current == replace(SOME, theme="dark")
+    assert ["could not be saved" in problem for problem in told] == [True]

@@ -22,8 +22,8 @@ from labapp import cli
 from labapp.gui.app import start_app
 from labapp.gui.preferences import Preferences
 app = start_app()
-from labapp.gui.shell.window import MainWindow
-window = MainWindow(Preferences(), Path(sys.argv[1]))
+from labapp.gui.shell.commands import make_window
+window = make_window(Preferences(), Path(sys.argv[1]))
 window.show()
 app.processEvents()
 print(*sys.modules)

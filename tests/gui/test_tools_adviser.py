@@ -35,7 +35,7 @@ SMALL = {
 def adviser(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> AdviserWindow:
     """The adviser's window beside a session, asked for little."""
     assert window.files.open(copy_sample("gtaw"))
-    window.menus.do("adviser")
+    window.do("adviser")
     tool = window.findChild(AdviserWindow)
     assert tool is not None
     qtbot.waitUntil(tool.isVisible)
@@ -141,5 +141,5 @@ def test_the_set_up_page_leads_to_it(window: MainWindow, copy_sample: CopySample
     assert tool is not None
     qtbot.waitUntil(tool.isVisible)
     click(tool.close_button)
-    window.menus.do("adviser")
+    window.do("adviser")
     assert len(window.findChildren(AdviserWindow)) == 1

@@ -34,7 +34,7 @@ def analysis(
     monkeypatch.setattr(setup_budget, "POOLS", 2)
     monkeypatch.setattr(setup_budget, "MOVED_POOLS", 1)
     assert window.files.open(copy_sample("gtaw"))
-    window.menus.do("analysis")
+    window.do("analysis")
     tool = window.findChild(AnalysisWindow)
     assert tool is not None
     qtbot.waitUntil(tool.isVisible)
@@ -174,7 +174,7 @@ def test_what_cannot_be_is_refused(analysis: AnalysisWindow, window: MainWindow,
     click(analysis.start_button)
     assert not analysis.working
     assert "expected 0.01 to 30 mm" in analysis.message.text()
-    window.menus.do("close")
+    window.do("close")
     analysis.sizes["height"].set_value(0.3)
     click(analysis.start_button)
     assert not analysis.working

@@ -23,7 +23,7 @@ from tests.conftest import Run
 @pytest.fixture
 def simulator(window: MainWindow, qtbot: QtBot) -> SimulatorWindow:
     """The simulator's window, its first scenario drawn."""
-    window.menus.do("simulator")
+    window.do("simulator")
     tool = window.findChild(SimulatorWindow)
     assert tool is not None
     qtbot.waitUntil(lambda: tool.preview is not None)

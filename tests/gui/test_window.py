@@ -21,6 +21,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences, read_preferences
 from labapp.gui.recent import look_at
 from labapp.gui.shell import window as window_module
+from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.files import title
 from labapp.gui.shell.step_list import StepList, mark_icon
 from labapp.gui.shell.steps import STEPS, Mark, first_step, states
@@ -80,7 +81,7 @@ def plain(
     """A window with pages of the tests' own."""
     kinds = (SetUp, Capture, Surface, Broken)
     monkeypatch.setattr(window_module, "PAGES", {kind.key: kind for kind in kinds})
-    made = MainWindow(Preferences(theme="light"), tmp_path / "preferences.json")
+    made = make_window(Preferences(theme="light"), tmp_path / "preferences.json")
     KEPT.append(made)
     made.show()
     yield made
@@ -121,9 +122,9 @@ def test_opening_shows_the_results_and_closing_the_welcome_page(
     assert plain.side_panel.title.text() == "Surface"
     assert "All 30 frames are measured" in plain.side_panel.state.text()
     assert plain.timeline.told.text().startswith("1 of 30")
-    assert plain.preferences.recent == (str(path),)
+    assert plain.preferences.current.recent == (str(path),)
     assert all(plain._docks[name].isVisible() for name in ("steps", "panel", "timeline"))
-    plain.menus.do("close")
+    plain.do("close")
     assert page.left == 1
     assert plain.workspace.session is None
     assert plain.stack.currentWidget() is plain.welcome
@@ -196,12 +197,12 @@ def test_keys_go_through_the_frames_and_the_steps(
         ("previous_corrected", 2),
         ("previous_corrected", 2),
     ]:
-        plain.menus.do(name)
+        plain.do(name)
         assert plain.workspace.frame == frame
     assert "No frame before this one is corrected by hand" in plain.status_line.message.text()
-    plain.menus.do("previous_step")
+    plain.do("previous_step")
     assert plain_page(plain).key == "capture"
-    plain.menus.do("step_setup")
+    plain.do("step_setup")
     assert plain.step_list.currentRow() == 0
     plain.step_list.setCurrentRow(2)
     assert plain_page(plain).key == "surface"
@@ -390,7 +391,7 @@ def test_a_copy_stands_elsewhere_and_finds_its_recording(
     there = tmp_path / "elsewhere" / "copy.labsession"
     there.parent.mkdir()
     monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: there)
-    plain.menus.do("copy")
+    plain.do("copy")
     settle(plain, qtbot)
     assert f"A copy is in {there}" in plain.status_line.message.text()
     with Session.open(there) as copy:
@@ -399,7 +400,7 @@ def test_a_copy_stands_elsewhere_and_finds_its_recording(
         assert copy.frame(3).image.shape == (640, 480)
         assert copy.problems() == []
     assert sorted(p.name for p in there.parent.iterdir() if "lock" not in p.name) == [there.name]
-    plain.menus.do("copy")
+    plain.do("copy")
     settle(plain, qtbot)
     assert "is there already" in problems(plain)[0]
 
@@ -442,8 +443,8 @@ def test_what_another_window_opens_is_recent_here_too(
     for path in (own, others):
         Session.create(path).close()
     window.files.open(own)
-    window.menus.do("close")
-    other = MainWindow(read_preferences(file)[0], file)
+    window.do("close")
+    other = make_window(read_preferences(file)[0], file)
     KEPT.append(other)
     other.show()
     other.activateWindow()
@@ -453,7 +454,7 @@ def test_what_another_window_opens_is_recent_here_too(
     qtbot.waitUntil(lambda: window.welcome.list.count() == 2)
     settle(window, qtbot)
     assert [action.toolTip() for action in window.menus.recent.actions()] == [str(others), str(own)]
-    window.menus.do("theme_light")
+    window.do("theme_light")
     other.close()
     window.close()
     found = read_preferences(file)[0]
@@ -466,28 +467,28 @@ def test_the_layout_and_the_theme_are_remembered(
     path = copy_sample("thumb_tack")
     plain.files.open(path)
     plain.resize(798, 555)
-    plain.menus.do("steps")
-    plain.menus.do("log")
-    plain.menus.do("theme_dark")
+    plain.do("steps")
+    plain.do("log")
+    plain.do("theme_dark")
     plain.close()
     found, problem = read_preferences(tmp_path / "preferences.json")
     assert problem == ""
     assert (found.theme, found.recent) == ("dark", (str(path),))
-    again = MainWindow(found, tmp_path / "preferences.json")
+    again = make_window(found, tmp_path / "preferences.json")
     KEPT.append(again)
     again.show()
     assert again.size().height() == 555
     again.files.open(path)
     assert not again._docks["steps"].isVisible()
     assert not again._docks["log"].isVisible()  # what was said then is not said now
-    again.menus.do("reset_layout")
+    again.do("reset_layout")
     assert again._docks["steps"].isVisible()
     again.close()
 
 
 def test_nonsense_for_a_layout_does_no_harm(qapp: QApplication, tmp_path: Path):
     odd = Preferences(("/gone/x.labsession",), "dark", "ä no base64", "AAAAB3NzaC1yc2E=", "/gone")
-    window = MainWindow(odd, tmp_path / "preferences.json")
+    window = make_window(odd, tmp_path / "preferences.json")
     KEPT.append(window)
     window.show()
     assert window.isVisible()
@@ -504,11 +505,11 @@ def test_closing_stops_the_measuring_and_keeps_what_is_finished(
         session.import_recording(tmp_path / "dark.npy")
     plain.files.open(path)
     settle(plain, qtbot)
-    plain.menus.do("measure")
+    plain.do("measure")
     task = plain.workspace.tasks.active[0]
     qtbot.waitUntil(lambda: task.done >= 5)
     assert plain.status_line.bar.isVisible()
-    plain.menus.do("measure_frame")
+    plain.do("measure_frame")
     assert "being measured already" in plain.status_line.message.text()
     plain.close()
     assert not task.thread.is_alive()
@@ -522,7 +523,7 @@ def test_a_set_up_that_is_not_complete_is_said_before_measuring(
 ):
     plain.files.open(copy_sample("thumb_tack"))
     plain.workspace.attempt(lambda s: s.update_setup({"laser": {"distance_mm": None}}))
-    plain.menus.do("measure_frame")
+    plain.do("measure_frame")
     assert "laser.distance_mm" in problems(plain)[0]
     assert plain.workspace.tasks.active == []
 
@@ -538,7 +539,7 @@ def test_copying_a_picture_and_a_table(plain: MainWindow, copy_sample: CopySampl
     from PySide6.QtWidgets import QTableWidget, QTableWidgetItem
 
     plain.files.open(copy_sample("thumb_tack"))
-    plain.menus.do("copy_table")
+    plain.do("copy_table")
     assert plain.status_line.message.text() == "This step has no table"
     table = QTableWidget(2, 2)
     table.setHorizontalHeaderLabels(["Quantity", "mm"])
@@ -547,10 +548,10 @@ def test_copying_a_picture_and_a_table(plain: MainWindow, copy_sample: CopySampl
             table.setItem(row, column, QTableWidgetItem(text))
     plain_page(plain).panel_layout.addWidget(table)
     table.show()
-    plain.menus.do("copy_table")
+    plain.do("copy_table")
     assert QApplication.clipboard().text() == "Quantity\tmm\nWidth\t6.66\nHeight\t0.294"
     assert table_text(table) == QApplication.clipboard().text()
-    plain.menus.do("copy_picture")
+    plain.do("copy_picture")
     assert QApplication.clipboard().pixmap().width() == plain_page(plain).width()
 
 
@@ -689,7 +690,7 @@ def test_a_number_that_is_being_typed_is_kept_when_the_session_is_closed(
         qtbot.keyClick(field.editor, Qt.Key.Key_A, Qt.KeyboardModifier.ControlModifier)
         qtbot.keyClicks(field.editor, number)
         if way == "close":
-            window.menus.do("close")
+            window.do("close")
         elif way == "another session":
             assert window.files.open(other)
         else:

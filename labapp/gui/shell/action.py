@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
-
-if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
+from typing import Literal
 
 Needs = Literal["", "session", "frames", "measuring", "undo", "redo", "work", "live"]
 """What must be there for an action to be of use; it is greyed out without."""
@@ -15,7 +11,7 @@ Needs = Literal["", "session", "frames", "measuring", "undo", "redo", "work", "l
 
 @dataclass(frozen=True)
 class Action:
-    """One thing the operator can do from anywhere in the window.
+    """One thing the operator can do from anywhere in the window; `commands` does it.
 
     Parameters
     ----------
@@ -29,12 +25,10 @@ class Action:
         Its key. One without Ctrl, Alt or F is first the key of what has the focus.
     tip
         What it does, a sentence.
-    call
-        Does it.
     needs
         What must be there.
-    checked
-        Whether it is on, for what can be on or off.
+    checkable
+        Whether it can be on or off.
     group
         Of actions of which one is on.
     begins
@@ -46,9 +40,8 @@ class Action:
     text: str
     key: str
     tip: str
-    call: Callable[[MainWindow], object]
     needs: Needs = ""
-    checked: Callable[[MainWindow], bool] | None = None
+    checkable: bool = False
     group: str = ""
     begins: bool = False
 

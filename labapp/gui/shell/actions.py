@@ -1,18 +1,9 @@
-"""Every action of the window as data: its menu, words, key, tip and what it calls."""
+"""Every action of the window as data: its menu, words, key, tip and what it needs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
-from labapp.gui.shell import filming
 from labapp.gui.shell.action import Action
-from labapp.gui.shell.focus import go_to_part
 from labapp.gui.shell.steps import STEPS
-from labapp.gui.tools import show_tool
-
-if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
 
 FILE = (
     Action(
@@ -21,7 +12,6 @@ FILE = (
         "&New session …",
         "Ctrl+N",
         "Make a file for a new experiment",
-        lambda window: window.files.new(),
     ),
     Action(
         "open",
@@ -29,7 +19,6 @@ FILE = (
         "&Open …",
         "Ctrl+O",
         "Open a session",
-        lambda window: window.files.choose(),
     ),
     Action(
         "sample",
@@ -37,7 +26,6 @@ FILE = (
         "Try the &sample",
         "",
         "Open a copy of a recorded run that is measured already",
-        lambda window: window.files.try_sample(),
     ),
     Action(
         "copy",
@@ -45,7 +33,6 @@ FILE = (
         "Save a &copy …",
         "Ctrl+Shift+S",
         "Save the session as it is now under another name; you go on in this one",
-        lambda window: window.files.save_copy(),
         needs="session",
         begins=True,
     ),
@@ -55,7 +42,6 @@ FILE = (
         "&Import a recording …",
         "Ctrl+I",
         "Take frames from a video, an image or a stack into the session",
-        lambda window: window.files.choose_recording(),
     ),
     Action(
         "export",
@@ -63,7 +49,6 @@ FILE = (
         "&Export …",
         "Ctrl+E",
         "Go to the step that writes tables, surfaces, pictures and the report",
-        lambda window: window.show_step("export"),
         needs="session",
     ),
     Action(
@@ -72,7 +57,6 @@ FILE = (
         "C&lose the session",
         "Ctrl+W",
         "Close the session and go back to the welcome page; everything is saved",
-        lambda window: window.files.close(),
         needs="session",
         begins=True,
     ),
@@ -82,7 +66,6 @@ FILE = (
         "&Quit",
         "Ctrl+Q",
         "Stop all work and end the program; everything is saved",
-        lambda window: window.files.quit(),
     ),
 )
 
@@ -93,7 +76,6 @@ EDIT = (
         "&Undo",
         "Ctrl+Z",
         "Take back the last change of set-up, calibration, settings, dots or rows",
-        lambda window: window.workspace.undo(),
         needs="undo",
     ),
     Action(
@@ -102,7 +84,6 @@ EDIT = (
         "&Redo",
         "Ctrl+Shift+Z",
         "Make the change again that was taken back last",
-        lambda window: window.workspace.redo(),
         needs="redo",
     ),
     Action(
@@ -111,7 +92,6 @@ EDIT = (
         "Copy &picture",
         "Ctrl+Shift+C",
         "Copy the picture of this step to the clipboard",
-        lambda window: window.copy_picture(),
         needs="session",
         begins=True,
     ),
@@ -121,7 +101,6 @@ EDIT = (
         "Copy &table",
         "Ctrl+Shift+T",
         "Copy the table of this step to the clipboard, for a spreadsheet",
-        lambda window: window.copy_table(),
         needs="session",
     ),
 )
@@ -133,7 +112,6 @@ FRAMES = (
         "&Measure what is not measured",
         "F5",
         "Measure every frame that is not measured, or whose measures no longer stand",
-        lambda window: window.measure_all(),
         needs="measuring",
     ),
     Action(
@@ -142,7 +120,6 @@ FRAMES = (
         "Measure this &frame",
         "Shift+F5",
         "Measure the frame in view",
-        lambda window: window.measure_frame(),
         needs="measuring",
     ),
     Action(
@@ -151,7 +128,6 @@ FRAMES = (
         "&Cancel the work",
         "Ctrl+.",
         "Stop the work under way; what is finished is kept",
-        lambda window: window.status_line.cancel(),
         needs="work",
     ),
     Action(
@@ -160,7 +136,6 @@ FRAMES = (
         "Frame &before",
         "Left",
         "Go to the frame before this one",
-        lambda window: window.timeline.step(-1),
         needs="frames",
         begins=True,
     ),
@@ -170,7 +145,6 @@ FRAMES = (
         "&Next frame",
         "Right",
         "Go to the frame after this one",
-        lambda window: window.timeline.step(1),
         needs="frames",
     ),
     Action(
@@ -179,7 +153,6 @@ FRAMES = (
         "F&irst frame",
         "Home",
         "Go to the first frame",
-        lambda window: window.timeline.step(-(10**9)),
         needs="frames",
     ),
     Action(
@@ -188,7 +161,6 @@ FRAMES = (
         "&Last frame",
         "End",
         "Go to the last frame",
-        lambda window: window.timeline.step(10**9),
         needs="frames",
     ),
     Action(
@@ -197,9 +169,8 @@ FRAMES = (
         "&Play",
         "Space",
         "Show one frame after another, or stop at this one",
-        lambda window: window.timeline.set_playing(not window.timeline.playing),
         needs="frames",
-        checked=lambda window: window.timeline.playing,
+        checkable=True,
     ),
     Action(
         "record",
@@ -207,7 +178,6 @@ FRAMES = (
         "&Record, or end the recording",
         "Ctrl+R",
         "Record what the live camera sees, or end that; Space does it, too, while a camera is live",
-        filming.trigger,
         needs="live",
         begins=True,
     ),
@@ -217,7 +187,6 @@ FRAMES = (
         "Mar&k this moment",
         "Ctrl+K",
         "Note this moment beside the recording that runs; M does it, too, while a camera is live",
-        filming.mark,
         needs="live",
     ),
     Action(
@@ -226,7 +195,6 @@ FRAMES = (
         "Next frame in &doubt",
         "F8",
         "Go to the next frame that could not be measured, stands out, or was changed since",
-        lambda window: window.jump("doubtful", True),
         needs="frames",
         begins=True,
     ),
@@ -236,7 +204,6 @@ FRAMES = (
         "Previous frame in d&oubt",
         "Shift+F8",
         "Go to the last frame before this one that stands out, or could not be measured",
-        lambda window: window.jump("doubtful", False),
         needs="frames",
     ),
     Action(
@@ -245,7 +212,6 @@ FRAMES = (
         "Next corr&ected frame",
         "F7",
         "Go to the next frame that was corrected by hand",
-        lambda window: window.jump("corrected", True),
         needs="frames",
     ),
     Action(
@@ -254,14 +220,9 @@ FRAMES = (
         "Pre&vious corrected frame",
         "Shift+F7",
         "Go to the last frame before this one that was corrected by hand",
-        lambda window: window.jump("corrected", False),
         needs="frames",
     ),
 )
-
-
-def _go(key: str) -> Callable[[MainWindow], object]:
-    return lambda window: window.show_step(key)
 
 
 STEP_ACTIONS = (
@@ -272,8 +233,7 @@ STEP_ACTIONS = (
             step.title,
             f"Ctrl+{number}",
             step.hint,
-            _go(step.key),
-            "session",
+            needs="session",
         )
         for number, step in enumerate(STEPS, 1)
     ),
@@ -283,7 +243,6 @@ STEP_ACTIONS = (
         "&Next step",
         "Ctrl+PgDown",
         "Go on to the next step",
-        lambda window: window.go_step(1),
         needs="session",
         begins=True,
     ),
@@ -293,7 +252,6 @@ STEP_ACTIONS = (
         "&Previous step",
         "Ctrl+PgUp",
         "Go back to the step before",
-        lambda window: window.go_step(-1),
         needs="session",
     ),
 )
@@ -305,9 +263,8 @@ VIEW = (
         "&Steps",
         "Ctrl+Shift+1",
         "Show or hide the steps at the left",
-        lambda window: window.toggle_dock("steps"),
         needs="session",
-        checked=lambda window: window.dock_is_wanted("steps"),
+        checkable=True,
     ),
     Action(
         "panel",
@@ -315,9 +272,8 @@ VIEW = (
         "P&arameters and results",
         "Ctrl+Shift+2",
         "Show or hide the panel at the right",
-        lambda window: window.toggle_dock("panel"),
         needs="session",
-        checked=lambda window: window.dock_is_wanted("panel"),
+        checkable=True,
     ),
     Action(
         "timeline",
@@ -325,9 +281,8 @@ VIEW = (
         "&Timeline",
         "Ctrl+Shift+3",
         "Show or hide the frames at the bottom",
-        lambda window: window.toggle_dock("timeline"),
         needs="session",
-        checked=lambda window: window.dock_is_wanted("timeline"),
+        checkable=True,
     ),
     Action(
         "log",
@@ -335,8 +290,7 @@ VIEW = (
         "&Messages",
         "F4",
         "Show or hide what the app has said since it was started",
-        lambda window: window.toggle_dock("log"),
-        checked=lambda window: window.dock_is_wanted("log"),
+        checkable=True,
     ),
     Action(
         "next_part",
@@ -344,7 +298,6 @@ VIEW = (
         "&Next part of the window",
         "F6",
         "Give the keys to the next of steps, page, parameters and timeline",
-        lambda window: go_to_part(window, 1),
         begins=True,
     ),
     Action(
@@ -353,7 +306,6 @@ VIEW = (
         "Part of the window &before",
         "Shift+F6",
         "Give the keys to the part of the window before this one",
-        lambda window: go_to_part(window, -1),
     ),
     Action(
         "theme_system",
@@ -361,8 +313,7 @@ VIEW = (
         "As the &desktop",
         "",
         "Light or dark, as the desktop is",
-        lambda window: window.set_theme("system"),
-        checked=lambda window: window.preferences.theme == "system",
+        checkable=True,
         group="theme",
         begins=True,
     ),
@@ -372,8 +323,7 @@ VIEW = (
         "&Light",
         "",
         "Dark words on a light ground",
-        lambda window: window.set_theme("light"),
-        checked=lambda window: window.preferences.theme == "light",
+        checkable=True,
         group="theme",
     ),
     Action(
@@ -382,8 +332,7 @@ VIEW = (
         "Dar&k",
         "",
         "Light words on a dark ground, for a dark lab",
-        lambda window: window.set_theme("dark"),
-        checked=lambda window: window.preferences.theme == "dark",
+        checkable=True,
         group="theme",
     ),
     Action(
@@ -392,8 +341,7 @@ VIEW = (
         "&Full screen",
         "F11",
         "Use all of the screen, or go back to a window",
-        lambda window: window.toggle_full_screen(),
-        checked=lambda window: window.isFullScreen(),
+        checkable=True,
         begins=True,
     ),
     Action(
@@ -402,17 +350,12 @@ VIEW = (
         "&Reset the layout",
         "",
         "Put the panels back where they were at the first start",
-        lambda window: window.reset_layout(),
     ),
 )
 
 
-def _show(key: str) -> Callable[[MainWindow], object]:
-    return lambda window: show_tool(window, key)
-
-
 TOOLS = tuple(
-    Action(name, "&Tools", text, key, tip, _show(name))
+    Action(name, "&Tools", text, key, tip)
     for name, text, key, tip in (
         (
             "simulator",
@@ -442,7 +385,6 @@ HELP = (
         "&Guide",
         "F1",
         "What to do, step by step",
-        lambda window: window.show_help("guide"),
     ),
     Action(
         "keys",
@@ -450,7 +392,6 @@ HELP = (
         "&Keys",
         "Shift+F1",
         "Every action that has a key",
-        lambda window: window.show_help("keys"),
     ),
     Action(
         "log_folder",
@@ -458,7 +399,6 @@ HELP = (
         "Show the &log folder",
         "",
         "Open the folder with the log, which tells what went wrong in full",
-        lambda window: window.show_log_folder(),
     ),
     Action(
         "about",
@@ -466,7 +406,6 @@ HELP = (
         "&About labapp",
         "",
         "Version, licence and what it is built on",
-        lambda window: window.show_help("about"),
         begins=True,
     ),
 )

@@ -2,45 +2,78 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from PySide6.QtCore import QObject, Signal
+
 from labapp.gui import dialogs
-from labapp.gui.shell import filming
+from labapp.gui.shell.filming import live_page
 from labapp.gui.workspace import MISSING
 from labapp.session.file.database import SUFFIX, SessionInUse
 
 if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
+    from PySide6.QtWidgets import QWidget
+
+    from labapp.gui.pages.page import Page
+    from labapp.gui.preferences import PreferencesStore
+    from labapp.gui.workspace import Workspace
     from labapp.session.session import Session
 
 
-class Files:
+class Files(QObject):
     """What the window opens and makes.
 
     Parameters
     ----------
     window
-        Where to show it.
+        Whose questions they are.
+    workspace
+        Where sessions are shown.
+    preferences
+        Where a question for a file begins, and what was opened last.
+    pages
+        Those made by now, by their keys: one of them may be recording.
+
+    Signals
+    -------
+    said
+        Something for the operator to read: a sentence, and whether it is a problem.
+    recording_wanted
+        The step Recording is to be shown, and to take this file or folder, unless it is None.
     """
 
-    def __init__(self, window: MainWindow) -> None:
+    said = Signal(str, bool)
+    recording_wanted = Signal(object)
+
+    def __init__(
+        self,
+        window: QWidget,
+        workspace: Workspace,
+        preferences: PreferencesStore,
+        pages: Mapping[str, Page],
+    ) -> None:
+        super().__init__(window)
         self._window = window
+        self.workspace = workspace
+        self.preferences = preferences
+        self._pages = pages
 
     def new(self) -> bool:
         """Ask for a file and make a session in it."""
-        return self._create(dialogs.new_path(self._window.preferences.folder, "experiment"))
+        return self._create(dialogs.new_path(self.preferences.current.folder, "experiment"))
 
     def choose(self) -> None:
         """Ask for a session and open it."""
-        path = dialogs.ask_session(self._window, self._window.preferences.folder)
+        path = dialogs.ask_session(self._window, self.preferences.current.folder)
         if path is not None:
             self.open(path)
 
     def choose_recording(self) -> None:
         """Ask for a recording and import it."""
-        path = dialogs.ask_recording(self._window, self._window.preferences.folder)
+        path = dialogs.ask_recording(self._window, self.preferences.current.folder)
         if path is not None:
             self.take(path)
 
@@ -53,12 +86,12 @@ class Files:
 
     def open(self, path: Path) -> bool:
         """Open a session file, read-only if it is in use elsewhere and the operator agrees."""
-        present = self._window.workspace.session
+        present = self.workspace.session
         if present is not None and path.absolute() == present.path:
             return True
-        if not filming.may_close(self._window):
+        if not self.may_close():
             return False
-        session = self._window.workspace.tried(lambda: self._opened(path))
+        session = self.workspace.tried(lambda: self._opened(path))
         if session is None:
             return False
         self._show(session)
@@ -67,19 +100,17 @@ class Files:
     def take(self, path: Path) -> None:
         """Take a recording to the capture page, in a new session where none is open."""
         if not path.exists():
-            self._window.say(f"{path} is not there", True)
-        elif self._window.workspace.session is not None or self._create(
+            self.said.emit(f"{path} is not there", True)
+        elif self.workspace.session is not None or self._create(
             dialogs.new_path(path.parent, path.stem)
         ):
             folder = str(path.parent)
-            self._window.remember(lambda before: replace(before, last_folder=folder))
-            self._window.show_step("capture")
-            if self._window.page is not None:
-                self._window.page.take(path)
+            self.preferences.remember(lambda before: replace(before, last_folder=folder))
+            self.recording_wanted.emit(path)
 
     def save_copy(self) -> None:
         """Ask for a file and save the session in it as it is now."""
-        session = self._window.workspace.session
+        session = self.workspace.session
         if session is None:
             return
         proposed = dialogs.new_path(session.path.parent, f"{session.path.stem} copy")
@@ -88,15 +119,15 @@ class Files:
             from labapp.session.copies import copy_session
 
             source = session.path
-            self._window.workspace.tasks.start(
+            self.workspace.tasks.start(
                 "Saving a copy",
                 lambda _: copy_session(source, path),
-                lambda copied: self._window.say(f"A copy is in {copied}"),
+                lambda copied: self.said.emit(f"A copy is in {copied}", False),
             )
 
     def begin_next(self, recording: Path) -> None:
         """Ask for a file and make a session like this one in it, for a recording; show it."""
-        present = self._window.workspace.session
+        present = self.workspace.session
         if present is None:
             return
         from labapp.session.copies import next_session
@@ -104,46 +135,46 @@ class Files:
         title = "New session from this recording"
         proposed = dialogs.new_path(present.path.parent, recording.stem)
         path = dialogs.ask_new_session(self._window, proposed, title)
-        if path is None or not filming.may_close(self._window):
+        if path is None or not self.may_close():
             return
-        session = self._window.workspace.tried(lambda: next_session(present, path))
+        session = self.workspace.tried(lambda: next_session(present, path))
         if session is not None:
             self._show(session)
-            self._window.show_step("capture")
+            self.recording_wanted.emit(None)
 
     def try_sample(self) -> None:
         """Open a copy of the sample run, in a folder of the user's."""
         from labapp.session.copies import copy_sample
 
-        folder = self._window.preferences.samples_folder / "gtaw"
-        path = self._window.workspace.tried(lambda: copy_sample("gtaw", folder))
+        folder = self.preferences.current.samples_folder / "gtaw"
+        path = self.workspace.tried(lambda: copy_sample("gtaw", folder))
         if path is not None and self.open(path):
-            self._window.say(
-                f"This is a copy of the sample, in {path.parent}: change what you like"
-            )
+            words = f"This is a copy of the sample, in {path.parent}: change what you like"
+            self.said.emit(words, False)
 
     def close(self) -> None:
         """Close the session and go back to the welcome page."""
-        if filming.may_close(self._window):
-            self._window.workspace.show(None)
+        if self.may_close():
+            self.workspace.show(None)
 
-    def quit(self) -> None:
-        """Close the window."""
-        if filming.may_close(self._window):
-            self._window.close()
-
-    def forget(self, path: Path) -> None:
-        """Take a session off the list of recent ones; the file stays."""
-        self._window.remember(lambda before: before.without_recent(path))
-        self.list_recent()
+    def may_close(self) -> bool:
+        """Ask what becomes of a recording that runs; False if it is to go on, nothing closed."""
+        page = live_page(self._pages.values())
+        take = None if page is None else page.recording
+        if page is None or take is None:
+            return True
+        answer = dialogs.ask_recording_end(self._window, take.path.name)
+        if answer == "discard":
+            page.discard(take)
+        return answer != "go on"
 
     def _create(self, proposed: Path) -> bool:
         from labapp.session.session import Session
 
         path = dialogs.ask_new_session(self._window, proposed)
-        if path is None or not filming.may_close(self._window):
+        if path is None or not self.may_close():
             return False
-        session = self._window.workspace.tried(lambda: Session.create(path))
+        session = self.workspace.tried(lambda: Session.create(path))
         if session is None:
             return False
         self._show(session)
@@ -160,21 +191,12 @@ class Files:
             return Session.open(path, read_only=True)
 
     def _show(self, session: Session) -> None:
-        self._window.remember(lambda before: before.with_recent(session.path))
-        self._window.workspace.show(session)
-        missing = self._window.workspace.tried(lambda: session.missing_recording)
+        self.preferences.remember(lambda before: before.with_recent(session.path))
+        self.workspace.show(session)
+        missing = self.workspace.tried(lambda: session.missing_recording)
         if missing is not None:
             words = f"The recording is not where it was: {missing}"
-            self._window.workspace.say_wrong(MISSING, words)
-
-    def list_recent(self) -> None:
-        """List the sessions opened before, in the menu and on the welcome page."""
-        self._window.recall()
-        self._window.menus.show_recent(self._window.preferences.recent)
-        if self._window.workspace.session is None:
-            self._window.welcome.show_recent(
-                [Path(name) for name in self._window.preferences.recent]
-            )
+            self.workspace.say_wrong(MISSING, words)
 
 
 def title(session: Session | None) -> str:

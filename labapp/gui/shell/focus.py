@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication, QWidget
 
-if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
 
-
-def go_to_part(window: MainWindow, by: int) -> None:
-    """Give the keys to the next part of the window that takes any, or the one before (-1)."""
-    line = window.status_line
-    parts = [window.step_list, window.stack, window.side_panel, window.timeline]
-    parts = [part for part in (*parts, window.log_panel, line) if part.isVisibleTo(window)]
+def go_to_part(parts: Sequence[QWidget], by: int) -> None:
+    """Give the keys to the next part of a window that takes any, or the one before (-1)."""
+    parts = [part for part in parts if part.isVisibleTo(part.window())]
     focus = QApplication.focusWidget()
     here = [k for k, part in enumerate(parts) if focus is not None and _holds(part, focus)]
     start = here[0] if here else (-1 if by > 0 else 0)

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QKeyCombination, Qt
 from PySide6.QtGui import QAction, QActionGroup, QKeyEvent, QKeySequence
-from PySide6.QtWidgets import QMenu
+from PySide6.QtWidgets import QMainWindow, QMenu
 
-from labapp.gui.shell.action import MENUS, Action
-from labapp.gui.shell.actions import ACTIONS
-from labapp.gui.shell.filming import live_page
-from labapp.gui.shell.steps import read_only
+from labapp.gui.shell.action import MENUS, Action, Needs
 from labapp.gui.widgets.labels import plain_tip
 
 if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
     from labapp.session.session import Session
 
 
 class Menus:
     """The window's menus, and which of their actions are of use now.
+
+    Parameters
+    ----------
+    window
+        Where they stand.
+    actions
+        Those in them.
+    do
+        Does an action, by its name.
+    open_session
+        Opens one of the recent sessions.
 
     Attributes
     ----------
@@ -29,22 +37,28 @@ class Menus:
         The Qt actions by their names.
     """
 
-    def __init__(self, window: MainWindow, shown: frozenset[str]) -> None:
+    def __init__(
+        self,
+        window: QMainWindow,
+        actions: Sequence[Action],
+        do: Callable[[str], object],
+        open_session: Callable[[Path], object],
+    ) -> None:
         self._window = window
+        self._needs = {action.name: action.needs for action in actions}
+        self._do = do
+        self._open_session = open_session
         self.actions: dict[str, QAction] = {}
         self._plain: dict[QKeyCombination, str] = {}
         self._menus = {title: window.menuBar().addMenu(title) for title in MENUS}
         groups: dict[str, QActionGroup] = {}
-        for action in ACTIONS:
-            if action.name in shown:
-                made = self._made(action)
-                if action.group:
-                    group = groups.setdefault(action.group, QActionGroup(window))
-                    group.addAction(made)
+        for action in actions:
+            made = self._made(action)
+            if action.group:
+                groups.setdefault(action.group, QActionGroup(window)).addAction(made)
         self.recent = QMenu("Open &recent", window)
         self.recent.setToolTipsVisible(True)
         self._menus["&File"].insertMenu(self.actions["sample"], self.recent)
-        self.refresh()
 
     def _made(self, action: Action) -> QAction:
         window, menu = self._window, self._menus[action.menu]
@@ -53,8 +67,8 @@ class Menus:
         made.setToolTip(f"{action.tip} ({action.key})" if action.key else action.tip)
         made.setStatusTip(action.tip)
         made.setMenuRole(QAction.MenuRole.NoRole)
-        made.setCheckable(action.checked is not None)
-        made.triggered.connect(lambda *_: self.do(action.name))
+        made.setCheckable(action.checkable)
+        made.triggered.connect(lambda *_: self._do(action.name))
         keys = QKeySequence(action.key)
         combination = QKeyCombination() if keys.isEmpty() else keys[0]  # type: ignore[index]
         if action.key and is_plain(combination):
@@ -69,39 +83,32 @@ class Menus:
         self.actions[action.name] = made
         return made
 
-    def do(self, name: str) -> None:
-        """Do an action."""
-        BY_NAME[name].call(self._window)
-        self.refresh()
-
     def key(self, event: QKeyEvent) -> bool:
         """Do the action of a plain key that nothing else has taken; whether there is one."""
         name = self._plain.get(event.keyCombination())
         if name is None or not self.actions[name].isEnabled():
             return False
-        self.do(name)
+        self._do(name)
         return True
 
-    def refresh(self) -> None:
-        """Enable what is of use now, check what is on, say what undo and redo would do."""
-        window = self._window
-        session = window.workspace.session
-        undo, redo = steps_of(session)
-        there = {
-            "": True,
-            "session": session is not None,
-            "frames": len(window.standings) > 0,
-            "measuring": len(window.standings) > 0 and not read_only(session),
-            "undo": bool(undo),
-            "redo": bool(redo),
-            "work": bool(window.workspace.tasks.active),
-            "live": live_page(window) is not None,
-        }
+    def refresh(
+        self, there: Mapping[Needs, bool], on: Mapping[str, bool], undo: str, redo: str
+    ) -> None:
+        """Enable what is of use now, check what is on, say what undo and redo would do.
+
+        Parameters
+        ----------
+        there
+            Whether that is there which actions need.
+        on
+            Whether those actions are on that can be, by their names.
+        undo, redo
+            Labels of the changes that they would take back and make again; or nothing.
+        """
         for name, made in self.actions.items():
-            action = BY_NAME[name]
-            made.setEnabled(there[action.needs])
-            if action.checked is not None:
-                made.setChecked(action.checked(window))
+            made.setEnabled(there[self._needs[name]])
+        for name, is_on in on.items():
+            self.actions[name].setChecked(is_on)
         self.actions["undo"].setText(f"&Undo {undo}".rstrip())
         self.actions["redo"].setText(f"&Redo {redo}".rstrip())
 
@@ -114,10 +121,7 @@ class Menus:
             text = f"{path.stem} — {path.parent}".replace("&", "&&")
             made = self.recent.addAction(f"&{number} {text}" if number < 10 else text)
             made.setToolTip(plain_tip(name))
-            made.triggered.connect(lambda *_, chosen=path: self._window.files.open(chosen))
-
-
-BY_NAME = {action.name: action for action in ACTIONS}
+            made.triggered.connect(lambda *_, chosen=path: self._open_session(chosen))
 
 
 def is_plain(key: QKeyCombination) -> bool:

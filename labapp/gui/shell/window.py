@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PySide6.QtCore import QByteArray, QEvent, QSize, Qt, QTimer, QUrl
-from PySide6.QtGui import QCloseEvent, QDesktopServices, QDragEnterEvent, QDropEvent, QKeyEvent
+from PySide6.QtCore import QByteArray, QEvent, QSize, Qt, QTimer
+from PySide6.QtGui import QCloseEvent, QDragEnterEvent, QDropEvent, QKeyEvent
 from PySide6.QtWidgets import (
     QApplication,
     QDialog,
     QDockWidget,
     QMainWindow,
     QStackedWidget,
-    QTableView,
     QWidget,
 )
 
@@ -25,22 +24,23 @@ from labapp.errors import InputError
 from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.welcome import Welcome
-from labapp.gui.preferences import Preferences, change_preferences, recall_preferences
+from labapp.gui.preferences import THEMES, PreferencesStore
+from labapp.gui.shell.action import Needs
 from labapp.gui.shell.actions import ACTIONS
 from labapp.gui.shell.files import Files, title
-from labapp.gui.shell.filming import may_close
+from labapp.gui.shell.filming import live_page
 from labapp.gui.shell.focus import finish_edit
-from labapp.gui.shell.help import HelpDialog
-from labapp.gui.shell.menus import Menus
+from labapp.gui.shell.menus import Menus, steps_of
 from labapp.gui.shell.messages import LogPanel, StatusLine
 from labapp.gui.shell.standing import DOUBTFUL, TICKS, next_frame, standings
 from labapp.gui.shell.step_list import SidePanel, StepList
-from labapp.gui.shell.steps import STEPS, first_step, states
+from labapp.gui.shell.steps import STEPS, first_step, read_only, states
 from labapp.gui.theme import apply_theme
-from labapp.gui.widgets.tables import table_text
 from labapp.gui.widgets.timeline import Timeline
 from labapp.gui.workspace import MEASURING, Workspace
-from labapp.log import log_file
+
+Commands = Callable[["MainWindow"], Mapping[str, Callable[[], object]]]
+"""What each action does in a window, by its name."""
 
 REST = 4
 """After showing a change the window rests so many times as long as that took, for the hands."""
@@ -64,50 +64,48 @@ class MainWindow(QMainWindow):
     ----------
     preferences
         What is remembered from the last start.
-    preferences_file
-        Where they are kept.
+    commands
+        What the actions of the menus do: `labapp.gui.shell.commands`.
 
     Attributes
     ----------
     workspace
         What is open.
+    pages
+        Those made by now, by their keys.
     standings
         How each frame stands, shape (n,).
     page
         The page in view; None for the welcome page.
     """
 
-    preferences: Preferences
-    workspace: Workspace
-    files: Files
-    timeline: Timeline
-    status_line: StatusLine
-
-    def __init__(self, preferences: Preferences, preferences_file: Path) -> None:
+    def __init__(self, preferences: PreferencesStore, commands: Commands) -> None:
         super().__init__()
         self.setObjectName("labapp")
         self.preferences = preferences
-        self._preferences_file = preferences_file
+        preferences.setParent(self)
         self.workspace = Workspace(self)
-        self.files = Files(self)
+        self.pages: dict[str, Page] = {}
+        self.files = Files(self, self.workspace, preferences, self.pages)
         self.standings: IntArray = np.zeros(0, np.int64)
         self.page: Page | None = None
         self._steps = tuple(step for step in STEPS if step.key in PAGES)
-        self.pages: dict[str, Page] = {}
         self._states = states(None)
         self._changes_due = False
         self._rest = QTimer(self)
         self._rest.setSingleShot(True)
         self._rest.timeout.connect(self._rested)
         self._make_views()
-        without = {f"step_{step.key}" for step in STEPS} - {f"step_{s.key}" for s in self._steps}
-        self.menus = Menus(self, frozenset(action.name for action in ACTIONS) - without)
+        without = {f"step_{step.key}" for step in STEPS if step not in self._steps}
+        actions = [action for action in ACTIONS if action.name not in without]
+        self.menus = Menus(self, actions, self.do, self.files.open)
+        self._commands = commands(self)
         self._connect()
         self.setAcceptDrops(True)
         self._plain_layout = self.saveState(LAYOUT_VERSION)
         self._restore()
-        if preferences.foot_switches:
-            self.workspace.foot_switches.use(preferences.foot_switches)
+        if preferences.current.foot_switches:
+            self.workspace.foot_switches.use(preferences.current.foot_switches)
         self._session_opened()
 
     def _make_views(self) -> None:
@@ -144,7 +142,11 @@ class MainWindow(QMainWindow):
         return dock
 
     def _connect(self) -> None:
-        space = self.workspace
+        space, preferences = self.workspace, self.preferences
+        preferences.changed.connect(lambda: self.menus.show_recent(preferences.current.recent))
+        preferences.failed.connect(self.say)
+        self.files.said.connect(self.say)
+        self.files.recording_wanted.connect(self._show_recording)
         space.closing.connect(self._leave)
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
@@ -152,19 +154,48 @@ class MainWindow(QMainWindow):
         space.frame_changed.connect(self._frame_changed)
         space.said.connect(self.say)
         space.settled.connect(self.status_line.settle)
-        space.asked.connect(self.menus.do)
+        space.asked.connect(self.do)
         space.next_wanted.connect(self.files.begin_next)
         space.pedals_kept.connect(
-            lambda held: self.remember(lambda before: replace(before, foot_switches=held))
+            lambda held: preferences.remember(lambda before: replace(before, foot_switches=held))
         )
-        space.tasks.changed.connect(self.menus.refresh)
+        space.tasks.changed.connect(self._show_actions)
         self.step_list.chosen.connect(self.show_step)
         self.timeline.moved.connect(space.show_frame)
         self.timeline.jumped.connect(self.jump)
         self.status_line.read.connect(self.read_messages)
-        self.welcome.asked.connect(self.menus.do)
+        self.welcome.asked.connect(self.do)
         self.welcome.chosen.connect(self.files.open)
-        self.welcome.forgotten.connect(self.files.forget)
+        self.welcome.forgotten.connect(self._forget)
+
+    # --- actions ----------------------------------------------------------------------------
+
+    def do(self, name: str) -> None:
+        """Do an action of the menus."""
+        self._commands[name]()
+        self._show_actions()
+
+    def _show_actions(self) -> None:
+        """Show in the menus what is of use now, and what is on."""
+        session, frames = self.workspace.session, len(self.standings) > 0
+        undo, redo = steps_of(session)
+        there: dict[Needs, bool] = {
+            "": True,
+            "session": session is not None,
+            "frames": frames,
+            "measuring": frames and not read_only(session),
+            "undo": bool(undo),
+            "redo": bool(redo),
+            "work": bool(self.workspace.tasks.active),
+            "live": live_page(self.pages.values()) is not None,
+        }
+        on = {
+            **self._wanted,
+            **{f"theme_{theme}": theme == self.preferences.current.theme for theme in THEMES},
+            "play": self.timeline.playing,
+            "full_screen": self.isFullScreen(),
+        }
+        self.menus.refresh(there, on, undo, redo)
 
     # --- what is in view --------------------------------------------------------------------
 
@@ -180,7 +211,7 @@ class MainWindow(QMainWindow):
         self._wanted["log"] = True
         self.status_line.mark_read()
         self._show_docks()
-        self.menus.refresh()
+        self._show_actions()
 
     def show_step(self, key: str) -> None:
         """Bring a step's page into view; it is made when it is first shown."""
@@ -205,7 +236,7 @@ class MainWindow(QMainWindow):
                 page.setFocus()  # or they stay with what is hidden now
         self.step_list.show_step(key)
         self._show_page()
-        self.menus.refresh()
+        self._show_actions()
 
     def go_step(self, by: int) -> None:
         """Go some steps on, or back."""
@@ -230,6 +261,25 @@ class MainWindow(QMainWindow):
         else:
             self.workspace.show_frame(found)
 
+    def _show_recording(self, path: Path | None) -> None:
+        """Show the step Recording, and have it take a recording."""
+        self.show_step("capture")
+        if path is not None and self.page is not None:
+            self.page.take(path)
+
+    def _list_recent(self) -> None:
+        """List the sessions opened before, in other windows too."""
+        self.preferences.recall()
+        recent = self.preferences.current.recent
+        self.menus.show_recent(recent)
+        if self.workspace.session is None:
+            self.welcome.show_recent([Path(name) for name in recent])
+
+    def _forget(self, path: Path) -> None:
+        """Take a session off the list of recent ones; the file stays."""
+        self.preferences.remember(lambda before: before.without_recent(path))
+        self._list_recent()
+
     def _leave(self) -> None:
         if self.page is not None:
             finish_edit(self.page, self.page.panel)
@@ -247,7 +297,7 @@ class MainWindow(QMainWindow):
         if session is None:
             self.stack.setCurrentWidget(self.welcome)
             self.step_list.show_step("")
-            self.files.list_recent()
+            self._list_recent()
         elif self._steps:
             keys = [step.key for step in self._steps]
             first = self.workspace.tried(lambda: first_step(session)) or "setup"
@@ -270,7 +320,7 @@ class MainWindow(QMainWindow):
         self._changes_due = False
         self._show_frames()
         self._show_page()
-        self.menus.refresh()
+        self._show_actions()
         self.setWindowTitle(title(self.workspace.session))
         took_ms = (time.perf_counter() - began) * 1000
         self._rest.start(min(LONGEST_REST_MS, round(REST * took_ms)))
@@ -309,7 +359,7 @@ class MainWindow(QMainWindow):
         self.timeline.set_frame(frame)
         self._show_page()
 
-    # --- measuring, copying -----------------------------------------------------------------
+    # --- measuring --------------------------------------------------------------------------
 
     def measure_all(self) -> None:
         """Measure the frames that are not measured, or no longer stand."""
@@ -337,39 +387,19 @@ class MainWindow(QMainWindow):
             return
         self.workspace.measure(frames)
 
-    def copy_picture(self) -> None:
-        """Copy the picture of the page in view."""
-        if self.page is not None:
-            QApplication.clipboard().setPixmap(self.page.picture())
-            self.say("The picture is on the clipboard")
-
-    def copy_table(self) -> None:
-        """Copy the table with the focus, or the first one in view."""
-        tables = [each for each in self.findChildren(QTableView) if each.isVisibleTo(self)]
-        if not tables:
-            self.say("This step has no table")
-            return
-        table = next((each for each in tables if each.hasFocus()), tables[0])
-        QApplication.clipboard().setText(table_text(table))
-        self.say("The table is on the clipboard")
-
     # --- look -------------------------------------------------------------------------------
 
     def set_theme(self, theme: str) -> None:
         """Show the app light, dark or as the desktop is."""
-        self.remember(lambda before: replace(before, theme=theme))
+        self.preferences.remember(lambda before: replace(before, theme=theme))
         self.apply_theme()
 
     def apply_theme(self) -> None:
         """Apply the theme that is remembered; the desktop may have changed."""
         app = QApplication.instance()
         if isinstance(app, QApplication):
-            apply_theme(app, self.preferences.theme)
+            apply_theme(app, self.preferences.current.theme)
         self._show_session()
-
-    def dock_is_wanted(self, name: str) -> bool:
-        """Whether a panel is to be seen while a session is open."""
-        return self._wanted[name]
 
     def toggle_dock(self, name: str) -> None:
         """Show or hide a panel."""
@@ -390,49 +420,19 @@ class MainWindow(QMainWindow):
         self._wanted = {name: name != "log" for name in self._wanted}
         self._show_docks()
 
-    def toggle_full_screen(self) -> None:
-        """Use all of the screen, or go back to a window."""
-        if self.isFullScreen():
-            self.showNormal()
-        else:
-            self.showFullScreen()
-
-    def show_help(self, kind: str) -> None:
-        """Show the guide, the keys or what the program is."""
-        HelpDialog(kind, self, self.page).show()
-
-    def show_log_folder(self) -> None:
-        """Open the folder with the log."""
-        folder = log_file().parent
-        if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(folder))):
-            self.say(f"The log is in {folder}")
-
     def _restore(self) -> None:
-        room = self.screen().availableSize()
+        preferences, room = self.preferences.current, self.screen().availableSize()
         self.resize(QSize(*SIZE_PX).boundedTo(room * PART_OF_SCREEN))
         restored = (
-            (self.restoreGeometry, self.preferences.geometry),
-            (lambda held: self.restoreState(held, LAYOUT_VERSION), self.preferences.layout),
+            (self.restoreGeometry, preferences.geometry),
+            (lambda held: self.restoreState(held, LAYOUT_VERSION), preferences.layout),
         )
         for restore, text in restored:
             if text:
                 restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
-        if self.preferences.layout:
+        if preferences.layout:
             self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
             self._wanted["log"] = False  # what was said then is not said now
-
-    def remember(self, change: Callable[[Preferences], Preferences]) -> None:
-        """Change what is kept for the next start, other windows' part of it included."""
-        self.preferences, problem = change_preferences(
-            self._preferences_file, self.preferences, change
-        )
-        if problem:
-            self.say(problem)
-        self.menus.show_recent(self.preferences.recent)
-
-    def recall(self) -> None:
-        """Look up what is remembered: other windows may have opened sessions meanwhile."""
-        self.preferences = recall_preferences(self._preferences_file, self.preferences)
 
     # --- events -----------------------------------------------------------------------------
 
@@ -446,11 +446,11 @@ class MainWindow(QMainWindow):
         """Look at what other windows have remembered when this one is worked in again."""
         super().changeEvent(event)
         if event.type() == QEvent.Type.ActivationChange and self.isActiveWindow():
-            before = self.preferences
-            self.recall()
-            if self.preferences.recent != before.recent:
-                self.files.list_recent()
-            if self.preferences.theme != before.theme:
+            before = self.preferences.current
+            self.preferences.recall()
+            if self.preferences.current.recent != before.recent:
+                self._list_recent()
+            if self.preferences.current.theme != before.theme:
                 self.apply_theme()
 
     def dragEnterEvent(self, event: QDragEnterEvent) -> None:
@@ -472,7 +472,7 @@ class MainWindow(QMainWindow):
 
         The operator is asked about a recording that runs; the program closes without a question.
         """
-        if event.spontaneous() and not may_close(self):
+        if event.spontaneous() and not self.files.may_close():
             event.ignore()
             return
         for beside in self.findChildren(QDialog):
@@ -480,7 +480,7 @@ class MainWindow(QMainWindow):
         self.timeline.set_playing(False)
         self._show_docks(everywhere=True)
         geometry, layout = _text(self.saveGeometry()), _text(self.saveState(LAYOUT_VERSION))
-        self.remember(lambda before: replace(before, geometry=geometry, layout=layout))
+        self.preferences.remember(lambda before: replace(before, geometry=geometry, layout=layout))
         self.workspace.opened.disconnect(self._session_opened)
         self.workspace.close()
         self._rest.stop()

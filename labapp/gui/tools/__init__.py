@@ -9,7 +9,9 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
+    from PySide6.QtWidgets import QWidget
+
+    from labapp.gui.shell.files import Files
     from labapp.gui.tools.tool import ToolWindow
 
 TOOLS = {
@@ -20,13 +22,13 @@ TOOLS = {
 """Module here → the window in it."""
 
 
-def show_tool(window: MainWindow, key: str) -> ToolWindow:
+def show_tool(key: str, sessions: Files, window: QWidget) -> ToolWindow:
     """Bring a tool's window into view; it is made when it is first asked for."""
     from PySide6.QtWidgets import QDialog
 
     tool: ToolWindow | None = window.findChild(QDialog, f"tool-{key}")  # type: ignore[assignment]
     if tool is None:
-        made: ToolWindow = getattr(importlib.import_module(f"{__name__}.{key}"), TOOLS[key])(window)
-        tool = made
+        kind: type[ToolWindow] = getattr(importlib.import_module(f"{__name__}.{key}"), TOOLS[key])
+        tool = kind(sessions, window)
     tool.open_beside()
     return tool

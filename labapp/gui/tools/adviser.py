@@ -30,7 +30,7 @@ from labapp.studies.adviser.report import cost_table
 from labapp.studies.adviser.search import Advice, Effort, advise
 
 if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
+    from labapp.gui.shell.files import Files
 
 RANGES = (
     ("pools.width_mm", "Width", "mm", 1, 50, 0.1, "Of the pools, along X"),
@@ -57,11 +57,11 @@ class AdviserWindow(ToolWindow):
     key = "adviser"
     title = "Configuration adviser"
 
-    def __init__(self, window: MainWindow) -> None:
+    def __init__(self, sessions: Files, window: QWidget) -> None:
         self.advice: Advice | None = None
         self._basis: object = None
         self._asked: advising.Values = {}
-        super().__init__(window)
+        super().__init__(sessions, window)
         self.ranges: dict[str, RangeField] = {}
         self.numbers: dict[str, NumberField] = {}
         self._make_form()

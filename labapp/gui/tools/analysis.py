@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QCheckBox, QFileDialog, QStackedWidget
+from PySide6.QtWidgets import QCheckBox, QFileDialog, QStackedWidget, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysing
@@ -28,7 +28,7 @@ from labapp.studies.tables import Table
 
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
-    from labapp.gui.shell.window import MainWindow
+    from labapp.gui.shell.files import Files
     from labapp.simulation.pools import Pool
 
 SIZES = (
@@ -50,12 +50,12 @@ class AnalysisWindow(ToolWindow):
     key = "analysis"
     title = "Error analysis"
 
-    def __init__(self, window: MainWindow) -> None:
+    def __init__(self, sessions: Files, window: QWidget) -> None:
         self.tables: dict[str, Table] = {}
         self.pictures: dict[str, bytes] = {}
         self._anew = False
         self._basis: object = None
-        super().__init__(window)
+        super().__init__(sessions, window)
         self._make_form()
         self._make_results()
         self.save_button = self.add_button(

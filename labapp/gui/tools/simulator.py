@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pyqtgraph as pg
 from PySide6.QtGui import QCloseEvent
-from PySide6.QtWidgets import QFileDialog
+from PySide6.QtWidgets import QFileDialog, QWidget
 
 from labapp.config.scenario import Scenario, read_scenario
 from labapp.gui.dialogs import new_path
@@ -26,7 +26,7 @@ from labapp.simulated.simulate import begin_session, simulate
 from labapp.words import several
 
 if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
+    from labapp.gui.shell.files import Files
 
 RING, RING_PX = "#2fd39b", 15
 """Round the true dots: a colour of the dots page; points of the screen."""
@@ -46,14 +46,15 @@ class SimulatorWindow(ToolWindow):
     key = "simulator"
     title = "Simulator"
 
-    def __init__(self, window: MainWindow) -> None:
+    def __init__(self, sessions: Files, window: QWidget) -> None:
         self.preview: Preview | None = None
         self.made: tuple[Scenario, Path] | None = None
         self._own: Path | None = None
         self._proposed = ""
         self._turn = threading.Lock()
-        super().__init__(window)
-        self._window = window
+        super().__init__(sessions, window)
+        self._sessions = sessions
+        self._preferences = sessions.preferences
         self.previews = Tasks(self)
         self._make_form()
         self._make_results()
@@ -118,7 +119,7 @@ class SimulatorWindow(ToolWindow):
     def prefill(self) -> None:
         """Propose a folder at the first time; draw what is chosen where it is not drawn."""
         if not self._proposed:
-            self._propose(self._window.preferences.folder)
+            self._propose(self._preferences.current.folder)
         if self.preview is None and not self.previews.active:
             self.show_scenario()
 
@@ -138,7 +139,7 @@ class SimulatorWindow(ToolWindow):
     def choose_scenario(self) -> None:
         """Ask for a scenario."""
         name, _ = QFileDialog.getOpenFileName(
-            self, "Choose a scenario", str(self._window.preferences.folder), "Scenarios (*.toml)"
+            self, "Choose a scenario", str(self._preferences.current.folder), "Scenarios (*.toml)"
         )
         if name:
             self.take(Path(name))
@@ -231,7 +232,7 @@ class SimulatorWindow(ToolWindow):
         self.made = scenario, folder
         frames = several(len(scenario.recording.pools), "frame")
         self.say(f"{frames}, set-up and truth are in {folder}")
-        self._window.remember(lambda before: replace(before, last_folder=str(folder.parent)))
+        self._preferences.remember(lambda before: replace(before, last_folder=str(folder.parent)))
         self.show_state()
 
     def open_session(self) -> None:
@@ -248,7 +249,7 @@ class SimulatorWindow(ToolWindow):
         self.begin("Importing", work, self._open)
 
     def _open(self, path: Path) -> None:
-        if self._window.files.open(path):
+        if self._sessions.open(path):
             self._propose(path.parent.parent)  # the next one does not replace what is open
             self.close()
 

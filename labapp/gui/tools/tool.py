@@ -29,7 +29,7 @@ from labapp.gui.widgets.fields import FieldForm
 from labapp.simulation.parallel import Progress, behind_a_window
 
 if TYPE_CHECKING:
-    from labapp.gui.shell.window import MainWindow
+    from labapp.gui.shell.files import Files
 
 SIZE_PX = (1120, 700)
 PART_OF_SCREEN = 0.9
@@ -44,8 +44,10 @@ class ToolWindow(QDialog):
 
     Parameters
     ----------
+    sessions
+        What opens sessions, and where they are shown.
     window
-        The app's window: its session, and where it tells.
+        The app's window, which it stands beside.
 
     Attributes
     ----------
@@ -64,9 +66,9 @@ class ToolWindow(QDialog):
     key = ""
     title = ""
 
-    def __init__(self, window: MainWindow) -> None:
+    def __init__(self, sessions: Files, window: QWidget) -> None:
         super().__init__(window)
-        self.workspace = window.workspace
+        self.workspace = sessions.workspace
         self.tasks = Tasks(self)
         self.files: dict[str, bytes] = {}
         self._task: Task | None = None

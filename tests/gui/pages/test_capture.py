@@ -276,7 +276,7 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     assert session.setup_text == setup
     assert not page.chosen.isVisible()
     assert window.page is page
-    assert window.preferences.recent[0] == str(second)
+    assert window.preferences.current.recent[0] == str(second)
     assert hashlib.sha256(first.read_bytes()).hexdigest() == before
 
 

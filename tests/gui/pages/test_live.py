@@ -438,7 +438,7 @@ def test_on_another_page_the_recording_goes_on_and_is_imported_when_it_ends(
     window.show_step("capture")
     assert page.title.text() == "Live: Simulated camera"
     qtbot.waitUntil(lambda: page.live_view.updates > updates + 2)
-    window.menus.do("close")
+    window.do("close")
     assert not live.is_open
     assert live.feed.state == "ended"
 
@@ -487,8 +487,8 @@ def test_while_it_records_closing_asks_and_a_no_closes_nothing(
 ):
     close = {
         "the frame": lambda: close_by_hand(window),
-        "quit": lambda: window.menus.do("quit"),
-        "close": lambda: window.menus.do("close"),
+        "quit": lambda: window.do("quit"),
+        "close": lambda: window.do("close"),
         "another": lambda: window.files.open(other),
     }[way]
     other, session = copy_sample("thumb_tack"), window.workspace.session
@@ -533,7 +533,7 @@ def test_recordings_made_besides_are_listed_when_the_session_is_opened_again(
     qtbot.waitUntil(lambda: live.takes[0].frames > 10)
     assert not page.kept.isVisible()
     answer("Finish and keep")
-    window.menus.do("close")
+    window.do("close")
     window.files.open(path)
     window.show_step("capture")
     hand = Hand(window)

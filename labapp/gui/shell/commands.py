@@ -1,0 +1,132 @@
+"""What each action of the window does, and the window with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from PySide6.QtCore import QUrl
+from PySide6.QtGui import QDesktopServices
+from PySide6.QtWidgets import QApplication, QTableView
+
+from labapp.gui.preferences import THEMES, Preferences, PreferencesStore
+from labapp.gui.shell import filming
+from labapp.gui.shell.focus import go_to_part
+from labapp.gui.shell.help import TITLES, HelpDialog
+from labapp.gui.shell.steps import STEPS
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.tools import TOOLS, show_tool
+from labapp.gui.widgets.tables import table_text
+from labapp.log import log_file
+
+FAR = 10**9
+"""More frames than there are."""
+
+
+def make_window(preferences: Preferences, file: Path) -> MainWindow:
+    """The app's window.
+
+    Parameters
+    ----------
+    preferences
+        What is remembered from the last start.
+    file
+        Where they are kept.
+    """
+    return MainWindow(PreferencesStore(preferences, file), commands)
+
+
+def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
+    """What the actions do in a window, by their names."""
+    files, workspace, timeline = window.files, window.workspace, window.timeline
+    pages, say = window.pages.values(), window.say
+    parts = (
+        window.step_list,
+        window.stack,
+        window.side_panel,
+        window.timeline,
+        window.log_panel,
+        window.status_line,
+    )
+    return {
+        "new": files.new,
+        "open": files.choose,
+        "sample": files.try_sample,
+        "copy": files.save_copy,
+        "import": files.choose_recording,
+        "export": lambda: window.show_step("export"),
+        "close": files.close,
+        "quit": lambda: files.may_close() and window.close(),
+        "undo": workspace.undo,
+        "redo": workspace.redo,
+        "copy_picture": lambda: copy_picture(window),
+        "copy_table": lambda: copy_table(window),
+        **{f"step_{step.key}": partial(window.show_step, step.key) for step in STEPS},
+        "next_step": lambda: window.go_step(1),
+        "previous_step": lambda: window.go_step(-1),
+        "measure": window.measure_all,
+        "measure_frame": window.measure_frame,
+        "cancel": window.status_line.cancel,
+        "previous": lambda: timeline.step(-1),
+        "next": lambda: timeline.step(1),
+        "first": lambda: timeline.step(-FAR),
+        "last": lambda: timeline.step(FAR),
+        "play": lambda: timeline.set_playing(not timeline.playing),
+        "record": lambda: filming.trigger(pages, say),
+        "mark": lambda: filming.mark(pages, say),
+        "next_doubtful": lambda: window.jump("doubtful", True),
+        "previous_doubtful": lambda: window.jump("doubtful", False),
+        "next_corrected": lambda: window.jump("corrected", True),
+        "previous_corrected": lambda: window.jump("corrected", False),
+        **{
+            name: partial(window.toggle_dock, name)
+            for name in ("steps", "panel", "timeline", "log")
+        },
+        "next_part": lambda: go_to_part(parts, 1),
+        "previous_part": lambda: go_to_part(parts, -1),
+        **{f"theme_{theme}": partial(window.set_theme, theme) for theme in THEMES},
+        "full_screen": lambda: toggle_full_screen(window),
+        "reset_layout": window.reset_layout,
+        **{key: partial(show_tool, key, files, window) for key in TOOLS},
+        **{kind: partial(show_help, window, kind) for kind in TITLES},
+        "log_folder": lambda: show_log_folder(window),
+    }
+
+
+def copy_picture(window: MainWindow) -> None:
+    """Copy the picture of the page in view."""
+    if window.page is not None:
+        QApplication.clipboard().setPixmap(window.page.picture())
+        window.say("The picture is on the clipboard")
+
+
+def copy_table(window: MainWindow) -> None:
+    """Copy the table with the focus, or the first one in view."""
+    tables = [each for each in window.findChildren(QTableView) if each.isVisibleTo(window)]
+    if not tables:
+        window.say("This step has no table")
+        return
+    table = next((each for each in tables if each.hasFocus()), tables[0])
+    QApplication.clipboard().setText(table_text(table))
+    window.say("The table is on the clipboard")
+
+
+def toggle_full_screen(window: MainWindow) -> None:
+    """Use all of the screen, or go back to a window."""
+    if window.isFullScreen():
+        window.showNormal()
+    else:
+        window.showFullScreen()
+
+
+def show_help(window: MainWindow, kind: str) -> None:
+    """Show the guide, the keys or what the program is."""
+    HelpDialog(kind, window, window.page).show()
+
+
+def show_log_folder(window: MainWindow) -> None:
+    """Open the folder with the log."""
+    folder = log_file().parent
+    if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(folder))):
+        window.say(f"The log is in {folder}")
