@@ -70,19 +70,38 @@ KINDS: dict[str, Draw] = {
 }
 
 
-def draw(kind: str, seed: int, missing: float, false: int) -> tuple[Rig, SeenDots, Pool]:
-    """A pool of a kind, the bench it is seen on, and its dots."""
-    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+def draw_pool(kind: str, rng: np.random.Generator) -> tuple[Rig, Pool]:
+    """A pool of a kind, and the bench it is seen on."""
     rig = replace(
         BENCH_RIG,
         laser=Laser(rng.uniform(28.0, 33.0), rng.uniform(29.0, 35.5)),
         imaging_plane=ImagingPlane.vertical(rng.uniform(46.0, 56.0), 45.0, 3.0),
     )
-    pool = KINDS[kind](rng, rng.uniform(4.6, 6.6), tuple(rng.uniform(-0.5, 0.5, 2)))
+    return rig, KINDS[kind](rng, rng.uniform(4.6, 6.6), tuple(rng.uniform(-0.5, 0.5, 2)))
+
+
+def draw(kind: str, seed: int, missing: float, false: int) -> tuple[Rig, SeenDots, Pool]:
+    """A pool of a kind, the bench it is seen on, and its dots."""
+    rng = np.random.default_rng([seed, list(KINDS).index(kind)])
+    rig, pool = draw_pool(kind, rng)
     sigma_px, many = rng.uniform(0.05, 0.3), len(see(pool, np.random.default_rng(0), rig=rig).ray)
     lost = round(many * rng.uniform(0.0, missing))
     strays = int(rng.integers(0, false + 1))
     return rig, see(pool, rng, sigma_px=sigma_px, missing=lost, false=strays, rig=rig), pool
+
+
+def report(kind: str, answers: list[Answer]) -> int:
+    """Say how the pools of a kind were answered; returns how many labels were wrong."""
+    good = [one for one in answers if one.status == "ok"]
+    off = 100 * np.abs([one.height for one in good] or [np.nan])
+    wrong, right = sum(one.wrong for one in good), sum(one.right for one in good)
+    print(
+        f"{kind}: {len(good)} of {len(answers)} answered, {wrong} labels wrong, "
+        f"{right / max(sum(one.shown for one in good), 1):.3f} labelled, height off by "
+        f"{np.median(off):.2f} % in the median, {off.max():.2f} % at worst",
+        flush=True,
+    )
+    return wrong
 
 
 def main() -> int:
@@ -102,15 +121,7 @@ def main() -> int:
             answers.append(answer(pool, seen, rig))
             if answers[-1].status != "ok" or answers[-1].wrong:
                 print(f"{kind} {seed}: {answers[-1]}", flush=True)
-        good = [one for one in answers if one.status == "ok"]
-        off = 100 * np.abs([one.height for one in good] or [np.nan])
-        wrong += sum(one.wrong for one in good)
-        print(
-            f"{kind}: {len(good)} of {len(answers)} answered, {sum(one.wrong for one in good)} "
-            f"labels wrong, height off by {np.median(off):.2f} % in the median, "
-            f"{off.max():.2f} % at worst",
-            flush=True,
-        )
+        wrong += report(kind, answers)
     return wrong
 
 

@@ -25,7 +25,7 @@ from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.lattice import GrowSettings, grow_lattice
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import Measures, measure
 from labapp.core.values import CannotMeasure
 from labapp.simulation.pools import Dent, Pool, egg
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see
@@ -68,9 +68,13 @@ def answer(pool: Pool, seen: SeenDots, rig: Rig = BENCH_RIG) -> Answer:
     except CannotMeasure as reason:
         return Answer(reason.status, shown=shown)
     wrong = int((seen.ray[match.dot] != match.ray).any(axis=-1).sum())
+    return Answer("ok", wrong, len(match.dot) - wrong, shown, height_error(pool, size))
+
+
+def height_error(pool: Pool, size: Measures) -> float:
+    """Error of a pool's height, or of its depth where that is more, as a share of it."""
     name = "height_mm" if pool.size.height_mm > -pool.size.depth_mm else "depth_mm"
-    height = getattr(size, name) / getattr(pool.size, name) - 1
-    return Answer("ok", wrong, len(match.dot) - wrong, shown, height)
+    return float(getattr(size, name) / getattr(pool.size, name) - 1)
 
 
 def matched(seen: SeenDots, rig: Rig = BENCH_RIG) -> Match:
