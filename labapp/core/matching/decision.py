@@ -79,8 +79,9 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     hypothesis that was followed from the wrong hole may lead to almost the right place.
     """
     best = min(found, key=lambda hypothesis: hypothesis.cost)
-    knots = FINE if best.residual_mm > MODEL_MM else FOLLOWING
-    if knots is FINE:
+    knots = FOLLOWING
+    if best.residual_mm > MODEL_MM or _is_rivalled(scene, best):
+        knots = FINE
         found = [h for each in found if (h := weigh(scene, each.labels, knots, near=each.pool))]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     neighbours: list[Hypothesis] = []
@@ -136,6 +137,18 @@ def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings)
             f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
             f"{_counted(best.missed, 'ray')} without a dot amid {best.count} pairs",
         )
+
+
+INFLATED = 40.0
+"""What a dip under the torch adds to χ² at most, that knots further apart cannot follow."""
+
+
+def _is_rivalled(scene: Scene, best: Hypothesis) -> bool:
+    """Whether labels a row or two on come so near that what knots leave of a dip may decide."""
+    if best.stray == best.missed == 0:
+        return False
+    rivals = _rivals(scene, best, moved(scene, best.labels), FOLLOWING)
+    return any(rival.cost < best.cost + INFLATED for rival in rivals)
 
 
 def _beyond_doubt(scene: Scene, best: Hypothesis, margin: float) -> bool:
