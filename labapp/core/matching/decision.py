@@ -102,11 +102,12 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     doubtful: list[int] = contested(scene, best).tolist()
     others = (turned(scene, best.labels, own, way) for way in settings.orientations if way != own)
     for other in [*found, *neighbours, *_rivals(scene, best, others, knots)]:
-        if other.cost >= best.cost + settings.margin:
+        near = other.cost < best.cost + settings.margin
+        if not near and not _may_be_unfinished(other, best, settings.margin):
             continue
         differing, shared = _differing(best, other)
         if len(differing) <= 0.2 * shared:
-            doubtful += differing
+            doubtful += differing if near else []
         elif other.orientation(scene) != own:
             raise CannotMeasure(
                 "ambiguous-orientation",
@@ -140,7 +141,16 @@ def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings)
 
 
 INFLATED = 40.0
-"""What a dip under the torch adds to χ² at most, that knots further apart cannot follow."""
+"""What a dip under the torch, or dots that labels a row on have not yet found, add to a cost."""
+
+
+def _may_be_unfinished(other: Hypothesis, best: Hypothesis, margin: float) -> bool:
+    """Whether another fits its dots as well, has a hole for the marker, and lacks but a few more.
+
+    Where rows cross, labels that were moved may keep some that are swapped, and find no others.
+    """
+    as_well = other.misfit < best.misfit + margin and other.marker == "dark"
+    return as_well and other.cost < best.cost + INFLATED
 
 
 def _is_rivalled(scene: Scene, best: Hypothesis) -> bool:
@@ -165,14 +175,17 @@ def _beyond_doubt(scene: Scene, best: Hypothesis, margin: float) -> bool:
 def _with_neighbours(
     scene: Scene, best: Hypothesis, knots: FitSettings
 ) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return what a hypothesis leads to if one a row or two on is cheaper; and its neighbours."""
+    """Return what a hypothesis leads to if one a row or two on is cheaper; and its neighbours.
+
+    One that comes near is followed first: moved, it may lack dots at its ends.
+    """
     while True:  # each round is cheaper than the one before
         neighbours = _rivals(scene, best, moved(scene, best.labels), knots)
-        cheaper = [each.labels for each in neighbours if each.cost < best.cost]
-        grown = [h for labels in cheaper if (h := grow_and_score(scene, labels, knots))]
+        near = [each.labels for each in neighbours if each.cost < best.cost + INFLATED]
+        grown = [h for labels in near if (h := grow_and_score(scene, labels, knots))]
         better = min(grown, key=lambda h: h.cost, default=best)
         if better.cost >= best.cost:
-            return best, neighbours
+            return best, neighbours + grown
         best = better
 
 

@@ -62,6 +62,9 @@ CONTESTED = 0.5
 REPAIRED = 2
 """So many rings of labels round what is unexplained are discarded and assigned again."""
 
+MIDDLE = 0.25
+"""A dot is in the middle between two that are so many times as far from each other."""
+
 LEAST_ROW, MOST_BEYOND = 3, 0.6
 """A dot or two beyond the last row may be false; so many where one surface has them are not. If a
 larger share of all dots than that is left over, it is not for a row that was not reached."""
@@ -109,6 +112,12 @@ class Hypothesis:
     def count(self) -> int:
         """How many dots have a ray."""
         return int(np.sum(self.labels != UNLABELLED))
+
+    @property
+    def misfit(self) -> float:
+        """χ² of the dots alone."""
+        lit = LIT_MARKER * (self.marker == "lit")
+        return self.cost - STRAY * self.stray - MISSED * self.missed - lit
 
     @property
     def residual_mm(self) -> float:
@@ -233,9 +242,9 @@ def without_false_ends(
     return without_false_ends(scene, best, settings)
 
 
-WEAK, LIT = 3, 2 * np.log(2)
-"""A label with so few labelled neighbours rests on what lies to one side of it. Beyond the last row
-a ray is as likely dark as lit: what that adds to −2 log likelihood."""
+WEAK, LIKELIER = 3, 2 * np.log(10)
+"""A label with so few labelled neighbours rests on what lies to one side of it. Its ray is to be so
+much likelier than a false dot, in units of −2 log likelihood: beyond the last row most are dark."""
 
 
 def without_false_rim(
@@ -257,7 +266,7 @@ def without_false_rim(
     rays = predict(scene, pool, weak)
     surprise = surprises(scene, pool, rays, hypothesis.labels[tuple(rays.at.T)])[1].diagonal()
     false_per_mm2 = max(FALSE_PER_MM2, (hypothesis.stray + 1) / scene.view_mm2)
-    certain = surprise + CLEAR + LIT < as_likely_false(false_per_mm2)
+    certain = surprise + CLEAR + LIKELIER < as_likely_false(false_per_mm2)
     kept = strong.copy()
     at = tuple(rays.at[certain].T)
     kept[at] = hypothesis.labels[at]
@@ -329,7 +338,8 @@ def with_repaired(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
     while best is not None:
         labels = np.where(_about_unexplained(scene, best), UNLABELLED, best.labels)
         tried = [labels] if (labels != best.labels).any() else []
-        led = [h for labels in (*tried, *_closed_up(best)) if (h := grow_and_score(scene, labels))]
+        tried += [*_closed_up(best), *_opened_up(scene, best)]
+        led = [h for labels in tried if (h := grow_and_score(scene, labels))]
         cheapest = min(led, key=lambda hypothesis: hypothesis.cost, default=best)
         best = cheapest if cheapest.cost < best.cost else None
         found = found if best is None else [*found, best]
@@ -350,6 +360,28 @@ def _closed_up(hypothesis: Hypothesis) -> Iterator[IntArray]:
             after[:line], after[line:-1] = own[:line], own[line + 1 :]
             before[line + 1 :], before[1 : line + 1] = own[line + 1 :], own[:line]
             yield from (after, before) if axis == 0 else (after.T.copy(), before.T.copy())
+
+
+def _opened_up(scene: Scene, hypothesis: Hypothesis) -> Iterator[IntArray]:
+    """Yield the labels with room made for a row or column of dots that was left out between two.
+
+    The dots without a ray are in the middle between those of two rays; the shorter side moves on.
+    """
+    labels, strays = hypothesis.labels, scene.plane_mm[hypothesis.strays]
+    for axis in (0, 1) if len(strays) else ():
+        own = labels if axis == 0 else labels.T
+        line, place = np.nonzero((own[:-1] != UNLABELLED) & (own[1:] != UNLABELLED))
+        ends = scene.plane_mm[own[line, place]], scene.plane_mm[own[line + 1, place]]
+        apart = np.linalg.norm(ends[1] - ends[0], axis=-1)
+        off = cKDTree(strays).query((ends[0] + ends[1]) / 2)[0]
+        lines, between = np.unique(line[off < MIDDLE * apart], return_counts=True)
+        for k in lines[between >= FEW]:
+            wider = np.full_like(own, UNLABELLED)
+            if np.sum(own[: k + 1] != UNLABELLED) < np.sum(own[k + 1 :] != UNLABELLED):
+                wider[:k], wider[k + 1 :] = own[1 : k + 1], own[k + 1 :]
+            else:
+                wider[: k + 1], wider[k + 2 :] = own[: k + 1], own[k + 1 : -1]
+            yield wider if axis == 0 else wider.T.copy()
 
 
 def _about_unexplained(scene: Scene, hypothesis: Hypothesis) -> BoolArray:
