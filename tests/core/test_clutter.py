@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from tests.benchmarks import rendered
 from tests.benchmarks.clutter import draw
 from tests.benchmarks.dips import Answer, answer
 
@@ -25,3 +26,19 @@ def test_false_dots_and_missing_ones_that_lie_apart_are_put_up_with(kind: str, s
 @pytest.mark.parametrize(("kind", "seed"), [("egg", 110), ("lowrear", 110)])
 def test_a_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> None:
     assert answered(kind, seed).wrong == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [14, 45])
+def test_rows_that_a_second_hole_leaves_open_are_not_answered(seed: int) -> None:
+    """A dot beside the marker is missing: with these frames every ray was a row off once."""
+    got, _ = rendered.measured("dented", seed)
+    assert got.status in {"ambiguous-rows", "no-reference"}
+
+
+@pytest.mark.slow
+def test_a_column_that_growth_left_out_gets_room() -> None:
+    """Three dots of a column were taken for those of the next."""
+    got, _ = rendered.measured("rippled", 2)
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.95 * got.shown
