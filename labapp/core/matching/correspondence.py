@@ -35,11 +35,10 @@ from labapp.core.matching.hypothesis import (
     grow_and_score,
     joined,
     turned,
-    with_repaired,
-    with_rows_beyond,
 )
 from labapp.core.matching.quadric_search import search_quadrics
 from labapp.core.matching.ray_growth import LEAST_LABELS, SOFT, UNLABELLED, Scene, try_fit
+from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, IntArray

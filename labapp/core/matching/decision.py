@@ -27,7 +27,7 @@ from labapp.core.matching.hypothesis import (
     without_false_rim,
 )
 from labapp.core.matching.ray_growth import UNLABELLED, Scene, try_fit
-from labapp.core.surface.pool_fit import FitSettings
+from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import CannotMeasure, IntArray, median
 
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
@@ -82,12 +82,14 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     knots = FOLLOWING
     if best.residual_mm > MODEL_MM or _is_rivalled(scene, best):
         knots = FINE
-        found = [h for each in found if (h := weigh(scene, each.labels, knots, near=each.pool))]
+        found = [h for each in found if (h := _judged(scene, each.labels, knots, each.pool))]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     neighbours: list[Hypothesis] = []
     if not _beyond_doubt(scene, best, settings.margin):
         best, neighbours = _with_neighbours(scene, best, knots)
-    best = without_false_rim(scene, without_false_ends(scene, best, knots), knots)
+    alone = weigh(scene, best.labels, knots, near=best.pool) or best
+    alone = without_false_rim(scene, without_false_ends(scene, alone, knots), knots)
+    best = _judged(scene, alone.labels, knots, alone.pool) or alone
     _refuse_unexplained(scene, best, settings)
     own = best.orientation(scene)
     if best.marker == "lit":
@@ -102,12 +104,11 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     doubtful: list[int] = contested(scene, best).tolist()
     others = (turned(scene, best.labels, own, way) for way in settings.orientations if way != own)
     for other in [*found, *neighbours, *_rivals(scene, best, others, knots)]:
-        near = other.cost < best.cost + settings.margin
-        if not near and not _may_be_unfinished(other, best, settings.margin):
+        if _stands_against(scene, best, other, knots, settings.margin):
             continue
         differing, shared = _differing(best, other)
         if len(differing) <= 0.2 * shared:
-            doubtful += differing if near else []
+            doubtful += differing
         elif other.orientation(scene) != own:
             raise CannotMeasure(
                 "ambiguous-orientation",
@@ -144,13 +145,21 @@ INFLATED = 40.0
 """What a dip under the torch, or dots that labels a row on have not yet found, add to a cost."""
 
 
-def _may_be_unfinished(other: Hypothesis, best: Hypothesis, margin: float) -> bool:
-    """Whether another fits its dots as well, has a hole for the marker, and lacks but a few more.
-
-    Where rows cross, labels that were moved may keep some that are swapped, and find no others.
-    """
-    as_well = other.misfit < best.misfit + margin and other.marker == "dark"
-    return as_well and other.cost < best.cost + INFLATED
+def _stands_against(
+    scene: Scene, best: Hypothesis, other: Hypothesis, knots: FitSettings, margin: float
+) -> bool:
+    """Whether the best costs less by a margin; with fine knots, less by either, by one clearly."""
+    if other.cost >= best.cost + margin:
+        return True
+    if knots is not FINE:
+        return False
+    ahead = []
+    for settings in (FINE, FOLLOWING):
+        own, rival = (weigh(scene, h.labels, settings, near=h.pool) for h in (best, other))
+        if own is None or rival is None:
+            return False
+        ahead.append(rival.cost - own.cost)
+    return min(ahead) >= 0 and max(ahead) >= margin
 
 
 def _is_rivalled(scene: Scene, best: Hypothesis) -> bool:
@@ -183,6 +192,7 @@ def _with_neighbours(
         neighbours = _rivals(scene, best, moved(scene, best.labels), knots)
         near = [each.labels for each in neighbours if each.cost < best.cost + INFLATED]
         grown = [h for labels in near if (h := grow_and_score(scene, labels, knots))]
+        grown = [h for each in grown if (h := _judged(scene, each.labels, knots, each.pool))]
         better = min(grown, key=lambda h: h.cost, default=best)
         if better.cost >= best.cost:
             return best, neighbours + grown
@@ -199,8 +209,22 @@ def _rivals(
         for labels in labelled
         if (pool := try_fit(scene, labels, near=best.pool)) is not None
         and pool.residual_rms_mm < most_mm
-        and (hypothesis := weigh(scene, labels, knots, near=pool)) is not None
+        and (hypothesis := _judged(scene, labels, knots, pool)) is not None
     ]
+
+
+def _judged(
+    scene: Scene, labels: IntArray, knots: FitSettings, near: FittedPool
+) -> Hypothesis | None:
+    """Weigh labels; with fine knots the cost is the mean of that and of the cost with wide ones.
+
+    Wide knots leave much of a dip, fine ones let wrong labels have the rough surface they need.
+    """
+    own = weigh(scene, labels, knots, near=near)
+    if own is None or knots is not FINE:
+        return own
+    wide = weigh(scene, labels, FOLLOWING, near=near)
+    return None if wide is None else replace(own, cost=(own.cost + wide.cost) / 2)
 
 
 PAIR, BESIDE = 2, 1.5
