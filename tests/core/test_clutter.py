@@ -29,11 +29,11 @@ def test_a_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [14, 45])
+@pytest.mark.parametrize("seed", [14, 33, 45])
 def test_rows_that_a_second_hole_leaves_open_are_not_answered(seed: int) -> None:
-    """A dot beside the marker is missing: with these frames every ray was a row off once."""
+    """Dots beside the marker are missing: with these frames every ray was a row off once."""
     got, _ = rendered.measured("dented", seed)
-    assert got.status in {"ambiguous-rows", "no-reference"}
+    assert got.status in {"ambiguous-rows", "no-reference", "no-match"}
 
 
 @pytest.mark.slow

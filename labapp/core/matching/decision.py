@@ -129,9 +129,11 @@ def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings)
     """Raise `CannotMeasure` where too much is left unexplained, or it may be a row."""
     strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
     missed = settings.missed[0] + settings.missed[1] * best.count
-    if best.marker == "dark" and _strays_lie_apart(scene, best):
+    # Missed rays side by side are a hole or a row: then so many dots without a ray may be theirs.
+    apart = best.marker == "dark" and _missed_lie_apart(best)
+    if apart and _strays_lie_apart(scene, best):
         strays = max(strays, STRAYS_APART * best.count)
-    if best.marker == "dark" and _missed_lie_apart(best):
+    if apart:
         missed = max(missed, MISSED_APART * best.count - EACH_STRAY * best.stray)
     if best.stray > strays or best.missed > missed:
         raise CannotMeasure(
