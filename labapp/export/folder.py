@@ -32,7 +32,7 @@ from labapp.export.pictures import (
     write_trend_picture,
 )
 from labapp.export.results import SURFACES, now, surface_files
-from labapp.export.studio import PICTURE_PX, drawing_process, told
+from labapp.export.studio import PICTURE_PX, drawing_errors, drawing_process
 from labapp.export.summary import Summary
 from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
 from labapp.files import as_bytes, beside
@@ -216,7 +216,7 @@ def export(
         if "film" in choice.pictures and extent.known:
             times_s = film_times([each[:2] for each in summary.frames], choice.film_rate_hz)
             path = files.new(FILM_FILE)
-            with told("film"), drawing_process(choice.size_px, choice.view) as process:
+            with drawing_errors("film"), drawing_process(choice.size_px, choice.view) as process:
                 write_film(path, measured, times_s, extent, process, lambda k: progress(frames + k))
         return files.finish({"frames": frames, "units": UNITS, "provenance": provenance})
 
@@ -328,7 +328,7 @@ def _write_results(
                 path = files.new(f"frame_{frame:06d}.png")
                 write_frame_picture(path, image_of(frame), measurement)
             if process is not None and reconstruction is not None:
-                with told("surfaces"):
+                with drawing_errors("surfaces"):
                     path = files.new(f"surface_{frame:06d}.png")
                     write_surface_picture(path, reconstruction, process)
             summary.add(frame, time_s, measurement)

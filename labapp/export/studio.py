@@ -88,7 +88,7 @@ def draw_there(scene: Scene) -> Picture:
 
 
 @contextmanager
-def told(what: str) -> Iterator[None]:
+def drawing_errors(what: str) -> Iterator[None]:
     """Turn what is missing to draw pictures of an export into what a user can act on."""
     try:
         yield

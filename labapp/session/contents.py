@@ -47,7 +47,7 @@ class SessionContents:
         self._signals = KeptSignals(self._documents)
 
     def close(self) -> None:
-        """Let go of the file. Closing twice does no harm."""
+        """Close the file. Closing twice does no harm."""
         self._frames.close()
         self._database.close()
 

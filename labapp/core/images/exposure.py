@@ -37,7 +37,7 @@ ADVICE: dict[Verdict, str] = {
     "blank": "All pixels are alike: is the shutter open, the camera connected?",
     "no dots": "No dot stands out: is the laser on, and the imaging plane in the picture?",
     "too dark": "The dots hardly leave the noise: expose longer, or open the lens.",
-    "saturated": "Dots are clipped, and their centres cannot be told well: expose less.",
+    "saturated": "Dots are clipped, and their centres are inaccurate: expose less.",
     "dots merge": "Neighbouring dots run together: focus, or move the imaging plane away.",
     "low contrast": "The background outshines the dots: shield the arc's light, or use the filter.",
     "good": "The dots stand out well.",

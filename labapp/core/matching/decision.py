@@ -87,14 +87,17 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     neighbours: list[Hypothesis] = []
     if not _beyond_doubt(scene, best, settings.margin):
         best, neighbours = _with_neighbours(scene, best, knots)
-    alone = weigh(scene, best.labels, knots, near=best.pool) or best
-    alone = without_false_rim(scene, without_false_ends(scene, alone, knots), knots)
-    best = _judged(scene, alone.labels, knots, alone.pool) or alone
+    if knots is FINE:  # what takes labels away compares costs of these knots alone
+        best = weigh(scene, best.labels, knots, near=best.pool) or best
+    best = without_false_rim(scene, without_false_ends(scene, best, knots), knots)
+    if knots is FINE:
+        best = _judged(scene, best.labels, knots, best.pool) or best
     _refuse_unexplained(scene, best, settings)
     own = best.orientation(scene)
     if best.marker == "lit":
+        others_explain = any_explains(scene, [h for h in found if h.marker == "dark"])
         raise CannotMeasure(
-            "ambiguous-rows" if any_explains(scene, found) else "no-reference",
+            "ambiguous-rows" if others_explain else "no-reference",
             "where the best rows have the absent centre dot, there is a dot",
         )
     if best.marker == "unknown":

@@ -110,7 +110,7 @@ def with_rows_beyond(scene: Scene, found: list[Hypothesis]) -> list[Hypothesis]:
     Beyond the last row a surface may be so uncertain that several rays come into question for
     every dot there; then `grow_labels` gives none of them a ray. Here each is tried, and what has
     come of it is a hypothesis to be held against the others: a row given to the wrong rays costs
-    the dots of the rays that it jumps, or comes too near to another way to be told from it.
+    the dots of the rays that it jumps, or costs nearly as much as another hypothesis.
     """
     # The cheapest of all, and of those that have the marker dark: all it lacks may be a row.
     groups = (found, [hypothesis for hypothesis in found if hypothesis.marker == "dark"])

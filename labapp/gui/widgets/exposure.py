@@ -78,7 +78,7 @@ def bars(exposure: Exposure) -> tuple[Bar, Bar, Bar]:
             "Saturation",
             exposure.clipped,
             f"{exposure.clipped:.0%} of the {of} clipped",
-            f"Part of the {of} at the top of the scale: their centres cannot be told well",
+            f"Part of the {of} at the top of the scale: their centres are inaccurate",
         ),
         Bar(
             "Contrast",
