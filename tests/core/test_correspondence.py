@@ -259,12 +259,44 @@ def test_a_second_hole_beside_the_true_one_never_misleads(
         np.testing.assert_array_equal(match.ray, seen.ray[kept][match.dot])
 
 
-@pytest.mark.parametrize("peak_mm", [0.005, 0.002])
-def test_a_pool_too_shallow_to_be_told_which_way_round_is_not_answered(peak_mm: float) -> None:
-    seen = see(egg(6.2, 2.8, 3.6, peak_mm), np.random.default_rng(0), sigma_px=0.3)
+def test_a_pool_too_shallow_to_be_told_which_way_round_is_not_answered() -> None:
+    seen = see(egg(6.2, 2.8, 3.6, 0.002), np.random.default_rng(0), sigma_px=0.3)
     match, status = matched(seen.dots)
     assert match is None
     assert status != "ok"
+
+
+@pytest.mark.parametrize("peak_mm", [0.005, -0.008])
+def test_which_way_round_a_shallow_pool_is_the_boundary_tells(peak_mm: float) -> None:
+    seen = see(egg(6.2, 2.8, 3.6, peak_mm), np.random.default_rng(0), sigma_px=0.3)
+    match, _ = matched(seen.dots)
+    assert match is not None
+    np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "way"), [(5, 1), (9, 1), (11, 1), (16, 1), (18, 1), (9, -1), (18, -1)]
+)
+def test_a_set_up_that_is_a_little_off_leads_to_no_wrong_rays(seed: int, way: int) -> None:
+    """Shallow pools were answered the other way round, with nearly all rays wrong."""
+    rng = np.random.default_rng([seed, 77])
+    width = rng.uniform(4.8, 6.6)
+    center = tuple(rng.uniform(-0.3, 0.3, 2))
+    peak_mm = way * rng.choice([0.004, 0.008, 0.015, 0.03])
+    pool = egg(width, 0.47 * width, 0.6 * width, peak_mm, center)
+    missing, false = int(rng.integers(0, 5)), int(rng.integers(0, 4))
+    seen = see(pool, rng, sigma_px=0.1, missing=missing, false=false)
+    laser, plane = BENCH_RIG.laser, BENCH_RIG.imaging_plane
+    angle, distance = rng.normal(0.0, [0.2, 0.3])
+    rig = replace(
+        BENCH_RIG,
+        laser=Laser(laser.projection_angle_deg + angle, laser.distance_mm + distance),
+        imaging_plane=replace(plane, origin_mm=plane.origin_mm + rng.normal(0, 0.3, 3)),
+    )
+    match, _ = matched(seen.dots, rig)
+    if match is not None:
+        assert (seen.ray[match.dot] == match.ray).all(axis=-1).mean() > 0.95
 
 
 @pytest.mark.parametrize(("pool", "forced"), [(CONVEX, "I/I"), (CONVEX, "S/I"), (CONCAVE, "S/S")])

@@ -15,7 +15,14 @@ from labapp.core.rows.correction import block_row, set_reference
 from labapp.media import open_source
 from labapp.simulation.recording import TARGET
 from labapp.simulation.samples.__main__ import main
-from labapp.simulation.samples.runs import blocked_rows, concave, gtaw, samples, thumb_tack
+from labapp.simulation.samples.runs import (
+    BENT_MM,
+    blocked_rows,
+    concave,
+    gtaw,
+    samples,
+    thumb_tack,
+)
 from labapp.simulation.torch import ConeTorch
 
 FOLDER = Path(__file__).parents[2] / "sample_sessions"
@@ -263,7 +270,7 @@ def test_torch_out_of_the_way_is_no_matter():
     assert result.measures.height_mm == pytest.approx(height, rel=0.03)
 
 
-@pytest.mark.parametrize("index", [2, 4])
+@pytest.mark.parametrize("index", [2, 4, 5])
 @pytest.mark.slow
 def test_blocked_frame_is_measured_while_its_rows_can_be_told(index):
     frame = blocked_rows().frame(index)
@@ -274,18 +281,32 @@ def test_blocked_frame_is_measured_while_its_rows_can_be_told(index):
     np.testing.assert_allclose(result.match.plane_mm, true, atol=0.3)
 
 
-@pytest.mark.parametrize(("index", "mark"), [(5, True), (5, False)])
 @pytest.mark.slow
-def test_blocked_frame_is_refused_and_put_right_by_hand(index, mark):
-    sample, frame = blocked_rows(), blocked_rows().frame(index)
-    result = measured(sample, index)
-    status, reference, place, blocked = advised(index)
-    assert result.status == status != "ok"
+def test_marked_rows_bring_a_blocked_frame_closer():
+    sample, frame = blocked_rows(), blocked_rows().frame(5)
+    correction = start_correction(measured(sample, 5))
+    for row in advised(5)[3]:
+        correction = block_row(correction, row)
+    result = measured(sample, 5, correction)
+    assert result.status == "ok"
+    assert result.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=0.02)
+
+
+@pytest.mark.parametrize("mark", [True, False])
+@pytest.mark.slow
+def test_a_frame_with_more_hidden_is_refused_and_put_right_by_hand(mark):
+    index, bench = 5, read_setup(FOLDER / "blocked_rows" / "setup.toml")
+    bench = bench.rig, bench.calibration, Settings()
+    sample = replace(blocked_rows(), torches=(ConeTorch((*BENT_MM, 0.8)),) * 6)
+    frame = sample.frame(index)
+    result = measure(frame.image, *bench)
+    _, reference, place, blocked = advised(index)
+    assert result.status != "ok"
     np.testing.assert_allclose(place, frame.dot_px[9, 9], atol=1.0)
     correction = set_reference(start_correction(result), reference)
     for row in blocked if mark else ():
         correction = block_row(correction, row)
-    again = measured(sample, index, correction)
+    again = measure(frame.image, *bench, correction)
     assert again.status == "ok"
     tolerance = 0.03 if mark else 0.05
     assert again.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=tolerance)

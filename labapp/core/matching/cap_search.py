@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from labapp.core.matching.ray_growth import UNLABELLED, Scene
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import FloatArray, IntArray, median
 
 _ASPECTS = (0.9, 1.1, 1.35)
 """Length over width that are tried."""
@@ -63,8 +62,7 @@ def search_caps(scene: Scene, most: int = 8) -> list[IntArray]:
     list of IntArray
         Index of the dot of each ray or `UNLABELLED`, shape (rows, columns); the best first.
     """
-    tree = cKDTree(scene.plane_mm)
-    judged = [found for cap in _caps(scene) if (found := _judged(scene, tree, cap)) is not None]
+    judged = [found for cap in _caps(scene) if (found := _judged(scene, cap)) is not None]
     judged.sort(key=lambda one: -one[0])
     best: list[IntArray] = []
     for _, labels in judged:
@@ -83,8 +81,9 @@ def _caps(scene: Scene) -> Iterator[_Cap]:
         yield _Cap(axes, np.array([x, y]), 2 * height * float(axes[0]))
 
 
-def _judged(scene: Scene, tree: cKDTree, cap: _Cap) -> tuple[float, IntArray] | None:
+def _judged(scene: Scene, cap: _Cap) -> tuple[float, IntArray] | None:
     """How well the dots lie where the cap has them, and the labels of those that do."""
+    from labapp.core.images.dot_kernels import two_nearest
     from labapp.core.surface import kernels
 
     down = np.array([0.0, 0.0, cap.height])  # the quadric has its top at 0
@@ -101,15 +100,16 @@ def _judged(scene: Scene, tree: cKDTree, cap: _Cap) -> tuple[float, IntArray] | 
     own = np.flatnonzero(there & ~scene.absent.ravel())
     if len(own) < LEAST:
         return None
-    predicted = cKDTree(dots[own])
-    spacing = predicted.query(dots[own], k=2)[0][:, 1]
-    away, dot = tree.query(dots[own])
-    mutual = predicted.query(scene.plane_mm)[1][dot] == np.arange(len(own))
+    predicted, captured = dots[own], scene.plane_mm
+    spacing = two_nearest(predicted, predicted)[0][:, 1]
+    away, dot = (part[:, 0] for part in two_nearest(predicted, captured))
+    mutual = two_nearest(captured, predicted)[1][dot, 0] == np.arange(len(own))
     near = mutual & (away < GATE * spacing)
     score = float(np.sum(1 - away[near] / spacing[near]) - DARK * np.sum(~near))
     marker = scene.absent.ravel() & there
     if marker.any():
-        score -= LIT_MARKER * np.mean(tree.query(dots[marker])[0] < 0.3 * np.median(spacing))
+        off = two_nearest(dots[marker], captured)[0][:, 0]
+        score -= LIT_MARKER * float(np.mean(off < 0.3 * median(spacing)))
     labels = np.full(scene.absent.size, UNLABELLED, np.int64)
     labels[own[near]] = dot[near]
     return score, labels.reshape(scene.absent.shape)

@@ -28,6 +28,7 @@ from labapp.core.matching.decision import (
     any_explains,
     decide,
     explains,
+    nearly_explains,
 )
 from labapp.core.matching.hypothesis import (
     Hypothesis,
@@ -84,6 +85,8 @@ def match_rays(
         if any_explains(scene, found):
             break
     try:
+        if not any(nearly_explains(scene, hypothesis) for hypothesis in found):
+            raise CannotMeasure("no-match", "no hypothesis explains most of the dots")
         best = _answer(scene, found, lattice, settings)
     except CannotMeasure as reason:
         if reason.status != "no-match":
@@ -181,6 +184,8 @@ def _by_caps(scene: Scene) -> list[Hypothesis]:
     for labels in search_caps(scene):
         hypothesis = grow_and_score(scene, labels)
         found += with_repaired(scene, [hypothesis]) if hypothesis is not None else []
+        if any_explains(scene, found):
+            break
     return found
 
 

@@ -35,6 +35,11 @@ MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
 with wrong rays they are mostly ten times those with the right ones."""
 
 
+MOST_LEFT = 0.5
+"""With a larger share of the dots left over, a hypothesis is not mended but another one looked
+for."""
+
+
 @dataclass(frozen=True)
 class MatchSettings:
     """How the correspondence is decided.
@@ -62,9 +67,16 @@ class MatchSettings:
 
 
 def explains(scene: Scene, hypothesis: Hypothesis) -> bool:
-    """Hardly a dot is left over, hardly one is missing, and none is where the marker is."""
+    """Hardly a dot is left over, few are missing and lie apart, and none is where the marker is."""
     few = max(2, 0.05 * len(scene.plane_mm))
-    return hypothesis.stray <= few and hypothesis.missed <= few and hypothesis.marker != "lit"
+    most = MISSED_APART * hypothesis.count if _missed_lie_apart(hypothesis) else 0.0
+    missed = hypothesis.missed <= max(few, most)
+    return hypothesis.stray <= few and missed and hypothesis.marker != "lit"
+
+
+def nearly_explains(scene: Scene, hypothesis: Hypothesis) -> bool:
+    """Most dots have their ray: what is left may be a row, or a dip."""
+    return hypothesis.stray <= MOST_LEFT * len(scene.plane_mm)
 
 
 def any_explains(scene: Scene, found: list[Hypothesis]) -> bool:
@@ -144,7 +156,17 @@ def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings)
             f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
             f"{_counted(best.missed, 'ray')} without a dot amid {best.count} pairs",
         )
+    if best.pool.level.rays and best.pool.level.disagreement > CONTRADICTED_BITS:
+        raise CannotMeasure(
+            "no-match",
+            "no boundary of the best surface has the rays that came back inside and the others "
+            "outside: is the set-up right?",
+        )
 
+
+CONTRADICTED_BITS = 0.5
+"""Mean surprise of a ray near the boundary above which the surface is not the pool's: less than 0.3
+even where the set-up is a little off, more than 1 where labels are wrong for that."""
 
 INFLATED = 40.0
 """What a dip under the torch, or dots that labels a row on have not yet found, add to a cost."""
@@ -223,13 +245,17 @@ def _judged(
 ) -> Hypothesis | None:
     """Weigh labels; with fine knots the cost is the mean of that and of the cost with wide ones.
 
-    Wide knots leave much of a dip, fine ones let wrong labels have the rough surface they need.
+    Wide knots leave much of a dip, fine ones let wrong labels have the rough surface they need: a
+    marker that either has lit is lit.
     """
     own = weigh(scene, labels, knots, near=near)
     if own is None or knots is not FINE:
         return own
     wide = weigh(scene, labels, FOLLOWING, near=near)
-    return None if wide is None else replace(own, cost=(own.cost + wide.cost) / 2)
+    if wide is None:
+        return None
+    marker = "lit" if wide.marker == "lit" else own.marker
+    return replace(own, marker=marker, cost=(own.cost + wide.cost) / 2)
 
 
 PAIR, BESIDE = 2, 1.5

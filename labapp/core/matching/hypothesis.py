@@ -26,7 +26,7 @@ from labapp.core.matching.ray_growth import (
     try_fit,
 )
 from labapp.core.rows.lattice import Lattice, Site
-from labapp.core.surface.pool_fit import FitSettings, FittedPool
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, Level
 from labapp.core.values import BoolArray, CannotMeasure, IntArray, median
 
 MODEL_MM = 0.045
@@ -47,6 +47,10 @@ STRAY, MISSED, LIT_MARKER = 16.0, 12.0, 60.0
 """What a dot without a ray, a ray without its dot amid the others, and a dot where the marker's
 absent ray would make one, cost in units of χ². The last is rarely a false dot: labels a row or a
 column off put one there nearly always."""
+
+RIM_MM, MOST_BOUNDARY = 0.01, 60.0
+"""How far the set-up may be off at the boundary, as height, mm; and the most that rays near the
+boundary may cost a hypothesis, in units of χ²."""
 
 Marker = Literal["dark", "lit", "unknown"]
 """What shows where the marker's absent ray would make its dot: nothing amid labelled rays, a dot,
@@ -73,7 +77,7 @@ class Hypothesis:
     marker
         What shows at the marker's absent ray; None if the pattern has no marker.
     cost
-        χ² of the dots, plus `STRAY`, `MISSED` and `LIT_MARKER` for those.
+        χ² of the dots, what the rays near the boundary have against it, and what is `unexplained`.
     """
 
     labels: IntArray
@@ -93,6 +97,11 @@ class Hypothesis:
     def missed(self) -> int:
         """How many rays amid the others have no dot."""
         return len(self.unseen.at)
+
+    @property
+    def unexplained(self) -> float:
+        """What dots without a ray, rays without a dot and a lit marker cost."""
+        return STRAY * self.stray + MISSED * self.missed + LIT_MARKER * (self.marker == "lit")
 
     @property
     def count(self) -> int:
@@ -164,10 +173,20 @@ def weigh(
     marker = _marker(scene, lit, pool)
     variance = scene.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
     surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY)
-    cost = float(surprise.sum()) + STRAY * len(stray) + MISSED * len(unseen.at)
-    cost += LIT_MARKER * (marker == "lit")
     witness = _witness(scene, labels, pool)
-    return Hypothesis(labels, pool, witness, unseen, stray, marker, cost)
+    known = float(surprise.sum()) + _boundary_cost(pool.level)
+    hypothesis = Hypothesis(labels, pool, witness, unseen, stray, marker, known)
+    return replace(hypothesis, cost=known + hypothesis.unexplained)
+
+
+def _boundary_cost(level: Level) -> float:
+    """−2 log likelihood of which rays near the boundary are lit, as far as the set-up is known.
+
+    Its errors tilt the surface: of a shallow pool the boundary then says little, and where the
+    rays contradict any level, it may be for the set-up.
+    """
+    share = level.rise_mm**2 / (level.rise_mm**2 + RIM_MM**2)
+    return min(2 * share * level.negative_log_likelihood, MOST_BOUNDARY)
 
 
 def _marker(scene: Scene, lit: BoolArray, pool: FittedPool) -> Marker | None:

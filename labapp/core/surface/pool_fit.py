@@ -103,16 +103,25 @@ class Level:
         +1 for a pool that stands above the work piece inside its boundary, −1 for one below.
     rear
         Where the boundary lies below the work piece.
-    disagreement
-        Mean surprise of the rays near the boundary, bits: 0 where every lit ray is inside and
-        every dark one outside.
+    negative_log_likelihood
+        Of the rays near the boundary, being lit or dark: 0 where every lit one lands inside and
+        every dark one outside, or where no ray is known to be dark.
+    rays, rise_mm
+        How many these are; by how much the surface rises there from one ray to the next, mm.
     """
 
     shift_mm: float
     sigma_mm: float
     sign: int
     rear: Rear
-    disagreement: float
+    negative_log_likelihood: float
+    rays: int = 0
+    rise_mm: float = 0.0
+
+    @property
+    def disagreement(self) -> float:
+        """Mean surprise of the rays near the boundary, bits; infinite where there are none."""
+        return self.negative_log_likelihood / np.log(2) / self.rays if self.rays else np.inf
 
 
 @dataclass(frozen=True)
@@ -202,7 +211,7 @@ def fit_pool(
     coefficients, moved = np.zeros(basis.count), np.inf
     if near is not None:
         points, _ = kernels.advance(near.basis.grid, near.coefficients, rays, points, 4)
-    level = Level(0.0, np.inf, 1, Rear(), np.inf)
+    level = Level(0.0, np.inf, 1, Rear(), 0.0)
     for count in range(settings.rounds):
         coefficients = equations.improve(coefficients, points, moved)
         if not (witness[witnesses] < 0).any():
@@ -250,7 +259,7 @@ def _rim_level(height: FloatArray, rim: BoolArray) -> Level:
     """Guess the level where nobody says where the pool ends: the outermost points lie at 0."""
     shift = -float(np.mean(height[rim]))
     sign = 1 if height[~rim].mean() + shift > 0 else -1
-    return Level(shift, float(np.std(height)), sign, Rear(), np.inf)
+    return Level(shift, float(np.std(height)), sign, Rear(), 0.0)
 
 
 NEARER = 0.3
@@ -350,8 +359,8 @@ def place_level(
     if about is not None and off_window > (AT_END if reach < 1.0 else AT_FAR_END):
         farther = about if reach < 1.0 else None
         return place_level(height, slope, y, witness, spacing_mm, drop_mm, farther)
-    surprise = nats.min() / np.log(2) / max(int(near.sum()), 1)
-    return Level(mean, sigma, sign, Rear(drop, start, end), float(surprise))
+    least, rays = float(nats.min()), int(near.sum())
+    return Level(mean, sigma, sign, Rear(drop, start, end), least, rays, usual)
 
 
 def _rough_level(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:

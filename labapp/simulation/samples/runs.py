@@ -183,15 +183,16 @@ to {TIP_MM[-1]:g} mm. The electrode is bent as well: its tip stands {BENT_MM[0]:
 of the origin and
 {-BENT_MM[1]:g} mm behind it. So it hides the middle of the front rows and of the rear ones, and \
 with them
-a dot next to the absent centre dot: no hole in the rows is the reference any more. Made by
+a dot next to the absent centre dot: no hole in the rows is surely the reference any more. Made by
 `python -m labapp.simulation.samples DIR`.
 
 {{files}}
 
-`labapp reconstruct recording.mkv --setup setup.toml --out DIR` measures frames 0 to 4 (height
-within 3 %, from frame 2 on within 5 %) and refuses frame 5. Who sees the whole run can put it
-right, for the rows stay where they are on the picture. Rows are counted from the bottom up, columns
-from left to right, both from 1, as the program finds them here.
+`labapp reconstruct recording.mkv --setup setup.toml --out DIR` measures every frame (height
+within 3 %, from frame 2 on within 5 %). Which hole is the reference, the rays that came back tell:
+with the rows a row on, they would lie outside the boundary. Who sees the whole run can say more,
+for the rows stay where they are on the picture. Rows are counted from the bottom up, columns from
+left to right, both from 1, as the program finds them here.
 
 | frame | status | reference (row, column) | on the picture (u, v) | rows to mark as blocked |
 | --- | --- | --- | --- | --- |
@@ -200,10 +201,10 @@ from left to right, both from 1, as the program finds them here.
 | 2 | `ok` | (6, 8) is found | (278, 281) px | 1, 2, 6, 7, 8 |
 | 3 | `ok` | (6, 8) is found | (278, 281) px | 1, 2, 6, 7, 8 |
 | 4 | `ok` | (6, 8) is found | (278, 281) px | 1, 2, 6, 7, 8 |
-| 5 | `ambiguous-rows` | (6, 8) | (278, 282) px | 1, 2, 6, 7 |
+| 5 | `ok` | (6, 8) is found | (278, 282) px | 1, 2, 6, 7 |
 
-The reference alone is what it takes; with the rows marked, a ray that the torch hid is not taken
-for one that missed the pool, and the measures come out closer: height within 2 % in every frame.
+With the rows marked, a ray that the torch hid is not taken for one that missed the pool, and the
+measures come out closer: height within 2 % in every frame.
 """
 
 
