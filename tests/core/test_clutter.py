@@ -30,9 +30,12 @@ def test_a_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [14, 33, 45])
+@pytest.mark.parametrize("seed", [14, 33, 45, 406])
 def test_a_second_hole_in_the_rows_is_not_taken_for_the_marker(seed: int) -> None:
-    """Dots beside the marker are missing: with these frames every ray was a row off once."""
+    """Dots beside the marker are missing: with these frames every ray was a row off once.
+
+    In the last a false dot lies at the marker as well.
+    """
     got, _ = rendered.measured("dented", seed)
     assert got.status in {"ok", "ambiguous-rows", "no-reference", "no-match"}
     assert got.wrong == 0

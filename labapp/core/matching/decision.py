@@ -175,7 +175,12 @@ INFLATED = 40.0
 def _stands_against(
     scene: Scene, best: Hypothesis, other: Hypothesis, knots: FitSettings, margin: float
 ) -> bool:
-    """Whether the best costs less by a margin; with fine knots, less by either, by one clearly."""
+    """Whether the best costs less by a margin; with fine knots, less by either, by one clearly.
+
+    A false dot may lie at the marker: what costs less but for that is a rival.
+    """
+    if other.unlit_cost < best.unlit_cost:
+        return False
     if other.cost >= best.cost + margin:
         return True
     if knots is not FINE:
@@ -255,7 +260,7 @@ def _judged(
     if wide is None:
         return None
     marker = "lit" if wide.marker == "lit" else own.marker
-    return replace(own, marker=marker, cost=(own.cost + wide.cost) / 2)
+    return replace(own, marker=marker, unlit_cost=(own.unlit_cost + wide.unlit_cost) / 2)
 
 
 PAIR, BESIDE = 2, 1.5

@@ -76,8 +76,8 @@ class Hypothesis:
         Rays amid the others that have no dot; indices of the dots that have no ray.
     marker
         What shows at the marker's absent ray; None if the pattern has no marker.
-    cost
-        χ² of the dots, what the rays near the boundary have against it, and what is `unexplained`.
+    unlit_cost
+        χ² of the dots, what the rays near the boundary have against it, `STRAY` and `MISSED`.
     """
 
     labels: IntArray
@@ -86,7 +86,12 @@ class Hypothesis:
     unseen: Prediction
     strays: IntArray
     marker: Marker | None
-    cost: float
+    unlit_cost: float
+
+    @property
+    def cost(self) -> float:
+        """The lower the likelier: `unlit_cost`, and `LIT_MARKER` where a dot is at the marker."""
+        return self.unlit_cost + LIT_MARKER * (self.marker == "lit")
 
     @property
     def stray(self) -> int:
@@ -97,11 +102,6 @@ class Hypothesis:
     def missed(self) -> int:
         """How many rays amid the others have no dot."""
         return len(self.unseen.at)
-
-    @property
-    def unexplained(self) -> float:
-        """What dots without a ray, rays without a dot and a lit marker cost."""
-        return STRAY * self.stray + MISSED * self.missed + LIT_MARKER * (self.marker == "lit")
 
     @property
     def count(self) -> int:
@@ -173,10 +173,10 @@ def weigh(
     marker = _marker(scene, lit, pool)
     variance = scene.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
     surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY)
+    cost = float(surprise.sum()) + STRAY * len(stray) + MISSED * len(unseen.at)
+    cost += _boundary_cost(pool.level)
     witness = _witness(scene, labels, pool)
-    known = float(surprise.sum()) + _boundary_cost(pool.level)
-    hypothesis = Hypothesis(labels, pool, witness, unseen, stray, marker, known)
-    return replace(hypothesis, cost=known + hypothesis.unexplained)
+    return Hypothesis(labels, pool, witness, unseen, stray, marker, cost)
 
 
 def _boundary_cost(level: Level) -> float:
