@@ -267,7 +267,7 @@ PAIR, BESIDE = 2, 1.5
 """So many missed rays, or dots without a ray, side by side are no row; dots are where they are
 nearer to one another than so many spacings."""
 
-STRAYS_APART, MISSED_APART, EACH_STRAY = 0.25, 0.12, 3
+STRAYS_APART, MISSED_APART, EACH_STRAY = 0.35, 0.12, 3
 """Shares of the dots with a ray that are put up with where they lie apart: false dots do, and those
 that fail at random; dots of a row that was left out or jumped do not. That leaves both kinds: for
 each dot without a ray, by so many missed rays fewer are put up with."""
