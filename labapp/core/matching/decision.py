@@ -90,17 +90,7 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     It is held against the others and against itself up to two rows or columns further on: a
     hypothesis that was followed from the wrong hole may lead to almost the right place.
     """
-    best = min(found, key=lambda hypothesis: hypothesis.cost)
-    knots = FOLLOWING
-    if best.residual_mm > MODEL_MM or _is_rivalled(scene, best):
-        knots = FINE
-        found = [h for each in found if (h := _judged(scene, each.labels, knots, each.pool))]
-        best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
-    neighbours: list[Hypothesis] = []
-    if not _beyond_doubt(scene, best, settings.margin):
-        best, neighbours = _with_neighbours(scene, best, knots)
-    if knots is FINE:  # what takes labels away compares costs of these knots alone
-        best = weigh(scene, best.labels, knots, near=best.pool) or best
+    best, found, neighbours, knots = _cheapest(scene, found, settings.margin)
     best = without_false_rim(scene, without_false_ends(scene, best, knots), knots)
     if knots is FINE:
         best = _judged(scene, best.labels, knots, best.pool) or best
@@ -138,6 +128,28 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
         witness = np.where(certain == best.labels, best.witness, 0)
         best = replace(weigh(scene, certain, knots, near=best.pool) or best, witness=witness)
     return best
+
+
+def _cheapest(
+    scene: Scene, found: list[Hypothesis], margin: float
+) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis], FitSettings]:
+    """Return the cheapest hypothesis, those found, its neighbours, and the knots they all have."""
+    best = min(found, key=lambda hypothesis: hypothesis.cost)
+    knots = FOLLOWING
+    neighbours: list[Hypothesis] = []
+    if best.stray or best.missed:
+        neighbours = _rivals(scene, best, moved(scene, best.labels), knots)
+    # What these knots leave of a dip may decide between rivals so near.
+    near = any(rival.cost < best.cost + INFLATED for rival in neighbours)
+    if near or best.residual_mm > MODEL_MM:
+        knots, neighbours = FINE, []
+        found = [h for each in found if (h := _judged(scene, each.labels, knots, each.pool))]
+        best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
+    if not neighbours and not _beyond_doubt(scene, best, margin):
+        best, neighbours = _with_neighbours(scene, best, knots)
+    if knots is FINE:  # what takes labels away compares costs of these knots alone
+        best = weigh(scene, best.labels, knots, near=best.pool) or best
+    return best, found, neighbours, knots
 
 
 def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings) -> None:
@@ -192,14 +204,6 @@ def _stands_against(
             return False
         ahead.append(rival.cost - own.cost)
     return min(ahead) >= 0 and max(ahead) >= margin
-
-
-def _is_rivalled(scene: Scene, best: Hypothesis) -> bool:
-    """Whether labels a row or two on come so near that what knots leave of a dip may decide."""
-    if best.stray == best.missed == 0:
-        return False
-    rivals = _rivals(scene, best, moved(scene, best.labels), FOLLOWING)
-    return any(rival.cost < best.cost + INFLATED for rival in rivals)
 
 
 def _beyond_doubt(scene: Scene, best: Hypothesis, margin: float) -> bool:
