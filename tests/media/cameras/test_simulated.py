@@ -28,8 +28,8 @@ def read(camera, count: int) -> list[CameraFrame]:
 def test_it_gives_its_pictures_in_order_at_its_rate() -> None:
     device = SimulatedDevice("test", numbered, rate_hz=500)
     with device.open() as camera:
-        camera.start()
         begun_s = time.monotonic()
+        camera.start()
         frames = read(camera, 50)
         took_s = time.monotonic() - begun_s
     assert [number_in(frame.image) for frame in frames] == list(range(50))
