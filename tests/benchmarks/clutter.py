@@ -18,7 +18,7 @@ import numpy as np
 
 from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
 from labapp.simulation.pools import Dent, LowRear, Pool, Wave, egg, ellipsoidal_cap, spherical_cap
-from tests.benchmarks.dips import Answer, answer
+from tests.benchmarks.dips import Answer, answer, report
 from tests.scenes import BENCH_RIG, SeenDots, see
 
 MODES = ((1, 1), (2, 1), (0, 2), (3, 1))
@@ -88,20 +88,6 @@ def draw(kind: str, seed: int, missing: float, false: int) -> tuple[Rig, SeenDot
     lost = round(many * rng.uniform(0.0, missing))
     strays = int(rng.integers(0, false + 1))
     return rig, see(pool, rng, sigma_px=sigma_px, missing=lost, false=strays, rig=rig), pool
-
-
-def report(kind: str, answers: list[Answer]) -> int:
-    """Say how the pools of a kind were answered; returns how many labels were wrong."""
-    good = [one for one in answers if one.status == "ok"]
-    off = 100 * np.abs([one.height for one in good] or [np.nan])
-    wrong, right = sum(one.wrong for one in good), sum(one.right for one in good)
-    print(
-        f"{kind}: {len(good)} of {len(answers)} answered, {wrong} labels wrong, "
-        f"{right / max(sum(one.shown for one in good), 1):.3f} labelled, height off by "
-        f"{np.median(off):.2f} % in the median, {off.max():.2f} % at worst",
-        flush=True,
-    )
-    return wrong
 
 
 def main() -> int:

@@ -86,6 +86,20 @@ def matched(seen: SeenDots, rig: Rig = BENCH_RIG) -> Match:
     return match_rays(seen.dots, lattice, rig, BENCH_VIEW, FRAME_SHAPE, MatchSettings())
 
 
+def report(kind: str, answers: list[Answer]) -> int:
+    """Say how the pools of a kind were answered; returns how many labels were wrong."""
+    good = [one for one in answers if one.status == "ok"]
+    off = 100 * np.abs([one.height for one in good] or [np.nan])
+    wrong, right = sum(one.wrong for one in good), sum(one.right for one in good)
+    print(
+        f"{kind}: {len(good)} of {len(answers)} answered, {wrong} labels wrong, "
+        f"{right / max(sum(one.shown for one in good), 1):.3f} labelled, height off by "
+        f"{np.median(off):.2f} % in the median, {off.max():.2f} % at worst",
+        flush=True,
+    )
+    return wrong
+
+
 def main() -> int:
     """How many labels were wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -99,14 +113,7 @@ def main() -> int:
         answers.append(answer(*draw(seed, chosen.missing, chosen.false)))
         if answers[-1].status != "ok" or answers[-1].wrong:
             print(f"{seed}: {answers[-1]}", flush=True)
-    good = [one for one in answers if one.status == "ok"]
-    off = 100 * np.abs([one.height for one in good] or [np.nan])
-    wrong, right = sum(one.wrong for one in good), sum(one.right for one in good)
-    print(
-        f"{len(good)} of {len(answers)} answered, {wrong} labels wrong, "
-        f"{right / max(sum(one.shown for one in good), 1):.3f} labelled, "
-        f"height off by {np.median(off):.2f} % in the median, {off.max():.2f} % at worst"
-    )
+    wrong = report("dips", answers)
     print(dict(Counter(one.status for one in answers)))
     return wrong
 

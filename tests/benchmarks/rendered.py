@@ -22,8 +22,8 @@ from labapp.core.pipeline import Settings, measure
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
 from labapp.simulation.render import Look, render
-from tests.benchmarks.clutter import KINDS, draw_pool, report
-from tests.benchmarks.dips import Answer, height_error
+from tests.benchmarks.clutter import KINDS, draw_pool
+from tests.benchmarks.dips import Answer, height_error, report
 from tests.scenes import FRAME_SHAPE
 
 ON_ITS_DOT_PX = 2.0

@@ -30,20 +30,16 @@ def test_a_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [14, 33, 45, 406])
-def test_a_second_hole_in_the_rows_is_not_taken_for_the_marker(seed: int) -> None:
-    """Dots beside the marker are missing: with these frames every ray was a row off once.
-
-    In the last a false dot lies at the marker as well.
-    """
+@pytest.mark.parametrize("seed", [14, 33, 406])
+def test_rows_that_a_second_hole_leaves_open_are_not_answered(seed: int) -> None:
+    """Dots beside the marker are missing, in 406 a false one lies at it: a row off, once."""
     got, _ = rendered.measured("dented", seed)
-    assert got.status in {"ok", "ambiguous-rows", "no-reference", "no-match"}
-    assert got.wrong == 0
+    assert got.status in {"ambiguous-rows", "no-reference", "no-match"}
 
 
 @pytest.mark.slow
 def test_of_two_holes_the_boundary_tells_the_marker() -> None:
-    """Rows a row on fit as well; then rays that came back would lie outside the boundary."""
+    """With rows a row on, rays that came back would lie outside the boundary."""
     got, _ = rendered.measured("dented", 45)
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.9 * got.shown

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-import re
 from pathlib import Path
 
 import cv2
@@ -140,7 +139,7 @@ def test_a_frame_that_cannot_be_measured_is_bad_and_says_why() -> None:
     image[:, 330:] = np.median(image)  # the torch before its right end
     found = judged(image, "blocked_rows")
     assert found.grade == "bad"
-    assert re.search(r"\((no-match|no-reference|ambiguous-rows)\)\.$", found.words)
+    assert found.words.endswith("(no-match).")
 
 
 @pytest.mark.slow

@@ -84,13 +84,15 @@ def match_rays(
         found = with_repaired(scene, found + way(scene, lattice, orientations))
         if any_explains(scene, found):
             break
+    # Where nothing explains most dots, what is found is not mended, but caps are followed at once.
+    hopeless = bool(found) and not any(nearly_explains(scene, each) for each in found)
     try:
-        if not any(nearly_explains(scene, hypothesis) for hypothesis in found):
-            raise CannotMeasure("no-match", "no hypothesis explains most of the dots")
-        best = _answer(scene, found, lattice, settings)
+        best = None if hopeless else _answer(scene, found, lattice, settings)
     except CannotMeasure as reason:
         if reason.status != "no-match":
             raise
+        best = None
+    if best is None:
         best = _answer(scene, found + _by_caps(scene), lattice, settings)
     return as_match(scene, best, best.orientation(scene))
 
