@@ -7,7 +7,6 @@ out for these alone.
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
@@ -25,6 +24,7 @@ from labapp.core.images.dot_size import (
     noise_gain,
     pairs,
     peak_disc,
+    scratch,
     size_of,
     with_grain,
 )
@@ -203,18 +203,18 @@ def _exposed(picture: Picture, settings: BandPassSettings) -> tuple[Exposure, _B
 
 
 class _Banded:
-    """A picture and its band at the dots' size: held by this thread's pad."""
+    """A picture and its band at the dots' size, on this thread's scratch pictures."""
 
     def __init__(self, picture: Picture, size: float) -> None:
-        self.picture, self.size, self._pad = picture, size, _pad(picture.shape)
-        self.wide, self.band = self._pad.wide, self._pad.band
+        self.picture, self.size = picture, size
+        names = ("narrow", "wide", "band")
+        self._narrow, self.wide, self.band = (scratch(name, picture.shape) for name in names)
         self._pass()
 
     def _pass(self) -> None:
-        narrow = self._pad.narrow
-        blur(self.picture, 0.8 * self.size, narrow)
-        self._small = self._pad.widen(narrow, self.wide, (1.6**2 - 0.8**2) * self.size**2)
-        cv2.subtract(narrow, self.wide, dst=self.band)
+        blur(self.picture, 0.8 * self.size, self._narrow)
+        self._small = widen(self._narrow, self.wide, (1.6**2 - 0.8**2) * self.size**2)
+        cv2.subtract(self._narrow, self.wide, dst=self.band)
 
     def peaks(self, exposure: Exposure) -> tuple[IntArray, IntArray]:
         """Columns and rows of the peaks over the floor that may be dots'.
@@ -256,55 +256,35 @@ class _Banded:
         """Centroids and moments of the light over its surroundings (`dot_kernels.centroids`)."""
         from labapp.core.images import dot_kernels
 
-        self._pad.widen(self._small, self.wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * self.size**2)
+        widen(self._small, self.wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * self.size**2)
         margin, taps, picture = margin_of(reach), kernel(0.5 * self.size), self.picture
         if len(u) * (2 * margin + 1) ** 2 > MUCH * picture.size:
-            picture, taps = blur(picture, 0.5 * self.size, self._pad.narrow), kernel(0.0)
+            picture, taps = blur(picture, 0.5 * self.size, self._narrow), kernel(0.0)
         return dot_kernels.centroids(picture, self.wide, taps, u, v, margin, width, reach)
 
 
-class Pad:
-    """Pictures to work on. Made anew for every frame they would cost as much as the work."""
+def widen(image: Grey, into: Grey, variance_px2: float) -> Grey:
+    """Blur by a Gaussian of some variance, px² of ``into``, by way of a smaller picture.
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.narrow, self.wide, self.band = (np.empty(shape, np.float32) for _ in range(3))
-        self._small: dict[int, tuple[Grey, Grey]] = {}
-
-    def widen(self, image: Grey, into: Grey, variance_px2: float) -> Grey:
-        """Blur by a Gaussian of some variance, px² of ``into``, by way of a smaller picture.
-
-        Returns the smaller picture of the image; it can be given to be widened further. Where the
-        blur is narrow, or the picture's sides cannot be divided, that is the image itself.
-        """
-        height, width = into.shape
-        scale = 1
-        while (
-            variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
-            and height % (2 * scale) == width % (2 * scale) == 0
-        ):
-            scale *= 2
-        if scale == 1:
-            blur(image, float(np.sqrt(variance_px2)), into)
-            return image
-        shape = height // scale, width // scale
-        if scale not in self._small:
-            self._small[scale] = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        small, blurred = self._small[scale]
-        cv2.resize(image, shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
-        blur(small, float(np.sqrt(variance_px2 / scale**2 - ROUND_PX2)), blurred)
-        cv2.resize(blurred, (width, height), dst=into)
-        return small
-
-
-_own = threading.local()
-
-
-def _pad(shape: tuple[int, ...]) -> Pad:
-    """What this thread works on: kept, for frames of one size follow on each other."""
-    pad: Pad | None = getattr(_own, "pad", None)
-    if pad is None or pad.band.shape != shape:
-        pad = _own.pad = Pad(shape)
-    return pad
+    Returns the smaller picture of the image; it can be given to be widened further. Where the
+    blur is narrow, or the picture's sides cannot be divided, that is the image itself.
+    """
+    height, width = into.shape
+    scale = 1
+    while (
+        variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
+        and height % (2 * scale) == width % (2 * scale) == 0
+    ):
+        scale *= 2
+    if scale == 1:
+        blur(image, float(np.sqrt(variance_px2)), into)
+        return image
+    shape = height // scale, width // scale
+    small, blurred = (scratch((name, scale), shape) for name in ("small", "small blurred"))
+    cv2.resize(image, shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
+    blur(small, float(np.sqrt(variance_px2 / scale**2 - ROUND_PX2)), blurred)
+    cv2.resize(blurred, (width, height), dst=into)
+    return small
 
 
 def _found(exposure: Exposure, seen: _Banded, settings: BandPassSettings) -> Dots:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -47,6 +48,9 @@ WHOLE = 0.6
 
 BEST = 0.884
 """The band that answers most to a Gaussian dot is that of so much of the dot's size."""
+
+KEPT_BYTES = 2**23
+"""Larger pictures to work on are not kept for the next frame."""
 
 
 def as_picture(frame: Image) -> Picture:
@@ -221,11 +225,16 @@ def _bands(picture: Picture, finest: int = 0) -> Iterator[tuple[int, tuple[int, 
         count = min(4 if scale == finest else 2, len(SCALES_PX) - scale)
         lost = (1 - step**-2) / 12  # what averaging has blurred already, px²
         blurred = [
-            blur(picture, float(np.sqrt((0.8 * SCALES_PX[0] * 2 ** (k / 2) / step) ** 2 - lost)))
+            blur(
+                picture,
+                float(np.sqrt((0.8 * SCALES_PX[0] * 2 ** (k / 2) / step) ** 2 - lost)),
+                scratch(("blurred", step, k), picture.shape),
+            )
             for k in range(scale, scale + count + 2)
         ]
         for k, (fine, wide) in enumerate(zip(blurred, blurred[2:], strict=False), scale):
-            yield k, (step, np.asarray(cv2.subtract(fine, wide), np.float32))
+            # What the finer blur was written to is free for its difference.
+            yield k, (step, np.asarray(cv2.subtract(fine, wide, dst=fine), np.float32))
         picture, step, scale = _smaller(picture, 2), 2 * step, scale + count
 
 
@@ -252,6 +261,25 @@ def with_grain(band: Grey, white: float) -> float:
     """
     excess = 1.4826 * float(np.median(np.abs(band))) / max(white, 1e-9)
     return white * min(max(1.0, excess), 3.0)
+
+
+_own = threading.local()
+
+
+def scratch(name: Hashable, shape: tuple[int, ...]) -> Grey:
+    """Return this thread's picture of a name to write on, shape (height, width).
+
+    Frames of one size follow on each other: made anew for each, pictures would cost as much as the
+    work on them.
+    """
+    kept: dict[Hashable, Grey] = _own.__dict__
+    if name not in kept or kept[name].shape != shape:
+        kept.pop(name, None)
+        made = np.empty(shape, np.float32)
+        if made.nbytes > KEPT_BYTES:
+            return made
+        kept[name] = made
+    return kept[name]
 
 
 def blur(picture: Picture, sigma: float, into: Grey | None = None) -> Grey:
