@@ -21,6 +21,7 @@ import typer.main
 
 from labapp.cli import advise, analyze, benchmark, cameras, session, simulate
 from labapp.cli.shared import (
+    ABOUT_SCHEMES,
     BAD_INPUT,
     FAULT,
     FRAMES_HELP,
@@ -29,6 +30,8 @@ from labapp.cli.shared import (
     NOTHING,
     RECORDING_HELP,
     TERMINATED,
+    Algorithm,
+    SchemeName,
     choose_frames,
     failure,
     measure_frames,
@@ -36,6 +39,7 @@ from labapp.cli.shared import (
     progress_bar,
 )
 from labapp.cli.window import asks_for_app, open_app, show_in_app, tour
+from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError
 from labapp.log import log_file, start_log
 from labapp.version import VERSION
@@ -186,11 +190,10 @@ def reconstruct(
         ),
     ],
     scheme: Annotated[
-        Literal["fit", "ers", "irs"],
-        typer.Option(help="How the surface is found: least-squares fit, ERS (ch. 7), IRS (ch. 6)."),
+        SchemeName, typer.Option(help=f"How the surface is found: {ABOUT_SCHEMES}.")
     ] = "fit",
     algorithm: Annotated[
-        Literal["opa", "epa-r", "epa-c", "epa-rc"],
+        Algorithm,
         typer.Option(help="Algorithm of IRS; the other schemes have none."),
     ] = "opa",
     correspondence: Annotated[
@@ -233,7 +236,7 @@ def reconstruct(
     """
     from labapp.core.pipeline import Settings
 
-    if algorithm != "opa" and scheme != "irs":
+    if algorithm != "opa" and not SCHEMES[scheme].algorithms:
         raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     places = {"lines": lines, "opcua": opcua}

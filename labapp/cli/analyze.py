@@ -9,9 +9,9 @@ import typer
 
 from labapp.cli.shared import progress_told, results_folder, write_figure, write_file
 from labapp.errors import InputError
+from labapp.studies import SCHEMES
 from labapp.studies.analysis import (
     PARTS,
-    SCHEMES,
     Made,
     Question,
     analyze_budget,
@@ -84,7 +84,7 @@ def errors(
     ] = None,
     scheme: Annotated[
         list[str] | None,
-        typer.Option(help=f"{', '.join(SCHEMES)}; repeat for more. Default: all three."),
+        typer.Option(help=f"{', '.join(SCHEMES)}; repeat for more. Default: all."),
     ] = None,
     step: Annotated[
         float,

@@ -13,11 +13,15 @@ import typer
 from labapp.cli.correct import InOrder, correct
 from labapp.cli.info import info, setup_problems
 from labapp.cli.shared import (
+    ABOUT_SCHEMES,
     FRAMES_HELP,
     FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING,
     RECORDING_HELP,
+    Algorithm,
+    ResultsName,
+    SchemeName,
     choose_frames,
     command,
     finite,
@@ -27,6 +31,7 @@ from labapp.cli.shared import (
     progress_bar,
     told_effect,
 )
+from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
 from labapp.words import several
 
@@ -44,11 +49,11 @@ File = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labses
 Frames = Annotated[str | None, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)]
 
 WhoseResults = Annotated[
-    Literal["fit", "ers", "irs-opa", "irs-epa-r", "irs-epa-c", "irs-epa-rc"] | None,
+    ResultsName | None,
     typer.Option(
         metavar="SCHEME",
-        help="Whose results: fit, ers, irs-opa, irs-epa-r, irs-epa-c, irs-epa-rc; without it, "
-        "those of the session's settings.",
+        help=f"Whose results: {', '.join(scheme_words())}; without it, those of the session's "
+        "settings.",
     ),
 ]
 View = Annotated[
@@ -209,11 +214,10 @@ def measure(
         bool, typer.Option("--all", help="All frames, also those whose measures stand.")
     ] = False,
     scheme: Annotated[
-        Literal["fit", "ers", "irs"] | None,
-        typer.Option(help="From now on: least-squares fit, ERS (ch. 7), IRS (ch. 6)."),
+        SchemeName | None, typer.Option(help=f"From now on: {ABOUT_SCHEMES}.")
     ] = None,
     algorithm: Annotated[
-        Literal["opa", "epa-r", "epa-c", "epa-rc"] | None,
+        Algorithm | None,
         typer.Option(help="From now on: algorithm of IRS; the other schemes have none."),
     ] = None,
     correspondence: Annotated[
@@ -253,7 +257,7 @@ def measure(
 def _set(session: Session, options: dict[str, str]) -> None:
     """Make options the session's settings, in one step of its history."""
     settings: Settings = replace(session.settings, **options)  # type: ignore[arg-type]
-    if "algorithm" in options and settings.scheme != "irs":
+    if "algorithm" in options and not SCHEMES[settings.scheme].algorithms:
         wanted = "--scheme irs, which alone has it"
         raise InputError("--algorithm", "algorithm", settings.algorithm, wanted)
     if settings != session.settings:

@@ -6,12 +6,13 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
 from labapp.system import quoted
 from labapp.words import several
@@ -21,9 +22,20 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from labapp.core.pipeline import Measurement
+    from labapp.core.schemes import irs
     from labapp.export.summary import Summary
     from labapp.session.session import Session
     from labapp.simulation import parallel
+
+    SchemeName: TypeAlias = str
+    ResultsName: TypeAlias = str
+    Algorithm: TypeAlias = irs.Algorithm
+else:  # an option may be what its type lists
+    SchemeName = Literal[tuple(SCHEMES)]
+    ResultsName = Literal[tuple(scheme_words())]
+    Algorithm = Literal[tuple(name for one in SCHEMES.values() for name in one.algorithms)]
+
+ABOUT_SCHEMES = ", ".join(scheme.about for scheme in SCHEMES.values())
 
 TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 143, 130, 3, 2, 1
 """Exit codes; 0 is done. `NOTHING`: done, but nothing was measured, or a session is not whole."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
@@ -15,10 +15,10 @@ from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
 from labapp.core.rows.lattice import Lattice
-from labapp.core.schemes import ers, fit, irs
+from labapp.core.schemes import SCHEMES, ers, irs
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
-from labapp.core.surface.reconstruction import Reconstruction, Scheme
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import CannotMeasure
 
 
@@ -29,7 +29,7 @@ class Settings:
     Parameters
     ----------
     scheme
-        ``fit`` (the default), ``ers`` or ``irs``.
+        One of `SCHEMES`.
     algorithm
         Of IRS: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``.
     correspondence
@@ -38,7 +38,7 @@ class Settings:
         Settings of the single steps.
     """
 
-    scheme: Scheme = "fit"
+    scheme: str = "fit"
     algorithm: irs.Algorithm = "opa"
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
     dots: DotSettings = field(default_factory=DotSettings)
@@ -69,7 +69,7 @@ class Measurement:
 
     status: str
     reason: str
-    scheme: Scheme
+    scheme: str
     dots: Dots | None = None
     lattice: Lattice | None = None
     match: Match | None = None
@@ -149,11 +149,11 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
     CannotMeasure
         If the scheme finds no surface.
     """
-    if settings.scheme == "irs":
-        return irs.reconstruct(match, rig, replace(settings.irs, algorithm=settings.algorithm))
-    if settings.scheme == "ers":
-        return ers.reconstruct(match, rig, settings.ers)
-    return fit.reconstruct(match, rig, settings.fit)
+    scheme = SCHEMES[settings.scheme]
+    own: Any = getattr(settings, scheme.name) if scheme.settings else None
+    if scheme.algorithms:
+        own = replace(own, algorithm=settings.algorithm)
+    return scheme.reconstruct(match, rig, own)
 
 
 def _lattice(

@@ -14,6 +14,7 @@ import numpy as np
 
 from labapp.config.setup import Setup, parse_setup
 from labapp.core.pipeline import Measurement, Settings
+from labapp.core.schemes import SCHEMES
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.errors import InputError
 from labapp.session.file.blobs import Damaged, fingerprint, pack, unpack
@@ -417,8 +418,9 @@ def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:
 
 
 def scheme_name(settings: Settings) -> str:
-    """``fit``, ``ers``, or ``irs-`` with its algorithm."""
-    return f"irs-{settings.algorithm}" if settings.scheme == "irs" else settings.scheme
+    """Name of the scheme; with its algorithm where it has several: ``irs-opa``."""
+    several = SCHEMES[settings.scheme].algorithms
+    return f"{settings.scheme}-{settings.algorithm}" if several else settings.scheme
 
 
 def _now() -> str:

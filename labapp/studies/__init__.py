@@ -1,1 +1,6 @@
 """What is computed with simulated pools: chapters 4 and 8, error budgets."""
+
+from labapp.core import schemes
+
+SCHEMES = tuple(reversed(schemes.SCHEMES))
+"""Names of the schemes that are studied: all of them, the default last."""

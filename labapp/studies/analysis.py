@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from labapp.errors import InputError
+from labapp.studies import SCHEMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from labapp.config.setup import Setup
-    from labapp.core.surface.reconstruction import Scheme
     from labapp.simulation.parallel import Progress
     from labapp.simulation.pools import Pool
     from labapp.studies.error_analysis import ErrorSurvey
@@ -28,8 +28,6 @@ PARTS = ("CE", "LE", "ME", "measurement", "images", "parameters")
 
 FIGURES = {"CE": (6, 7), "LE": (8, 9), "ME": (10, 11)}
 """Numbers in chapter 8 of the figures that show errors and ARE."""
-
-SCHEMES: tuple[Scheme, ...] = ("irs", "ers", "fit")
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Question:
     """
 
     parts: tuple[str, ...] = PARTS
-    schemes: tuple[Scheme, ...] = SCHEMES
+    schemes: tuple[str, ...] = SCHEMES
     step: float = 2.0
     frames: int = 3
     draws: int = 400

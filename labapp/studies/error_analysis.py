@@ -23,15 +23,13 @@ from labapp.core.match import Match
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.schemes import ers, irs
 from labapp.core.surface.measures import Measures, measure
-from labapp.core.surface.reconstruction import Scheme
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool, caps_8_3_1
+from labapp.studies import SCHEMES
 from labapp.studies.correspondence_table import OPEN_BENCH
 from labapp.studies.tables import Cell, Table
-
-SCHEMES: tuple[Scheme, ...] = ("irs", "ers", "fit")
 
 ERRORS = ("depth", "boundary", "are_mm", "actual_are_mm")
 """CE-D, CE-B (Eq. 8-2, 8-3), computed and actual ARE (Eq. 6-3, 8-4)."""
@@ -61,7 +59,7 @@ TEXT = {
 """Mean and worst error that the text has, with ERS (Fig. 8-6, 8-8, 8-10)."""
 
 
-def circle_settings(scheme: Scheme) -> Settings:
+def circle_settings(scheme: str) -> Settings:
     """A scheme with the circle as boundary model (§8.2.1); fit has a boundary of its own."""
     return Settings(
         scheme=scheme,
@@ -89,7 +87,7 @@ def computed_are(measures: Measures) -> float:
     return own if np.isfinite(own) else measures.are_mm
 
 
-def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: Scheme) -> FloatArray:
+def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str) -> FloatArray:
     """`ERRORS` of one reconstruction, shape (4,); NaN where the scheme finds no surface."""
     try:
         made = reconstruct(match, rig, circle_settings(scheme))
@@ -123,14 +121,14 @@ class ErrorSurvey:
 
     kind: str
     caps: tuple[Pool, ...]
-    schemes: tuple[Scheme, ...]
+    schemes: tuple[str, ...]
     errors: FloatArray
     lost: FloatArray
 
     def __post_init__(self) -> None:
         freeze(self)
 
-    def of(self, scheme: Scheme, error: str, surface: str = "all") -> FloatArray:
+    def of(self, scheme: str, error: str, surface: str = "all") -> FloatArray:
         """One of `ERRORS` of the caps: ``convex``, ``concave`` or ``all``."""
         sign = {"convex": 1, "concave": -1, "all": 0}[surface]
         chosen = [sign * cap.peak_mm >= 0 for cap in self.caps]
@@ -139,7 +137,7 @@ class ErrorSurvey:
 
 def survey(
     kind: str,
-    schemes: Sequence[Scheme] = SCHEMES,
+    schemes: Sequence[str] = SCHEMES,
     step: float = 2.0,
     caps: Sequence[Pool] | None = None,
     progress: Progress | None = None,
@@ -193,7 +191,7 @@ def laser_places(step: float) -> list[Laser]:
     return [Laser(float(angle), float(distance)) for angle in angles for distance in distances]
 
 
-def _errors(task: tuple[Pool, Rig, tuple[Scheme, ...]]) -> FloatArray:
+def _errors(task: tuple[Pool, Rig, tuple[str, ...]]) -> FloatArray:
     cap, rig, schemes = task
     seen = followed(cap, rig)
     match = exact_match(seen, rig)

@@ -16,15 +16,14 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.pipeline import measure as measure_frame
 from labapp.core.surface.measures import measure
-from labapp.core.surface.reconstruction import Scheme
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool, spherical_cap
 from labapp.simulation.render import Frame, Look, render
+from labapp.studies import SCHEMES
 from labapp.studies.error_analysis import (
-    SCHEMES,
     circle_settings,
     computed_are,
     followed,
@@ -119,7 +118,7 @@ def frame_errors(
     rig: Rig,
     frames: int,
     *,
-    schemes: Sequence[Scheme] = SCHEMES,
+    schemes: Sequence[str] = SCHEMES,
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> list[list[FrameErrors]]:
@@ -141,7 +140,7 @@ def rendered(cap: Pool, rig: Rig, number: int) -> Frame:
     return render(followed(cap, rig), VIEW, LOOK, np.random.default_rng(seed))
 
 
-def _frame_errors(task: tuple[Pool, Rig, int, tuple[Scheme, ...]]) -> FrameErrors:
+def _frame_errors(task: tuple[Pool, Rig, int, tuple[str, ...]]) -> FrameErrors:
     cap, rig, number, schemes = task
     known = exactly_seen(cap, rig)
     exact = np.array([_sizes(known, scheme) for scheme in schemes])
@@ -155,7 +154,7 @@ def _frame_errors(task: tuple[Pool, Rig, int, tuple[Scheme, ...]]) -> FrameError
     return FrameErrors(seen.status, errors, exact, off, missed)
 
 
-def _sizes(known: KnownPool, scheme: Scheme) -> FloatArray:
+def _sizes(known: KnownPool, scheme: str) -> FloatArray:
     try:
         made = reconstruct(known.match, known.rig, circle_settings(scheme))
     except CannotMeasure:
@@ -174,7 +173,7 @@ def _off(seen: Measurement, frame: Frame) -> tuple[FloatArray, int]:
     return off, int(frame.shown.sum()) - int((off <= WRONG_PX).sum())
 
 
-def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[Scheme] = SCHEMES) -> Table:
+def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCHEMES) -> Table:
     """Measurement error of §8.2, of exact reflections and of rendered frames, beside the text's."""
     rows = []
     for k, scheme in enumerate(schemes):
@@ -207,7 +206,7 @@ def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[Scheme] = 
 def image_error_table(
     caps: Sequence[Pool],
     found: Sequence[Sequence[FrameErrors]],
-    schemes: Sequence[Scheme] = SCHEMES,
+    schemes: Sequence[str] = SCHEMES,
 ) -> Table:
     """Image processing error: what frames add to what exact reflections give; and the dots."""
     rows = []

@@ -18,7 +18,6 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import reconstruct
 from labapp.core.surface.measures import measure
-from labapp.core.surface.reconstruction import Scheme
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool
@@ -200,7 +199,7 @@ class KnownPool:
 
 def parameter_deviation(
     known: KnownPool,
-    scheme: Scheme,
+    scheme: str,
     sigma: Sequence[float] = NOMINAL,
     draws: int = DRAWS,
     progress: Progress | None = None,
@@ -234,7 +233,7 @@ def parameter_deviation(
     return ParameterDeviation(np.array(sigma), np.array(parts), found[2 * OFFSETS + 1 :] - found[0])
 
 
-def moved_errors(task: tuple[KnownPool, FloatArray, Scheme]) -> FloatArray:
+def moved_errors(task: tuple[KnownPool, FloatArray, str]) -> FloatArray:
     """Relative errors of height and diameter, shape (2,), with the bench off by an offset."""
     known, offset, scheme = task
     match, rig = move(known.match, known.rig, known.axes, offset)
@@ -245,7 +244,7 @@ def moved_errors(task: tuple[KnownPool, FloatArray, Scheme]) -> FloatArray:
     return np.array(relative_errors(measures, known.cap))
 
 
-def deviation_table(found: dict[tuple[str, Scheme], ParameterDeviation]) -> Table:
+def deviation_table(found: dict[tuple[str, str], ParameterDeviation]) -> Table:
     """Contribution of each quantity, their sum and the Monte Carlo's; by (surface, scheme)."""
     rows = []
     for (surface, scheme), one in found.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from labapp.core.geometry.rig import Rig
+from labapp.core.schemes import SCHEMES
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import Reflections
 from labapp.simulation.positioning import Fate, SideView, side_view
@@ -19,9 +21,15 @@ from labapp.studies.error_analysis import ErrorSurvey
 from labapp.studies.plotting import INCHES, STYLE, new_figure, row_colour
 from labapp.studies.positioning_tables import Coverage
 
-COLOURS = {"irs": "#c05a00", "ers": "#1b4f8a", "fit": "#1b7a3d"}
+STYLES = (
+    *(("#1b7a3d", "^"), ("#1b4f8a", "o"), ("#c05a00", "s")),
+    *(("#7a3fa0", "D"), ("#b01030", "v"), ("#5f6b00", "P")),
+)
+"""Colours and markers of the schemes, in their order; then once more."""
+
+STYLE_OF = dict(zip(SCHEMES, itertools.cycle(STYLES), strict=False))
+COLOURS = {name: colour for name, (colour, _) in STYLE_OF.items()}
 COLOURS |= {"predicted": "#8ab0d8", "simulated": "#1b4f8a"}
-MARKERS = {"irs": "s", "ers": "o", "fit": "^"}
 FATES = {
     Fate.CAUGHT: "#1b7a3d",
     Fate.PAST: "#c05a00",
@@ -158,7 +166,7 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
                             ],
                             fmt=style,
                             elinewidth=0.5,
-                            marker=MARKERS[scheme],
+                            marker=STYLE_OF[scheme][1],
                             color=COLOURS[scheme],
                             ms=3,
                             label=f"{scheme}, D = B/{ratio}",

@@ -31,7 +31,7 @@ from labapp.core.match import Match
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import SurfaceThroughPoints, whole_surface
 from labapp.core.surface.measures import reflection_scale
-from labapp.core.surface.reconstruction import Reconstruction, Scheme
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import Surface, intersect
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, freeze
 
@@ -389,7 +389,7 @@ def best_of_loops(
 
 
 def whole_pool(
-    scheme: Scheme, match: Match, rays: ReflectedRays, best: Estimate, boundary: Boundary
+    scheme: str, match: Match, rays: ReflectedRays, best: Estimate, boundary: Boundary
 ) -> Reconstruction:
     """Interpolate the whole surface through an estimate's points and the boundary, and test it.
 

@@ -1,22 +1,15 @@
-"""What every reconstruction scheme returns: `irs`, `ers` and `fit` share this one signature.
-
-``reconstruct(match: Match, rig: Rig, settings) -> Reconstruction``
-"""
+"""What every reconstruction scheme returns."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.surface import Surface
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
-
-Scheme = Literal["fit", "ers", "irs"]
-
 
 ROUNDING = 1e-9
 """Share of the way from the centre by which a place may lie beyond the boundary and be on it."""
@@ -83,7 +76,7 @@ class Reconstruction:
         §6.3.1 and §7.1), mm: what the text tells. NaN for fit, whose points are the surface's.
     """
 
-    scheme: Scheme
+    scheme: str
     surface: Surface
     boundary: Boundary
     ray: IntArray

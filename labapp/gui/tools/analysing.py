@@ -6,7 +6,7 @@ import re
 
 from labapp.errors import InputError
 from labapp.session.session import Session
-from labapp.studies.analysis import SCHEMES
+from labapp.studies import SCHEMES
 
 BUDGET = "budget"
 
@@ -33,7 +33,7 @@ PARTS = (
 )
 """What can be worked out: key, words, and what it is."""
 
-SCHEME_CHOICES = (("", "all three"), *((scheme, scheme) for scheme in SCHEMES))
+SCHEME_CHOICES = (("", "all of them"), *((scheme, scheme) for scheme in SCHEMES))
 
 OPENED, USUAL = "opened", "usual"
 SETUPS = ((OPENED, "of the session"), (USUAL, "of §8.3.1, 4″ plane"))

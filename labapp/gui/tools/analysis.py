@@ -16,8 +16,8 @@ from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import plain_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
+from labapp.studies import SCHEMES
 from labapp.studies.analysis import (
-    SCHEMES,
     Made,
     Question,
     analyze_budget,

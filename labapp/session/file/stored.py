@@ -23,8 +23,7 @@ from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows import detection, lattice, row_search
 from labapp.core.rows.correction import Correction
-from labapp.core.schemes import ers, irs
-from labapp.core.surface import pool_fit
+from labapp.core.schemes import SCHEMES
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
@@ -65,10 +64,16 @@ class Stored:
         return {in_files.get(name, name): name for name in names}
 
 
+def _scheme_is_known(value: Any) -> bool:
+    return value.scheme in SCHEMES
+
+
 def _measurement_fits(value: Any) -> bool:
     count = 0 if value.dots is None else len(value.dots)
-    return (value.lattice is None or len(value.lattice.row) == count) and (
-        value.match is None or _all_within(value.match.dot, 0, count - 1)
+    return (
+        _scheme_is_known(value)
+        and (value.lattice is None or len(value.lattice.row) == count)
+        and (value.match is None or _all_within(value.match.dot, 0, count - 1))
     )
 
 
@@ -109,7 +114,7 @@ STORED = {
     "Limits": Stored(Limits),
     "Signals": Stored(Signals, shapes=dict.fromkeys(("time_s", "current_a", "voltage_v"), "n")),
     # Settings
-    "Settings": Stored(Settings),
+    "Settings": Stored(Settings, fits=_scheme_is_known),
     "DotSettings": Stored(detection.DotSettings),
     "BandPassSettings": Stored(dots.BandPassSettings),
     "BlockThresholdSettings": Stored(threshold_dots.BlockThresholdSettings),
@@ -119,9 +124,7 @@ STORED = {
     "RowSearchSettings": Stored(row_search.RowSearchSettings),
     "MaskRowsSettings": Stored(row_search.MaskRowsSettings),
     "MatchSettings": Stored(MatchSettings),
-    "FitSettings": Stored(pool_fit.FitSettings),
-    "IrsSettings": Stored(irs.IrsSettings),
-    "ErsSettings": Stored(ers.ErsSettings),
+    **{one.settings: Stored(one.settings_class) for one in SCHEMES.values() if one.settings},
     # Results
     "Dots": Stored(
         dots.Dots,
@@ -150,6 +153,7 @@ STORED = {
     "Reconstruction": Stored(
         Reconstruction,
         retired=("variants",),
+        fits=_scheme_is_known,
         shapes={
             "ray": "n 2",
             "points_mm": "n 3",

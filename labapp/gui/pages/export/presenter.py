@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from labapp.core.schemes import scheme_words
 from labapp.core.values import FloatArray, IntArray
 from labapp.export.drawing import Direction
 from labapp.export.film import UNTIMED_HZ, film_times
@@ -29,15 +30,6 @@ from labapp.session.session import Session
 from labapp.words import several, size_in_words
 
 REPORT_FILE = "report.pdf"
-
-SCHEMES = {
-    "fit": "fit",
-    "ers": "ERS",
-    "irs-opa": "IRS, OPA",
-    "irs-epa-r": "IRS, EPA-R",
-    "irs-epa-c": "IRS, EPA-C",
-    "irs-epa-rc": "IRS, EPA-RC",
-}
 
 SHOWN_PROBLEMS = 5
 
@@ -315,7 +307,8 @@ def _files(wish: Wish, count: int, surfaces: int) -> tuple[str, ...]:
 
 
 def _named(scheme: str) -> str:
-    return SCHEMES.get(scheme, scheme)
+    words = scheme_words().get(scheme)
+    return scheme if words is None else words.short
 
 
 def schemes(session: Session) -> tuple[tuple[str, str], ...]:

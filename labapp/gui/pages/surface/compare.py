@@ -16,7 +16,7 @@ from PySide6.QtWidgets import (
 from threadpoolctl import threadpool_limits
 
 from labapp.gui.pages.surface.comparison import Comparison, compared, other_scheme
-from labapp.gui.pages.surface.presenter import SCHEMES, Options
+from labapp.gui.pages.surface.presenter import SCHEME_CHOICES, Options
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.widgets.fields import ChoiceField
@@ -175,9 +175,7 @@ class _SchemeBox(QWidget):
 
     def __init__(self, order: str) -> None:
         super().__init__()
-        self.choice = ChoiceField(
-            order, list(SCHEMES.items()), tooltip=f"{order} of the two to compare"
-        )
+        self.choice = ChoiceField(order, SCHEME_CHOICES, tooltip=f"{order} of the two to compare")
         self.view = make_view3d(f"{order} surface")
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)

@@ -27,8 +27,9 @@ Row = tuple[str, str, str, str, str]
 
 
 def other_scheme(scheme: str) -> str:
-    """The scheme to compare with at first."""
-    return "ers" if scheme == "fit" else "fit"
+    """The scheme to compare with at first: the first in the list that is made otherwise."""
+    made = scheme.partition("-")[0]
+    return next(name for name in SCHEMES if name.partition("-")[0] != made)
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def compared(
         assert second.reconstruction is not None
         plain = difference_scene(first.reconstruction, second.reconstruction)
         rows = compared_rows(first.measures, second.measures)
-        names = [SCHEMES[scheme].split(":")[0] for scheme in schemes]
+        names = [SCHEMES[scheme].title for scheme in schemes]
         told = f"{names[0]} minus {names[1]}, from the same dots: "
         if len(plain.values):
             difference = replace(plain, exaggeration=options.exaggeration)

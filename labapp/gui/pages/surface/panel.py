@@ -9,6 +9,7 @@ from PySide6.QtWidgets import QGridLayout, QLabel, QProgressBar, QPushButton, QV
 
 from labapp.gui.pages.surface.presenter import (
     CORRESPONDENCES,
+    SCHEME_CHOICES,
     SCHEMES,
     Shown,
     why_not,
@@ -40,7 +41,7 @@ class SurfacePanel:
         self.workspace = workspace
         self._task: Task | None = None
         self.scheme = ChoiceField(
-            "Scheme", list(SCHEMES.items()), tooltip="How the surface is found from the dots"
+            "Scheme", SCHEME_CHOICES, tooltip="How the surface is found from the dots"
         )
         self.correspondence = ChoiceField(
             "Correspondence",
@@ -161,7 +162,7 @@ class SurfacePanel:
     def _choose_scheme(self, name: str) -> None:
         self.workspace.attempt(
             lambda session: session.set_settings(
-                with_scheme(session.settings, name), f"scheme {SCHEMES[name].split(':')[0]}"
+                with_scheme(session.settings, name), f"scheme {SCHEMES[name].title}"
             )
         )
 

@@ -12,6 +12,7 @@ from labapp.config.setup import parse_setup
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings
+from labapp.core.schemes import scheme_words
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
@@ -24,15 +25,10 @@ from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
 from labapp.words import SIGMA_OF
 
-SCHEMES = {
-    "fit": "Fit: all dots at once",
-    "ers": "ERS: extrapolation",
-    "irs-opa": "IRS, one point (OPA)",
-    "irs-epa-r": "IRS, edge points, rows (EPA-R)",
-    "irs-epa-c": "IRS, edge points, columns (EPA-C)",
-    "irs-epa-rc": "IRS, edge points, both (EPA-RC)",
-}
+SCHEMES = scheme_words()
 """Name that results are kept under → words for the operator."""
+
+SCHEME_CHOICES = [(name, words.long) for name, words in SCHEMES.items()]
 
 CORRESPONDENCES = {
     "auto": "Automatic",
@@ -152,7 +148,7 @@ def shown(session: Session, frame: int) -> Shown:
         return Shown(None, "unmeasured", "There are no frames yet: import a recording first.")
     result = session.result(frame)
     if result is None:
-        scheme = SCHEMES[scheme_name(session.settings)].split(":")[0]
+        scheme = SCHEMES[scheme_name(session.settings)].title
         return Shown(None, "unmeasured", f"Frame {frame} is not measured by {scheme} yet.")
     measurement = result.measurement
     told = Shown(
@@ -182,7 +178,7 @@ def provenance(result: Result) -> str:
     by_hand = result.measurement.correction is not None
     when = result.measured[:16].replace("T", " ")
     dots = "dots corrected by hand" if by_hand else "dots found automatically"
-    scheme = SCHEMES.get(result.scheme, result.scheme).split(":")[0]
+    scheme = SCHEMES[result.scheme].title if result.scheme in SCHEMES else result.scheme
     return f"Frame {result.frame} · {scheme} · {dots} · labapp {result.version} · {when}"
 
 
