@@ -1,0 +1,172 @@
+"""A scheme is a file and an entry of `SCHEMES` (docs/development.md): all offer it then.
+
+Python loads the `sitecustomize` below at the start of each process, before labapp.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.waiting import PATIENCE_S
+
+SAMPLE = Path(__file__).parents[1] / "sample_sessions" / "gtaw"
+
+SITE = """
+from pathlib import Path
+from labapp.core import schemes
+
+schemes.__path__.append(str(Path(__file__).parent))
+words = schemes.Words("toy", "Toy: a quadric by least squares")
+schemes.SCHEMES["toy"] = schemes.Scheme("toy", "a toy", words)
+"""
+
+TOY = '''
+"""The quadric whose slopes fit those that the reflections ask for on the work piece."""
+
+import numpy as np
+
+from labapp.core.schemes.slopes import Estimate, reflected_rays, whole_pool
+from labapp.core.surface.boundary import boundary_on_work_piece
+from labapp.core.surface.interpolation import ThinPlateSurface
+
+
+def reconstruct(match, rig, settings):
+    assert settings is None
+    rays = reflected_rays(match, rig)
+    boundary = boundary_on_work_piece(match, rig, "piecewise")
+    distance = rays.distance_at(0.0)
+    points, normal = rays.points(distance), rays.normals(distance)
+    x, y, _ = points.T
+    none, one = 0 * x, 0 * x + 1
+    along_x = np.column_stack([one, none, 2 * x, y, none])
+    along_y = np.column_stack([none, one, none, x, 2 * y])
+    slope = -(normal[:, :2] / normal[:, 2:]).T.ravel()
+    quadric = np.linalg.lstsq(np.vstack([along_x, along_y]), slope)[0]
+
+    def height(x, y):
+        return np.column_stack([x, y, x * x, x * y, y * y]) @ quadric
+
+    points[:, 2] = height(x, y) - height(*boundary.points_mm[:, :2].T).mean()
+    best = Estimate(points, ThinPlateSurface(points), np.nan)
+    return whole_pool("toy", match, rays, best, boundary)
+'''
+
+IN_THE_WINDOW = """
+import json, sys
+
+from PySide6.QtWidgets import QApplication, QVBoxLayout, QWidget
+
+app = QApplication([])
+from labapp.gui.pages.export import presenter as export
+from labapp.gui.pages.surface import compare, comparison, panel, presenter
+from labapp.gui.tools import analysing
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+from labapp.studies import analysis, error_analysis, pictures
+
+
+def offered(field):
+    combo = field._combo
+    return {combo.itemData(k): combo.itemText(k) for k in range(combo.count())}
+
+
+holder = QWidget()
+side = panel.SurfacePanel(Workspace(), QVBoxLayout(holder))
+box = compare._SchemeBox("First")
+found = {
+    "surface page": offered(side.scheme),
+    "comparison": offered(box.choice),
+    "error analysis, window": dict(analysing.SCHEME_CHOICES),
+    "error analysis": dict.fromkeys(analysis.Question().schemes),
+    "survey": dict.fromkeys(error_analysis.survey.__defaults__[0]),
+    "pictures": pictures.STYLE_OF,
+}
+with Session.open(sys.argv[1], read_only=True) as session:
+    found["export page"] = dict(export.schemes(session))
+    first = presenter.provenance(session.result(0, "toy"))
+    compared = comparison.compared(session, 0, ("toy", "fit"), presenter.Options()).told
+found["other"] = comparison.other_scheme("toy")
+found["provenance"], found["compared"] = first, compared
+print(json.dumps(found))
+"""
+
+Python = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def python(tmp_path: Path) -> Python:
+    """Run Python where the toy is in the folder and in the list."""
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(SITE)
+    (site / "toy.py").write_text(TOY)
+    there = [str(site), str(SAMPLE.parents[1]), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, there)),
+        "QT_QPA_PLATFORM": "offscreen",
+        "COLUMNS": "200",
+        "XDG_STATE_HOME": str(tmp_path / "state"),
+    }
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *map(str, arguments)],
+            env=environment,
+            timeout=PATIENCE_S,
+            capture_output=True,
+            encoding="utf-8",
+            check=False,
+        )
+
+    return run
+
+
+@pytest.mark.slow
+def test_the_command_line_offers_and_runs_it(python: Python, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    given = (SAMPLE / "recording.avi", "--setup", SAMPLE / "setup.toml", "--frames", "0:1")
+    done = python("-m", "labapp", "reconstruct", *given, "--out", out, "--scheme", "toy")
+    assert done.returncode == 0, done.stderr
+    with (out / "measures.csv").open(encoding="utf-8", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["scheme"], row["status"]) == ("toy", "ok")
+    for command in ("reconstruct", "session measure", "session export", "analyze errors"):
+        told = python("-m", "labapp", *command.split(), "--help").stdout
+        (line,) = (line for line in told.splitlines() if "--scheme" in line)
+        assert "toy" in line, command
+    refused = python("-m", "labapp", "reconstruct", *given, "--out", out, "--scheme", "toys")
+    assert refused.returncode == 2
+    assert "'toy'" in refused.stderr
+    given = ("--algorithm", "epa-r", "--scheme", "toy", "--out", out, *given)
+    assert python("-m", "labapp", "reconstruct", *given).returncode == 2
+
+
+@pytest.mark.slow
+def test_sessions_and_pages_have_it(python: Python, tmp_path: Path) -> None:
+    file = Path(shutil.copytree(SAMPLE, tmp_path / "gtaw")) / "gtaw.labsession"
+    done = python("-m", "labapp", "session", "measure", file, "--frames", "0:1", "--scheme", "toy")
+    assert done.returncode == 0, done.stderr
+    told = python("-c", IN_THE_WINDOW, file)
+    assert told.returncode == 0, told.stderr
+    found = json.loads(told.stdout)
+    assert found.pop("compared").startswith("Toy minus Fit, from the same dots: the heights")
+    assert found.pop("other") == "fit"
+    assert found.pop("provenance").startswith("Frame 0 · Toy · dots found automatically")
+    assert found.pop("export page")[""] == "toy (as in the settings)"
+    for where, offered in found.items():
+        assert "toy" in offered, where
+    assert found["surface page"]["toy"] == "Toy: a quadric by least squares"
+    out = tmp_path / "out"
+    wanted = ("--scheme", "toy", "--frames", "0:1", "--out", out)
+    done = python("-m", "labapp", "session", "export", file, *wanted)
+    assert done.returncode == 0, done.stderr
+    assert ",ok,toy," in (out / "measures.csv").read_text("utf-8").splitlines()[1]
