@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+import scipy
 
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, freeze
@@ -34,8 +34,8 @@ def sigma_at(reconstruction: Reconstruction, x_mm: FloatArray, y_mm: FloatArray)
     places, sigma = reconstruction.points_mm[known, :2], reconstruction.sigma_mm[known]
     if len(places) < 4:
         return np.full(len(x_mm), np.nan)
-    inside = LinearNDInterpolator(places, sigma)(x_mm, y_mm)
-    nearest = NearestNDInterpolator(places, sigma)(x_mm, y_mm)
+    inside = scipy.interpolate.LinearNDInterpolator(places, sigma)(x_mm, y_mm)
+    nearest = scipy.interpolate.NearestNDInterpolator(places, sigma)(x_mm, y_mm)
     return np.asarray(np.where(np.isfinite(inside), inside, nearest))
 
 

@@ -15,7 +15,6 @@ from labapp.media.formats.numpy_stack import NPY_MAGIC, ZIP_MAGIC, NumpyStack
 from labapp.media.formats.photron import PHOTRON_SUFFIXES, PhotronSource
 from labapp.media.formats.stored import regular_size
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
-from labapp.media.formats.video import VideoSource
 from labapp.media.quiet import quiet_opencv
 
 __all__ = ["Frame", "FrameSource", "GreyImage", "open_source"]
@@ -72,7 +71,7 @@ def _by_content(path: Path, head: bytes, index: bytes | None) -> FrameSource | N
     if head[:4] == ZIP_MAGIC:
         return NumpyStack(path, archive=True)
     if head[:4] == b"GIF8" or (head[:4] == b"RIFF" and head[8:] != b"WEBP"):
-        return VideoSource(path, index)
+        return _video(path, index)
     return None
 
 
@@ -88,6 +87,13 @@ def _by_name(path: Path, index: bytes | None) -> FrameSource:
         return TiffStack(path)
     if suffix in IMAGE_SUFFIXES or cv2.haveImageReader(str(path)):
         return ImageSequence(path, [path])
+    return _video(path, index)
+
+
+def _video(path: Path, index: bytes | None) -> FrameSource:
+    # PyAV is as much to load as NumPy: it is loaded where there is a video.
+    from labapp.media.formats.video import VideoSource
+
     return VideoSource(path, index)
 
 

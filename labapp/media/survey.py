@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,9 @@ import numpy.typing as npt
 from labapp.core.values import FloatArray, freeze
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage
-from labapp.media.formats.video import VideoSource
+
+if TYPE_CHECKING:
+    from labapp.media.formats.video import VideoSource
 
 CHECKED_FRAMES = 24
 """Frames drawn to be read again out of order."""
@@ -105,7 +108,8 @@ def _read(source: FrameSource, index: int) -> Frame | None:
 
 def _order(source: FrameSource) -> list[int]:
     """Frames to read again: last, first, jumps both ways, then steps backwards."""
-    if isinstance(source, VideoSource) and not source.seekable:
+    video = _as_video(source)
+    if video is not None and not video.seekable:
         return []
     count = len(source)
     drawn = np.random.default_rng(count).permutation(count)[:CHECKED_FRAMES].tolist()
@@ -124,8 +128,16 @@ def _unread(readable: npt.NDArray[np.bool_]) -> tuple[str, ...]:
 def _inexact(source: FrameSource, exact: bool) -> tuple[str, ...]:
     if exact:
         return ()
-    if not isinstance(source, VideoSource):
+    video = _as_video(source)
+    if video is None:
         return (f"{source.name} gave other frames when they were read again; has it changed?",)
-    before = source.warnings
-    source.decode_from_start()
-    return tuple(sentence for sentence in source.warnings if sentence not in before)
+    before = video.warnings
+    video.decode_from_start()
+    return tuple(sentence for sentence in video.warnings if sentence not in before)
+
+
+def _as_video(source: FrameSource) -> VideoSource | None:
+    # Its PyAV is as much to load as NumPy, and where a session is opened nothing is surveyed.
+    from labapp.media.formats.video import VideoSource
+
+    return source if isinstance(source, VideoSource) else None

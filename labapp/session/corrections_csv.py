@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.images.dots import Dots
 from labapp.core.rows.correction import MOST, PLACED_PX, Correction, set_reference
@@ -112,7 +112,7 @@ def _same_dots(place: FloatArray, before: FloatArray) -> IntArray:
     same = np.full(len(place), -1)
     if not len(before):
         return same
-    distance, nearest = cKDTree(before).query(place, distance_upper_bound=SAME_PX)
+    distance, nearest = scipy.spatial.cKDTree(before).query(place, distance_upper_bound=SAME_PX)
     taken: set[int] = set()
     for dot in np.argsort(distance, kind="stable").tolist():
         if math.isfinite(distance[dot]) and int(nearest[dot]) not in taken:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy
 
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.session.measured import Overview
@@ -218,7 +218,7 @@ def doubtful_frames(seen: Overview) -> BoolArray:
     for key in ("width_mm", "length_mm", "height_mm"):
         size = seen.measures[key][has]
         # Mirrored, an odd one at the end does not meet itself again.
-        usual = median_filter(size, min(NEIGHBOURS, len(size)), mode="mirror")
+        usual = scipy.ndimage.median_filter(size, min(NEIGHBOURS, len(size)), mode="mirror")
         off = np.abs(size - usual)
         out |= off > np.maximum(
             FAR_SIGMA * 1.4826 * np.nanmedian(off), FAR_PART * np.abs(np.nanmedian(size))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtri, fdtrc, stdtrit
+import scipy
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import FloatArray, freeze
@@ -159,13 +159,17 @@ class MarkFits:
         slope = used.jacobian(seen)[0]
         off = (used.to_plane(seen) - corner)[0]
         # Scatter along an axis is itself known from the few residuals there only.
-        wider = stdtrit(self.whole.spare[:, 0].sum(), 0.975) / 1.96
+        wider = scipy.special.stdtrit(self.whole.spare[:, 0].sum(), 0.975) / 1.96
         covariance = wider**2 * slope @ self.whole.covariance_px2(corner) @ slope.T
         # |off + noise|² is nearly c·χ²(n) with its mean and variance (Satterthwaite 1946).
         mean = off @ off + np.trace(covariance)
         spread = 2 * np.sum(covariance**2) + 4 * off @ covariance @ off
         n = 2 * mean**2 / max(spread, 1e-300)
-        return float(np.sqrt(mean * chdtri(n, 0.05) / n)) if n < 1e6 else float(np.sqrt(mean))
+        return (
+            float(np.sqrt(mean * scipy.special.chdtri(n, 0.05) / n))
+            if n < 1e6
+            else float(np.sqrt(mean))
+        )
 
     def bound_words(self, used: ImageCalibration) -> tuple[str, ...]:
         """How far a map may err where dots land, and what helps where that matters."""
@@ -276,7 +280,7 @@ def _chance(smaller: MarkFit, larger: MarkFit) -> float:
     """How probable it is that noise alone gains as much by a fit's further entries (F-test)."""
     more, spare = len(larger.free) - len(smaller.free), float(larger.spare.sum())
     gain = smaller.variance * (spare + more) - larger.variance * spare
-    return float(fdtrc(more, spare, max(gain, 0.0) / more / larger.variance))
+    return float(scipy.special.fdtrc(more, spare, max(gain, 0.0) / more / larger.variance))
 
 
 def _gains(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> bool:

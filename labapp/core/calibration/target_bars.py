@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, map_coordinates
+import scipy
 
 from labapp.core.calibration.target_marks import Mark, Refusal
 from labapp.core.values import FloatArray, freeze
@@ -87,8 +87,10 @@ def measured_bar(mark: Mark, darkness: FloatArray, axis: str) -> Bar:
     across = np.arange(-mark.width, mark.width + step / 2.0, step)
     normal = np.array([-mark.direction[1], mark.direction[0]])
     grid = mark.center + along[:, None, None] * mark.direction + across[None, :, None] * normal
-    cut = map_coordinates(darkness, [grid[..., 1], grid[..., 0]], order=1, mode="nearest")
-    cut = gaussian_filter1d(cut, 1.0 / step, axis=0)
+    cut = scipy.ndimage.map_coordinates(
+        darkness, [grid[..., 1], grid[..., 0]], order=1, mode="nearest"
+    )
+    cut = scipy.ndimage.gaussian_filter1d(cut, 1.0 / step, axis=0)
 
     core = np.abs(along) < 0.4 * mark.length
     full = float(np.median(cut[core].max(axis=1)))
@@ -240,12 +242,12 @@ def _flag(
     profile = np.zeros_like(along)
     for side in (out, -out):
         grid = guess + along[:, None, None] * bar.direction + side[None, :, None] * flags_along
-        profile += map_coordinates(
+        profile += scipy.ndimage.map_coordinates(
             darkness, [grid[..., 1], grid[..., 0]], order=1, mode="nearest"
         ).mean(axis=1)
     profile -= np.median(profile)
     noise = 1.4826 * float(np.median(np.abs(profile)))
-    peak = int(np.argmax(gaussian_filter1d(profile, 0.7 / step)))
+    peak = int(np.argmax(scipy.ndimage.gaussian_filter1d(profile, 0.7 / step)))
     if profile[peak] < max(0.1 * bar.darkness, 4.0 * noise):
         return None
     reach = max(0.1 * unit_px, 3.0)

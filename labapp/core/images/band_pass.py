@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.images.dot_size import (
     SLENDER,
@@ -166,7 +166,9 @@ def dot_at(
     away = np.hypot(u - u_px, v - v_px)
     taken = np.full(len(u), np.inf)
     if len(others) and len(u):
-        taken = np.asarray(cKDTree(others.image_px).query(np.stack([u, v], axis=1))[0])
+        taken = np.asarray(
+            scipy.spatial.cKDTree(others.image_px).query(np.stack([u, v], axis=1))[0]
+        )
     away[taken < max(1.5, size)] = np.inf
     if not (away <= 2.0 * size).any():
         at = round(v_px), round(u_px)
@@ -280,7 +282,7 @@ def widen(image: Grey, into: Grey, variance_px2: float) -> Grey:
         blur(image, float(np.sqrt(variance_px2)), into)
         return image
     shape = height // scale, width // scale
-    small, blurred = (scratch((name, scale), shape) for name in ("small", "small blurred"))
+    small, blurred = (scratch(f"{name} {scale}", shape) for name in ("small", "small blurred"))
     cv2.resize(image, shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
     blur(small, float(np.sqrt(variance_px2 / scale**2 - ROUND_PX2)), blurred)
     cv2.resize(blurred, (width, height), dst=into)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -228,7 +228,7 @@ def _bands(picture: Picture, finest: int = 0) -> Iterator[tuple[int, tuple[int, 
             blur(
                 picture,
                 float(np.sqrt((0.8 * SCALES_PX[0] * 2 ** (k / 2) / step) ** 2 - lost)),
-                scratch(("blurred", step, k), picture.shape),
+                scratch(f"blurred {step} {k}", picture.shape),
             )
             for k in range(scale, scale + count + 2)
         ]
@@ -266,13 +266,13 @@ def with_grain(band: Grey, white: float) -> float:
 _own = threading.local()
 
 
-def scratch(name: Hashable, shape: tuple[int, ...]) -> Grey:
+def scratch(name: str, shape: tuple[int, ...]) -> Grey:
     """Return this thread's picture of a name to write on, shape (height, width).
 
     Frames of one size follow on each other: made anew for each, pictures would cost as much as the
     work on them.
     """
-    kept: dict[Hashable, Grey] = _own.__dict__
+    kept: dict[str, Grey] = _own.__dict__
     if name not in kept or kept[name].shape != shape:
         kept.pop(name, None)
         made = np.empty(shape, np.float32)

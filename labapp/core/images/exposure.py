@@ -8,7 +8,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.images.dots import Dots, Grey, Image
 from labapp.core.values import BoolArray, FloatArray
@@ -138,7 +138,7 @@ def _valley(grey: Grey, dots: Dots) -> float:
     if len(dots) < 2:
         return float("nan")
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    distance, neighbour = cKDTree(dots.image_px).query(dots.image_px, k=2)
+    distance, neighbour = scipy.spatial.cKDTree(dots.image_px).query(dots.image_px, k=2)
     reach = 2 * round(AROUND * float(np.median(distance[:, 1]))) + 1
     reach = min(reach, 2 * max(grey.shape) + 1)
     low = cv2.erode(smooth, np.ones((reach, 1), np.uint8))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
@@ -189,7 +189,7 @@ def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
     """Refuse sites that the surface cannot reconcile, and name the row that is worst."""
     scene, labels = bound.scene, bound.hypothesis.labels
     dot = labels[labels != UNLABELLED]
-    next_mm = cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][dot, 1]
+    next_mm = scipy.spatial.cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][dot, 1]
     off = np.linalg.norm(bound.hypothesis.pool.residual_mm, axis=-1) > OFF * next_mm
     wrong, sited = dot[off & (rows.row[dot] > 0)], int((rows.row > 0).sum())
     if len(wrong) > max(2, FEW_OFF * sited):

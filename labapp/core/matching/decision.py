@@ -8,7 +8,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.match import ORIENTATIONS, Orientation
 from labapp.core.matching.hypothesis import (
@@ -288,9 +288,11 @@ def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
 def _strays_lie_apart(scene: Scene, hypothesis: Hypothesis) -> bool:
     """Whether the dots without a ray are scattered."""
     dots = scene.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
-    spacing = median(cKDTree(dots).query(dots, k=2)[0][:, 1])
+    spacing = median(scipy.spatial.cKDTree(dots).query(dots, k=2)[0][:, 1])
     strays = scene.plane_mm[hypothesis.strays]
-    beside = cKDTree(strays).query_ball_point(strays, BESIDE * spacing, return_length=True)
+    beside = scipy.spatial.cKDTree(strays).query_ball_point(
+        strays, BESIDE * spacing, return_length=True
+    )
     return bool((beside <= PAIR).all())
 
 

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.match import Orientation, ways
 from labapp.core.matching.ray_growth import (
@@ -217,8 +217,10 @@ def contested(scene: Scene, hypothesis: Hypothesis) -> IntArray:
     rivals = np.concatenate([hypothesis.unseen.plane_mm, scene.plane_mm[hypothesis.strays]])
     if len(rivals) == 0 or len(dots) < 2:
         return np.zeros(0, np.int64)
-    spacing = median(cKDTree(scene.plane_mm[dots]).query(scene.plane_mm[dots], k=2)[0][:, 1])
-    near = cKDTree(rivals).query(scene.plane_mm[dots])[0] < CONTESTED * spacing
+    spacing = median(
+        scipy.spatial.cKDTree(scene.plane_mm[dots]).query(scene.plane_mm[dots], k=2)[0][:, 1]
+    )
+    near = scipy.spatial.cKDTree(rivals).query(scene.plane_mm[dots])[0] < CONTESTED * spacing
     return np.asarray(dots[near])
 
 
@@ -354,7 +356,9 @@ def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[Pred
     unseen = among.part(silent & scene.in_view(among.plane_mm))
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
     if merged.any() and len(stray):
-        off = np.asarray(cKDTree(among.plane_mm[merged]).query(scene.plane_mm[stray])[0])
+        off = np.asarray(
+            scipy.spatial.cKDTree(among.plane_mm[merged]).query(scene.plane_mm[stray])[0]
+        )
         stray = stray[off > scene.resolution_mm]
     return unseen, stray
 
@@ -372,7 +376,7 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     # A dot that no ray was given may be the dot of a ray that seems dark.
     stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
     if len(stray):
-        distance = cKDTree(scene.plane_mm[stray]).query(around.plane_mm)[0]
+        distance = scipy.spatial.cKDTree(scene.plane_mm[stray]).query(around.plane_mm)[0]
         doubt = around.at[distance < around.spacing_mm]
         doubt = doubt[witness[doubt[:, 0], doubt[:, 1]] < 0]
         witness[doubt[:, 0], doubt[:, 1]] = 0

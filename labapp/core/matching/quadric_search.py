@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.geometry.optics import bisecting_gradient
 from labapp.core.matching.ray_growth import UNLABELLED, Scene
@@ -74,7 +74,7 @@ def search_quadrics(scene: Scene, most: int = 8) -> list[QuadricGuess]:
     return sorted(found.values(), key=lambda guess: -guess.hits)[:most]
 
 
-def _holes(scene: Scene, tree: cKDTree) -> Iterator[tuple[FloatArray, float]]:
+def _holes(scene: Scene, tree: scipy.spatial.cKDTree) -> Iterator[tuple[FloatArray, float]]:
     """Empty places between two dots, IPCS, and half the dots' distance along X′, mm."""
     dots = scene.plane_mm
     for p, near in enumerate(tree.query(dots, k=min(10, len(dots)))[1]):
@@ -129,7 +129,10 @@ class _Window:
         rows, columns = scene.rays.shape[:2]
         reach = min(REACH, i, j, rows - 1 - i, columns - 1 - j)
         self.scene = scene
-        self.tree, self.plane = cKDTree(scene.plane_mm), scene.rig.imaging_plane.pose_mm
+        self.tree, self.plane = (
+            scipy.spatial.cKDTree(scene.plane_mm),
+            scene.rig.imaging_plane.pose_mm,
+        )
         self.part = slice(i - reach, i + reach + 1), slice(j - reach, j + reach + 1)
         self.rays = scene.rays[self.part]
         self.landing_mm = scene.landing_mm[i, j]

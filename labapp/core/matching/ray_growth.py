@@ -11,7 +11,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.optics import meet_level, ray_directions
@@ -415,7 +415,7 @@ def _without_outliers(scene: Scene, labels: IntArray, settings: FitSettings) -> 
     """Drop labels far from where the surface through all of them puts their dot."""
     if len(scene.plane_mm) < 2:
         return labels
-    spacing = cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][:, 1]
+    spacing = scipy.spatial.cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][:, 1]
     for _ in range(3):
         pool = try_fit(scene, labels, settings)
         if pool is None:

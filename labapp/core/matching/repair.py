@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.matching.hypothesis import FEW, Hypothesis, grow_and_score
 from labapp.core.matching.ray_growth import (
@@ -76,7 +76,7 @@ def _opened_up(scene: Scene, hypothesis: Hypothesis) -> Iterator[IntArray]:
         line, place = np.nonzero((own[:-1] != UNLABELLED) & (own[1:] != UNLABELLED))
         ends = scene.plane_mm[own[line, place]], scene.plane_mm[own[line + 1, place]]
         apart = np.linalg.norm(ends[1] - ends[0], axis=-1)
-        off = cKDTree(strays).query((ends[0] + ends[1]) / 2)[0]
+        off = scipy.spatial.cKDTree(strays).query((ends[0] + ends[1]) / 2)[0]
         lines, between = np.unique(line[off < MIDDLE * apart], return_counts=True)
         for k in lines[between >= FEW]:
             wider = np.full_like(own, UNLABELLED)
@@ -97,7 +97,7 @@ def _about_unexplained(scene: Scene, hypothesis: Hypothesis) -> BoolArray:
     about[unseen.at[:, 0], unseen.at[:, 1]] = True
     rays = predict(scene, hypothesis.pool, within_rings(hypothesis.labels, 1))
     if len(stray) and len(rays.at):
-        nearest = rays.at[cKDTree(rays.plane_mm).query(scene.plane_mm[stray])[1]]
+        nearest = rays.at[scipy.spatial.cKDTree(rays.plane_mm).query(scene.plane_mm[stray])[1]]
         about[nearest[:, 0], nearest[:, 1]] = True
     if not about.any():
         return about

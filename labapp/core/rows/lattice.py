@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.images.dots import Dots
 from labapp.core.values import BoolArray, CannotMeasure, ComplexArray, FloatArray, IntArray, freeze
@@ -127,7 +127,7 @@ def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
     may be ten times further apart than the dots within them).
     """
     points = np.stack([plane.real, plane.imag], axis=-1)
-    near = cKDTree(points).query(points, k=min(41, len(points)))[1][:, 1:]
+    near = scipy.spatial.cKDTree(points).query(points, k=min(41, len(points)))[1][:, 1:]
     offset = plane[near] - plane[:, None]
     length = np.abs(offset)
     a, b = np.triu_indices(min(10, near.shape[1]), 1)
@@ -290,7 +290,7 @@ def find_holes(grid: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
     if not grid:
         return []
     points = dots.image_px
-    tree = cKDTree(points)
+    tree = scipy.spatial.cKDTree(points)
     holes = []
     for k, t in {(k + dk, t + dt) for k, t in grid for dk, dt in _NEXT} - grid.keys():
         lit = [(k + dk, t + dt) in grid for dk, dt in _NEXT]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+import scipy
 
 from labapp.core.images.dots import Dots
 from labapp.core.rows.lattice import Lattice
@@ -158,7 +158,7 @@ def mask_rows(
     """
     settings = settings or MaskRowsSettings()
     place = _places(dots)
-    distance = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
+    distance = np.asarray(scipy.spatial.cKDTree(place).query(place, k=2)[0])[:, 1]
     spacing = max(float(np.median(distance)), 1.0)
     labels = _row_masks(place, frame_shape, spacing, settings)
     parts = _regions(place, labels, settings)

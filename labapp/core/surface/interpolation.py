@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial import QhullError
+import scipy
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.surface import Surface
@@ -50,7 +50,7 @@ class CloughTocherSurface:
         self.points_mm = points_mm = np.asarray(points_mm, float)
         try:
             self._cubic = CloughTocher2DInterpolator(points_mm[:, :2], points_mm[:, 2])
-        except (QhullError, ValueError) as error:
+        except (scipy.spatial.QhullError, ValueError) as error:
             raise CannotMeasure(
                 "no-surface", "the reflection points do not span an area"
             ) from error

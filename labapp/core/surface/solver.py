@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.blas import dsbmv
-from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs
+import scipy
 
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
@@ -86,7 +85,7 @@ class NormalEquations:
         at = self.basis.grid, coefficients, points_mm, self.weights
         target = kernels.gradient_rhs(*at, self.laser_mm, self.dots_mm)
         width = len(self.stiffness) - 1
-        target -= dsbmv(width, 1.0, self.stiffness, coefficients - rest, lower=1)
+        target -= scipy.linalg.blas.dsbmv(width, 1.0, self.stiffness, coefficients - rest, lower=1)
         change = solve(self.factor, target)
         # Slopes leave the level open: the mean height of the points stays.
         change -= kernels.surface_at(self.basis.grid, change, points_mm)[0].mean()
@@ -95,7 +94,7 @@ class NormalEquations:
 
 def solve(factor: FloatArray, right: npt.ArrayLike) -> FloatArray:
     """Solve the normal equations of a factor for right sides, shape (p,) or (p, m)."""
-    return np.asarray(dpbtrs(factor, right, lower=1)[0])
+    return np.asarray(scipy.linalg.lapack.dpbtrs(factor, right, lower=1)[0])
 
 
 def normal_factor(
@@ -126,7 +125,7 @@ def normal_factor(
     band = columns.reshape(count, height).T
     middle = kernels.splines_at(basis.grid, points_mm.mean(axis=0)[None])[0]
     band[0, middle[0, 5]] += band[0].mean()
-    lower, info = dpbtrf(band, lower=1, overwrite_ab=1)
+    lower, info = scipy.linalg.lapack.dpbtrf(band, lower=1, overwrite_ab=1)
     if info:
         raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
     return np.asarray(lower)
@@ -154,7 +153,7 @@ def sigma_of(
     """
     by_level = gradients.sum(axis=1)
     free = gradients - by_level[:, None] * level_at
-    half = dtbtrs(lower, np.asfortranarray(free.T), uplo="L")[0]
+    half = scipy.linalg.lapack.dtbtrs(lower, np.asfortranarray(free.T), uplo="L")[0]
     return np.asarray(np.sqrt((half * half).sum(axis=0) + (sigma_mm * by_level) ** 2))
 
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
+import scipy
 from PySide6.QtCore import QRectF, Qt
 from PySide6.QtGui import QBrush, QColor, QPen
-from scipy.spatial import cKDTree
 
 from labapp.core.rows.correction import Correction
 from labapp.core.values import FloatArray, IntArray
@@ -215,7 +215,7 @@ def _apart(dots_px: FloatArray) -> float:
     """How far dots are from their nearest, px, the median; infinite for one or none."""
     if len(dots_px) < 2:
         return np.inf
-    return float(np.median(cKDTree(dots_px).query(dots_px, 2)[0][:, 1]))
+    return float(np.median(scipy.spatial.cKDTree(dots_px).query(dots_px, 2)[0][:, 1]))
 
 
 def _joints(correction: Correction | None) -> tuple[IntArray, ...]:
