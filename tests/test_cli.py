@@ -627,13 +627,23 @@ def test_the_version_is_told(labapp: Run) -> None:
     assert (code, said) == (0, "labapp 0.1.0\n")
 
 
-def test_help_loads_nothing_heavy() -> None:
-    """So that it answers at once."""
+@pytest.mark.parametrize(
+    ("start", "heavy"),
+    [
+        ("import labapp.cli", {"numpy", "scipy", "cv2", "pyvista", "matplotlib"}),
+        (
+            "from labapp import Session",
+            {"scipy.linalg", "scipy.spatial", "scipy.special", "av", "numba", "h5py", "matplotlib"},
+        ),
+    ],
+)
+def test_nothing_heavy_is_loaded_before_it_is_needed(start: str, heavy: set[str]) -> None:
+    """So that help answers at once, and scripts begin soon."""
     loaded = subprocess.run(
-        [sys.executable, "-c", "import labapp.cli, sys; print(*sys.modules)"],
+        [sys.executable, "-c", f"{start}; import sys; print(*sys.modules)"],
         capture_output=True,
         text=True,
         check=True,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     ).stdout.split()
-    assert not {"numpy", "scipy", "cv2", "pyvista", "matplotlib"} & set(loaded)
+    assert not heavy & set(loaded)
