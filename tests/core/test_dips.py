@@ -61,6 +61,12 @@ def test_with_dots_missing_and_false_no_row_is_wrong(seed: int, missing: int, fa
     assert answer(*draw(seed, missing, false)).wrong == 0
 
 
+def test_the_boundary_alone_speaks_against_no_rows() -> None:
+    """Its likelihood, unbounded, had rows that are right lose to others."""
+    got = answer(*draw(9007, missing=6, false=3))
+    assert (got.status, got.wrong) == ("ok", 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [30005, 30010, 30015])
 def test_many_rays_without_a_dot_are_put_up_with_where_they_lie_apart(seed: int) -> None:
