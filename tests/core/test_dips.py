@@ -68,9 +68,15 @@ def test_the_boundary_alone_speaks_against_no_rows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [30005, 30010, 30015])
-def test_many_rays_without_a_dot_are_put_up_with_where_they_lie_apart(seed: int) -> None:
-    got = answer(*draw(seed, missing=9))
+@pytest.mark.parametrize(
+    ("seed", "missing", "false"),
+    [(30005, 9, 0), (30010, 9, 0), (30015, 9, 0), (9064, 6, 3), (9070, 6, 3)],
+)
+def test_many_rays_without_a_dot_are_put_up_with_where_they_lie_apart(
+    seed: int, missing: int, false: int
+) -> None:
+    """So do dots without a ray."""
+    got = answer(*draw(seed, missing, false))
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.95 * got.shown
 

@@ -157,12 +157,13 @@ def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings)
     strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
     missed = settings.missed[0] + settings.missed[1] * best.count
     # Missed rays side by side are a hole or a row: then so many dots without a ray may be theirs.
-    apart = best.marker == "dark" and _missed_lie_apart(best)
-    if apart and _strays_lie_apart(scene, best):
-        strays = max(strays, STRAYS_APART * best.count)
-    if apart:
-        missed = max(missed, MISSED_APART * best.count - EACH_STRAY * best.stray)
-    if best.stray > strays or best.missed > missed:
+    scattered = (
+        best.marker == "dark"
+        and _missed_lie_apart(best)
+        and (best.stray <= strays or _strays_lie_apart(scene, best))
+        and best.stray + best.missed <= SCATTERED * best.count
+    )
+    if not scattered and (best.stray > strays or best.missed > missed):
         raise CannotMeasure(
             "no-match",
             f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
@@ -271,10 +272,10 @@ PAIR, BESIDE = 2, 1.5
 """So many missed rays, or dots without a ray, side by side are no row; dots are where they are
 nearer to one another than so many spacings."""
 
-STRAYS_APART, MISSED_APART, EACH_STRAY = 0.35, 0.12, 3
-"""Shares of the dots with a ray that are put up with where they lie apart: false dots do, and those
-that fail at random; dots of a row that was left out or jumped do not. That leaves both kinds: for
-each dot without a ray, by so many missed rays fewer are put up with."""
+SCATTERED, MISSED_APART = 0.3, 0.12
+"""Where dots without a ray and missed rays lie apart, so many of both, as a share of the dots with a
+ray, are put up with: false dots lie apart, and those that fail at random; dots of a row that was
+left out or jumped do not. With so many missed rays no other hypothesis is looked for."""
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
