@@ -6,6 +6,7 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled as _compiled
+from labapp.core.compiled import part as _inner
 from labapp.core.values import FloatArray
 
 _f, _i = types.float64, types.int64
@@ -16,6 +17,33 @@ EPS = 1e-17
 
 FACTORS = 1000
 """So many factors of at most 2 have a product that is a number still."""
+
+
+@_inner
+def _multiply(factors: FloatArray, k: int, way: int, factor: float, shrinks: float) -> None:
+    """Multiply by 1 + factor from k on one way, while the factor shrinks to nothing.
+
+    Four factors shrink side by side, so that none waits for the one before it.
+    """
+    count, square = len(factors), shrinks * shrinks
+    second, third, fourth = factor * shrinks, factor * square, factor * square * shrinks
+    shrinks = square * square
+    while 0 <= k + 3 * way < count and factor > EPS:
+        factors[k] *= 1.0 + factor
+        factors[k + way] *= 1.0 + second
+        factors[k + 2 * way] *= 1.0 + third
+        factors[k + 3 * way] *= 1.0 + fourth
+        factor, second, third, fourth = (
+            factor * shrinks,
+            second * shrinks,
+            third * shrinks,
+            fourth * shrinks,
+        )
+        k += 4 * way
+    for last in (factor, second, third):
+        if 0 <= k < count:
+            factors[k] *= 1.0 + last
+            k += way
 
 
 @_compiled(_f2, _f1, _f, _f, _i, _f1)
@@ -44,6 +72,7 @@ def level_negative_log_likelihood(
     """
     made = np.empty((len(over), len(blurs), count))
     factors, starts, slopes = np.empty(count), np.empty(count + 1), np.empty(count + 1)
+    shrinking = np.exp(-step * np.outer(1.0 / blurs, np.abs(side)))
     for d in range(len(over)):
         for b in range(len(blurs)):
             factors[:], starts[:], slopes[:], total = 1.0, 0.0, 0.0, made[d, b]
@@ -58,17 +87,12 @@ def level_negative_log_likelihood(
                 begins, ends = (0, turn) if slope > 0.0 else (turn, count)
                 starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
                 starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
-                shrinks = np.exp(-abs(slope))
-                factor, k = np.exp(-abs(start + turn * slope)), turn
-                while k < count and factor > EPS:
-                    factors[k] *= 1.0 + factor
-                    factor *= shrinks
-                    k += 1
-                factor, k = np.exp(-abs(start + (turn - 1) * slope)), turn - 1
-                while k >= 0 and factor > EPS:
-                    factors[k] *= 1.0 + factor
-                    factor *= shrinks
-                    k -= 1
+                shrinks = shrinking[b, n]
+                if turn < count:
+                    _multiply(factors, turn, 1, np.exp(-abs(start + turn * slope)), shrinks)
+                if turn > 0:
+                    last = turn - 1
+                    _multiply(factors, last, -1, np.exp(-abs(start + last * slope)), shrinks)
                 if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
                     total += np.log(factors)
                     factors[:] = 1.0
