@@ -273,8 +273,8 @@ PAIR, BESIDE = 2, 1.5
 nearer to one another than so many spacings."""
 
 SCATTERED, MISSED_APART = 0.3, 0.12
-"""Where dots without a ray and missed rays lie apart, so many of both, as a share of the dots with a
-ray, are put up with: false dots lie apart, and those that fail at random; dots of a row that was
+"""Where dots without a ray and missed rays lie apart, so many of both, as a share of the dots with
+a ray, are put up with: false dots lie apart, and those that fail at random; dots of a row that was
 left out or jumped do not. With so many missed rays no other hypothesis is looked for."""
 
 
