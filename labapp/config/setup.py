@@ -134,6 +134,17 @@ def updated_setup(
     return tomlkit.dumps(document)
 
 
+def pattern_values(pattern: DotPattern) -> dict[str, object]:
+    """What a setup file says of a pattern: key → value."""
+    values: dict[str, object] = {
+        "rows": pattern.rows,
+        "columns": pattern.columns,
+        "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
+        "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
+    }
+    return values if pattern.kind == DotPattern.kind else values | {"kind": pattern.kind}
+
+
 def _text(path: Path) -> str:
     try:
         return path.read_bytes().decode("utf-8-sig")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number
+from labapp.core.geometry.patterns import PATTERNS
 
 _LENGTH = between(0, LARGEST_MM, "mm")
 _PLACE = between(-LARGEST_MM, LARGEST_MM, "mm")
@@ -59,6 +60,11 @@ SECTIONS = {
         "absent": Rule(
             "a list of rays [row, column] within the pattern, counted from 1",
             _is_rays,
+            required=False,
+        ),
+        "kind": Rule(
+            f"one of {', '.join(PATTERNS)}",
+            lambda value: isinstance(value, str) and value in PATTERNS,
             required=False,
         ),
     },

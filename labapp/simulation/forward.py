@@ -1,7 +1,7 @@
 """The forward model: which rays come back from a pool, and where they meet the imaging plane.
 
-Written from the geometry alone (laser and pattern of §4.2.2.2, blocking of §4.2.1), in vectors,
-with nothing of the code that measures.
+Written from the geometry alone (laser of §4.2.2.2, blocking of §4.2.1), in vectors, for the rays
+of the rig's pattern, with nothing of the code that measures.
 """
 
 from __future__ import annotations
@@ -208,14 +208,10 @@ def _rays(rig: Rig) -> tuple[FloatArray, FloatArray]:
     alpha = np.radians(rig.laser.projection_angle_deg)
     beam = np.array([0.0, -np.cos(alpha), -np.sin(alpha)])
     up = np.array([0.0, -np.sin(alpha), np.cos(alpha)])
-    beta = np.radians(rig.pattern.inter_beam_angle_deg)
-    rows, columns = rig.pattern.rows, rig.pattern.columns
     # Row 1 is the topmost of the fan as the laser sends it, so it lands farthest, at the tail.
-    v = np.tan(beta * ((rows - 1) / 2 - np.arange(rows)))
-    h = np.tan(beta * (np.arange(columns) - (columns - 1) / 2))
-    direction = np.empty((rows, columns, 3))
+    h, v = np.moveaxis(rig.pattern.tangents, -1, 0)
+    direction = beam + v[..., None] * up
     direction[..., 0] = h
-    direction[..., 1:] = (beam + v[:, None] * up)[:, None, 1:]
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     return -rig.laser.distance_mm * beam, direction
 

@@ -12,7 +12,7 @@ from labapp.core.values import FloatArray
 
 @lru_cache(maxsize=16)
 def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
-    """Unit direction of every projected ray (Eq. 4-1, tangent grid of Fig. 4-14).
+    """Unit direction of every projected ray (Eq. 4-1, Fig. 4-14).
 
     Returns
     -------
@@ -24,14 +24,8 @@ def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
     axis = np.array([0.0, -np.cos(angle), -np.sin(angle)])
     across = np.array([1.0, 0.0, 0.0])
     along = np.array([0.0, -np.sin(angle), np.cos(angle)])
-    step = np.radians(pattern.inter_beam_angle_deg)
-    i = np.arange(1, pattern.rows + 1)[:, None, None]
-    j = np.arange(1, pattern.columns + 1)[None, :, None]
-    direction = (
-        axis
-        + np.tan((j - (pattern.columns + 1) / 2) * step) * across
-        + np.tan(((pattern.rows + 1) / 2 - i) * step) * along
-    )
+    tangents = pattern.tangents
+    direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     direction.flags.writeable = False
     return np.asarray(direction)

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from labapp.core.geometry.patterns import PATTERNS
 from labapp.core.values import FloatArray, freeze
 
 
@@ -38,7 +39,7 @@ class Laser:
 
 @dataclass(frozen=True)
 class DotPattern:
-    """The projected dot matrix: a square tangent grid of rays (Fig. 4-14).
+    """The projected dot matrix: rays in rows and columns (Fig. 4-14).
 
     Parameters
     ----------
@@ -48,12 +49,15 @@ class DotPattern:
         Angle between neighbouring rays at the centre, degrees.
     absent
         Rays ``(i, j)``, counted from 1, that the lens does not make. None: the centre.
+    kind
+        How the rays lie to each other, one of `PATTERNS`.
     """
 
     rows: int = 19
     columns: int = 19
     inter_beam_angle_deg: float = 0.77
     absent: frozenset[tuple[int, int]] | None = None
+    kind: str = "square"
 
     def __post_init__(self) -> None:
         if self.absent is None:
@@ -73,6 +77,11 @@ class DotPattern:
             key=lambda ray: float(np.linalg.norm(np.array(ray) - center)),
             default=None,
         )
+
+    @property
+    def tangents(self) -> FloatArray:
+        """Tangents of the rays to the beam axis, see `Tangents`, shape (rows, columns, 2)."""
+        return PATTERNS[self.kind](self.rows, self.columns, np.radians(self.inter_beam_angle_deg))
 
     @property
     def absent_rays(self) -> frozenset[tuple[int, int]]:

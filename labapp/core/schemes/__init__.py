@@ -95,7 +95,7 @@ SCHEMES: dict[str, Scheme] = {
         ),
     )
 }
-"""All schemes by name, as they are listed; the first is the default."""
+"""All schemes by name, in the order in which they are offered."""
 
 
 def scheme_words() -> dict[str, Words]:

@@ -109,6 +109,8 @@ def begin(
     match, made = measurement.match, measurement.reconstruction
     if match is None or made is None or not isinstance(made.whole, SplineSurface):
         return None
+    if made.scheme != "fit":
+        return None
     if settings.dots.method != "band-pass" or rig.pattern.marker is None:
         return None
     own, pool = SequenceGeometry.of(rig, made.whole.basis, settings.fit), None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from labapp.config.setup import pattern_values
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.setup.presenter import rig
 from labapp.session.session import Session
@@ -51,7 +52,7 @@ def question(session: Session | None) -> Values:
     }
     found = None if session is None else rig(session)
     if found is not None:
-        bench, pattern = values["bench"], found.pattern
+        bench = values["bench"]
         for key, value in (
             ("projection_angle_deg", found.laser.projection_angle_deg),
             ("distance_mm", found.laser.distance_mm),
@@ -61,12 +62,7 @@ def question(session: Session | None) -> Values:
         bench["width_mm"] = found.imaging_plane.width_mm
         bench["height_mm"] = found.imaging_plane.height_mm
         bench["electrode_height_mm"] = found.electrode.height_mm
-        values["pattern"] = {
-            "rows": pattern.rows,
-            "columns": pattern.columns,
-            "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
-            "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
-        }
+        values["pattern"] = pattern_values(found.pattern)
     return values
 
 

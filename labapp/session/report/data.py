@@ -363,6 +363,7 @@ def rig_cells(setup: Setup) -> Cells:
         ["laser", "projection angle α", f"{rig.laser.projection_angle_deg:.6g} °"],
         ["", "distance to the origin", f"{rig.laser.distance_mm:.6g} mm"],
         ["dot pattern", "rows × columns", f"{rig.pattern.rows} × {rig.pattern.columns}"],
+        ["", "kind", rig.pattern.kind],
         ["", "inter-beam angle β", f"{rig.pattern.inter_beam_angle_deg:.6g} °"],
         ["", "absent rays (i, j)", absent + (" …" if len(rig.pattern.absent_rays) > 8 else "")],
         ["electrode", "height of the tip", f"{rig.electrode.height_mm:.6g} mm"],

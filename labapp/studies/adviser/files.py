@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from labapp.config.setup import updated_setup
+from labapp.config.setup import pattern_values, updated_setup
 from labapp.studies.adviser.report import advice_picture, advice_table, advice_text, cost_table
 from labapp.studies.adviser.search import Advice
 from labapp.studies.plotting import as_bytes
@@ -36,18 +36,12 @@ def advice_files(advice: Advice) -> dict[str, bytes]:
 def advised_setup(advice: Advice) -> dict[str, dict[str, Any]]:
     """The recommended set-up: section → key → value, hundredths of a mm and of a degree."""
     place, limits = advice.best.place, advice.limits
-    pattern = limits.pattern
     return {
         "laser": {
             "projection_angle_deg": round(place.projection_angle_deg, 2),
             "distance_mm": round(place.distance_mm, 2),
         },
-        "pattern": {
-            "rows": pattern.rows,
-            "columns": pattern.columns,
-            "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
-            "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
-        },
+        "pattern": pattern_values(limits.pattern),
         "electrode": {"height_mm": limits.electrode_mm},
         "imaging_plane": {
             "distance_mm": round(place.plane_mm, 2),
