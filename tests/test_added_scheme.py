@@ -25,7 +25,7 @@ from pathlib import Path
 from labapp.core import schemes
 
 schemes.__path__.append(str(Path(__file__).parent))
-words = schemes.Words("toy", "Toy: a quadric by least squares")
+words = schemes.Words("the toy", "Toy: a quadric by least squares")
 schemes.SCHEMES["toy"] = schemes.Scheme("toy", "a toy", words)
 """
 
@@ -161,7 +161,7 @@ def test_sessions_and_pages_have_it(python: Python, tmp_path: Path) -> None:
     assert found.pop("compared").startswith("Toy minus Fit, from the same dots: the heights")
     assert found.pop("other") == "fit"
     assert found.pop("provenance").startswith("Frame 0 · Toy · dots found automatically")
-    assert found.pop("export page")[""] == "toy (as in the settings)"
+    assert found.pop("export page")[""] == "the toy (as in the settings)"
     for where, offered in found.items():
         assert "toy" in offered, where
     assert found["surface page"]["toy"] == "Toy: a quadric by least squares"
