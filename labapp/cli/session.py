@@ -33,6 +33,7 @@ from labapp.cli.shared import (
 )
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
+from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
 from labapp.words import several
 
 if TYPE_CHECKING:
@@ -296,12 +297,21 @@ def export(
     ] = True,
     surfaces: Annotated[
         str,
-        typer.Option(metavar="A,B,…", help="Some of csv, stl, stl-ascii, ply, vtp, or none (mm)."),
+        typer.Option(metavar="A,B,…", help=f"Some of {', '.join(SURFACE_FORMATS)}, or none (mm)."),
     ] = "csv,stl",
     solid: Annotated[
         bool, typer.Option("--solid", help="Each surface as a watertight body, too.")
     ] = False,
-    hdf5: Annotated[bool, typer.Option("--hdf5", help="Everything in one HDF5 file.")] = False,
+    together: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,…",
+            help=f"Everything in one file, some of {', '.join(RUN_FORMATS)}, or none.",
+        ),
+    ] = "none",
+    hdf5: Annotated[
+        bool, typer.Option("--hdf5", help="Everything in one HDF5 file: --together hdf5.")
+    ] = False,
     pictures: Annotated[
         str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, film, or none.")
     ] = "none",
@@ -318,13 +328,14 @@ def export(
     from labapp.export.tables import TABLES
     from labapp.session.session import Session
 
-    if surfaces == pictures == "none" and not (tables or hdf5 or report):
+    if surfaces == pictures == together == "none" and not (tables or hdf5 or report):
         raise InputError("export", "choice", "nothing", "tables, surfaces, HDF5, pictures, report")
     choice = ExportChoice(
         tables=frozenset(TABLES if tables else ()),
         surfaces=_words(surfaces),
         solid=solid,
         hdf5=hdf5,
+        together=_words(together),
         pictures=_words(pictures),
         view=view,
         size_px=_size(size),

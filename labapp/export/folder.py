@@ -24,8 +24,8 @@ from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.export.drawing import VIEWS, Direction
 from labapp.export.film import TICKS_HZ, Extent, film_times, write_film
-from labapp.export.hdf5 import Hdf5Writer
-from labapp.export.meshes import FORMATS, SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
+from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, mesh_formats
+from labapp.export.meshes import SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
 from labapp.export.pictures import (
     write_frame_picture,
     write_surface_picture,
@@ -42,7 +42,6 @@ from labapp.version import VERSION
 from labapp.words import SIGMA_OF
 
 MANIFEST = "manifest.json"
-HDF5_FILE = "results.h5"
 TREND_FILE = "trends.png"
 TREND = ("width", "length", "height")
 FILM_FILE = "film.mp4"
@@ -72,11 +71,11 @@ class ExportChoice:
     tables
         Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``.
     surfaces
-        How to write each surface: some of ``csv``, ``stl``, ``stl-ascii``, ``ply``, ``vtp``.
+        How to write each surface: some of `SURFACE_FORMATS`.
     solid
         Whether to add each surface as a watertight body, in the mesh formats of `surfaces`.
     hdf5
-        Whether to write everything into one HDF5 file.
+        Short for ``hdf5`` in `together`.
     pictures
         Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
         ``film`` (the surfaces, one after the other in one view and on one colour scale).
@@ -89,6 +88,8 @@ class ExportChoice:
         Width and height of these, even, px.
     film_rate_hz
         Frames of the film a second; None: as fast as they were recorded (`film.film_times`).
+    together
+        How to write everything into one file: some of `RUN_FORMATS`.
 
     Raises
     ------
@@ -105,18 +106,21 @@ class ExportChoice:
     view: Direction = "free"
     size_px: tuple[int, int] = PICTURE_PX
     film_rate_hz: float | None = None
+    together: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         allowed: dict[str, Collection[str]] = {
             "tables": TABLES,
-            "surfaces": ("csv", *FORMATS),
+            "surfaces": SURFACE_FORMATS,
             "pictures": PICTURES,
+            "together": RUN_FORMATS,
         }
         for field, words in allowed.items():
             if unknown := sorted(getattr(self, field) - frozenset(words)):
                 raise InputError("export", field, unknown[0], f"some of {', '.join(words)}")
-        if self.solid and not self.surfaces & FORMATS.keys():
-            raise InputError("export", "solid", "no mesh format", f"one of {', '.join(FORMATS)}")
+        if self.solid and not self.surfaces & frozenset(mesh_formats()):
+            wanted = f"one of {', '.join(mesh_formats())}"
+            raise InputError("export", "solid", "no mesh format", wanted)
         if not SMALLEST_SPACING_MM <= self.spacing_mm <= 1:
             raise InputError(
                 "export", "spacing_mm", self.spacing_mm, f"from {SMALLEST_SPACING_MM} to 1 mm"
@@ -130,6 +134,12 @@ class ExportChoice:
         rate = self.film_rate_hz
         if rate is not None and not 0 < rate <= TICKS_HZ:
             raise InputError("export", "film_rate_hz", rate, f"above 0, at most {TICKS_HZ}")
+
+    @property
+    def run_formats(self) -> list[RunFormat]:
+        """How everything is written into one file."""
+        chosen = self.together | {"hdf5"} if self.hdf5 else self.together
+        return [each for name, each in RUN_FORMATS.items() if name in chosen]
 
 
 @dataclass(frozen=True)
@@ -177,7 +187,7 @@ def export(
     calibration
         Pixel ↔ imaging plane, for the dots' places on the plane.
     provenance
-        What the manifest and the HDF5 file are to say of source, setup and settings; plain values.
+        What manifest and files of all frames say of source, setup and settings; plain values.
     choice
         What to write.
     image_of
@@ -302,16 +312,16 @@ def _write_results(
     for name in choice.tables:
         files.add(f"{name}.csv", csv_header(name).encode())
     with ExitStack() as stack:
-        hdf5 = process = None
-        if choice.hdf5:
-            about = _root_attributes(provenance)
-            writer = Hdf5Writer(files.new(HDF5_FILE), about, choice.spacing_mm)
-            hdf5 = stack.enter_context(writer)
+        process, about = None, _about(provenance)
+        together = [
+            stack.enter_context(each.open(files.new(each.file), about, choice.spacing_mm))
+            for each in choice.run_formats
+        ]
         if "surfaces" in choice.pictures:
             process = stack.enter_context(drawing_process(choice.size_px, choice.view))
         for frame, time_s, measurement in measured:
             reconstruction = measurement.reconstruction
-            if reconstruction is not None and (choice.surfaces or choice.hdf5):
+            if reconstruction is not None and (choice.surfaces or together):
                 refuse_too_large(reconstruction, choice.spacing_mm)
             tables = frame_tables(frame, time_s, measurement, calibration)
             for name in choice.tables:
@@ -322,8 +332,8 @@ def _write_results(
             )
             for name, content in surfaces.items():
                 files.add(name, content)
-            if hdf5 is not None:
-                hdf5.write(frame, tables, reconstruction)
+            for writer in together:
+                writer.write(frame, tables, reconstruction)
             if image_of is not None and _has_picture(measurement, choice):
                 path = files.new(f"frame_{frame:06d}.png")
                 write_frame_picture(path, image_of(frame), measurement)
@@ -348,8 +358,8 @@ def _made() -> dict[str, object]:
     return {**made, "sigma_of": SIGMA_OF}
 
 
-def _root_attributes(provenance: Mapping[str, object]) -> dict[str, object]:
-    """Attributes of the HDF5 file; the setup as the TOML text it is."""
+def _about(provenance: Mapping[str, object]) -> dict[str, object]:
+    """What a file of all frames says of its source; the setup as the TOML text it is."""
     about = {**_made(), **provenance}
     setup = about.get("setup")
     if isinstance(setup, Mapping) and "toml" in setup:

@@ -7,14 +7,13 @@ from above: its normals point up. The same reconstruction gives the same bytes.
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.surface.measures import surface_mesh
+from labapp.core.surface.measures import surface_grid, surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, freeze
 from labapp.errors import InputError
@@ -84,6 +83,12 @@ def drawn_spacing(reconstruction: Reconstruction, spacing_mm: float) -> float:
 def _radius_mm(reconstruction: Reconstruction) -> float:
     boundary = reconstruction.boundary
     return float(np.hypot(*(boundary.points_mm[:, :2] - boundary.center_mm).T).max())
+
+
+def nodes(reconstruction: Reconstruction, spacing_mm: float) -> FloatArray:
+    """Nodes of a grid within the boundary where the surface is known, shape (n, 3), mm."""
+    each = np.column_stack(surface_grid(reconstruction, spacing_mm))
+    return np.asarray(each[np.isfinite(each).all(axis=1)])
 
 
 def surface(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
@@ -255,12 +260,3 @@ def _vtk_array(name: str, values: npt.NDArray[Any], kind: str, components: int =
         f'<DataArray type="{vtk_type}" Name="{name}" NumberOfComponents="{components}" '
         f'format="binary">{text}</DataArray>'
     )
-
-
-FORMATS: dict[str, tuple[str, Callable[[Mesh], bytes]]] = {
-    "stl": (".stl", stl),
-    "stl-ascii": ("_ascii.stl", stl_ascii),
-    "ply": (".ply", ply),
-    "vtp": (".vtp", vtp),
-}
-"""Format → how its files' names end, and what writes it."""

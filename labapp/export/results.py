@@ -16,8 +16,9 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
-from labapp.export.meshes import FORMATS, SPACING_MM, solid, surface
-from labapp.export.tables import TABLES, csv_header, surface_csv, table_rows
+from labapp.export.formats import SURFACE_FORMATS
+from labapp.export.meshes import SPACING_MM, nodes, solid, surface
+from labapp.export.tables import TABLES, csv_header, table_rows
 from labapp.files import as_bytes, write_whole
 from labapp.version import VERSION
 from labapp.words import SIGMA_OF
@@ -45,22 +46,22 @@ def surface_files(
     reconstruction
         What it gave.
     formats
-        Some of ``csv`` and those of `FORMATS`.
+        Some of `SURFACE_FORMATS`.
     spacing_mm
         Distance of the nodes, mm.
     as_solid
-        Whether to add the mesh as a watertight body in each of the `FORMATS` chosen.
+        Whether to add a watertight body in each of the formats that is of meshes.
     """
     if reconstruction is None:
         return {}
-    files = {}
-    if "csv" in formats:
-        files[f"surface_{frame:06d}.csv"] = surface_csv(reconstruction, spacing_mm)
-    chosen = [FORMATS[name] for name in FORMATS if name in formats]
-    for stem, make in (("surface", surface), ("solid", solid))[: 1 + as_solid]:
-        mesh = make(reconstruction, spacing_mm) if chosen else None
-        if mesh is not None:
-            files |= {f"{stem}_{frame:06d}{end}": write(mesh) for end, write in chosen}
+    files: dict[str, bytes] = {}
+    chosen = [each for name, each in SURFACE_FORMATS.items() if name in formats]
+    shapes = (("surface", "nodes", nodes), ("surface", "mesh", surface), ("solid", "mesh", solid))
+    for stem, of, make in shapes[: 2 + as_solid]:
+        alike = [each for each in chosen if each.of == of]
+        if alike:
+            shape = make(reconstruction, spacing_mm)
+            files |= {f"{stem}_{frame:06d}{each.end}": each.content(shape) for each in alike}
     return files
 
 

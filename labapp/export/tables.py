@@ -18,8 +18,9 @@ import numpy.typing as npt
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
-from labapp.core.surface.measures import Measures, surface_grid
+from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.values import FloatArray
 from labapp.words import SIGMA_OF, as_cell
 
 PX_DIGITS, MM_DIGITS = 4, 6
@@ -263,10 +264,8 @@ AS_NUMBER = {"nan": "", "-inf": "", "inf": ""} | {
 """Cells as Python formats them, and as `number` does."""
 
 
-def surface_csv(reconstruction: Reconstruction, spacing_mm: float) -> bytes:
-    """Nodes of the surface within the boundary, as `x_mm,y_mm,z_mm`."""
-    nodes = np.column_stack(surface_grid(reconstruction, spacing_mm))
-    nodes = nodes[np.isfinite(nodes).all(axis=1)]
+def nodes_csv(nodes: FloatArray) -> bytes:
+    """Nodes of a surface, shape (n, 3), mm, as `x_mm,y_mm,z_mm`."""
     text = io.StringIO()
     np.savetxt(text, nodes, f"%.{MM_DIGITS}f", ",", header="x_mm,y_mm,z_mm", comments="")
     return text.getvalue().encode()

@@ -15,6 +15,7 @@ from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import Surface
 from labapp.export import meshes
+from labapp.export.formats import SURFACE_FORMATS, mesh_formats
 from labapp.export.meshes import Mesh
 from labapp.simulation.pools import Dent, Pool, egg, spherical_cap
 
@@ -235,8 +236,8 @@ def test_vtp_is_read_back_by_vtk(mesh: Mesh) -> None:
     assert read.GetFieldData().GetAbstractArray("units").GetValue(0) == "mm"
 
 
-@pytest.mark.parametrize("name", meshes.FORMATS)
+@pytest.mark.parametrize("name", mesh_formats())
 def test_the_same_mesh_gives_the_same_bytes(name: str) -> None:
-    write = meshes.FORMATS[name][1]
+    write = SURFACE_FORMATS[name].content
     again = meshes.surface(of(cap(HEIGHT_MM)), 0.2)
     assert write(again) == write(MESHES["surface"])

@@ -12,11 +12,11 @@ from pytestqt.qtbot import QtBot
 from labapp.export.folder import ExportChoice, verify_export
 from labapp.gui.pages.export.page import ExportPage
 from labapp.gui.pages.export.presenter import (
-    GROUPS,
     USUAL,
     Wish,
     Written,
     folder_within,
+    groups,
     plan,
     proposed_folder,
     schemes,
@@ -33,10 +33,10 @@ def gtaw(copy_sample) -> Path:
 
 def test_the_usual_ticks_are_the_usual_export() -> None:
     assert Wish().choice() == ExportChoice()
-    keys = {item.key for _, items in GROUPS for item in items}
+    keys = {item.key for _, items in groups() for item in items}
     everything = Wish(ticked=frozenset(keys)).choice()
     assert everything.solid
-    assert everything.hdf5
+    assert [each.file for each in everything.run_formats] == ["results.h5"]
     assert len(everything.surfaces) == 5
     assert everything.pictures == {"frames", "surfaces", "trends", "film"}
     assert keys > USUAL

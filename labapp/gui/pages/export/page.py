@@ -22,7 +22,6 @@ from PySide6.QtWidgets import (
 
 from labapp.export.meshes import SMALLEST_SPACING_MM
 from labapp.gui.pages.export.presenter import (
-    GROUPS,
     SIZES,
     USUAL,
     VIEWS,
@@ -30,6 +29,7 @@ from labapp.gui.pages.export.presenter import (
     Wish,
     Written,
     folder_within,
+    groups,
     plan,
     proposed_folder,
     schemes,
@@ -216,7 +216,7 @@ class ExportPage(Page):
         grid.setContentsMargins(16, 12, 16, 12)
         grid.setHorizontalSpacing(32)
         grid.setVerticalSpacing(18)
-        for number, (title, items) in enumerate(GROUPS):
+        for number, (title, items) in enumerate(groups()):
             column = QVBoxLayout()
             column.addWidget(heading(title))
             for item in items:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,14 +15,20 @@ from labapp.export.drawing import Direction
 from labapp.export.film import UNTIMED_HZ, film_times
 from labapp.export.folder import (
     FILM_FILE,
-    HDF5_FILE,
     MANIFEST,
     TREND_FILE,
     ExportChoice,
     ExportedFile,
     verify_export,
 )
-from labapp.export.meshes import FORMATS, SPACING_MM
+from labapp.export.formats import (
+    RUN_FORMATS,
+    SURFACE_FORMATS,
+    RunFormat,
+    SurfaceFormat,
+    mesh_formats,
+)
+from labapp.export.meshes import SPACING_MM
 from labapp.export.studio import PICTURE_PX
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
@@ -52,7 +58,7 @@ class Item:
     Parameters
     ----------
     key
-        ``tables:dots``, ``surfaces:stl``, ``solid``, ``hdf5``, ``pictures:frames``, ``report``.
+        ``tables:dots``, ``surfaces:stl``, ``solid``, ``together:hdf5``, ``report``.
     name
         Its words.
     tip
@@ -64,50 +70,59 @@ class Item:
     tip: str
 
 
-GROUPS: tuple[tuple[str, tuple[Item, ...]], ...] = (
-    (
-        "Tables (CSV)",
+def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
+    """What can be ticked: (heading, items) of each group."""
+    return (
         (
-            Item("tables:measures", "Measures", "A row a frame: width, length, height, ARE …"),
-            Item("tables:dots", "Dots", "A row a dot: its place, row, column and ray"),
-            Item("tables:points", "Points", "A row a reflection point, with its residual"),
-            Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
-        ),
-    ),
-    (
-        "Surfaces, a file a frame",
-        (
-            Item("surfaces:csv", "CSV", "x, y, z of a grid within the boundary, mm"),
-            Item("surfaces:stl", "STL", "Triangles, binary, mm"),
-            Item("surfaces:stl-ascii", "STL as text", "Triangles as text, for old programs, mm"),
-            Item("surfaces:ply", "PLY", "Triangles for mesh programs, mm"),
-            Item("surfaces:vtp", "VTP", "Triangles for ParaView, mm"),
-            Item("solid", "also as solids", "Each surface as a watertight body, mesh formats only"),
-        ),
-    ),
-    (
-        "Pictures (PNG), film (MP4)",
-        (
-            Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
-            Item(
-                "pictures:surfaces", "Surfaces", "Each surface in 3-D, seen from where you choose"
-            ),
-            Item("pictures:trends", "Trends", "Width, length and height over time"),
-            Item(
-                "pictures:film",
-                "Film",
-                "The surface in 3-D over all frames, each at its time",
+            "Tables (CSV)",
+            (
+                Item("tables:measures", "Measures", "A row a frame: width, length, height, ARE …"),
+                Item("tables:dots", "Dots", "A row a dot: its place, row, column and ray"),
+                Item("tables:points", "Points", "A row a reflection point, with its residual"),
+                Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
             ),
         ),
-    ),
-    (
-        "Everything together",
         (
-            Item("hdf5", "HDF5", "All tables and surfaces with units and their source in one file"),
-            Item("report", "Report (PDF)", "Set-up, calibration, results, error budget, versions"),
+            "Surfaces, a file a frame",
+            (
+                *_formats("surfaces", SURFACE_FORMATS),
+                Item(
+                    "solid",
+                    "also as solids",
+                    "Each surface as a watertight body, mesh formats only",
+                ),
+            ),
         ),
-    ),
-)
+        (
+            "Pictures (PNG), film (MP4)",
+            (
+                Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
+                Item(
+                    "pictures:surfaces",
+                    "Surfaces",
+                    "Each surface in 3-D, seen from where you choose",
+                ),
+                Item("pictures:trends", "Trends", "Width, length and height over time"),
+                Item(
+                    "pictures:film", "Film", "The surface in 3-D over all frames, each at its time"
+                ),
+            ),
+        ),
+        (
+            "Everything together",
+            (
+                *_formats("together", RUN_FORMATS),
+                Item(
+                    "report", "Report (PDF)", "Set-up, calibration, results, error budget, versions"
+                ),
+            ),
+        ),
+    )
+
+
+def _formats(kind: str, formats: Mapping[str, SurfaceFormat | RunFormat]) -> list[Item]:
+    return [Item(f"{kind}:{name}", each.title, each.tip) for name, each in formats.items()]
+
 
 USUAL = frozenset(
     "tables:measures tables:dots tables:points tables:boundary surfaces:csv surfaces:stl".split()
@@ -152,7 +167,7 @@ class Wish:
     @property
     def has_mesh(self) -> bool:
         """Whether surfaces are written as triangles, which solids need."""
-        return bool(self.some("surfaces") & FORMATS.keys())
+        return bool(self.some("surfaces") & frozenset(mesh_formats()))
 
     @property
     def has_view(self) -> bool:
@@ -165,7 +180,7 @@ class Wish:
             tables=self.some("tables"),
             surfaces=self.some("surfaces"),
             solid="solid" in self.ticked and self.has_mesh,
-            hdf5="hdf5" in self.ticked,
+            together=self.some("together"),
             pictures=self.some("pictures"),
             spacing_mm=self.spacing_mm,
             view=self.view,
@@ -289,8 +304,8 @@ def _files(wish: Wish, count: int, surfaces: int) -> tuple[str, ...]:
         return ()
     lines = [f"{name}.csv" for name in ("measures", "dots", "points", "boundary")]
     lines = [line for line in lines if line.removesuffix(".csv") in wish.some("tables")]
-    many = [".csv"] if "csv" in wish.some("surfaces") else []
-    many += [FORMATS[name][0] for name in FORMATS if name in wish.some("surfaces")]
+    formats = wish.some("surfaces")
+    many = [each.end for name, each in SURFACE_FORMATS.items() if name in formats]
     if "surfaces" in wish.some("pictures"):
         many.append(".png")
     lines += [f"surface_NNNNNN{end}, {surfaces} of them" for end in many if surfaces]
@@ -302,7 +317,9 @@ def _files(wish: Wish, count: int, surfaces: int) -> tuple[str, ...]:
         lines.append(TREND_FILE)
     if "film" in wish.some("pictures") and surfaces:
         lines.append(FILM_FILE)
-    lines += [HDF5_FILE] * ("hdf5" in wish.ticked) + [REPORT_FILE] * ("report" in wish.ticked)
+    whole = wish.some("together")
+    lines += [each.file for name, each in RUN_FORMATS.items() if name in whole]
+    lines += [REPORT_FILE] * ("report" in wish.ticked)
     return (*lines, f"{MANIFEST}: source, set-up, versions, every file with its SHA-256")
 
 
