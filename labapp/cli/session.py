@@ -57,6 +57,12 @@ WhoseResults = Annotated[
         "settings.",
     ),
 ]
+Tables = Annotated[
+    bool, typer.Option(help="Measures, dots, points and boundaries as CSV (mm, px).")
+]
+Pictures = Annotated[
+    str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, film, or none.")
+]
 View = Annotated[
     Literal["free", "top", "side", "front"],
     typer.Option(help="Where pictures of surfaces and the film look from; free: obliquely."),
@@ -292,9 +298,7 @@ def export(
     *,
     frames: Frames = None,
     scheme: WhoseResults = None,
-    tables: Annotated[
-        bool, typer.Option(help="Measures, dots, points and boundaries as CSV (mm, px).")
-    ] = True,
+    tables: Tables = True,
     surfaces: Annotated[
         str,
         typer.Option(metavar="A,B,…", help=f"Some of {', '.join(SURFACE_FORMATS)}, or none (mm)."),
@@ -312,9 +316,7 @@ def export(
     hdf5: Annotated[
         bool, typer.Option("--hdf5", help="Everything in one HDF5 file: --together hdf5.")
     ] = False,
-    pictures: Annotated[
-        str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, film, or none.")
-    ] = "none",
+    pictures: Pictures = "none",
     view: View = "free",
     size: Size = "1280x720",
     film_rate: FilmRate = None,

@@ -17,7 +17,6 @@ from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import wrapped
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
-from labapp.media.cameras.uvc import KIND
 from labapp.session.session import Session
 
 NUMBERS = {
@@ -119,8 +118,7 @@ class CameraFields(QObject):
         self._answers.clear()
         for field in self.fields.values():
             field.refuse("")  # what another camera refused
-        own_steps = feed.camera.info.kind == KIND  # which its driver does not tell in dB
-        self.fields["gain_db"].unit.setText("" if own_steps else NUMBERS["gain_db"][1])
+        self.fields["gain_db"].unit.setText(feed.camera.limits.gain_unit)
         self._show(feed.settings, feed.camera.limits)
 
     def set_recording(self, recording: bool) -> None:

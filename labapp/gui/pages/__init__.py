@@ -6,6 +6,8 @@ import importlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
+from labapp.gui.shell.steps import STEPS
+
 if TYPE_CHECKING:
     from labapp.gui.pages.page import Page
     from labapp.gui.workspace import Workspace
@@ -22,16 +24,6 @@ def _maker(key: str, name: str) -> Callable[[Workspace], Page]:
 
 
 PAGES: Mapping[str, Callable[[Workspace], Page]] = {
-    key: _maker(key, name)
-    for key, name in (
-        ("setup", "SetupPage"),
-        ("laser", "LaserPage"),
-        ("plane", "PlanePage"),
-        ("capture", "CapturePage"),
-        ("dots", "DotsPage"),
-        ("surface", "SurfacePage"),
-        ("trends", "TrendsPage"),
-        ("export", "ExportPage"),
-    )
+    step.key: _maker(step.key, step.page) for step in STEPS
 }
-"""By key, in the order of `steps.STEPS`; a step without a page is not shown."""
+"""What makes each step's page, by key."""

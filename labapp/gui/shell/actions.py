@@ -231,7 +231,7 @@ STEP_ACTIONS = (
             f"step_{step.key}",
             "&Steps",
             step.title,
-            f"Ctrl+{number}",
+            f"Ctrl+{number}" if number < 10 else "",
             step.hint,
             needs="session",
         )

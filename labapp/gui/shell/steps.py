@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
@@ -28,95 +28,11 @@ class Mark(Enum):
 
 
 @dataclass(frozen=True)
-class Step:
-    """One step of the guided way.
-
-    Parameters
-    ----------
-    key
-        Its name in code.
-    title
-        Its name for the operator.
-    hint
-        What to do there, in two or three sentences.
-    """
-
-    key: str
-    title: str
-    hint: str
-
-
-STEPS = (
-    Step(
-        "setup",
-        "Set-up",
-        "Note the experiment, go through the safety list, and enter what is bolted to the bench. "
-        "The drawing shows which rays come back.",
-    ),
-    Step(
-        "laser",
-        "Laser",
-        "Put the cross-hair lens on the laser and measure the three lengths of the cross, more "
-        "than once. The laser's angle and distance follow.",
-    ),
-    Step(
-        "plane",
-        "Imaging plane",
-        "Take a picture of the target on the imaging plane. O′ and the axes are found in it; drag "
-        "any of them that is not where it should be.",
-    ),
-    Step(
-        "capture",
-        "Recording",
-        "Import a video, images or a stack, or capture one with a camera. What is imported is read "
-        "through once, and stays where it is.",
-    ),
-    Step(
-        "dots",
-        "Dots",
-        "Check the dots and their rows. Where the program is in doubt it says so: put right what "
-        "is wrong, and go on to the next frame.",
-    ),
-    Step(
-        "surface",
-        "Surface",
-        "Measure the frames and look at the surface. The residuals tell whether to trust it.",
-    ),
-    Step(
-        "trends",
-        "Trends",
-        "See how the pool changes over the recording. Click a point to go to its frame.",
-    ),
-    Step("export", "Export", "Tick what you want to take along, and choose a folder."),
-)
-
-
-@dataclass(frozen=True)
 class State:
     """How far a step is, and why: the words that explain its mark and its disabled buttons."""
 
     mark: Mark
     why: str
-
-
-def states(session: Session | None, seen: Overview | None = None) -> dict[str, State]:
-    """State of every step, by its key; ``seen`` is the session's overview, if it is at hand."""
-    if session is None:
-        return {step.key: State(Mark.TODO, "Open or make a session first") for step in STEPS}
-    problems: tuple[InputError, ...] = ()
-    try:
-        _ = session.setup
-    except InputError as error:
-        problems = error.problems
-    missing = setup_to_do(problems)
-    parts = {problem.field.partition(".")[0] for problem in problems}
-    laser_used, plane_used = calibrations_in_use(session)
-    return {
-        "setup": State(Mark.READY, missing) if missing else State(Mark.DONE, "Complete"),
-        "laser": _calibrated(session.laser_calibration, laser_used, "laser" in parts),
-        "plane": _calibrated(session.plane_calibration, plane_used, "image_calibration" in parts),
-        **_frame_states(session, missing, seen),
-    }
 
 
 PARTS = {
@@ -191,6 +107,73 @@ def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
         return False
 
 
+@dataclass(frozen=True)
+class Facts:
+    """What the steps' states are computed from.
+
+    Parameters
+    ----------
+    session
+        What is open.
+    problems
+        Of its set-up.
+    count, measured, without, stale
+        Frames; of these those that are measured, have no surface then, no longer stand.
+    """
+
+    session: Session
+    problems: tuple[InputError, ...] = ()
+    count: int = 0
+    measured: int = 0
+    without: int = 0
+    stale: int = 0
+
+    @property
+    def to_do(self) -> str:
+        """What the set-up lacks, in words; empty if nothing."""
+        return setup_to_do(self.problems)
+
+    def lacks(self, part: str) -> bool:
+        """Whether something in a section of the set-up is missing or wrong."""
+        return any(problem.field.partition(".")[0] == part for problem in self.problems)
+
+
+def _facts(session: Session, seen: Overview | None) -> Facts:
+    problems: tuple[InputError, ...] = ()
+    try:
+        _ = session.setup
+    except InputError as error:
+        problems = error.problems
+    if session.recording is None:
+        return Facts(session, problems)
+    seen = seen or session.overview()
+    status = np.array(seen.status, dtype=object)
+    measured = status != ""
+    return Facts(
+        session,
+        problems,
+        count=len(seen.frame),
+        measured=int(measured.sum()),
+        without=int((measured & (status != "ok")).sum()),
+        stale=int(seen.stale.sum()),
+    )
+
+
+def _setup(facts: Facts) -> State:
+    to_do = facts.to_do
+    return State(Mark.READY, to_do) if to_do else State(Mark.DONE, "Complete")
+
+
+def _laser(facts: Facts) -> State:
+    used, _ = calibrations_in_use(facts.session)
+    return _calibrated(facts.session.laser_calibration, used, facts.lacks("laser"))
+
+
+def _plane(facts: Facts) -> State:
+    _, used = calibrations_in_use(facts.session)
+    return _calibrated(facts.session.plane_calibration, used, facts.lacks("image_calibration"))
+
+
 def _calibrated(kept: object, used: bool, needed: bool) -> State:
     if used:
         return State(Mark.DONE, "Calibrated")
@@ -201,61 +184,154 @@ def _calibrated(kept: object, used: bool, needed: bool) -> State:
     return State(Mark.READY, "Not calibrated here: the values were entered")
 
 
-def _frame_states(session: Session, missing: str, seen: Overview | None) -> dict[str, State]:
-    recording, gone = session.recording, recording_gone(session)
-    if recording is None:
-        first = State(Mark.TODO, "Import a recording first")
-        return {
-            "capture": State(Mark.READY, "No recording yet"),
-            **dict.fromkeys(("dots", "surface", "trends", "export"), first),
-        }
-    seen = seen or session.overview()
-    status = np.array(seen.status, dtype=object)
-    measured = int((status != "").sum())
-    without = int(((status != "") & (status != "ok")).sum())
-    stale = int(seen.stale.sum())
-    count = len(seen.frame)
-    capture = State(Mark.DONE, several(count, "frame"))
-    if gone:
-        capture = State(Mark.ATTENTION, gone)
-    blocked = f"Set-up: {missing}" if missing else ""
-    if blocked and not measured:
-        surface = State(Mark.TODO, blocked)
-    elif stale:
-        surface = State(
-            Mark.ATTENTION, f"{stale} of {several(count, 'frame')} no longer stand: measure again"
-        )
-    elif measured < count:
-        surface = State(
-            Mark.READY, f"{count - measured} of {several(count, 'frame')} not measured yet"
-        )
-    else:
-        told = f"All {count} frames are" if count > 1 else "The frame is"
-        if without:
-            told = f"{count - without} of {several(count, 'frame')} are"
-        missing = f", {without} could not be" if without else ""
-        surface = State(Mark.DONE, f"{told} measured{missing}")
-    dots = State(Mark.READY, f"{several(count - measured, 'frame')} to be measured")
-    if measured == count:
-        dots = State(Mark.DONE, "The dots of all frames make a surface")
-    if stale:
-        dots = State(Mark.READY, f"{several(stale, 'frame')} to be measured again")
-    if without:
-        missing = several(without, "frame")
-        dots = State(Mark.ATTENTION, f"{missing} could not be measured: look at their dots")
-    results = (
-        State(Mark.READY, several(measured, "frame"))
-        if measured
-        else State(Mark.TODO, "Measure some frames first")
-    )
-    export = State(Mark.ATTENTION, surface.why) if stale else results
-    return {
-        "capture": capture,
-        "dots": dots,
-        "surface": surface,
-        "trends": results,
-        "export": export,
-    }
+def _capture(facts: Facts) -> State:
+    if facts.session.recording is None:
+        return State(Mark.READY, "No recording yet")
+    gone = recording_gone(facts.session)
+    return State(Mark.ATTENTION, gone) if gone else State(Mark.DONE, several(facts.count, "frame"))
+
+
+def _dots(facts: Facts) -> State:
+    if facts.without:
+        missing = several(facts.without, "frame")
+        return State(Mark.ATTENTION, f"{missing} could not be measured: look at their dots")
+    if facts.stale:
+        return State(Mark.READY, f"{several(facts.stale, 'frame')} to be measured again")
+    if facts.measured == facts.count:
+        return State(Mark.DONE, "The dots of all frames make a surface")
+    return State(Mark.READY, f"{several(facts.count - facts.measured, 'frame')} to be measured")
+
+
+def _surface(facts: Facts) -> State:
+    frames = several(facts.count, "frame")
+    if facts.to_do and not facts.measured:
+        return State(Mark.TODO, f"Set-up: {facts.to_do}")
+    if facts.stale:
+        return State(Mark.ATTENTION, f"{facts.stale} of {frames} no longer stand: measure again")
+    if facts.measured < facts.count:
+        return State(Mark.READY, f"{facts.count - facts.measured} of {frames} not measured yet")
+    if facts.without:
+        measured = f"{facts.count - facts.without} of {frames} are measured"
+        return State(Mark.DONE, f"{measured}, {facts.without} could not be")
+    told = f"All {facts.count} frames are" if facts.count > 1 else "The frame is"
+    return State(Mark.DONE, f"{told} measured")
+
+
+def results(facts: Facts) -> State:
+    """State of a step that needs nothing but results: ready as soon as there are some."""
+    if facts.measured:
+        return State(Mark.READY, several(facts.measured, "frame"))
+    return State(Mark.TODO, "Measure some frames first")
+
+
+def _export(facts: Facts) -> State:
+    return State(Mark.ATTENTION, _surface(facts).why) if facts.stale else results(facts)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the guided way.
+
+    Parameters
+    ----------
+    key
+        Its name in code: its page is in ``labapp.gui.pages.KEY``.
+    title
+        Its name for the operator.
+    hint
+        What to do there, in two or three sentences.
+    page
+        The page's class.
+    state
+        How far it is.
+    needs_frames
+        Whether it is of no use before there is a recording; ``state`` is not asked then.
+    """
+
+    key: str
+    title: str
+    hint: str
+    page: str
+    state: Callable[[Facts], State] = results
+    needs_frames: bool = True
+
+
+STEPS = (
+    Step(
+        "setup",
+        "Set-up",
+        "Note the experiment, go through the safety list, and enter what is bolted to the bench. "
+        "The drawing shows which rays come back.",
+        "SetupPage",
+        _setup,
+        needs_frames=False,
+    ),
+    Step(
+        "laser",
+        "Laser",
+        "Put the cross-hair lens on the laser and measure the three lengths of the cross, more "
+        "than once. The laser's angle and distance follow.",
+        "LaserPage",
+        _laser,
+        needs_frames=False,
+    ),
+    Step(
+        "plane",
+        "Imaging plane",
+        "Take a picture of the target on the imaging plane. O′ and the axes are found in it; drag "
+        "any of them that is not where it should be.",
+        "PlanePage",
+        _plane,
+        needs_frames=False,
+    ),
+    Step(
+        "capture",
+        "Recording",
+        "Import a video, images or a stack, or capture one with a camera. What is imported is read "
+        "through once, and stays where it is.",
+        "CapturePage",
+        _capture,
+        needs_frames=False,
+    ),
+    Step(
+        "dots",
+        "Dots",
+        "Check the dots and their rows. Where the program is in doubt it says so: put right what "
+        "is wrong, and go on to the next frame.",
+        "DotsPage",
+        _dots,
+    ),
+    Step(
+        "surface",
+        "Surface",
+        "Measure the frames and look at the surface. The residuals tell whether to trust it.",
+        "SurfacePage",
+        _surface,
+    ),
+    Step(
+        "trends",
+        "Trends",
+        "See how the pool changes over the recording. Click a point to go to its frame.",
+        "TrendsPage",
+    ),
+    Step(
+        "export",
+        "Export",
+        "Tick what you want to take along, and choose a folder.",
+        "ExportPage",
+        _export,
+    ),
+)
+"""The registry of the app's pages: list, menu, keys, guide, window and tour are made from it."""
+
+
+def states(session: Session | None, seen: Overview | None = None) -> dict[str, State]:
+    """State of every step, by its key; ``seen`` is the session's overview, if it is at hand."""
+    if session is None:
+        return {step.key: State(Mark.TODO, "Open or make a session first") for step in STEPS}
+    facts, bare = _facts(session, seen), session.recording is None
+    first = State(Mark.TODO, "Import a recording first")
+    return {step.key: first if bare and step.needs_frames else step.state(facts) for step in STEPS}
 
 
 def first_step(session: Session) -> str:

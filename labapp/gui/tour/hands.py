@@ -87,6 +87,11 @@ class Hands:
         Width and height of the pictures, px of the screen.
     tell
         Called with a line for every picture.
+
+    Attributes
+    ----------
+    pages
+        Keys of the pages that have a picture.
     """
 
     window: MainWindow
@@ -95,6 +100,7 @@ class Hands:
     tell: Callable[[str], None]
     count: int = field(default=0, init=False)
     pictures: dict[bytes, str] = field(default_factory=dict, init=False)
+    pages: set[str] = field(default_factory=set, init=False)
 
     # --- waiting -----------------------------------------------------------------------------
 
@@ -297,6 +303,7 @@ class Hands:
             raise self.fail(f"the window is {wide}×{high} px large, not as it was asked for")
         image = image.copy(0, 0, *self.size_px)
         self.count += 1
+        self.pages.add(self.page)
         part = name if name.startswith("dialog-") else "-".join(filter(None, (self.page, name)))
         file = self.out / f"{self.count:02d}-{part}.png"
         same = self.pictures.setdefault(sha256(image.constBits()).digest(), file.name)

@@ -16,6 +16,7 @@ from labapp.gui.pages.laser import LaserPage
 from labapp.gui.pages.plane import PlanePage
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.pages.surface import SurfacePage
+from labapp.gui.shell.steps import STEPS
 from labapp.gui.tools.adviser import AdviserWindow
 from labapp.gui.tools.analysis import AnalysisWindow
 from labapp.gui.tools.simulator import SimulatorWindow
@@ -60,6 +61,7 @@ def go_through(hands: Hands, folder: Path) -> None:
     _dots(hands)
     _trends(hands, files)
     _export(hands, files)
+    _other_pages(hands)
     _menus(hands)
     _simulator(hands)
     _adviser(hands)
@@ -264,6 +266,14 @@ def _export(hands: Hands, files: Path) -> None:
     hands.choose("Frames", "the frame in view")
     hands.press("Export")
     hands.picture("after")
+
+
+def _other_pages(hands: Hands) -> None:
+    """The pages that have no part of the way of their own: a picture each."""
+    for step in STEPS:
+        if step.key not in hands.pages:
+            hands.do(f"step_{step.key}")
+            hands.picture()
 
 
 def _menus(hands: Hands) -> None:

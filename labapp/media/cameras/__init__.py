@@ -10,6 +10,7 @@ from labapp.media.cameras.base import (
     CameraError,
     CameraFrame,
     CameraInfo,
+    CameraKind,
     CameraLost,
     CameraSettings,
     Limits,
@@ -21,11 +22,13 @@ from labapp.media.cameras.feed import Counts, Feed
 from labapp.media.cameras.simulated import Faults, SimulatedDevice, there_and_back
 
 __all__ = [
+    "KINDS",
     "BrokenFrame",
     "Camera",
     "CameraError",
     "CameraFrame",
     "CameraInfo",
+    "CameraKind",
     "CameraLost",
     "CameraSettings",
     "Counts",
@@ -42,13 +45,19 @@ __all__ = [
 ]
 
 
+KINDS: list[CameraKind] = [uvc.USB_VIDEO, aravis.GENICAM]
+"""The kinds of cameras, in the order in which they are listed."""
+
+
 def find_cameras() -> tuple[list[CameraInfo], list[str]]:
     """Cameras that are connected, and why some kinds could not be looked for; about a second."""
-    found, problems = uvc.find_uvc(), []
-    try:
-        found += aravis.find_genicam()
-    except CameraError as error:
-        problems.append(str(error))
+    found: list[CameraInfo] = []
+    problems: list[str] = []
+    for kind in KINDS:
+        try:
+            found += kind.find()
+        except CameraError as error:
+            problems.append(str(error))
     return found, problems
 
 
@@ -62,14 +71,8 @@ def open_camera(id: str) -> Camera:
     CameraError
         If it is not there or cannot be opened: what to do about it.
     """
-    if id.startswith(aravis.PREFIX):
-        named = next((info for info in aravis.find_genicam() if info.id == id), None)
-        if named is None:
-            raise CameraLost(f"{id} is not connected")
-        return aravis.GenicamCamera(named)
-    number = id.removeprefix(uvc.PREFIX)
-    if id.startswith(uvc.PREFIX) and number.isdecimal():
-        known = (info for info in uvc.find_uvc() if info.id == id)
-        return uvc.UvcCamera(next(known, CameraInfo(id, id, uvc.KIND)))
-    expected = f"{uvc.PREFIX}NUMBER or {aravis.PREFIX}NAME, as labapp cameras lists them"
-    raise InputError(id, "camera", id, expected)
+    for kind in KINDS:
+        if id.startswith(kind.prefix):
+            return kind.open(id)
+    forms = " or ".join(kind.form for kind in KINDS)
+    raise InputError(id, "camera", id, f"{forms}, as labapp cameras lists them")

@@ -19,6 +19,7 @@ from labapp.media.cameras.base import (
     CameraError,
     CameraFrame,
     CameraInfo,
+    CameraKind,
     CameraLost,
     CameraSettings,
     Limits,
@@ -324,3 +325,13 @@ class _Stream:
             self.turns += 1
         self.last = frame_id
         return frame_id + self.turns * LARGEST_SHORT_ID
+
+
+def _open(id: str) -> Camera:
+    named = next((info for info in find_genicam() if info.id == id), None)
+    if named is None:
+        raise CameraLost(f"{id} is not connected")
+    return GenicamCamera(named)
+
+
+GENICAM = CameraKind(f"{PREFIX}NAME", find_genicam, _open)

@@ -5,6 +5,7 @@ Every back-end gives the same: `Camera`. What keeps one going whatever it does i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from types import TracebackType
 from typing import Any, Literal, Protocol, Self
@@ -79,6 +80,8 @@ class Limits:
         (width, height) of the smallest region, px; None where no region can be set.
     triggers
         The triggers it knows, "free" among them.
+    gain_unit
+        Of the gain, for people; empty where it is in the driver's own steps.
     """
 
     exposure_us: Range | None = None
@@ -87,6 +90,7 @@ class Limits:
     sensor: tuple[int, int]
     least_region: tuple[int, int] | None = None
     triggers: tuple[Trigger, ...] = ("free",)
+    gain_unit: str = "dB"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +239,32 @@ class Camera(Protocol):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+@dataclass(frozen=True)
+class CameraKind:
+    """What cameras of a kind are found and opened by.
+
+    Parameters
+    ----------
+    form
+        How an id is written: what all ids of the kind begin with, to the colon, and a word for the
+        rest: "uvc:NUMBER".
+    find
+        Gives those that are connected; may raise `CameraError` where that cannot be told.
+    open
+        Opens the camera of an id; may raise `InputError` for an id that no camera has, and
+        `CameraError` where the camera is not there or cannot be opened.
+    """
+
+    form: str
+    find: Callable[[], list[CameraInfo]]
+    open: Callable[[str], Camera]
+
+    @property
+    def prefix(self) -> str:
+        """What its ids begin with."""
+        return self.form[: self.form.index(":") + 1]
 
 
 def check_settings(info: CameraInfo, limits: Limits, wanted: CameraSettings) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 
+from labapp.errors import InputError
 from labapp.media.base import to_grey
 from labapp.media.cameras.base import (
     BrokenFrame,
@@ -19,6 +20,7 @@ from labapp.media.cameras.base import (
     CameraError,
     CameraFrame,
     CameraInfo,
+    CameraKind,
     CameraLost,
     CameraSettings,
     Limits,
@@ -29,8 +31,6 @@ from labapp.media.quiet import quiet_opencv
 from labapp.system import IS_LINUX
 
 PREFIX = "uvc:"
-
-KIND = "USB video"
 
 LISTED = Path("/sys/class/video4linux")
 
@@ -70,7 +70,7 @@ def find_uvc(listed: Path = LISTED) -> list[CameraInfo]:
         with contextlib.suppress(OSError):
             if (entry / "index").read_text().strip() == "0":
                 name = (entry / "name").read_text(errors="replace").strip()
-                found.append(CameraInfo(f"{PREFIX}{entry.name[5:]}", name, KIND))
+                found.append(CameraInfo(f"{PREFIX}{entry.name[5:]}", name, "USB video"))
     return found
 
 
@@ -146,6 +146,7 @@ class UvcCamera(Camera):
         self.limits = Limits(
             exposure_us=exposure,
             gain_db=gain,
+            gain_unit="",  # in steps of the driver's own
             rate_hz=Range(1.0, HIGHEST_HZ),
             sensor=(self._get(cv2.CAP_PROP_FRAME_WIDTH), self._get(cv2.CAP_PROP_FRAME_HEIGHT)),
         )
@@ -247,3 +248,13 @@ class UvcCamera(Camera):
             join = "sudo usermod -aG video $USER"
             return f"{device} may not be read: join the group that may ({join}) and log in anew"
         return f"{self.info.name} is used by another program: close that"
+
+
+def _open(id: str) -> Camera:
+    if not id.removeprefix(PREFIX).isdecimal():
+        raise InputError(id, "camera", id, f"{USB_VIDEO.form}, as labapp cameras lists them")
+    known = (info for info in find_uvc() if info.id == id)
+    return UvcCamera(next(known, CameraInfo(id, id, "USB video")))
+
+
+USB_VIDEO = CameraKind(f"{PREFIX}NUMBER", find_uvc, _open)

@@ -112,7 +112,7 @@ def test_only_what_the_camera_has_is_shown(fields: CameraFields):
 def test_the_gain_of_usb_video_has_no_unit(fields: CameraFields, monkeypatch: pytest.MonkeyPatch):
     assert fields.fields["gain_db"].unit.text() == "dB"
     camera = fields._feed.camera
-    monkeypatch.setattr(camera, "info", replace(camera.info, kind="USB video"))
+    monkeypatch.setattr(camera, "limits", replace(camera.limits, gain_unit=""))
     fields.show_camera(fields._feed)
     assert fields.fields["gain_db"].unit.text() == ""
 

@@ -85,6 +85,7 @@ def test_what_it_can_be_set_to_comes_of_its_driver() -> None:
     with opened(driver, exposure=Range(3, 2047), gain=Range(0, 100)) as camera:
         assert camera.limits.exposure_us == Range(300, 204700)
         assert camera.limits.gain_db == Range(0, 100)
+        assert camera.limits.gain_unit == ""  # the driver's own steps
         assert camera.limits.sensor == (640, 480)
         assert driver.values[cv2.CAP_PROP_AUTO_EXPOSURE] == uvc.MANUAL
         found = camera.apply(CameraSettings(exposure_us=2040, gain_db=7.6, rate_hz=50))
