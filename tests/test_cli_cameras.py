@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from labapp.media import open_source
-from labapp.media.cameras import CameraInfo, CameraLost
+from labapp.media.cameras import (
+    KINDS,
+    CameraError,
+    CameraInfo,
+    CameraKind,
+    CameraLost,
+    SimulatedDevice,
+)
 from labapp.media.recording.take_files import Take
 from labapp.session.session import Session
 from labapp.simulated.cameras import simulated_device
@@ -167,3 +174,42 @@ def test_a_scenario_is_played_there_and_back(
     for k, same in ((3, 1), (4, 0), (5, 1), (8, 0)):
         assert np.array_equal(frames[k], frames[same])
     assert not np.array_equal(frames[0], frames[1])
+
+
+def test_a_kind_that_is_added_is_listed_and_recorded_from(
+    tmp_path: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    still = SimulatedDevice("still", lambda _: np.full((24, 32), 7, np.uint8))
+
+    def absent() -> list[CameraInfo]:
+        raise CameraError("No driver of Toys")
+
+    kinds = [
+        CameraKind("toy:NUMBER", absent, lambda _: still.open()),
+        CameraKind(
+            "still:NAME",
+            lambda: [CameraInfo("still:1", "Still picture", "a toy")],
+            lambda id: still.open(),
+        ),
+    ]
+    monkeypatch.setattr("labapp.media.cameras.KINDS", kinds)
+    code, told, said = labapp("cameras")
+    assert (code, said) == (0, "No driver of Toys\n")
+    assert told.splitlines()[:2] == [
+        "still:1  Still picture (a toy)",
+        "    picture   32×24 px, 8 bit, any region",
+    ]
+    out = tmp_path / "a.nut"
+    code, told, _ = labapp("record", "still:1", "--out", out, "--seconds", 0.3)
+    assert code == 0
+    with open_source(out) as video:
+        assert told.startswith(f"{len(video)} frame")
+        assert (video.frame(0).image == 7).all()
+    code, _, said = labapp("record", "uvc:0", "--out", tmp_path / "b.nut", "--seconds", 0.3)
+    assert code == 2
+    assert "expected toy:NUMBER or still:NAME, as labapp cameras lists them" in said
+
+
+def test_every_kind_is_in_the_documents() -> None:
+    text = (ROOT / "docs/cameras.md").read_text("utf-8")
+    assert all(f"| `{kind.prefix}" in text for kind in KINDS)

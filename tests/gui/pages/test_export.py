@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from PySide6.QtWidgets import QAbstractButton
 from pytestqt.qtbot import QtBot
 
 from labapp.export.folder import ExportChoice, verify_export
+from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, SurfaceFormat
 from labapp.gui.pages.export.page import ExportPage
 from labapp.gui.pages.export.presenter import (
     USUAL,
@@ -20,6 +23,7 @@ from labapp.gui.pages.export.presenter import (
     plan,
     proposed_folder,
     schemes,
+    write,
 )
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
@@ -211,3 +215,25 @@ def test_every_control_says_what_it_does(page: ExportPage) -> None:
         for button in widget.findChildren(QAbstractButton):
             if button.text():
                 assert button.toolTip(), button.text()
+
+
+def test_a_format_that_is_added_can_be_ticked(gtaw: Path, tmp_path: Path, monkeypatch) -> None:
+    module = SimpleNamespace(xyz=lambda nodes: b"%d points" % len(nodes))
+    monkeypatch.setitem(sys.modules, "labapp.export.toys", module)
+    toy = SurfaceFormat(".xyz", "Points", "A toy, mm", "nodes", "toys:xyz")
+    monkeypatch.setitem(SURFACE_FORMATS, "xyz", toy)
+    monkeypatch.setitem(RUN_FORMATS, "toy", RunFormat("toy.bin", "Toy", "A toy", "toys:Toy"))
+    workspace = Workspace()
+    workspace.open(gtaw)
+    page = ExportPage(workspace)
+    KEPT.extend((workspace, page))
+    page.refresh()
+    points, whole = page._boxes["surfaces:xyz"], page._boxes["together:toy"]
+    assert (points.text(), points.toolTip(), whole.text()) == ("Points", "A toy, mm", "Toy")
+    for box in page._boxes.values():
+        box.setChecked(box in (points, whole))
+    assert page.files.text().splitlines()[:2] == ["surface_NNNNNN.xyz, 30 of them", "toy.bin"]
+    whole.setChecked(False)
+    write(session_of(page), page.wish, [3], tmp_path / "out", lambda done, total: None)
+    assert (tmp_path / "out/surface_000003.xyz").read_bytes().endswith(b" points")
+    workspace.close()

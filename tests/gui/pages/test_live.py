@@ -25,7 +25,13 @@ from labapp.gui.live.live import SIMULATED, STATES, WAITS, Live, choices
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
 from labapp.media import GreyImage, open_source
-from labapp.media.cameras import CameraInfo, CameraSettings, Faults, SimulatedDevice
+from labapp.media.cameras import (
+    CameraInfo,
+    CameraKind,
+    CameraSettings,
+    Faults,
+    SimulatedDevice,
+)
 from labapp.media.recording.recorder import Plan
 from labapp.run.live_watch import Followed
 from labapp.session.session import Session
@@ -590,6 +596,22 @@ def test_cameras_are_looked_for(window: MainWindow, page: CapturePage, qtbot: Qt
     assert page.live_view.camera.value() == SIMULATED
     page.live_view.camera.set_value("uvc:0")
     assert page.live_view.camera.value() == "uvc:0"
+
+
+def test_a_kind_that_is_added_can_be_watched(page: CapturePage, qtbot: QtBot, monkeypatch):
+    still = SimulatedDevice("still", lambda _: np.full(SHAPE, 7, np.uint8))
+    found = [CameraInfo("still:1", "Still picture", "a toy")]
+    kind = CameraKind("still:NUMBER", lambda: found, lambda _: still.open())
+    monkeypatch.setattr("labapp.media.cameras.KINDS", [kind])
+    page.live_view.find_button.click()
+    qtbot.waitUntil(lambda: "still:1" in dict(page.live_view._choices))
+    page.live_view.camera.set_value("still:1")
+    assert page.live_view.camera.editor.currentText() == "Still picture (a toy)"
+    page.live_view.start_button.click()
+    qtbot.waitUntil(lambda: page.live_view.updates > 0)
+    assert np.array_equal(page.picture_view.picture, np.full(SHAPE, 7))
+    page.live_view.stop()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
 def test_a_file_that_is_chosen_takes_the_place_of_the_camera(

@@ -1,0 +1,139 @@
+"""The formats of an export: one that is added to the registry is written and offered everywhere."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.export.folder import ExportChoice, export
+from labapp.export.formats import (
+    RUN_FORMATS,
+    SURFACE_FORMATS,
+    RunFormat,
+    SurfaceFormat,
+    mesh_formats,
+)
+from labapp.export.meshes import Mesh
+from tests.conftest import Run
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / "sample_sessions/gtaw/gtaw.labsession"
+
+
+def xyz(nodes: FloatArray) -> bytes:
+    """A list of points, as many programs for clouds of points read it."""
+    return "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in nodes).encode()
+
+
+def off(mesh: Mesh) -> bytes:
+    return f"OFF\n{len(mesh.vertices_mm)} {len(mesh.triangles)} 0\n".encode()
+
+
+class Frames:
+    """Writes the frames' numbers and statuses as JSON."""
+
+    def __init__(self, path: Path, about: dict[str, object], spacing_mm: float) -> None:
+        self.path, self.about, self.frames = path, about, {}
+
+    def write(self, frame: int, tables: dict, reconstruction: object) -> None:
+        self.frames[frame] = (*tables["measures"]["status"], reconstruction is not None)
+
+    def __enter__(self) -> Frames:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.path.write_text(json.dumps({"by": self.about["program"], "frames": self.frames}))
+
+
+@pytest.fixture(autouse=True)
+def toys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three formats more: points, triangles, and a file of all frames."""
+    module = SimpleNamespace(xyz=xyz, off=off, Frames=Frames)
+    monkeypatch.setitem(sys.modules, "labapp.export.toys", module)  # type: ignore[arg-type]
+    for name, of in (("xyz", "nodes"), ("off", "mesh")):
+        toy = SurfaceFormat(f".{name}", name.upper(), "A toy, mm", of, f"toys:{name}")
+        monkeypatch.setitem(SURFACE_FORMATS, name, toy)
+    whole = RunFormat("frames.json", "JSON", "A toy", "toys:Frames")
+    monkeypatch.setitem(RUN_FORMATS, "json", whole)
+
+
+def test_they_are_written_as_the_others_are(
+    measured: Measurement, unmeasured: Measurement, calibration: ImageCalibration, tmp_path: Path
+) -> None:
+    choice = ExportChoice(
+        tables=frozenset(),
+        surfaces=frozenset({"csv", "xyz", "off"}),
+        solid=True,
+        together=frozenset({"json"}),
+        spacing_mm=0.5,
+    )
+    frames = [(3, 0.5, measured), (4, None, unmeasured)]
+    written = export(tmp_path / "out", frames, calibration, {}, choice)
+    assert [file.name for file in written] == [
+        *("frames.json", "solid_000003.off"),
+        *("surface_000003.csv", "surface_000003.off", "surface_000003.xyz"),
+    ]
+    points = np.loadtxt(tmp_path / "out/surface_000003.xyz")
+    table = np.loadtxt(tmp_path / "out/surface_000003.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(points, table)
+    assert json.loads((tmp_path / "out/frames.json").read_text()) == {
+        "by": "labapp",
+        "frames": {"3": ["ok", True], "4": ["ambiguous-rows", False]},
+    }
+    with pytest.raises(InputError, match=r"expected some of csv, .*, xyz, off"):
+        ExportChoice(surfaces=frozenset({"obj"}))
+    with pytest.raises(InputError, match="expected one of stl, stl-ascii, ply, vtp, off"):
+        ExportChoice(surfaces=frozenset({"xyz"}), solid=True)
+    with pytest.raises(InputError, match="expected some of hdf5, json"):
+        ExportChoice(together=frozenset({"parquet"}))
+
+
+def test_the_command_line_offers_and_writes_them(
+    labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "250")
+    code, told, _ = labapp("session", "export", "--help")
+    assert code == 0
+    assert "Some of csv, stl, stl-ascii, ply, vtp, xyz, off, or none" in told
+    assert "some of hdf5, json, or none" in told
+    code, _, complained = labapp(
+        *("session", "export", SAMPLE, "--out", tmp_path / "out", "--frames", "4"),
+        *("--no-tables", "--surfaces", "xyz", "--together", "json"),
+    )
+    assert (code, complained) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *("frames.json", "manifest.json", "surface_000004.xyz")
+    ]
+
+
+def test_hdf5_is_one_of_the_formats_of_a_whole_run() -> None:
+    short = ExportChoice(hdf5=True, together=frozenset({"json"}))
+    assert [each.file for each in short.run_formats] == ["results.h5", "frames.json"]
+    assert [each.file for each in ExportChoice(together=frozenset({"hdf5"})).run_formats] == [
+        "results.h5"
+    ]
+    assert ExportChoice().run_formats == []
+
+
+@pytest.mark.parametrize("name", [*SURFACE_FORMATS, *RUN_FORMATS])
+def test_every_format_has_a_writer_and_a_place_in_the_documents(name: str) -> None:
+    each = (SURFACE_FORMATS | RUN_FORMATS)[name]
+    module, _, function = each.writer.partition(":")
+    made = getattr(__import__(f"labapp.export.{module}", fromlist=[function]), function)
+    if isinstance(each, SurfaceFormat):
+        assert list(inspect.signature(made).parameters) == [each.of]
+        assert (name in mesh_formats()) == (each.of == "mesh")
+    options = (ROOT / "docs/command-line.md").read_text("utf-8").partition("### export")[2]
+    assert name in options
+    end = each.end if isinstance(each, SurfaceFormat) else each.file
+    assert end in (ROOT / "docs/results.md").read_text("utf-8")

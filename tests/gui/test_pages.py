@@ -1,0 +1,109 @@
+"""A page that is added to the steps is everywhere: list, menu, keys, guide, window, tour."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.steps import STEPS
+from tests.gui.conftest import SAMPLES
+
+PROGRAM = """
+import json, sys, types
+from pathlib import Path
+
+from labapp.gui.app import start_app
+from labapp.gui.shell import steps
+
+for name in ("toy", "tenth"):
+    toy = steps.Step(name, f"The {name}", f"Play with the {name}.", "ToyPage")
+    steps.STEPS = (*steps.STEPS, toy)
+app = start_app()
+
+from labapp.gui.pages import PAGES
+from labapp.gui.pages.page import Page
+from labapp.gui.preferences import Preferences
+from labapp.gui.shell.commands import make_window
+from labapp.gui.shell.help import guide, keys
+from labapp.gui.tour import way
+
+
+class ToyPage(Page):
+    key = "toy"
+    shown = 0
+
+    def refresh(self):
+        self.shown += 1
+
+
+module = types.ModuleType("labapp.gui.pages.toy")
+module.ToyPage = ToyPage
+sys.modules["labapp.gui.pages.toy"] = module
+
+window = make_window(Preferences(theme="light"), Path(sys.argv[1]))
+window.show()
+window.workspace.open(Path(sys.argv[2]))
+action = window.menus.actions["step_toy"]
+action.trigger()
+panel, listed = window.side_panel, window.step_list
+told = []
+hands = types.SimpleNamespace(
+    pages=set(PAGES) - {"toy"}, do=told.append, picture=lambda: told.append("a picture")
+)
+way._other_pages(hands)
+found = {
+    "listed": [listed.item(row).text() for row in range(listed.count())],
+    "keys": [action.shortcut().toString(), "Ctrl+9" in keys()],
+    "tenth": window.menus.actions["step_tenth"].shortcut().toString(),
+    "enabled": action.isEnabled(),
+    "guide": "Play with the toy." in guide(),
+    "in view": [window.page.key, window.page.shown > 0, window.page.accessibleName()],
+    "panel": [panel.title.text(), panel.hint.text(), panel.state.text()],
+    "tour": told,
+}
+window.do("previous_step")
+found["before"] = window.page.key
+window.close()
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+def test_a_page_that_is_added_is_everywhere(tmp_path: Path):
+    shutil.copytree(SAMPLES / "gtaw", tmp_path / "gtaw")
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c", PROGRAM),
+            *(tmp_path / "preferences.json", tmp_path / "gtaw/gtaw.labsession"),
+        ],
+        env={**os.environ, "QT_QPA_PLATFORM": "offscreen", "XDG_STATE_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert [text.split(maxsplit=1)[-1] for text in found["listed"]][-2:] == ["The toy", "The tenth"]
+    assert found["keys"] == ["Ctrl+9", True]
+    assert found["tenth"] == ""
+    assert found["enabled"]
+    assert found["guide"]
+    assert found["in view"] == ["toy", True, "The toy"]
+    assert found["panel"][:2] == ["The toy", "Play with the toy."]
+    assert found["panel"][2].endswith("30 frames")
+    assert found["tour"] == ["step_toy", "a picture"]
+    assert found["before"] == "export"
+
+
+def test_every_step_has_a_key_as_long_as_there_are_digits():
+    keys = {action.name: action.key for action in ACTIONS}
+    assert [keys[f"step_{step.key}"] for step in STEPS[:9]] == [
+        f"Ctrl+{number}" for number, _ in enumerate(STEPS[:9], 1)
+    ]
