@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -60,9 +60,6 @@ WhoseResults = Annotated[
 Tables = Annotated[
     bool, typer.Option(help="Measures, dots, points and boundaries as CSV (mm, px).")
 ]
-Pictures = Annotated[
-    str, typer.Option(metavar="A,B,…", help="Some of frames, surfaces, trends, film, or none.")
-]
 View = Annotated[
     Literal["free", "top", "side", "front"],
     typer.Option(help="Where pictures of surfaces and the film look from; free: obliquely."),
@@ -81,6 +78,10 @@ FilmRate = Annotated[
 
 def _quantity(text: str) -> Any:
     return typer.Option(min=0, callback=finite, help=text)
+
+
+def _some(names: Iterable[str], words: str = "Some", unit: str = "") -> Any:
+    return typer.Option(metavar="A,B,…", help=f"{words} of {', '.join(names)}, or none{unit}.")
 
 
 @app.command()
@@ -299,24 +300,15 @@ def export(
     frames: Frames = None,
     scheme: WhoseResults = None,
     tables: Tables = True,
-    surfaces: Annotated[
-        str,
-        typer.Option(metavar="A,B,…", help=f"Some of {', '.join(SURFACE_FORMATS)}, or none (mm)."),
-    ] = "csv,stl",
+    surfaces: Annotated[str, _some(SURFACE_FORMATS, unit=" (mm)")] = "csv,stl",
     solid: Annotated[
         bool, typer.Option("--solid", help="Each surface as a watertight body, too.")
     ] = False,
-    together: Annotated[
-        str,
-        typer.Option(
-            metavar="A,B,…",
-            help=f"Everything in one file, some of {', '.join(RUN_FORMATS)}, or none.",
-        ),
-    ] = "none",
+    together: Annotated[str, _some(RUN_FORMATS, "Everything in one file, some")] = "none",
     hdf5: Annotated[
         bool, typer.Option("--hdf5", help="Everything in one HDF5 file: --together hdf5.")
     ] = False,
-    pictures: Pictures = "none",
+    pictures: Annotated[str, _some(("frames", "surfaces", "trends", "film"))] = "none",
     view: View = "free",
     size: Size = "1280x720",
     film_rate: FilmRate = None,
