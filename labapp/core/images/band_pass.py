@@ -199,8 +199,8 @@ def _exposed(picture: Picture, settings: BandPassSettings) -> tuple[Exposure, _B
     white = float(np.median(noise[::8, ::8])) / noise_gain(size)
     grain = with_grain(seen.band[::4, ::4], white) / max(white, 1e-9)
     least = 1e-3 * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
-    floor = np.maximum(noise * np.float32(grain / noise_gain(size)), np.float32(least))
-    floor *= np.float32(settings.threshold)
+    floor = noise * np.float32(settings.threshold * grain / noise_gain(size))
+    np.maximum(floor, np.float32(settings.threshold * least), out=floor)
     return Exposure(size, noise, floor), seen
 
 
