@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice
+from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice, joined
 from labapp.core.rows.lattice_kernels import BORDER, grow
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.pools import egg, ellipsoidal_cap, spherical_cap
@@ -53,6 +53,35 @@ def test_a_whole_grid_is_indexed_from_the_lower_left(
     site = sites()[order]
     lattice = grow_lattice(as_dots(bowed(site, bow, fan, roll_deg)), GrowSettings())
     np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), site)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tiles_with_gaps_between_them_are_one_grid(seed: int) -> None:
+    """As an infrared projector has them: rows staggered and bowed, steps a quarter longer there."""
+    rng = np.random.default_rng(seed)
+    row, column = np.mgrid[0:24, 0:24].reshape(2, -1)
+    u = 20.0 * (column + 0.25 * (column // 8) + row % 2 / 2)
+    v = 14.5 * (row + 0.25 * (row // 8)) + 6e-4 * (u - 250) ** 2
+    place = np.stack([u, v], axis=-1) + rng.normal(0, 0.2, (len(u), 2))
+    lattice = grow_lattice(as_dots(place), GrowSettings())
+    indexed = lattice.row > 0
+    assert indexed.mean() > 0.95
+    # In whole steps along two sides of the triangles that staggered dots make.
+    true = np.stack([row, column - row // 2, np.ones_like(row)], axis=-1)[indexed]
+    site = np.stack([lattice.row, lattice.column], axis=-1)[indexed]
+    steps = np.rint(np.linalg.lstsq(true, site, rcond=None)[0])
+    assert abs(round(np.linalg.det(steps[:2]))) == 1
+    np.testing.assert_array_equal(true @ steps, site)
+
+
+def test_grids_that_contradict_each_other_are_not_joined() -> None:
+    left, right = (np.arange(64).reshape(8, 8) + first for first in (0, 100))
+    right[:, :2] = left[:, -2:]
+    whole = joined([left, right.T])
+    assert whole.shape == (8, 14)
+    np.testing.assert_array_equal(whole[:, 6:], right)
+    right[4:, 0] = left[3:7, -2]  # slipped by a row
+    np.testing.assert_array_equal(joined([left, right.T]), left)
 
 
 @pytest.mark.parametrize("seed", range(12))

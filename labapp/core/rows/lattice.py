@@ -20,6 +20,10 @@ Site = tuple[int, int]
 MOST_STEPS = 1000
 """A grid grows no further than so many steps from the dot that it begins at."""
 
+SHARED = 4
+"""Grids are joined that have so many dots in common, not all on one line, in the same rows and
+columns."""
+
 _NEXT: tuple[Site, ...] = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
@@ -92,7 +96,7 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
     across = 2 * (min(len(dots), MOST_STEPS) + BORDER) + 1
     dot_at = np.full((across, across), -1)
     tried = np.zeros(len(dots), np.bool_)
-    grid = np.empty((0, 0), np.int64)
+    grids: list[IntArray] = []
     for seed, first, second in _seeds(plane):
         if tried[seed]:
             continue
@@ -101,10 +105,13 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         )
         dot = order[dot]
         tried[dot] = True
-        # Held against the best so far by what is left of it: a slip halves the largest grid.
-        if len(dot) > _count(grid):
+        if len(dot) >= settings.least:
             grown = _upright(_unsheared(_grid_of(k, t, dot), plane), plane)
-            grid = max(grid, _without_slips(grown, plane), key=_count)
+            grids.append(_without_slips(grown, plane))
+    grid = max(grids, key=_count, default=np.empty((0, 0), np.int64))
+    if len(grids) > 1 and _count(grid) < settings.share * len(dots):
+        whole = _upright(_unsheared(joined(grids), plane), plane)
+        grid = max(grid, _without_slips(whole, plane), key=_count)
     if _count(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
     grid = _grid_of(*_sites(grid))
@@ -117,6 +124,59 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         reference=certain[0] if len(certain) == 1 else None,
         candidates=tuple(site for site, _ in holes),
     )
+
+
+def joined(grids: list[IntArray]) -> IntArray:
+    """Join grids that overlap to the largest, as far as they agree on all dots they share.
+
+    Each is the dot at each site, −1 where there is none, shape (rows, columns); so is the result.
+    A gap between tiles of a pattern ends a grid's growth in most places, and not in all: grids of
+    two tiles then have some dots of each other.
+    """
+    first, *rest = sorted(grids, key=_count, reverse=True)
+    whole = _site_of(first)
+    while True:
+        for number, other in enumerate(rest):
+            further = _further(whole, _site_of(other))
+            if further is not None:
+                whole |= further
+                del rest[number]
+                break
+        else:
+            k, t = np.array(list(whole.values())).T
+            return _grid_of(k, t, np.array(list(whole)))
+
+
+def _site_of(grid: IntArray) -> dict[int, Site]:
+    """The site of each dot of a grid."""
+    return {dot: (k, t) for k, t, dot in np.stack(_sites(grid), axis=-1).tolist()}
+
+
+def _further(whole: dict[int, Site], other: dict[int, Site]) -> dict[int, Site] | None:
+    """Sites that another grid's further dots have in a grid; None where the two do not agree."""
+    shared = list(whole.keys() & other.keys())
+    if len(shared) < SHARED:
+        return None
+    own, its = (np.array([sites[dot] for dot in shared]) for sites in (whole, other))
+    # What is a row of one may be a diagonal of the other.
+    turn, _, rank, _ = np.linalg.lstsq(_centered(its), _centered(own), rcond=None)
+    if rank < 2:
+        return None
+    turn = np.rint(turn).astype(np.int64)
+    offset = own - its @ turn
+    if abs(round(np.linalg.det(turn))) != 1 or np.ptp(offset, axis=0).any():
+        return None
+    sites = np.array(list(other.values())) @ turn + offset[0]
+    taken = set(whole.values())
+    return {
+        dot: site
+        for dot, site in zip(other, map(tuple, sites.tolist()), strict=True)
+        if dot not in whole and site not in taken
+    }
+
+
+def _centered(sites: IntArray) -> FloatArray:
+    return np.asarray(sites - sites.mean(axis=0))
 
 
 def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
@@ -254,8 +314,8 @@ def _without_slips(grid: IntArray, plane: ComplexArray) -> IntArray:
     for k in np.nonzero(~np.isnan(lean).all(axis=1))[0]:
         slant[k + 1] = np.median(lean[k][~np.isnan(lean[k])])
     usual = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
-    joined = (np.abs(slant - usual) < 0.55) & (np.abs(slant) < 0.7)
-    part = np.cumsum(~joined)
+    sound = (np.abs(slant - usual) < 0.55) & (np.abs(slant) < 0.7)
+    part = np.cumsum(~sound)
     kept: BoolArray = part == np.bincount(part, (grid >= 0).sum(axis=1)).argmax()
     return grid[kept]
 
