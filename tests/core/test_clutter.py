@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from labapp.core.geometry.rig import Laser
 from tests.benchmarks import rendered
 from tests.benchmarks.clutter import draw
 from tests.benchmarks.dips import Answer, answer
@@ -27,6 +31,21 @@ def test_false_dots_and_missing_ones_that_lie_apart_are_put_up_with(kind: str, s
 def test_a_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> None:
     got = answered(kind, seed)
     assert (got.status, got.wrong) == ("ok", 0)
+
+
+def test_what_lies_apart_is_put_up_with_as_far_as_a_wrong_set_up_leaves_it() -> None:
+    """Of a looser rule all labels were wrong, with thirteen dots and six rays left over."""
+    rig, seen, pool = draw("rippled", 7020, 0.1, 10)
+    rng = np.random.default_rng([7020, 78])
+    angle, distance = rng.normal(0.0, [0.2, 0.3])
+    laser, plane = rig.laser, rig.imaging_plane
+    off = replace(
+        rig,
+        laser=Laser(laser.projection_angle_deg + angle, laser.distance_mm + distance),
+        imaging_plane=replace(plane, origin_mm=plane.origin_mm + rng.normal(0, 0.3, 3)),
+    )
+    got = answer(pool, seen, off)
+    assert got.status in {"no-match", "ambiguous-rows", "no-reference"}
 
 
 @pytest.mark.slow
