@@ -6,7 +6,7 @@ import inspect
 import json
 import sys
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -58,8 +58,9 @@ class Frames:
 @pytest.fixture(autouse=True)
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three formats more: points, triangles, and a file of all frames."""
-    module = SimpleNamespace(xyz=xyz, off=off, Frames=Frames)
-    monkeypatch.setitem(sys.modules, "labapp.export.toys", module)  # type: ignore[arg-type]
+    module = ModuleType("labapp.export.toys")
+    module.__dict__.update(xyz=xyz, off=off, Frames=Frames)
+    monkeypatch.setitem(sys.modules, "labapp.export.toys", module)
     for name, of in (("xyz", "nodes"), ("off", "mesh")):
         toy = SurfaceFormat(f".{name}", name.upper(), "A toy, mm", of, f"toys:{name}")
         monkeypatch.setitem(SURFACE_FORMATS, name, toy)

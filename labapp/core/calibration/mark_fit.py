@@ -165,11 +165,8 @@ class MarkFits:
         mean = off @ off + np.trace(covariance)
         spread = 2 * np.sum(covariance**2) + 4 * off @ covariance @ off
         n = 2 * mean**2 / max(spread, 1e-300)
-        return (
-            float(np.sqrt(mean * scipy.special.chdtri(n, 0.05) / n))
-            if n < 1e6
-            else float(np.sqrt(mean))
-        )
+        quantile = scipy.special.chdtri(n, 0.05) / n if n < 1e6 else 1.0
+        return float(np.sqrt(mean * quantile))
 
     def bound_words(self, used: ImageCalibration) -> tuple[str, ...]:
         """How far a map may err where dots land, and what helps where that matters."""

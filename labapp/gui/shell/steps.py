@@ -213,8 +213,8 @@ def _surface(facts: Facts) -> State:
     if facts.without:
         measured = f"{facts.count - facts.without} of {frames} are measured"
         return State(Mark.DONE, f"{measured}, {facts.without} could not be")
-    told = f"All {facts.count} frames are" if facts.count > 1 else "The frame is"
-    return State(Mark.DONE, f"{told} measured")
+    every = f"All {facts.count} frames are" if facts.count > 1 else "The frame is"
+    return State(Mark.DONE, f"{every} measured")
 
 
 def results(facts: Facts) -> State:

@@ -251,7 +251,7 @@ class CameraKind:
         How an id is written: what all ids of the kind begin with, to the colon, and a word for the
         rest: "uvc:NUMBER".
     find
-        Gives those that are connected; may raise `CameraError` where that cannot be told.
+        Lists those that are connected; may raise `CameraError` where that is unknown.
     open
         Opens the camera of an id; may raise `InputError` for an id that no camera has, and
         `CameraError` where the camera is not there or cannot be opened.
