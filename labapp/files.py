@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Atomic writing of files: a reader sees all of a new file, or the former one."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ def as_bytes(text: str) -> bytes:
 
 
 def beside(path: Path) -> Path:
-    """A hidden name beside a path that nobody can foresee: no link waits there to be followed.
+    """Hidden, unpredictable path in the folder of ``path``: no link can wait there to be followed.
 
-    What is made there must still be made as new (``xb``, `mkdir`), never opened or emptied.
+    A file or folder there must still be created as new (``xb``, `mkdir`), never opened.
     """
     return path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
 
 
 @contextmanager
-def made_whole(path: Path) -> Iterator[Path]:
-    """A new, empty file beside a path, which takes its place when all went well; else it is gone.
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Temporary file that replaces ``path`` when the block ends without error, else is deleted.
 
     Raises
     ------
     OSError
-        If it cannot be made or renamed.
+        If it cannot be created or renamed.
     """
     part = beside(path)
     part.open("xb").close()
@@ -41,8 +41,8 @@ def made_whole(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file beside its place and rename it, so that no reader sees half of it.
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a temporary file and rename it to ``path``, so that no reader sees a part of it.
 
     A file that was there keeps its permissions, and a link keeps pointing at what it did.
 
@@ -52,7 +52,7 @@ def write_whole(path: Path, content: bytes) -> None:
         If it cannot be written; then what was there is untouched and nothing is left beside it.
     """
     path = path.resolve()
-    with made_whole(path) as part:
+    with atomic_file(path) as part:
         with part.open("wb") as file:
             file.write(content)
             file.flush()

@@ -5,13 +5,13 @@ from unittest import mock
 
 import pytest
 
-from labapp.files import made_whole, write_whole
+from labapp.files import atomic_file, write_atomically
 
 
 def test_a_link_beside_its_place_is_not_followed(tmp_path: Path):
     (tmp_path / "mine.txt").write_text("mine")
     (tmp_path / ".setup.toml.part").symlink_to("mine.txt")
-    write_whole(tmp_path / "setup.toml", b"new")
+    write_atomically(tmp_path / "setup.toml", b"new")
     assert (tmp_path / "setup.toml").read_bytes() == b"new"
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
@@ -21,7 +21,7 @@ def test_a_link_in_the_very_place_is_refused(tmp_path: Path):
     with mock.patch("secrets.token_hex", return_value="known"):
         (tmp_path / ".setup.toml.known.part").symlink_to("mine.txt")
         with pytest.raises(FileExistsError):
-            write_whole(tmp_path / "setup.toml", b"new")
+            write_atomically(tmp_path / "setup.toml", b"new")
     assert (tmp_path / "mine.txt").read_text() == "mine"
     assert not (tmp_path / "setup.toml").exists()
 
@@ -30,7 +30,7 @@ def test_a_file_keeps_its_permissions_and_a_link_stays_one(tmp_path: Path):
     (tmp_path / "real").write_text("old")
     (tmp_path / "real").chmod(0o640)
     (tmp_path / "link").symlink_to("real")
-    write_whole(tmp_path / "link", b"new")
+    write_atomically(tmp_path / "link", b"new")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "real").read_bytes() == b"new"
     assert (tmp_path / "real").stat().st_mode & 0o777 == 0o640
@@ -38,14 +38,14 @@ def test_a_file_keeps_its_permissions_and_a_link_stays_one(tmp_path: Path):
 
 def test_a_new_file_may_be_read_as_any_other(tmp_path: Path):
     (tmp_path / "other").touch()
-    write_whole(tmp_path / "new", b"")
+    write_atomically(tmp_path / "new", b"")
     assert (tmp_path / "new").stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
 def test_what_fails_on_the_way_leaves_what_was_there(tmp_path: Path):
     path = tmp_path / "a"
     path.write_text("old")
-    with pytest.raises(RuntimeError), made_whole(path) as part:  # noqa: PT012
+    with pytest.raises(RuntimeError), atomic_file(path) as part:  # noqa: PT012
         part.write_text("half")
         raise RuntimeError
     assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("a", "old")]

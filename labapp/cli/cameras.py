@@ -13,7 +13,7 @@ import typer
 
 from labapp.cli.shared import NOTHING, finite, note, progress_bar
 from labapp.errors import InputError
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.media.cameras import Camera, CameraSettings, Feed, Range
@@ -191,8 +191,8 @@ def _opened(path: Path | None) -> Iterator[Session | None]:
 
 def _tell(take: Take, session: Session | None) -> None:
     """Say what was recorded; import it where a session was named."""
-    lost = f", {several(take.lost, 'frame')} lost" * (take.lost > 0)
-    typer.echo(f"{several(take.frames, 'frame')}{lost} in {take.path.absolute()}")
+    lost = f", {pluralize(take.lost, 'frame')} lost" * (take.lost > 0)
+    typer.echo(f"{pluralize(take.frames, 'frame')}{lost} in {take.path.absolute()}")
     if session is not None and take.frames:
         session.import_recording(take.path)
         typer.echo(f"Imported into {session.path}")

@@ -18,7 +18,7 @@ from typer.core import TyperCommand
 
 from labapp.cli.shared import frames_text, measure_frames, told_effect
 from labapp.errors import InputError
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Measurement
@@ -300,7 +300,7 @@ def _carried_on(session: Session, frame: int, correction: Correction) -> dict[in
     replaced = [number for number in carried if session.correction(number) is not None]
     if replaced:
         typer.echo(f"It replaces earlier corrections of {frames_text(replaced)}")
-    typer.echo(f"Carried on over {several(len(carried), 'frame')}, up to {stopped}")
+    typer.echo(f"Carried on over {pluralize(len(carried), 'frame')}, up to {stopped}")
     return carried
 
 

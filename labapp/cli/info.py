@@ -12,7 +12,7 @@ import typer
 
 from labapp.cli.shared import frames_text
 from labapp.errors import InputError
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.session.session import Session
@@ -144,7 +144,7 @@ def _setup_lines(lacks: list[str]) -> list[tuple[str, str]]:
 
 
 def _recording_lines(recording: dict[str, Any] | None) -> list[tuple[str, str]]:
-    from labapp.media.base import rate_in_words
+    from labapp.media.base import format_frame_rate
 
     if recording is None:
         return [("recording", "none imported yet")]
@@ -155,8 +155,8 @@ def _recording_lines(recording: dict[str, Any] | None) -> list[tuple[str, str]]:
         ("recording", f"{where}: {recording['description']}"),
         (
             "",
-            f"{several(recording['frames'], 'frame')}, of which {start}:{stop}:{step}; "
-            f"{'no time base' if rate is None else rate_in_words(rate)}; "
+            f"{pluralize(recording['frames'], 'frame')}, of which {start}:{stop}:{step}; "
+            f"{'no time base' if rate is None else format_frame_rate(rate)}; "
             f"{'' if recording['frame_exact'] else 'not '}frame-exact",
         ),
         *(("", f"warning: {warning}") for warning in recording["warnings"]),

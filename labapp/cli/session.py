@@ -34,7 +34,7 @@ from labapp.cli.shared import (
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
@@ -166,7 +166,7 @@ def import_recording(
     ] = False,
 ) -> None:
     """Take in a recording: read it through, check it, and say what was read."""
-    from labapp.media.base import rate_in_words
+    from labapp.media.base import format_frame_rate
     from labapp.session.session import Session
 
     with Session.open(file) as session:
@@ -176,13 +176,13 @@ def import_recording(
             )
         for warning in found.warnings:
             typer.echo(f"warning: {warning}", err=True)
-        used = several(len(session.frames), "frame")
+        used = pluralize(len(session.frames), "frame")
         start, stop, step = found.selected
         if found.frame_rate_hz is None:
             time_base = "none: give --frame-rate, or the frames have no times"
         else:
             whose = "as given" if found.rate_is_given else "the recording's own"
-            time_base = f"{rate_in_words(found.frame_rate_hz)}, {whose}"
+            time_base = f"{format_frame_rate(found.frame_rate_hz)}, {whose}"
         exact = "frame-exact" if found.frame_exact else INEXACT
         typer.echo(f"{recording.name}: {found.description}")
         typer.echo(
@@ -349,7 +349,7 @@ def export(
         )
     if missing:
         typer.echo(f"Not measured, so not in it: {frames_text(missing)}")
-    typer.echo(f"{several(len(files), 'file')} and the manifest are in {out.absolute()}")
+    typer.echo(f"{pluralize(len(files), 'file')} and the manifest are in {out.absolute()}")
 
 
 def _not_measured(session: Session, scheme: str | None) -> set[int]:
@@ -409,7 +409,7 @@ def verify(
         results = sum(session.measured_by.values())
         parts = ((len(session.frames), "frame"), (results, "result"))
         told = [
-            several(count, thing) for count, thing in (*parts, (len(session.history), "change"))
+            pluralize(count, thing) for count, thing in (*parts, (len(session.history), "change"))
         ]
         typer.echo(f"whole: {', '.join(told)}")
 

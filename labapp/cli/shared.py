@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
 from labapp.system import quoted
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,11 +80,11 @@ def command(name: str, file: Path) -> str:
 
 def frames_text(frames: Collection[int]) -> str:
     """Frames in short: "frames 0 to 3, 7"; "no frame"."""
-    from labapp.export.summary import runs_text
+    from labapp.export.summary import format_ranges
 
     if not frames:
         return "no frame"
-    return f"frame{'s' * (len(frames) > 1)} {runs_text(frames, ' to ', RUNS_SHOWN)}"
+    return f"frame{'s' * (len(frames) > 1)} {format_ranges(frames, ' to ', RUNS_SHOWN)}"
 
 
 def finite(value: float | None) -> float | None:
@@ -169,7 +169,7 @@ def _stale(session: Session) -> set[tuple[int, str]]:
 
 def _results(results: Collection[tuple[int, str]]) -> str:
     frames = {frame for frame, _ in results}
-    return f"{several(len(results), 'result')} ({frames_text(frames)})"
+    return f"{pluralize(len(results), 'result')} ({frames_text(frames)})"
 
 
 def results_folder(out: Path | None, tables: bool = True) -> Path | None:
@@ -208,10 +208,10 @@ def write_file(path: Path, content: bytes) -> None:
     InputError
         If it cannot be written.
     """
-    from labapp.files import write_whole
+    from labapp.files import write_atomically
 
     try:
-        write_whole(path, content)
+        write_atomically(path, content)
     except OSError as error:
         raise InputError(path, "file", error.strerror, "one that can be written") from error
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from labapp.cli.shared import INTERRUPTED, note, progress_bar
-from labapp.words import several
+from labapp.text import pluralize
 
 
 def simulate(
@@ -49,5 +49,5 @@ def simulate(
             note(bar.console, f"stopped: nothing is written in {out}")
             raise typer.Exit(INTERRUPTED) from None
     name = read.recording.file
-    typer.echo(f"{several(count, 'frame')}, setup, calibration picture and truth are in {out}")
+    typer.echo(f"{pluralize(count, 'frame')}, setup, calibration picture and truth are in {out}")
     typer.echo(f"  labapp reconstruct {out / name} --setup {out / 'setup.toml'} --out results")

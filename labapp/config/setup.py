@@ -19,7 +19,7 @@ from labapp.config.toml_keys import check_keys, shown, unknown_key
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.errors import InputError
-from labapp.files import write_whole
+from labapp.files import write_atomically
 
 A_SETUP = "a setup file (TOML, UTF-8)"
 
@@ -107,7 +107,7 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
     try:
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(13, "write-protected")
-        write_whole(path, text.encode())
+        write_atomically(path, text.encode())
     except OSError as error:
         raise InputError(path, "file", error.strerror, "a file that can be written") from error
 

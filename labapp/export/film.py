@@ -25,7 +25,7 @@ from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.export.scene import Scene, empty_scene, scene_of
 from labapp.export.studio import Picture, draw_there
-from labapp.files import made_whole
+from labapp.files import atomic_file
 
 CODEC = "mpeg4"
 QUALITY = 2
@@ -186,7 +186,7 @@ def write_video(path: Path, pictures: Iterable[Picture], times_s: FloatArray) ->
         most = f"at most {TICKS_HZ} frames/s: a film that is slower than the recording"
         raise InputError("export", "film_rate_hz", f"{rate:.6g}", most)
     # Written through Python's file, that a full disk is told as such.
-    with made_whole(path) as part, part.open("wb") as file:
+    with atomic_file(path) as part, part.open("wb") as file:
         container = av.open(file, "w", format="mp4")
         try:
             _encode(container, pictures, ticks)

@@ -38,8 +38,8 @@ from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
 from labapp.files import as_bytes, beside
 from labapp.media import GreyImage
 from labapp.system import sync_folder
+from labapp.text import SIGMA_OF
 from labapp.version import VERSION
-from labapp.words import SIGMA_OF
 
 MANIFEST = "manifest.json"
 TREND_FILE = "trends.png"

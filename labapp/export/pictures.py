@@ -22,7 +22,7 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.scene import scene_of
 from labapp.export.studio import draw_there, drawing_process
-from labapp.files import write_whole
+from labapp.files import write_atomically
 
 ENLARGED = 3
 """Screen pixels per pixel of the frame, so that labels can be read."""
@@ -92,7 +92,7 @@ def _row_colour(row: int) -> tuple[int, int, int]:
 def write_frame_picture(path: Path, image: npt.NDArray[Any], measurement: Measurement) -> None:
     """Write `frame_picture` as PNG."""
     _, content = cv2.imencode(".png", frame_picture(image, measurement))
-    write_whole(path, content.tobytes())
+    write_atomically(path, content.tobytes())
 
 
 def write_trend_picture(
@@ -124,7 +124,7 @@ def write_trend_picture(
     plots[-1].set_xlabel(label)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=120)
-    write_whole(path, content.getvalue())
+    write_atomically(path, content.getvalue())
 
 
 def write_surface_picture(
@@ -153,4 +153,4 @@ def write_surface_picture(
         process = process or stack.enter_context(drawing_process())
         drawing = process.submit(draw_there, scene_of(reconstruction))
         _, content = cv2.imencode(".png", drawing.result())
-    write_whole(path, content.tobytes())
+    write_atomically(path, content.tobytes())

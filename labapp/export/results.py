@@ -19,9 +19,9 @@ from labapp.errors import InputError
 from labapp.export.formats import SURFACE_FORMATS
 from labapp.export.meshes import SPACING_MM, nodes, solid, surface
 from labapp.export.tables import TABLES, csv_header, table_rows
-from labapp.files import as_bytes, write_whole
+from labapp.files import as_bytes, write_atomically
+from labapp.text import SIGMA_OF
 from labapp.version import VERSION
-from labapp.words import SIGMA_OF
 
 RUN_FILE = "run.json"
 OURS = re.compile(r"(measures|dots|points|boundary|surface_\d{6,})\.csv|surface_\d{6,}\.stl")
@@ -150,7 +150,7 @@ class ResultsWriter:
         rows = rows or table_rows(frame, time_s, measurement, self._calibration)
         try:
             for path, content in surfaces.items():
-                write_whole(path, content)
+                write_atomically(path, content)
             for name, text in rows.items():
                 _append(self._files[name], text)
         except BaseException as error:
@@ -188,7 +188,7 @@ class ResultsWriter:
 
     def _write_run(self) -> None:
         text = json.dumps(self._run, indent=2, ensure_ascii=False) + "\n"
-        write_whole(self.folder / RUN_FILE, as_bytes(text))
+        write_atomically(self.folder / RUN_FILE, as_bytes(text))
 
     def _close_files(self) -> None:
         for file in self._files.values():
@@ -207,7 +207,7 @@ class ResultsWriter:
 
 def _clear(folder: Path) -> None:
     """Take away a former run's results, `measures.csv` first: no row without its files."""
-    if (folder / RUN_FILE).is_symlink():  # `write_whole` would write to where it points
+    if (folder / RUN_FILE).is_symlink():  # `write_atomically` would write to where it points
         raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
     ours = [path for path in folder.iterdir() if OURS.fullmatch(path.name)]
     if ours and not _is_run(folder / RUN_FILE):

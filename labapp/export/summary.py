@@ -73,7 +73,7 @@ class Summary:
         return np.asarray(values[np.isfinite(values)])
 
 
-def runs_text(frames: Iterable[int], to: str = "–", most: int = 12) -> str:
+def format_ranges(frames: Iterable[int], to: str = "–", most: int = 12) -> str:
     """Frame numbers in short, so many runs of them at most: ``0–4, 7, 9–11``."""
     runs: list[list[int]] = []
     for frame in sorted(frames):

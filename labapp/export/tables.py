@@ -21,7 +21,7 @@ from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
-from labapp.words import SIGMA_OF, as_cell
+from labapp.text import SIGMA_OF, as_cell
 
 PX_DIGITS, MM_DIGITS = 4, 6
 

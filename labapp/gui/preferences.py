@@ -15,7 +15,7 @@ import platformdirs
 from filelock import FileLock, Timeout
 from PySide6.QtCore import QObject, Signal
 
-from labapp.files import as_bytes, write_whole
+from labapp.files import as_bytes, write_atomically
 from labapp.log import NAME
 
 VERSION = 1
@@ -177,7 +177,7 @@ def write_preferences(path: Path, preferences: Preferences) -> str:
     held = {"version": VERSION, **dataclasses.asdict(preferences)}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, as_bytes(json.dumps(held, indent=1, ensure_ascii=False) + "\n"))
+        write_atomically(path, as_bytes(json.dumps(held, indent=1, ensure_ascii=False) + "\n"))
     except OSError as error:
         return f"Preferences could not be saved ({error.strerror}): {path}"
     return ""

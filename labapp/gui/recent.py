@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from labapp.errors import InputError
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.media import GreyImage
@@ -68,7 +68,7 @@ def _counted(statuses: Sequence[str]) -> str:
     measured = sum(status == "ok" for status in statuses)
     without = sum(status not in ("", "ok") for status in statuses)
     some = "all" if measured == len(statuses) else measured or "none"
-    told = f"{several(len(statuses), 'frame')}, {some} measured"
+    told = f"{pluralize(len(statuses), 'frame')}, {some} measured"
     return f"{told}, {without} could not be" if without else told
 
 

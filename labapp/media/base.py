@@ -117,8 +117,8 @@ def check_index(source: FrameSource, index: int) -> None:
         raise IndexError(f"{source.name} has frames 0 to {len(source) - 1}, not {index}")
 
 
-def rate_in_words(rate_hz: float) -> str:
-    """A frame rate: "60 frames/s", "1 frame/s", "29.97 frames/s"; whole or to five digits."""
+def format_frame_rate(rate_hz: float) -> str:
+    """Frame rate with its unit, to five digits: "60 frames/s", "1 frame/s", "29.97 frames/s"."""
     is_whole = rate_hz == round(rate_hz) or rate_hz >= 10_000
     figure = f"{rate_hz:.0f}" if is_whole else f"{rate_hz:.5g}"
     return f"{figure} frame{'s' * (figure != '1')}/s"

@@ -14,7 +14,7 @@ from datetime import datetime
 
 from labapp.core.surface.measures import Measures
 from labapp.run.limits import NAMES, Limits, Size, Standing, sizes_of, standing
-from labapp.words import several
+from labapp.text import pluralize
 
 CALM_S = 1.0
 """An alarm is over when its cause has been away for so long, by the camera's clock."""
@@ -168,7 +168,9 @@ class Alarms:
             unknown.pop(SILENT, None)
             if self._unmeasured < self._limits.unmeasured:
                 return unknown
-            words = f"{several(self._unmeasured, 'frame')} in a row could not be measured: {reason}"
+            words = (
+                f"{pluralize(self._unmeasured, 'frame')} in a row could not be measured: {reason}"
+            )
             return {**unknown, NOT_MEASURED: words}
         found: dict[str, str | None] = {}
         for name, size in zip(NAMES, sizes_of(measures), strict=True):

@@ -13,7 +13,7 @@ from labapp.core.rows.lattice import Lattice
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.export.tables import PX_DIGITS, as_csv, number
-from labapp.files import write_whole
+from labapp.files import write_atomically
 from labapp.media import open_source
 
 COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".split()
@@ -68,6 +68,6 @@ def write_detected(path: Path, dots: Dots, lattice: Lattice | None) -> None:
     ]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, as_csv([COLUMNS, *rows]).encode())
+        write_atomically(path, as_csv([COLUMNS, *rows]).encode())
     except OSError as error:
         raise InputError(path, "--out", error.strerror, "a file that can be written") from error

@@ -13,7 +13,7 @@ from typing import Any, get_args
 from urllib.parse import quote
 
 from labapp.errors import InputError
-from labapp.files import made_whole
+from labapp.files import atomic_file
 from labapp.session.documents import WHOLE, Key, Kind
 from labapp.session.file.database import SUFFIX, new_session_path
 from labapp.session.samples import SAMPLES, sample_folder
@@ -47,7 +47,7 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
     uri = f"file:{quote(os.fspath(source))}?mode=ro"
     try:
         with (
-            made_whole(path) as part,
+            atomic_file(path) as part,
             closing(sqlite3.connect(uri, uri=True, timeout=BUSY_S)) as there,
             closing(sqlite3.connect(part)) as here,
         ):

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from labapp.core.values import IntArray
 from labapp.errors import InputError
-from labapp.export.summary import runs_text
+from labapp.export.summary import format_ranges
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.formats.images import decoded
 from labapp.media.formats.stored import regular_size
@@ -269,7 +269,7 @@ class Frames:
         if numbers:
             raise InputError(
                 self._database.path if self._imported().embedded else self._place(),
-                f"frame{'s' * (len(numbers) > 1)} {runs_text(numbers)}",
+                f"frame{'s' * (len(numbers) > 1)} {format_ranges(numbers)}",
                 "no longer what was imported (what was measured before is kept)",
                 "the recording as it was at import",
             )

@@ -26,7 +26,7 @@ from labapp.core.pipeline import Settings, measure
 from labapp.core.sequence.warm import WarmChain
 from labapp.core.values import FloatArray, IntArray
 from labapp.export.results import ResultsWriter
-from labapp.files import made_whole
+from labapp.files import atomic_file
 from labapp.media import open_source
 from labapp.run.sequence import Job, await_ready, followers, measure_sequence
 from labapp.simulated.simulate import simulate
@@ -137,7 +137,7 @@ def _rows(path: Path) -> Iterator[dict[str, str]]:
 
 def _write_raw(source_path: Path, path: Path) -> None:
     with (
-        made_whole(path) as part,
+        atomic_file(path) as part,
         open_source(source_path) as source,
         av.open(str(part), "w", format="avi") as container,
     ):

@@ -31,7 +31,7 @@ from labapp.studies.error_analysis import (
 )
 from labapp.studies.parameter_deviation import AxisPoints, KnownPool
 from labapp.studies.tables import Table
-from labapp.words import several
+from labapp.text import pluralize
 
 TACK = spherical_cap(9.75, 0.91)
 """The thumb tack of §8.2."""
@@ -197,7 +197,7 @@ def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCH
     return Table(
         "measurement_error",
         f"Measurement error on the thumb tack of §8.2: exact reflections, and "
-        f"{several(len(frames), 'frame')}",
+        f"{pluralize(len(frames), 'frame')}",
         ("scheme", "error", "exact", "frames_mean", "frames_worst", "frames_measured", "text"),
         tuple(rows),
     )

@@ -23,7 +23,7 @@ from labapp.export.results import ResultsWriter
 from labapp.export.tables import TABLES
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
-from labapp.words import SIGMA_OF
+from labapp.text import SIGMA_OF
 from tests.export.conftest import dots
 
 Writer = Callable[[Path], ResultsWriter]
@@ -275,7 +275,7 @@ def test_a_frame_that_fails_leaves_no_trace(
     out: Path, writer: Writer, measured: Measurement, failure: BaseException, at: int
 ) -> None:
     """Whichever of a frame's six files fails, half of it written."""
-    whole, append = results.write_whole, results._append
+    whole, append = results.write_atomically, results._append
     calls = iter(range(100))
 
     def fail_whole(path: Path, content: bytes) -> None:
@@ -294,7 +294,7 @@ def test_a_frame_that_fails_leaves_no_trace(
         files.write(0, 0.0, measured)
         before = {path: path.read_bytes() for path in out.iterdir()}
         with (
-            mock.patch.object(results, "write_whole", fail_whole),
+            mock.patch.object(results, "write_atomically", fail_whole),
             mock.patch.object(results, "_append", fail_append),
         ):
             files.write(1, 0.1, measured)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from labapp.media.base import rate_in_words
+from labapp.media.base import format_frame_rate
 
 
 @pytest.mark.parametrize(
@@ -19,4 +19,4 @@ from labapp.media.base import rate_in_words
     ],
 )
 def test_a_frame_rate_is_told_with_sensible_digits(rate_hz: float, words: str) -> None:
-    assert rate_in_words(rate_hz) == words
+    assert format_frame_rate(rate_hz) == words

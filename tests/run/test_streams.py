@@ -23,7 +23,7 @@ from labapp.export.tables import SIZES
 from labapp.run import streams
 from labapp.run.alarms import Alarm
 from labapp.run.streams import LineStream, OpcuaStream, live_values, open_stream, told_values
-from labapp.words import SIGMA_OF
+from labapp.text import SIGMA_OF
 from tests.waiting import PATIENCE_S, connect
 
 

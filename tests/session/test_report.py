@@ -22,7 +22,7 @@ from labapp.core.rows import correction
 from labapp.core.schemes import ers
 from labapp.core.surface.measures import measure
 from labapp.errors import InputError
-from labapp.export.summary import runs_text
+from labapp.export.summary import format_ranges
 from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
 from labapp.session.report import data, figures, layout, report_pdf
@@ -219,7 +219,7 @@ def test_the_frame_that_stands_for_all_has_the_median_peak(seen: Measurement):
     ],
 )
 def test_frames_are_named_in_short(numbers: list[int], text: str):
-    assert runs_text(numbers) == text
+    assert format_ranges(numbers) == text
 
 
 def test_settings_that_differ_are_told_with_their_defaults():

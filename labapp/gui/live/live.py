@@ -35,7 +35,7 @@ from labapp.run.live_measuring import LiveMeasuringEnded
 from labapp.run.live_queue import newest_of
 from labapp.run.live_watch import RATE_S, LiveWatch
 from labapp.session.session import Session
-from labapp.words import several, size_in_words
+from labapp.text import format_bytes, pluralize
 
 SIMULATED = "simulated"
 """Id of the simulated camera."""
@@ -370,9 +370,9 @@ class Live:
         if self.feed is None:
             return ""
         counts = self.feed.counts
-        told = [several(counts.frames, "frame")]
+        told = [pluralize(counts.frames, "frame")]
         told += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
-        told += [f"lost {several(counts.lost, 'time')}"] * (counts.lost > 0)
+        told += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
         return ", ".join(told)
 
     def ring(self) -> tuple[float, str]:
@@ -394,7 +394,7 @@ class Live:
         """
         take, told = self.running, []
         if take is not None:
-            told = [f"● Recording: {several(take.frames, 'frame')} written, {take.lost} lost"]
+            told = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
             told += [f"▲ {take.trouble}"] * bool(take.trouble)
         elif self.takes and not self.takes[-1].finished.is_set():
             told = [f"Writing the rest of {self.takes[-1].path.name}"]
@@ -403,7 +403,7 @@ class Live:
         rate = self.rate_hz()
         if room_byte is not None and rate:
             room_s = room_byte / (self._frame_byte * rate / self.plan.every)
-            told.append(f"room for {_lasting(room_s)} ({size_in_words(room_byte)})")
+            told.append(f"room for {_lasting(room_s)} ({format_bytes(room_byte)})")
         return "; ".join(told)
 
     # --- to do --------------------------------------------------------------------------------

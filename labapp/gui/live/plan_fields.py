@@ -8,7 +8,7 @@ from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import wrapped
 from labapp.media.recording.nut import Codec
 from labapp.media.recording.recorder import Plan
-from labapp.words import size_in_words
+from labapp.text import format_bytes
 
 BEFORE_S = 2.0
 
@@ -117,7 +117,7 @@ def cost_in_words(plan: Plan, frame_byte: int, rate_hz: float) -> str:
     byte_s = frame_byte * rate_hz / plan.every
     core = core_s * byte_s
     told = (
-        f"About {size_in_words(round(part * byte_s))} a second, {max(1, round(100 * core))} % of a "
+        f"About {format_bytes(round(part * byte_s))} a second, {max(1, round(100 * core))} % of a "
         "core"
     )
     if plan.codec == "ffv1" and core > SHARE:

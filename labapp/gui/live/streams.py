@@ -14,7 +14,7 @@ from labapp.gui.widgets.labels import Message, headed, wrapped
 from labapp.gui.workspace import Workspace
 from labapp.run.live_watch import LiveWatch
 from labapp.run.streams import Stream, open_stream
-from labapp.words import several
+from labapp.text import pluralize
 
 KINDS = {
     "lines": (
@@ -175,7 +175,7 @@ def stream_in_words(stream: Stream | None, at_work: bool, problem: str) -> str:
     if stream is None:
         return "○ One moment …" if at_work else "○ Off"
     listen = "program listens" if stream.listeners == 1 else "programs listen"
-    told = several(stream.told, "frame")
+    told = pluralize(stream.told, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
     return f"● {where or stream.address}: {stream.listeners} {listen}, {told} told"
 

@@ -18,7 +18,7 @@ from labapp.gui.widgets.labels import plain_label
 from labapp.gui.workspace import Workspace
 from labapp.run.limits import LARGEST_MM, NAMES, Ends, Limits
 from labapp.run.live_watch import TREND_S, LiveWatch, Trend
-from labapp.words import SIGMA_OF
+from labapp.text import SIGMA_OF
 
 LAST_S = 30.0
 """So much is seen at first."""

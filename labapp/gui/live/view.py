@@ -46,7 +46,7 @@ from labapp.media.recording.take_files import Take
 from labapp.run.live_watch import Followed, LiveWatch
 from labapp.session.session import Session
 from labapp.simulated.simulated_pool import pool_camera, simulated_pool
-from labapp.words import several
+from labapp.text import pluralize
 
 TICK_MS = 33
 """The picture is renewed no more often; less often where that takes long."""
@@ -136,7 +136,7 @@ class LiveView(QObject):
             found, problems = answer
             self._choices = choices(found)
             self.camera.set_choices(self._choices)
-            told = f"{several(len(found), 'camera')} found"
+            told = f"{pluralize(len(found), 'camera')} found"
             self.workspace.said.emit(". ".join([told, *problems]), False)
 
         if self._finding not in self.workspace.tasks.active:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from labapp.errors import InputError
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.session.measured import Overview
@@ -188,22 +188,24 @@ def _capture(facts: Facts) -> State:
     if facts.session.recording is None:
         return State(Mark.READY, "No recording yet")
     gone = recording_gone(facts.session)
-    return State(Mark.ATTENTION, gone) if gone else State(Mark.DONE, several(facts.count, "frame"))
+    return (
+        State(Mark.ATTENTION, gone) if gone else State(Mark.DONE, pluralize(facts.count, "frame"))
+    )
 
 
 def _dots(facts: Facts) -> State:
     if facts.without:
-        missing = several(facts.without, "frame")
+        missing = pluralize(facts.without, "frame")
         return State(Mark.ATTENTION, f"{missing} could not be measured: look at their dots")
     if facts.stale:
-        return State(Mark.READY, f"{several(facts.stale, 'frame')} to be measured again")
+        return State(Mark.READY, f"{pluralize(facts.stale, 'frame')} to be measured again")
     if facts.measured == facts.count:
         return State(Mark.DONE, "The dots of all frames make a surface")
-    return State(Mark.READY, f"{several(facts.count - facts.measured, 'frame')} to be measured")
+    return State(Mark.READY, f"{pluralize(facts.count - facts.measured, 'frame')} to be measured")
 
 
 def _surface(facts: Facts) -> State:
-    frames = several(facts.count, "frame")
+    frames = pluralize(facts.count, "frame")
     if facts.to_do and not facts.measured:
         return State(Mark.TODO, f"Set-up: {facts.to_do}")
     if facts.stale:
@@ -220,7 +222,7 @@ def _surface(facts: Facts) -> State:
 def results(facts: Facts) -> State:
     """State of a step that needs nothing but results: ready as soon as there are some."""
     if facts.measured:
-        return State(Mark.READY, several(facts.measured, "frame"))
+        return State(Mark.READY, pluralize(facts.measured, "frame"))
     return State(Mark.TODO, "Measure some frames first")
 
 

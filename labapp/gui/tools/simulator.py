@@ -23,7 +23,7 @@ from labapp.gui.widgets.labels import plain_label
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.simulated.simulate import begin_session, simulate
-from labapp.words import several
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
@@ -230,7 +230,7 @@ class SimulatorWindow(ToolWindow):
 
     def _written(self, scenario: Scenario, folder: Path) -> None:
         self.made = scenario, folder
-        frames = several(len(scenario.recording.pools), "frame")
+        frames = pluralize(len(scenario.recording.pools), "frame")
         self.say(f"{frames}, set-up and truth are in {folder}")
         self._preferences.remember(lambda before: replace(before, last_folder=str(folder.parent)))
         self.show_state()

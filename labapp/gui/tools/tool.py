@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.errors import InputError
-from labapp.files import write_whole
+from labapp.files import write_atomically
 from labapp.gui.shell.messages import PROBLEM, ElidedLabel
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.widgets.fields import FieldForm
@@ -231,7 +231,7 @@ class ToolWindow(QDialog):
             try:
                 folder.mkdir(parents=True, exist_ok=True)
                 for name, content in self.files.items():
-                    write_whole(folder / name, content)
+                    write_atomically(folder / name, content)
             except OSError as error:
                 expected = "one that can be written"
                 raise InputError(folder, "folder", error.strerror, expected) from error

@@ -25,7 +25,7 @@ from labapp.media.cameras.base import (
     CameraSettings,
 )
 from labapp.media.events import Event, Kind, Say, Tally, silent
-from labapp.words import several
+from labapp.text import pluralize
 
 WAIT_S = 0.1
 """So long a frame is waited for before it is seen whether the feed is to end."""
@@ -117,10 +117,10 @@ class Feed:
         self._pulls = threading.Semaphore(0)
         self._frames = self._lost = 0
         self._broken = Tally(
-            lambda n: self._tell("loss", f"{several(n, 'frame')} not whole, left out")
+            lambda n: self._tell("loss", f"{pluralize(n, 'frame')} not whole, left out")
         )
         self._dropped = Tally(
-            lambda n: self._tell("loss", f"{several(n, 'frame')} lost on the way")
+            lambda n: self._tell("loss", f"{pluralize(n, 'frame')} lost on the way")
         )
         self._set_words = ""
         """To be said when frames come again after a setting."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.media.base import Frame, FrameSource, GreyImage, check_index, rate_in_words
+from labapp.media.base import Frame, FrameSource, GreyImage, check_index, format_frame_rate
 from labapp.pixels import MOST_PIXELS
 
 
@@ -65,7 +65,7 @@ class StoredFrames(FrameSource):
         self.shape = shape
         self.bit_depth = bit_depth
         self.frame_rate_hz = frame_rate_hz
-        rate = "" if frame_rate_hz is None else f", {rate_in_words(frame_rate_hz)}"
+        rate = "" if frame_rate_hz is None else f", {format_frame_rate(frame_rate_hz)}"
         self.description = (
             f"{kind}, {shape[1]}×{shape[0]} px, {bit_depth} bit "
             f"{'colour' if colour else 'grey'}{rate}"

@@ -21,7 +21,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from labapp.errors import InputError
-from labapp.media.base import Frame, FrameSource, check_index, rate_in_words
+from labapp.media.base import Frame, FrameSource, check_index, format_frame_rate
 from labapp.media.formats.boxes import mp4_formats
 from labapp.media.formats.ffv1 import slices_whole
 from labapp.media.formats.luminance import bit_depth_of, grey_of
@@ -407,7 +407,7 @@ class VideoSource(FrameSource):
                 CODECS.get(codec, codec.upper()),
                 f"{columns}×{rows} px",
                 f"{bit_depth_of(frame)} bit {colour}",
-                *([] if rate is None else [rate_in_words(rate)]),
+                *([] if rate is None else [format_frame_rate(rate)]),
             ]
         )
 

@@ -22,7 +22,7 @@ from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Kind, Say, Tally, silent
 from labapp.media.recording.nut import TICKS_HZ, Codec, NutWriter, WrongFrame
 from labapp.media.recording.take_files import Note, Take, TakeFiles, notes_of
-from labapp.words import several
+from labapp.text import pluralize
 
 FRAME_BYTE = 200
 """What a frame takes in memory besides its levels, about."""
@@ -202,7 +202,7 @@ class Recorder:
             count = len(self._ring)
             self._ring.clear()
             self._add_note(
-                take, Event("recording", "note", f"trigger, {several(count, 'frame')} before it")
+                take, Event("recording", "note", f"trigger, {pluralize(count, 'frame')} before it")
             )
             self._turn.notify()
         self._say(Event(path.name, "note", "recording"))
@@ -311,7 +311,7 @@ class Recorder:
 
     def _tell_lost(self, count: int) -> None:
         faster = "; raw is written faster" * (self.plan.codec == "ffv1")
-        lost = several(count, "frame")
+        lost = pluralize(count, "frame")
         self._tell("loss", f"{lost} lost: writing does not keep up, and memory is full{faster}")
 
     # --- in the writer's thread ---------------------------------------------------------------
@@ -365,7 +365,7 @@ class Recorder:
             logging.getLogger("labapp").exception("recording %s", take.path)
         reason = (isinstance(error, OSError) and error.strerror) or error
         take.trouble = f"cannot be written: {reason}"
-        words = f"{take.trouble}; what was written is whole: {several(take.frames, 'frame')}"
+        words = f"{take.trouble}; what was written is whole: {pluralize(take.frames, 'frame')}"
         self._say(Event(take.path.name, "loss", words))
 
 

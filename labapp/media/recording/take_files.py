@@ -14,7 +14,7 @@ from pathlib import Path
 from labapp.media.cameras.base import CameraFrame
 from labapp.media.events import Event, Say, Tally
 from labapp.media.recording.nut import NutWriter
-from labapp.words import as_cell, several
+from labapp.text import as_cell, pluralize
 
 NOTES = ("time_s", "frame", "source", "kind", "what")
 """Columns of the notes beside a recording; the frame is the one that was next at that time."""
@@ -71,7 +71,7 @@ class Take:
     @property
     def summary(self) -> Event:
         """What became of it."""
-        words = f"{several(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
+        words = f"{pluralize(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
             self.lost > 0
         )
         return Event(self.path.name, "loss" if self.lost else "note", words)
@@ -148,7 +148,7 @@ class TakeFiles:
         self._times_s.append(frame.time_s)
 
     def _tell_wrong(self, count: int) -> None:
-        frames = several(count, "frame")
+        frames = pluralize(count, "frame")
         words = f"{frames} left out: of another size, or brighter than the camera's bits allow"
         event = Event(self.take.path.name, "loss", words)
         self._say(event)

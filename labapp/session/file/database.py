@@ -23,7 +23,7 @@ import numpy.typing as npt
 from filelock import FileLock, Timeout
 
 from labapp.errors import InputError
-from labapp.files import made_whole
+from labapp.files import atomic_file
 from labapp.session.file.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 
 SUFFIX = ".labsession"
@@ -90,7 +90,7 @@ class Database:
         try:
             # Made beside its place: a crash on the way leaves no session that is none.
             with (
-                made_whole(path) as part,
+                atomic_file(path) as part,
                 _told(path),
                 _closing(_connect(part, read_only=False)) as connection,
             ):
@@ -373,7 +373,7 @@ def _migrate(path: Path, version: int) -> None:
     """Bring a file up to date, its former self kept beside it."""
     kept = path.with_name(f"{path.stem}.version-{version}{SUFFIX}")
     if not kept.exists():
-        with made_whole(kept) as part:
+        with atomic_file(kept) as part:
             shutil.copyfile(path, part)
     _apply_migrations(path, version)
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from labapp.errors import InputError
-from labapp.media.base import rate_in_words
+from labapp.media.base import format_frame_rate
 from labapp.session.contents import SessionContents
 from labapp.session.report import data, figures
 from labapp.session.report.data import Told, number, with_unit
@@ -149,7 +149,7 @@ def _recording(story: Story, session: SessionContents) -> None:
             ("size", f"{recording.size} bytes"),
             ("SHA-256", recording.sha256),
             ("frames used", used + (f", in steps of {step}" if step > 1 else "")),
-            ("frame rate", "unknown" if rate is None else f"{rate_in_words(rate)} ({source})"),
+            ("frame rate", "unknown" if rate is None else f"{format_frame_rate(rate)} ({source})"),
             ("frame-exact", exact),
             ("kept in the session", "yes, lossless" if recording.embedded else "no"),
             ("imported", recording.imported.replace("T", " ")),

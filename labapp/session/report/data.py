@@ -17,7 +17,7 @@ from labapp.core.pipeline import Measurement, Settings
 from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.export.summary import runs_text
+from labapp.export.summary import format_ranges
 from labapp.session.contents import SessionContents
 from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
@@ -247,7 +247,7 @@ def status_cells(lines: Sequence[FrameLine]) -> Cells:
         groups.setdefault((status, NUMBER.sub("#", why)), []).append(line)
     ranked = sorted(groups.items(), key=lambda item: (item[0][0] != "in the mean", item[0]))
     rows = [
-        [*_outcome(found[0]), str(len(found)), runs_text([line.frame for line in found])]
+        [*_outcome(found[0]), str(len(found)), format_ranges([line.frame for line in found])]
         for _, found in ranked
     ]
     return [["outcome", "why", "frames", "which"], *rows]

@@ -16,7 +16,7 @@ from labapp.session.report.data import FrameLine, Told
 from labapp.session.report.layout import Story
 from labapp.studies.error_budget import calibration_budget
 from labapp.studies.parameter_deviation import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX
-from labapp.words import SIGMA_OF
+from labapp.text import SIGMA_OF
 
 LATEST_CHANGES = 40
 """So many of the newest changes are listed."""

@@ -36,7 +36,7 @@ from labapp.gui.workspace import Workspace
 from labapp.session.copies import next_session
 from labapp.session.record import Record
 from labapp.session.session import Session
-from labapp.words import size_in_words
+from labapp.text import format_bytes
 from tests.gui.conftest import KEPT, CopySample
 from tests.gui.hand import Hand
 from tests.waiting import PATIENCE_S
@@ -100,8 +100,8 @@ def test_what_was_read_is_told(copy_sample) -> None:
         assert seen.exposure is not None
         assert seen.exposure.verdict == "good"
         assert [bar.name for bar in bars(seen.exposure)] == ["Exposure", "Saturation", "Contrast"]
-    assert size_in_words(999) == "999 bytes"
-    assert size_in_words(2_500_000_000) == "2.5 GB"
+    assert format_bytes(999) == "999 bytes"
+    assert format_bytes(2_500_000_000) == "2.5 GB"
     blank = bars(judge_exposure(np.zeros((9, 9), np.uint8), None, 8))
     assert [bar.part for bar in blank] == [0, 0, 0]
 

@@ -38,7 +38,7 @@ from labapp.gui.workspace import MISSING, Workspace
 from labapp.media.recording.take_files import Take
 from labapp.session.record import Recording
 from labapp.session.session import Session
-from labapp.words import several
+from labapp.text import pluralize
 
 REST_MS = 120
 """Exposure is judged where a frame stays in view so long: not while frames rush by."""
@@ -381,7 +381,7 @@ class CapturePage(Page):
             if self.workspace.frame not in frames:
                 self.workspace.show_frame(frames[0])
             self._seen = None
-            told = f"{several(len(frames), 'frame')} of {path.name} imported"
+            told = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
             self.workspace.said.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
             self.workspace.changed.emit()
 

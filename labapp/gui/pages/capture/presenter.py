@@ -13,10 +13,10 @@ from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.gui.shell.steps import recording_gone
 from labapp.media import GreyImage, open_source
-from labapp.media.base import rate_in_words
+from labapp.media.base import format_frame_rate
 from labapp.session.record import Recording
 from labapp.session.session import Session
-from labapp.words import size_in_words
+from labapp.text import format_bytes
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def choice_in_words(preview: Preview, choice: Choice) -> str:
     rate = choice.rate_hz or preview.frame_rate_hz
     if rate is None:
         return f"{told}; without a frame rate there are no times"
-    return f"{told}, {choice.count * choice.every / rate:.3f} s at {rate_in_words(rate)}"
+    return f"{told}, {choice.count * choice.every / rate:.3f} s at {format_frame_rate(rate)}"
 
 
 def refusal(session: Session | None, choice: Choice | None, working: bool) -> str:
@@ -168,7 +168,7 @@ def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
     which += f", every {step}." * (step > 1)
     given = " (entered)" if recording.rate_is_given else ""
     rate = recording.frame_rate_hz
-    base = f"{rate_in_words(rate)}{given}" if rate is not None else "none"
+    base = f"{format_frame_rate(rate)}{given}" if rate is not None else "none"
     exact = "frame-exact" if recording.frame_exact else "not frame-exact: wrong frames are refused"
     return (
         ("File", Path(recording.path).name),
@@ -178,7 +178,7 @@ def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
         ("Time base", base),
         ("Seeking", exact),
         ("Kept", "in the session itself" if recording.embedded else recording.path),
-        ("Size", size_in_words(recording.size)),
+        ("Size", format_bytes(recording.size)),
         ("SHA-256", recording.sha256),
         ("Imported", local_time(recording.imported)),
     )

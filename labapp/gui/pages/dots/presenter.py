@@ -23,7 +23,7 @@ from labapp.gui.shell.steps import recording_gone
 from labapp.gui.tasks import Cancelled, Control
 from labapp.session.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
-from labapp.words import SIGMA_OF, several
+from labapp.text import SIGMA_OF, pluralize
 
 NO_PLACES: FloatArray = np.zeros((0, 2))
 
@@ -239,7 +239,7 @@ def sentence(seen: Shown) -> str:
         "found": "As found, not measured",
         "looked for": "",
     }[seen.origin]
-    words = f"{told}: {several(len(dots), 'dot')} in {several(rows, 'row')}"
+    words = f"{told}: {pluralize(len(dots), 'dot')} in {pluralize(rows, 'row')}"
     words += f", {doubtful} in doubt" if doubtful else ", none in doubt"
     if lattice.reference is None:
         words += ". The reference is not known"
@@ -414,7 +414,7 @@ def carry(session: Session, seen: Shown, most: int | None, control: Control) -> 
             stopped = f"stopped before frame {number}: {why}"
             break
         carried[number] = last = following
-    return Carried(carried, f"Carried on over {several(len(carried), 'frame')}, {stopped}")
+    return Carried(carried, f"Carried on over {pluralize(len(carried), 'frame')}, {stopped}")
 
 
 def _confirmed(seen: Shown) -> Correction:

@@ -33,7 +33,7 @@ from labapp.export.studio import PICTURE_PX
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.session import Session
-from labapp.words import several, size_in_words
+from labapp.text import format_bytes, pluralize
 
 REPORT_FILE = "report.pdf"
 
@@ -239,12 +239,12 @@ def plan(session: Session, wish: Wish, frame: int) -> Plan:
     notes = []
     if len(unmeasured):
         notes.append(
-            f"{several(len(unmeasured), 'frame')} not measured by {_named(scheme)}: left out."
+            f"{pluralize(len(unmeasured), 'frame')} not measured by {_named(scheme)}: left out."
         )
     if measured.any() and surfaces < measured.sum():
         without = int(measured.sum()) - surfaces
         notes.append(
-            f"{several(without, 'frame')} without a surface: in the tables with the reason."
+            f"{pluralize(without, 'frame')} without a surface: in the tables with the reason."
         )
     if "film" in wish.some("pictures") and surfaces:
         notes.append(film_note(seen.frame[measured], seen.time_s[measured], wish.film_rate_hz))
@@ -288,7 +288,7 @@ def _why_not(session: Session, wish: Wish, scheme: str, frames: IntArray, stale:
         result = session.result(int(stale[0]), scheme)
         why = " and ".join(result.stale) if result is not None else SETUP_CHANGED
         return (
-            f"{several(len(stale), 'frame')} no longer stand{'s' * (len(stale) == 1)}, "
+            f"{pluralize(len(stale), 'frame')} no longer stand{'s' * (len(stale) == 1)}, "
             f"because {why}. Measure again, or undo the change."
         )
     if not wish.ticked - {"solid"}:
@@ -373,7 +373,7 @@ class Written:
     @property
     def words(self) -> str:
         """For the operator."""
-        size = size_in_words(sum(file.size for file in self.files))
+        size = format_bytes(sum(file.size for file in self.files))
         told = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
         if not self.problems:
             return f"✓ {told} Read again and compared with the manifest: all as written."

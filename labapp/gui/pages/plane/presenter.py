@@ -17,7 +17,7 @@ from labapp.core.calibration.plane_calibration import (
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.files import write_whole
+from labapp.files import write_atomically
 from labapp.gui.digits import ResultRow
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage
@@ -296,7 +296,7 @@ def save_target(path: Path) -> None:
         If it cannot be written.
     """
     try:
-        write_whole(path, target_svg(Target()).encode())
+        write_atomically(path, target_svg(Target()).encode())
     except OSError as error:
         raise InputError(path, "file", error.strerror, "a file that can be written") from error
 

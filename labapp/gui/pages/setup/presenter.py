@@ -11,7 +11,7 @@ from labapp.config.setup import parse_setup, read_setup, updated_setup
 from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.rig import Rig
 from labapp.errors import InputError
-from labapp.files import write_whole
+from labapp.files import write_atomically
 from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
 from labapp.session.session import Session
@@ -416,6 +416,6 @@ def save_setup(session: Session, path: Path) -> None:
         If it cannot be written.
     """
     try:
-        write_whole(path, session.setup_text.encode())
+        write_atomically(path, session.setup_text.encode())
     except OSError as error:
         raise InputError(path, "file", error.strerror, "a file that can be written") from error

@@ -17,7 +17,7 @@ from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.widgets.labels import plain_label
-from labapp.words import SIGMA_OF
+from labapp.text import SIGMA_OF
 
 BAND_ALPHA = 70
 

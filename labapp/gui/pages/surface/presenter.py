@@ -23,7 +23,7 @@ from labapp.gui.digits import ResultRow
 from labapp.gui.shell.steps import READ_ONLY, recording_gone, setup_to_do
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
-from labapp.words import SIGMA_OF
+from labapp.text import SIGMA_OF
 
 SCHEMES = scheme_words()
 """Name that results are kept under → words for the operator."""

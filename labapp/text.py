@@ -1,0 +1,44 @@
+"""Text that the window, the command line, files and messages share: counts, sizes, CSV cells."""
+
+from __future__ import annotations
+
+SIGMA_OF = "noise and level only"
+"""What the ± of a measured pool covers; an error of the set-up is not in it."""
+
+
+def pluralize(count: int, noun: str) -> str:
+    """Count and noun, the noun in the plural unless the count is 1: "1 frame", "2 frames"."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+UNITS = ("bytes", "kB", "MB", "GB", "TB")
+
+
+def format_bytes(size: int) -> str:
+    """File size with a decimal unit: "512 bytes", "1.5 MB"."""
+    value, unit = float(size), 0
+    while value >= 1000 and unit < len(UNITS) - 1:
+        value, unit = value / 1000, unit + 1
+    return f"{value:.0f} {UNITS[unit]}" if unit == 0 else f"{value:.1f} {UNITS[unit]}"
+
+
+FORMULA = tuple("=+-@＝＋－＠\t\r\n")
+"""A spreadsheet takes a cell that begins so for a formula and evaluates it (CSV injection).
+
+Some treat full-width signs alike.
+"""
+
+
+def as_cell(value: object) -> object:
+    """Value as a CSV cell: text that a spreadsheet would evaluate is escaped with a leading ``'``.
+
+    Text in which only further ``'`` stand before such a beginning is escaped too, so that removing
+    one ``'`` restores any escaped text. Numbers stay as they are.
+    """
+    if not isinstance(value, str) or not value.lstrip("'").startswith(FORMULA):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
