@@ -238,30 +238,40 @@ def csv_header(name: str) -> str:
 
 
 def csv_rows(name: str, table: Table) -> str:
-    """A table's rows as CSV text, rounded to the digits of `TABLES`."""
-    columns = TABLES[name]
-    if name == "measures":  # its reason may hold commas
-        cells = [
-            table[column.name].tolist()
-            if column.digits is None
-            else [number(value, column.digits) for value in table[column.name].tolist()]
-            for column in columns
-        ]
-        return as_csv(zip(*cells, strict=True))
-    line = ",".join("%s" if c.digits is None else f"%.{c.digits}f" for c in columns) + "\n"
-    rows = zip(*(table[column.name].tolist() for column in columns), strict=True)
-    text = "".join([line % row for row in rows])
-    for odd, plain in AS_NUMBER.items():
-        for end in ",\n":
-            if odd + end in text:
-                text = text.replace(odd + end, plain + end)
-    return text
+    """CSV text of a table's rows, without header, rounded to the decimals of `TABLES`."""
+    text = _numeric_rows(name, table)
+    if text is not None:
+        return text
+    cells = [
+        table[column.name].tolist()
+        if column.digits is None
+        else [number(value, column.digits) for value in table[column.name].tolist()]
+        for column in TABLES[name]
+    ]
+    return as_csv(zip(*cells, strict=True))
 
 
-AS_NUMBER = {"nan": "", "-inf": "", "inf": ""} | {
-    f"{-0.0:.{digits}f}": f"{0.0:.{digits}f}" for digits in (0, PX_DIGITS, MM_DIGITS)
-}
-"""Cells as Python formats them, and as `number` does."""
+def _numeric_rows(name: str, table: Table) -> str | None:
+    """The same by compiled loops; None unless all is numbers, but for one word in the last column.
+
+    None also where the rounding of a number to its decimals is too near to a tie.
+    """
+    from labapp.export.fixed_point import format_fixed  # loads numba
+
+    columns, end = TABLES[name], "\n"
+    if columns[-1].digits is None:
+        words = set(table[columns[-1].name].tolist())
+        if len(words) != 1:
+            return None
+        columns, end = columns[:-1], f",{words.pop()}\n"
+    if any(column.digits is None for column in columns):
+        return None
+    digits = np.array([column.digits for column in columns])
+    values = np.column_stack([table[column.name] for column in columns]).astype(float)
+    text, length = format_fixed(values, digits)
+    if length < 0:
+        return None
+    return text[:length].tobytes().decode("ascii").replace("\n", end)
 
 
 def nodes_csv(nodes: FloatArray) -> bytes:

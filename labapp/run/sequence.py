@@ -217,7 +217,7 @@ def _ready() -> None:
     import labapp.core.matching.match_kernels
     import labapp.core.rows.lattice_kernels
     import labapp.core.sequence.warm
-    import labapp.export.quick_rows  # noqa: F401
+    import labapp.export.fixed_point  # noqa: F401
 
 
 class Following:
@@ -225,9 +225,9 @@ class Following:
 
     def __init__(self, job: Job) -> None:
         from labapp.core.sequence.warm import WarmChain
-        from labapp.export.quick_rows import quick_rows
+        from labapp.export.tables import table_rows
 
-        self._job, self._rows = job, quick_rows
+        self._job, self._rows = job, table_rows
         self._source: FrameSource = open_source(job.path, job.index)
         self._threads = ThreadpoolController()
         self._chain = WarmChain(job.setup.rig, job.setup.calibration, job.settings)
