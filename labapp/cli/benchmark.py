@@ -12,7 +12,7 @@ from labapp.cli.shared import progress_told
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
-    from labapp.simulated.benchmark import Detected, Latency, Run, Spread
+    from labapp.simulated.benchmark import Latency, Run, Spread
 
 
 def benchmark(
@@ -31,12 +31,10 @@ def benchmark(
     """Measure a simulated video of an oscillating pool: speed, wrong labels, ±, frequency.
 
     The video is simulated once, which takes minutes, and kept: 0.3 MB a frame, twice.
-
-    Other dot finders are timed on the same frames where they are installed.
     """
     import platformdirs
 
-    from labapp.simulated.benchmark import compare_detectors, make_video, run_video, time_frames
+    from labapp.simulated.benchmark import make_video, run_video, time_frames
 
     folder = cache or Path(platformdirs.user_cache_dir("labapp")) / "benchmark"
     try:
@@ -57,12 +55,11 @@ def benchmark(
             progress("frames", done, frames)
 
         run = run_video(video, Path(out) / "results", workers, advance)
-    _tell_run(run)
-    _tell_latency(time_frames(video, min(frames, 400)))
-    _tell_detectors(compare_detectors(video, 40))
+    _print_run(run)
+    _print_latency(time_frames(video, min(frames, 400)))
 
 
-def _tell_run(run: Run) -> None:
+def _print_run(run: Run) -> None:
     whole = run.frames / (run.seconds + run.start_s)
     typer.echo(f"\nfrom file to CSV        {run.frames / run.seconds:.1f} frames/s")
     typer.echo(f"start of processes      {run.start_s:.1f} s more; with it {whole:.1f} frames/s")
@@ -73,11 +70,11 @@ def _tell_run(run: Run) -> None:
         f"{run.cold} by the cold chain"
     )
     typer.echo(f"wrong labels            {run.wrong}; {100 * run.labelled:.2f} % of the dots shown")
-    typer.echo(f"height: error over σ    {run.surprise:.2f} (root mean square)")
+    typer.echo(f"height: error over σ    {run.normalized_error:.2f} (root mean square)")
     typer.echo(f"height: frequency       {run.frequency_hz:.3f} Hz, true {run.true_hz:.3f} Hz")
 
 
-def _tell_latency(latency: Latency) -> None:
+def _print_latency(latency: Latency) -> None:
     def line(name: str, spread: Spread) -> str:
         return f"{name:22}{spread.median:8.2f}{spread.worst:8.2f}"
 
@@ -88,14 +85,3 @@ def _tell_latency(latency: Latency) -> None:
         typer.echo(line(f"  {name}", spread))
     ratio = 1e3 * latency.cold_s / latency.processor.median
     typer.echo(f"cold chain            {1e3 * latency.cold_s:8.0f}, {ratio:.0f} times as much")
-
-
-def _tell_detectors(made: list[Detected | tuple[str, str]]) -> None:
-    head = f"{'median':>9}{'99 %':>9}  ms{'recall':>9}{'precision':>11}{'error':>8}  px"
-    typer.echo(f"\n{'dots of a frame':26}{head}")
-    for one in made:
-        if isinstance(one, tuple):
-            typer.echo(f"{one[0]:26} {one[1]}")
-            continue
-        time = f"{one.time.median:9.2f}{one.time.worst:9.2f}    "
-        typer.echo(f"{one.name:26}{time}{one.recall:9.4f}{one.precision:11.4f}{one.error_px:8.3f}")

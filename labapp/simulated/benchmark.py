@@ -1,27 +1,22 @@
-"""How fast a recording is measured, and how well: one simulated video, all timings in one run."""
+"""Speed and accuracy of measuring one simulated video of an oscillating pool."""
 
 from __future__ import annotations
 
 import csv
-import importlib
 import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import av
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 from threadpoolctl import ThreadpoolController
 
 from labapp.config.scenario import read_scenario
 from labapp.config.setup import Setup, read_setup
-from labapp.core.images.band_pass import Exposure, band_pass_dots, quick_dots
-from labapp.core.images.dots import Dots, Image
 from labapp.core.pipeline import Settings, measure
 from labapp.core.sequence.warm import WarmChain
 from labapp.core.values import FloatArray, IntArray
@@ -71,7 +66,7 @@ STEPS = ("dots", "match", "fit", "level", "measures")
 
 @dataclass(frozen=True)
 class Video:
-    """The video and what it was made of.
+    """A simulated video and its ground truth.
 
     Parameters
     ----------
@@ -97,7 +92,7 @@ def make_video(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Video:
-    """Simulate the video into a folder, or take it from there.
+    """Simulate the video into a folder, or reuse the one that is there.
 
     Raises
     ------
@@ -150,34 +145,31 @@ def _write_raw(source_path: Path, path: Path) -> None:
         container.mux(stream.encode(None))
 
 
-# --- the chain ----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Spread:
-    """Times of one thing, ms."""
+    """Median and 99th percentile of measured times, ms."""
 
     median: float
     worst: float
 
     @classmethod
     def of(cls, times_s: Sequence[float]) -> Spread:
-        """Median and 99th percentile."""
+        """Spread of times in s."""
         return cls(*(1e3 * np.quantile(times_s, [0.5, 0.99])))
 
 
 @dataclass(frozen=True)
 class Latency:
-    """How long one frame takes, alone on one core.
+    """Time per frame on one core.
 
     Parameters
     ----------
     frame, steps
-        A whole frame, and its steps, by the clock.
+        Wall time of a followed frame, and of its steps.
     processor
-        A whole frame by the time its processor spent on it, which other programs hardly change.
+        Processor time of a followed frame, which other programs hardly change.
     cold_s
-        A frame of the cold chain, s of the processor.
+        Processor time of a frame measured without a prior, s.
     """
 
     frame: Spread
@@ -187,7 +179,7 @@ class Latency:
 
 
 def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
-    """Measure so many frames of the video one after the other, and some by the cold chain."""
+    """Time the first ``frames`` frames, each followed from the one before, and ``cold`` without."""
     cv2.setNumThreads(1)
     steps: dict[str, list[float]] = {name: [] for name in STEPS}
     last = [0.0]
@@ -217,28 +209,28 @@ def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
             image = source.frame((number + 1) * frames // (cold + 1)).image
             measure(image, rig, calibration, settings)
         cold_s = (time.process_time() - begun) / cold
-    told = {name: Spread.of(times) for name, times in steps.items()}
-    return Latency(Spread.of(wall), told, Spread.of(used), cold_s)
+    by_step = {name: Spread.of(times) for name, times in steps.items()}
+    return Latency(Spread.of(wall), by_step, Spread.of(used), cold_s)
 
 
 @dataclass(frozen=True)
 class Run:
-    """The whole video, from its file to the tables.
+    """Throughput and accuracy over the whole video, from its file to the CSV tables.
 
     Parameters
     ----------
     frames, seconds, processor_s
-        How many frames, in how long, and what time of processors that took.
+        Number of frames, wall time and processor time.
     start_s
-        How long before the processes that measure had started and loaded what they need.
+        Time until the measuring processes had started and loaded their modules.
     measured, cold
-        How many have a surface; how many were measured by the cold chain.
+        Frames with a surface; frames measured without a prior.
     wrong, labelled
-        Dots with a wrong ray; share of the dots shown that have theirs.
-    surprise
-        Root mean square error of the height over its σ.
+        Dots with a wrong ray; share of the visible dots with the right one.
+    normalized_error
+        Root mean square of the height's error over its σ.
     frequency_hz, true_hz
-        Of the height's largest swing, and of the pool's.
+        Frequency of the height's largest oscillation, measured and true.
     """
 
     frames: int
@@ -249,7 +241,7 @@ class Run:
     cold: int
     wrong: int
     labelled: float
-    surprise: float
+    normalized_error: float
     frequency_hz: float
     true_hz: float = WAVE_HZ
 
@@ -257,7 +249,7 @@ class Run:
 def run_video(
     video: Video, out: Path, workers: int | None, progress: Callable[[], None] = lambda: None
 ) -> Run:
-    """Measure the video into CSV files and hold them against the truth.
+    """Measure the video into CSV files and compare them with the ground truth.
 
     Raises
     ------
@@ -271,9 +263,9 @@ def run_video(
         await_ready(pools)
         start_s = time.perf_counter() - begun
         with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
-            for told in measure_sequence(job, range(frames), pools):
-                results.write(told.frame, told.time_s, told.measurement, told.rows)
-                broke += told.broke is not None
+            for one in measure_sequence(job, range(frames), pools):
+                results.write(one.frame, one.time_s, one.measurement, one.rows)
+                broke += one.broke is not None
                 progress()
         seconds = time.perf_counter() - begun - start_s
     used = sum(os.times()[:4]) - used
@@ -282,7 +274,7 @@ def run_video(
         if row["status"] == "ok":
             frame = int(row["frame"])
             heights[frame], sigma[frame] = float(row["height_mm"]), float(row["height_sigma_mm"])
-    surprise = (heights - video.height_mm) / sigma
+    normalized_error = (heights - video.height_mm) / sigma
     right = wrong = 0
     for row in _rows(out / "dots.csv"):
         if row["ray_row"]:
@@ -298,13 +290,13 @@ def run_video(
         broke,
         wrong,
         right / shown,
-        float(np.sqrt(np.nanmean(np.square(surprise)))),
+        float(np.sqrt(np.nanmean(np.square(normalized_error)))),
         _frequency(heights),
     )
 
 
 def _is_right(video: Video, row: dict[str, str]) -> bool:
-    """Whether a dot's ray, in its row of ``dots.csv``, made a dot there."""
+    """Whether the ray in a row of ``dots.csv`` has a true dot within `TRUE_PX` of it."""
     place, ray = video.dots[int(row["frame"])]
     own = place[(ray == [int(row["ray_row"]), int(row["ray_column"])]).all(axis=1)]
     off = own - [float(row["u_px"]), float(row["v_px"])]
@@ -312,7 +304,7 @@ def _is_right(video: Video, row: dict[str, str]) -> bool:
 
 
 def _frequency(heights: FloatArray) -> float:
-    """Of the largest swing above 10 Hz, by a spectrum that is padded to a hundredth of a Hz."""
+    """Frequency of the strongest oscillation above 10 Hz, from a zero-padded spectrum (0.01 Hz)."""
     known = np.isfinite(heights)
     at = np.arange(len(heights))
     swing = np.interp(at, at[known], heights[known])
@@ -322,122 +314,3 @@ def _frequency(heights: FloatArray) -> float:
     frequency = np.fft.rfftfreq(count, 1 / RATE_HZ)
     fast = frequency > 10.0
     return float(frequency[fast][np.argmax(power[fast])])
-
-
-# --- detectors of dots --------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Detected:
-    """What a detector made of some frames.
-
-    Parameters
-    ----------
-    name
-        The detector.
-    time
-        Of a frame, by the processor, ms.
-    recall, precision
-        Share of the dots shown that it found; share of what it found that is one.
-    error_px
-        Root mean square distance of those from their true places, px.
-    """
-
-    name: str
-    time: Spread
-    recall: float
-    precision: float
-    error_px: float
-
-
-def detectors(size_px: float) -> Iterator[tuple[str, Callable[[Image], FloatArray] | str]]:
-    """Yield name and function of each detector, or where it is missing how to get it.
-
-    Those of other programs are set as their guides say, for dots of the given size, as Gaussians.
-    """
-    settings = Settings().dots.band_pass
-
-    opencv: Any = cv2  # its hints leave this detector out
-
-    def blobs(image: Image) -> FloatArray:
-        chosen = opencv.SimpleBlobDetector_Params()
-        chosen.filterByColor, chosen.blobColor = True, 255
-        chosen.filterByArea, chosen.minArea = True, float(size_px**2)
-        chosen.maxArea = float(60 * size_px**2)
-        chosen.filterByCircularity = chosen.filterByConvexity = chosen.filterByInertia = False
-        chosen.minThreshold, chosen.maxThreshold, chosen.thresholdStep = 25.0, 200.0, 5.0
-        chosen.minDistBetweenBlobs = 3.0 * size_px
-        found = opencv.SimpleBlobDetector_create(chosen).detect(image)
-        return np.array([point.pt for point in found]).reshape(-1, 2)
-
-    def located(trackpy: Any) -> Callable[[Image], FloatArray]:
-        diameter = 2 * round(2 * size_px) + 1
-        return lambda image: np.asarray(
-            trackpy.locate(image, diameter, minmass=20 * size_px**2)[["x", "y"]]
-        )
-
-    def dogs(feature: Any) -> Callable[[Image], FloatArray]:
-        return lambda image: feature.blob_dog(
-            np.asarray(image, float) / 255.0,
-            min_sigma=0.7 * size_px,
-            max_sigma=1.6 * size_px,
-            threshold=0.03,
-        )[:, 1::-1]
-
-    yield "labapp, whole search", lambda image: band_pass_dots(image, settings).image_px
-    yield "OpenCV SimpleBlobDetector", blobs
-    for name, module, package, made in (
-        ("trackpy locate", "trackpy", "trackpy", located),
-        ("scikit-image blob_dog", "skimage.feature", "scikit-image", dogs),
-    ):
-        try:
-            yield name, made(importlib.import_module(module))
-        except ImportError:
-            yield name, f"not installed: pip install {package}"
-
-
-def compare_detectors(video: Video, count: int) -> list[Detected | tuple[str, str]]:
-    """Run every detector on ``count`` frames over the video; of one missing, say how to get it."""
-    frames = np.linspace(0, len(video.dots) - 1, count).astype(int).tolist()
-    with open_source(video.path) as source:
-        images = [source.frame(number).image for number in frames]
-    settings = Settings().dots.band_pass
-    exposure = Exposure.of(images[0], settings)
-
-    def quick(image: Image) -> FloatArray:
-        dots: Dots = quick_dots(image, exposure, settings)
-        return dots.image_px
-
-    true = [video.dots[number][0] for number in frames]
-    made: list[Detected | tuple[str, str]] = [_detected("labapp, warm", quick, images, true)]
-    for name, detector in detectors(exposure.size_px):
-        if isinstance(detector, str):
-            made.append((name, detector))
-        else:
-            made.append(_detected(name, detector, images, true))
-    return made
-
-
-def _detected(
-    name: str,
-    detector: Callable[[Image], FloatArray],
-    images: list[Image],
-    true: list[FloatArray],
-) -> Detected:
-    times, hits, found_count, off = [], 0, 0, []
-    detector(images[0])
-    for image, places in zip(images, true, strict=True):
-        begun = time.process_time()
-        found = detector(image)
-        times.append(time.process_time() - begun)
-        found_count += len(found)
-        if len(found) == 0:
-            continue
-        distance, nearest = cKDTree(found).query(places)
-        _, own = cKDTree(places).query(found)
-        pairs = (own[nearest] == np.arange(len(places))) & (distance <= TRUE_PX)
-        hits += int(pairs.sum())
-        off += distance[pairs].tolist()
-    shown = sum(map(len, true))
-    error = float(np.sqrt(np.mean(np.square(off)))) if off else float("nan")
-    return Detected(name, Spread.of(times), hits / shown, hits / max(found_count, 1), error)

@@ -1,0 +1,166 @@
+"""Detectors of dots side by side: labapp's, trackpy's, OpenCV's and scikit-image's.
+
+Run as ``python tests/benchmarks/detectors.py [--frames N] [--cache FOLDER]``. The frames are those
+of `labapp benchmark`. trackpy and scikit-image are in the dependency group ``benchmark``; one that
+is not installed is named.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import platformdirs
+import typer
+from scipy.spatial import cKDTree
+
+from labapp.core.images.band_pass import Exposure, band_pass_dots, quick_dots
+from labapp.core.images.dots import Dots, Image
+from labapp.core.pipeline import Settings
+from labapp.core.values import FloatArray
+from labapp.media import open_source
+from labapp.simulated.benchmark import TRUE_PX, Spread, Video, make_video
+
+COUNT = 40
+"""Frames that every detector searches."""
+
+
+@dataclass(frozen=True)
+class Detected:
+    """Scores of a detector.
+
+    Parameters
+    ----------
+    name
+        The detector.
+    time
+        Processor time per frame.
+    recall, precision
+        Share of the visible dots that it found; share of its finds that are dots.
+    error_px
+        Root mean square distance of found dots from their true places, px.
+    """
+
+    name: str
+    time: Spread
+    recall: float
+    precision: float
+    error_px: float
+
+
+def detectors(size_px: float) -> Iterator[tuple[str, Callable[[Image], FloatArray] | str]]:
+    """Yield name and function of each detector; of one that is missing, how to install it.
+
+    Others' parameters follow their guides, for Gaussian dots of the given standard deviation.
+    """
+    settings = Settings().dots.band_pass
+
+    opencv: Any = cv2  # its hints leave this detector out
+
+    def blobs(image: Image) -> FloatArray:
+        chosen = opencv.SimpleBlobDetector_Params()
+        chosen.filterByColor, chosen.blobColor = True, 255
+        chosen.filterByArea, chosen.minArea = True, float(size_px**2)
+        chosen.maxArea = float(60 * size_px**2)
+        chosen.filterByCircularity = chosen.filterByConvexity = chosen.filterByInertia = False
+        chosen.minThreshold, chosen.maxThreshold, chosen.thresholdStep = 25.0, 200.0, 5.0
+        chosen.minDistBetweenBlobs = 3.0 * size_px
+        found = opencv.SimpleBlobDetector_create(chosen).detect(image)
+        return np.array([point.pt for point in found]).reshape(-1, 2)
+
+    def located(trackpy: Any) -> Callable[[Image], FloatArray]:
+        diameter = 2 * round(2 * size_px) + 1
+        return lambda image: np.asarray(
+            trackpy.locate(image, diameter, minmass=20 * size_px**2)[["x", "y"]]
+        )
+
+    def dogs(feature: Any) -> Callable[[Image], FloatArray]:
+        return lambda image: feature.blob_dog(
+            np.asarray(image, float) / 255.0,
+            min_sigma=0.7 * size_px,
+            max_sigma=1.6 * size_px,
+            threshold=0.03,
+        )[:, 1::-1]
+
+    yield "labapp, whole search", lambda image: band_pass_dots(image, settings).image_px
+    yield "OpenCV SimpleBlobDetector", blobs
+    for name, module, package, made in (
+        ("trackpy locate", "trackpy", "trackpy", located),
+        ("scikit-image blob_dog", "skimage.feature", "scikit-image", dogs),
+    ):
+        try:
+            yield name, made(importlib.import_module(module))
+        except ImportError:
+            yield name, f"not installed: pip install {package}"
+
+
+def compare_detectors(video: Video, count: int) -> list[Detected | tuple[str, str]]:
+    """Scores of every detector on ``count`` frames over the video; see `detectors`."""
+    frames = np.linspace(0, len(video.dots) - 1, count).astype(int).tolist()
+    with open_source(video.path) as source:
+        images = [source.frame(number).image for number in frames]
+    settings = Settings().dots.band_pass
+    exposure = Exposure.of(images[0], settings)
+
+    def quick(image: Image) -> FloatArray:
+        dots: Dots = quick_dots(image, exposure, settings)
+        return dots.image_px
+
+    true = [video.dots[number][0] for number in frames]
+    made: list[Detected | tuple[str, str]] = [_detected("labapp, warm", quick, images, true)]
+    for name, detector in detectors(exposure.size_px):
+        if isinstance(detector, str):
+            made.append((name, detector))
+        else:
+            made.append(_detected(name, detector, images, true))
+    return made
+
+
+def _detected(
+    name: str,
+    detector: Callable[[Image], FloatArray],
+    images: list[Image],
+    true: list[FloatArray],
+) -> Detected:
+    times, hits, found_count, off = [], 0, 0, []
+    detector(images[0])
+    for image, places in zip(images, true, strict=True):
+        begun = time.process_time()
+        found = detector(image)
+        times.append(time.process_time() - begun)
+        found_count += len(found)
+        if len(found) == 0:
+            continue
+        distance, nearest = cKDTree(found).query(places)
+        _, own = cKDTree(places).query(found)
+        pairs = (own[nearest] == np.arange(len(places))) & (distance <= TRUE_PX)
+        hits += int(pairs.sum())
+        off += distance[pairs].tolist()
+    shown = sum(map(len, true))
+    error = float(np.sqrt(np.mean(np.square(off)))) if off else float("nan")
+    return Detected(name, Spread.of(times), hits / shown, hits / max(found_count, 1), error)
+
+
+def main(frames: int = 2000, cache: Path | None = None) -> None:
+    """Simulate the video, or reuse it, and print a line per detector."""
+    folder = cache or Path(platformdirs.user_cache_dir("labapp")) / "benchmark"
+    folder.mkdir(parents=True, exist_ok=True)
+    head = f"{'median':>9}{'99 %':>9}  ms{'recall':>9}{'precision':>11}{'error':>8}  px"
+    typer.echo(f"{'dots of a frame':26}{head}")
+    for one in compare_detectors(make_video(folder, frames), COUNT):
+        if isinstance(one, tuple):
+            typer.echo(f"{one[0]:26} {one[1]}")
+            continue
+        spread = f"{one.time.median:9.2f}{one.time.worst:9.2f}    "
+        scores = f"{one.recall:9.4f}{one.precision:11.4f}{one.error_px:8.3f}"
+        typer.echo(f"{one.name:26}{spread}{scores}")
+
+
+if __name__ == "__main__":
+    typer.run(main)
