@@ -21,7 +21,7 @@ from labapp import cli, log
 from labapp.core.pipeline import Measurement, Settings
 from labapp.errors import InputError
 from labapp.export import results
-from labapp.run import runner as run
+from labapp.run import measurers
 from labapp.run.runner import select_frames
 from tests.conftest import Run
 from tests.waiting import PATIENCE_S, connect, wait_until
@@ -59,7 +59,7 @@ def measured_images(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         images.append(image)
         return answer()
 
-    monkeypatch.setattr(run, "measure", measure)
+    monkeypatch.setattr(measurers, "measure", measure)
     return images
 
 
@@ -127,7 +127,7 @@ def test_options_reach_the_measurement(
     labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[Settings] = []
-    monkeypatch.setattr(run, "measure", lambda *given: seen.append(given[3]) or answer())
+    monkeypatch.setattr(measurers, "measure", lambda *given: seen.append(given[3]) or answer())
     out = tmp_path / "out"
     options = "--scheme irs --algorithm epa-rc --correspondence I/I --frames 0:3:2".split()
     labapp("reconstruct", folder, "--setup", SETUP, "--out", out, *options)
@@ -254,14 +254,14 @@ SLOW = """
     from labapp.cli import main
     from labapp.core.images.dots import Dots
     from labapp.core.pipeline import Measurement
-    from labapp.run import runner as run
+    from labapp.run import measurers
     import numpy as np
 
     def slow(*given):
         time.sleep(0.05)
         return Measurement("no-rows", "for the test", "fit", dots=Dots(*np.ones((7, 5))))
 
-    run.measure = slow
+    measurers.measure = slow
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     main(sys.argv[1:])
 """
@@ -337,7 +337,7 @@ def test_ctrl_c_again_and_again_is_no_more_than_once(tmp_path: Path) -> None:
     program = """
         import os, signal, sys
         from labapp import cli
-        from labapp.run import runner as run
+        from labapp.run import measurers
 
         def pressed(*given):
             try:
@@ -346,7 +346,7 @@ def test_ctrl_c_again_and_again_is_no_more_than_once(tmp_path: Path) -> None:
                 os.kill(os.getpid(), signal.SIGINT)
                 print("tidied up", flush=True)
 
-        run.measure = pressed
+        measurers.measure = pressed
         signal.signal(signal.SIGINT, signal.default_int_handler)
         cli.main(sys.argv[1:])
     """
@@ -376,7 +376,7 @@ def test_ctrl_c_while_modules_load_is_no_fault(
             raise ImportError("initialization failed") from None
         return answer()
 
-    monkeypatch.setattr(run, "measure", loading)
+    monkeypatch.setattr(measurers, "measure", loading)
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         code, _, complained = labapp(
@@ -408,7 +408,7 @@ def test_a_fault_of_ours_is_told_without_a_traceback(
     def broken(*_: object) -> Measurement:
         raise ZeroDivisionError("by nothing")
 
-    monkeypatch.setattr(run, "measure", broken)
+    monkeypatch.setattr(measurers, "measure", broken)
     code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o")
     assert code == 3
     assert "a fault in the program: ZeroDivisionError: by nothing" in complained

@@ -22,7 +22,7 @@ from labapp.core.rows.detection import find_dots, find_lattice
 from labapp.core.surface.measures import Measures
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.run import runner as run
+from labapp.run import measurers
 from labapp.session.frames import Frames
 from labapp.session.measured import Results
 from labapp.session.session import Session
@@ -74,7 +74,7 @@ def measure(
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "measure", measure)
+    monkeypatch.setattr(measurers, "measure", measure)
     monkeypatch.setattr(pipeline, "measure", measure)
 
 
@@ -105,7 +105,7 @@ def measured_once(imported_once: Path, tmp_path_factory: pytest.TempPathFactory)
         pytest.MonkeyPatch.context() as patched,
         Session.open(folder / "run.labsession") as session,
     ):
-        patched.setattr(run, "measure", measure)
+        patched.setattr(measurers, "measure", measure)
         statuses = [measurement.status for _, measurement in session.measure()]
     assert statuses == ["ok"] * DARK + ["no-dots"]
     return folder
@@ -478,7 +478,7 @@ def test_stopped_it_keeps_what_was_finished(
             os.kill(os.getpid(), sent)
         return measure(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(run, "measure", pressed)
+    monkeypatch.setattr(measurers, "measure", pressed)
     former = signal.signal(sent, usual)
     try:
         code, said, complained = labapp("session", "measure", file)

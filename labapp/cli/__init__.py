@@ -10,7 +10,7 @@ import errno
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
@@ -33,10 +33,10 @@ from labapp.cli.shared import (
     Algorithm,
     SchemeName,
     choose_frames,
-    failure,
     measure_frames,
     note,
     progress_bar,
+    shown,
 )
 from labapp.cli.window import asks_for_app, open_app, show_in_app, tour
 from labapp.core.schemes import SCHEMES
@@ -45,8 +45,10 @@ from labapp.log import log_file, start_log
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
-    from labapp.core.pipeline import Measurement, Settings
+    from labapp.core.pipeline import Settings
     from labapp.export.summary import Summary
+    from labapp.run.runner import Measurer, Sink
+    from labapp.run.streams import Stream
 
 IMPATIENT_S = 2.0
 """Asked to stop again within this time, nothing more happens: the first is being obeyed."""
@@ -240,35 +242,30 @@ def reconstruct(
         raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
     places = {"lines": lines, "opcua": opcua}
-    with ExitStack() as streams:
-        tell = _teller(streams, places, anywhere)
-        summary = _run(source, setup, out, settings, frames, surfaces == "all", warm, tell)
+    with ExitStack() as at_end:
+        streams = _stream_sinks(at_end, places, anywhere)
+        summary = _run(source, setup, out, settings, frames, surfaces == "all", warm, streams)
     if not summary.statuses["ok"]:
         raise typer.Exit(NOTHING)
 
 
-def _teller(
-    streams: ExitStack, places: dict[str, str | None], anywhere: bool
-) -> Callable[[int, float | None, Measurement], None] | None:
-    """Tells measurements to the streams that are asked for; None where none is."""
-    if not any(places.values()):
-        return None
+def _stream_sinks(at_end: ExitStack, places: dict[str, str | None], anywhere: bool) -> list[Sink]:
+    """Open the streams that are asked for; gives what tells results to each."""
+    asked = {kind: place for kind, place in places.items() if place is not None}
+    if not asked:
+        return []
     from labapp.run.streams import open_stream, told_values
 
-    opened = []
-    for kind, place in places.items():
-        if place is not None:
-            stream = open_stream(kind, place, anywhere)
-            streams.callback(stream.close)
-            typer.echo(f"Measures are told at {stream.address}", err=True)
-            opened.append(stream)
+    def sink(stream: Stream) -> Sink:
+        return lambda result: stream.publish(told_values(result))
 
-    def tell(frame: int, time_s: float | None, measurement: Measurement) -> None:
-        values = told_values(frame, time_s, measurement)
-        for stream in opened:
-            stream.publish(values)
-
-    return tell
+    sinks = []
+    for kind, place in asked.items():
+        stream = open_stream(kind, place, anywhere)
+        at_end.callback(stream.close)
+        typer.echo(f"Measures are told at {stream.address}", err=True)
+        sinks.append(sink(stream))
+    return sinks
 
 
 def _run(
@@ -276,18 +273,18 @@ def _run(
     setup_path: Path,
     out: Path,
     settings: Settings,
-    frames: str = ":",
-    surfaces: bool = True,
-    warm: bool = False,
-    tell: Callable[[int, float | None, Measurement], None] | None = None,
+    frames: str,
+    surfaces: bool,
+    warm: bool,
+    streams: Sequence[Sink],
 ) -> Summary:
     """Measure, showing progress and failures on stderr and the summary on stdout."""
     from labapp.config.setup import read_setup
     from labapp.export.results import ResultsWriter
     from labapp.export.summary import Summary
     from labapp.media import open_source
-    from labapp.run.runner import measure_frames, provenance, select_frames
-    from labapp.run.sequence import follow_frames
+    from labapp.run.measurers import ColdMeasurer, Recorded, WarmProcesses, stretch_pools
+    from labapp.run.runner import provenance, run, select_frames
 
     setup = read_setup(setup_path)
     summary = Summary()
@@ -295,22 +292,18 @@ def _run(
         for warning in source.warnings:
             note(progress.console, f"warning: {warning}")
         selected = select_frames(frames, len(source))
-        task = progress.add_task(source.name, total=len(selected))
         origin = provenance(source, source_path, setup_path, setup, settings, selected, warm)
         results = ResultsWriter(out, setup.calibration, origin, surfaces)
+        show = shown(progress, source.name, len(selected))
         try:
-            with results:
-                for frame, time_s, measurement in (
-                    follow_frames(source_path, source.index, selected, setup, settings, results)
-                    if warm
-                    else measure_frames(source, selected, setup, settings, results)
-                ):
-                    summary.add(frame, time_s, measurement)
-                    if tell is not None:
-                        tell(frame, time_s, measurement)
-                    progress.advance(task)
-                    if measurement.status != "ok":
-                        note(progress.console, failure(frame, measurement))
+            with results, ExitStack() as at_end:
+                measurer: Measurer = ColdMeasurer(source.frame, setup, settings)
+                if warm:
+                    recorded = Recorded(source_path, source.index, setup, settings, whole=surfaces)
+                    pools = at_end.enter_context(stretch_pools(len(selected)))
+                    measurer = WarmProcesses(recorded, pools)
+                for _ in run(selected, measurer, [results.write, summary.add, *streams, show]):
+                    pass
         except KeyboardInterrupt:
             done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
             note(progress.console, done)
@@ -483,10 +476,10 @@ def demo(
     typer.echo(f"Results are in {out / 'results'}: tables, surfaces, pictures, report.pdf")
     if summary.example is None:
         raise typer.Exit(NOTHING)
-    frame, measurement = summary.example
-    assert measurement.reconstruction is not None
-    picture = out / f"surface_{frame:06d}.png"
-    problem = draw_surface(measurement.reconstruction, picture)
+    surface = summary.example.measurement.reconstruction
+    assert surface is not None
+    picture = out / f"surface_{summary.example.frame:06d}.png"
+    problem = draw_surface(surface, picture)
     typer.echo(f"No picture in 3-D: {problem}" if problem else f"In 3-D: {picture}")
     if window:
         show_in_app(session.path)

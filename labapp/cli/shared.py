@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.progress import TaskID
 
-    from labapp.core.pipeline import Measurement
     from labapp.core.schemes import irs
+    from labapp.export.frame_result import FrameResult
     from labapp.export.summary import Summary
+    from labapp.run.runner import Sink
     from labapp.session.session import Session
     from labapp.simulation import parallel
 
@@ -68,9 +69,18 @@ def note(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def failure(frame: int, measurement: Measurement) -> str:
-    """Say of a frame that it gave nothing, and why."""
-    return f"frame {frame}: {measurement.status}: {measurement.reason}"
+def shown(progress: Progress, name: str, count: int) -> Sink:
+    """Show results as they come: how many of so many there are, and why a frame gave nothing."""
+    task = progress.add_task(name, total=count)
+
+    def show(result: FrameResult) -> None:
+        progress.advance(task)
+        measurement = result.measurement
+        if measurement.status != "ok":
+            why = f"{measurement.status}: {measurement.reason}"
+            note(progress.console, f"frame {result.frame}: {why}")
+
+    return show
 
 
 def command(name: str, file: Path) -> str:
@@ -124,13 +134,10 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
 
     summary = Summary()
     with progress_bar() as progress:
-        task = progress.add_task(session.path.name, total=len(frames))
+        sinks = [summary.add, shown(progress, session.path.name, len(frames))]
         try:
-            for frame, measurement in session.measure(frames, warm=warm):
-                summary.add(frame, None, measurement)
-                progress.advance(task)
-                if measurement.status != "ok":
-                    note(progress.console, failure(frame, measurement))
+            for _ in session.measure(frames, warm=warm, sinks=sinks):
+                pass
         except KeyboardInterrupt:
             done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
             note(progress.console, f"{done}; the others: {command('measure', session.path)}")

@@ -23,6 +23,7 @@ from av.video.stream import VideoStream
 from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
+from labapp.export.frame_result import FrameResult
 from labapp.export.scene import Scene, empty_scene, scene_of
 from labapp.export.studio import Picture, draw_there
 from labapp.files import atomic_file
@@ -81,7 +82,7 @@ class Extent:
 
 def write_film(
     path: Path,
-    measured: Iterable[tuple[int, float | None, Measurement]],
+    measured: Iterable[FrameResult],
     times_s: FloatArray,
     extent: Extent,
     process: Executor,
@@ -94,7 +95,7 @@ def write_film(
     path
         Where to; written beside it and renamed.
     measured
-        (frame, time in s, measurement) of each frame; taken a few at a time.
+        What each frame gave; taken a few at a time.
     times_s
         When each is shown: `film_times`.
     extent
@@ -115,7 +116,7 @@ def write_film(
     OSError
         If it cannot be written.
     """
-    scenes = (film_scene(*each, extent) for each in measured)
+    scenes = (film_scene(each, extent) for each in measured)
 
     def counted() -> Iterator[Picture]:
         for done, picture in enumerate(_drawn(scenes, process), 1):
@@ -125,9 +126,11 @@ def write_film(
     write_video(path, counted(), times_s)
 
 
-def film_scene(frame: int, time_s: float | None, measurement: Measurement, extent: Extent) -> Scene:
+def film_scene(result: FrameResult, extent: Extent) -> Scene:
     """What a film shows of a frame: its surface, or why there is none."""
-    stamp = f"frame {frame}" if time_s is None else f"frame {frame}, {time_s:.4f} s"
+    measurement, stamp = result.measurement, f"frame {result.frame}"
+    if result.time_s is not None:
+        stamp += f", {result.time_s:.4f} s"
     if measurement.reconstruction is None:
         why = f"cannot be measured: {measurement.reason or measurement.status}"
         notice = "\n".join(textwrap.wrap(why, LINE))

@@ -25,12 +25,9 @@ from labapp.errors import InputError
 from labapp.export.drawing import VIEWS, Direction
 from labapp.export.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, mesh_formats
+from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
-from labapp.export.pictures import (
-    write_frame_picture,
-    write_surface_picture,
-    write_trend_picture,
-)
+from labapp.export.pictures import write_frame_picture, write_surface_picture, write_trend_picture
 from labapp.export.results import SURFACES, now, surface_files
 from labapp.export.studio import PICTURE_PX, drawing_errors, drawing_process
 from labapp.export.summary import Summary
@@ -166,7 +163,7 @@ class ExportedFile:
 
 def export(
     folder: str | os.PathLike[str],
-    measured: Iterable[tuple[int, float | None, Measurement]],
+    measured: Iterable[FrameResult],
     calibration: ImageCalibration,
     provenance: Mapping[str, object],
     choice: ExportChoice,
@@ -182,8 +179,7 @@ def export(
     folder
         Where to: a new or an empty folder, or an earlier export, which is replaced.
     measured
-        (frame, time in s, measurement) of each frame; taken one at a time, and once more for a
-        film.
+        What each frame gave; taken one at a time, and once more for a film.
     calibration
         Pixel ↔ imaging plane, for the dots' places on the plane.
     provenance
@@ -300,7 +296,7 @@ class _Files:
 
 def _write_results(
     files: _Files,
-    measured: Iterable[tuple[int, float | None, Measurement]],
+    measured: Iterable[FrameResult],
     calibration: ImageCalibration,
     provenance: Mapping[str, object],
     choice: ExportChoice,
@@ -319,11 +315,12 @@ def _write_results(
         ]
         if "surfaces" in choice.pictures:
             process = stack.enter_context(drawing_process(choice.size_px, choice.view))
-        for frame, time_s, measurement in measured:
+        for result in measured:
+            frame, measurement = result.frame, result.measurement
             reconstruction = measurement.reconstruction
             if reconstruction is not None and (choice.surfaces or together):
                 refuse_too_large(reconstruction, choice.spacing_mm)
-            tables = frame_tables(frame, time_s, measurement, calibration)
+            tables = frame_tables(result, calibration)
             for name in choice.tables:
                 rows = csv_rows(name, tables[name])
                 files.extend(f"{name}.csv", rows, len(tables[name]["frame"]))
@@ -341,7 +338,7 @@ def _write_results(
                 with drawing_errors("surfaces"):
                     path = files.new(f"surface_{frame:06d}.png")
                     write_surface_picture(path, reconstruction, process)
-            summary.add(frame, time_s, measurement)
+            summary.add(result)
             extent.add(measurement)
             progress(len(summary.frames))
     if "trends" in choice.pictures and summary.example is not None:

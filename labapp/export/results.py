@@ -13,10 +13,10 @@ from types import TracebackType
 from typing import Self
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.pipeline import Measurement
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.export.formats import SURFACE_FORMATS
+from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SPACING_MM, nodes, solid, surface
 from labapp.export.tables import TABLES, csv_header, table_rows
 from labapp.files import as_bytes, write_atomically
@@ -125,14 +125,8 @@ class ResultsWriter:
             self._close_files()
             raise self._unwritable(error) from error
 
-    def write(
-        self,
-        frame: int,
-        time_s: float | None,
-        measurement: Measurement,
-        rows: Mapping[str, str] | None = None,
-    ) -> None:
-        """Write everything about one frame; its ``rows`` of each table where they are made already.
+    def write(self, result: FrameResult) -> None:
+        """Write everything about one frame.
 
         Raises
         ------
@@ -144,10 +138,10 @@ class ResultsWriter:
         surfaces = {
             self.folder / name: content
             for name, content in surface_files(
-                frame, measurement.reconstruction, formats, SPACING_MM
+                result.frame, result.measurement.reconstruction, formats, SPACING_MM
             ).items()
         }
-        rows = rows or table_rows(frame, time_s, measurement, self._calibration)
+        rows = result.rows or table_rows(result, self._calibration)
         try:
             for path, content in surfaces.items():
                 write_atomically(path, content)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
+from labapp.export.frame_result import FrameResult
 
 TOLD = {
     "width": "width_mm",
@@ -33,19 +33,20 @@ class Summary:
     statuses
         How many frames ended with which status.
     example
-        The first frame with a surface, and its measurement.
+        The first frame with a surface.
     """
 
     frames: list[tuple[int, float | None, Measures | None]] = field(default_factory=list)
     statuses: Counter[str] = field(default_factory=Counter)
-    example: tuple[int, Measurement] | None = None
+    example: FrameResult | None = None
 
-    def add(self, frame: int, time_s: float | None, measurement: Measurement) -> None:
+    def add(self, result: FrameResult) -> None:
         """Count one more frame."""
-        self.frames.append((frame, time_s, measurement.measures))
+        measurement = result.measurement
+        self.frames.append((result.frame, result.time_s, measurement.measures))
         self.statuses[measurement.status] += 1
         if self.example is None and measurement.measures is not None:
-            self.example = (frame, measurement)
+            self.example = result
 
     def series(self, name: str) -> FloatArray:
         """One of the measures over the frames, shape (n,); NaN without a surface."""

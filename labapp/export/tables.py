@@ -21,6 +21,7 @@ from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
+from labapp.export.frame_result import FrameResult
 from labapp.text import SIGMA_OF, as_cell
 
 PX_DIGITS, MM_DIGITS = 4, 6
@@ -132,33 +133,30 @@ TABLES: dict[str, tuple[Column, ...]] = {
 SIZES = [column.name for column in TABLES["measures"][7:-2]]
 
 
-def frame_tables(
-    frame: int, time_s: float | None, measurement: Measurement, calibration: ImageCalibration
-) -> dict[str, Table]:
+def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Table]:
     """All that a frame has to say, table by table, with the columns of `TABLES`.
 
     Parameters
     ----------
-    frame, time_s
-        Its number, and its time where it has one.
-    measurement
+    result
         What it gave. `measures` gets a row in any case, the others none for what there is not.
     calibration
         Pixel ↔ imaging plane, for the dots' places on the plane.
     """
+    measurement = result.measurement
     reconstruction = measurement.reconstruction
     columns = {
         "dots": _dots(measurement, calibration),
         "points": [] if reconstruction is None else _points(reconstruction, measurement.measures),
         "boundary": [] if reconstruction is None else _boundary(reconstruction),
-        "measures": _measures(time_s, measurement),
+        "measures": _measures(result.time_s, measurement),
     }
     tables = {}
     for name, values in columns.items():
         rows = len(values[0]) if values else 0
         filled = values or [np.empty(0)] * (len(TABLES[name]) - 1)
         names = [column.name for column in TABLES[name]]
-        tables[name] = dict(zip(names, [np.full(rows, frame), *filled], strict=True))
+        tables[name] = dict(zip(names, [np.full(rows, result.frame), *filled], strict=True))
     return tables
 
 
@@ -224,11 +222,9 @@ def _boundary(reconstruction: Reconstruction) -> list[npt.NDArray[Any]]:
     return [reconstruction.boundary.theta_deg, *reconstruction.boundary.points_mm.T]
 
 
-def table_rows(
-    frame: int, time_s: float | None, measurement: Measurement, calibration: ImageCalibration
-) -> dict[str, str]:
+def table_rows(result: FrameResult, calibration: ImageCalibration) -> dict[str, str]:
     """A frame's rows of every table, as CSV text (`frame_tables`)."""
-    tables = frame_tables(frame, time_s, measurement, calibration)
+    tables = frame_tables(result, calibration)
     return {name: csv_rows(name, table) for name, table in tables.items()}
 
 

@@ -262,7 +262,7 @@ class Workspace(QObject):
         if session is None:
             return None
         if self._pool is None:
-            from labapp.run.runner import measuring_pool
+            from labapp.run.measurers import measuring_pool
 
             self._pool = measuring_pool(max(1, (os.cpu_count() or 2) - 1))
         pool = self._pool

@@ -15,6 +15,7 @@ import numpy as np
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.export.frame_result import FrameResult
 from labapp.export.scene import Scene
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event, Kind
@@ -244,7 +245,7 @@ class LiveWatch:
         self._tell(Measurement("silent", words, self._scheme))
 
     def _tell(self, measured: Measurement) -> None:
-        values = live_values(*self._last, measured, self.alarms.shown)
+        values = live_values(FrameResult(*self._last, measured), self.alarms.shown)
         with self._turn:  # one that is told must not be closed meanwhile
             for stream in self._streams.values():
                 stream.publish(values)

@@ -1,30 +1,52 @@
-"""A run: frames of a source, each measured and written, one after the other."""
+"""A run: frames are measured, and what each gave goes to all who want it, frame by frame.
+
+The command line, sessions and the benchmark run by `run`: they differ in what measures (a
+`Measurer`, see `measurers`) and in where results go (`Sink`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
 import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any
-
-from threadpoolctl import ThreadpoolController
 
 from labapp.config.setup import Setup
-from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.rows.correction import Correction
+from labapp.core.pipeline import Settings
 from labapp.errors import InputError
-from labapp.export.results import ResultsWriter
-from labapp.media import Frame, FrameSource
-from labapp.simulation.parallel import NICE, begin_worker
+from labapp.export.frame_result import FrameResult
+from labapp.media import FrameSource
 
-AHEAD = 8
-"""So many frames are given to a pool before the first of them must be done."""
+Measurer = Callable[[Iterable[int]], Generator[FrameResult]]
+"""Measures the frames of these numbers, in their order. Closed early, it cancels what it began."""
+
+Sink = Callable[[FrameResult], object]
+"""Takes each result in turn. What it raises ends the run."""
 
 SOME_FRAMES = "A:B:STEP, frames A to before B (from 0), every STEP-th; each may be left out"
+
+
+def run(frames: Iterable[int], measurer: Measurer, sinks: Sequence[Sink]) -> Generator[FrameResult]:
+    """Measure frames and give each result to every sink; yields it when all have it.
+
+    Closing the generator stops the run, as does what a sink raises: frames that were begun are
+    cancelled then, and no sink hears of them.
+
+    Parameters
+    ----------
+    frames
+        Their numbers, in the order in which they are measured.
+    measurer
+        What measures them.
+    sinks
+        Where results go, in this order.
+    """
+    with closing(measurer(frames)) as results:
+        for result in results:
+            for sink in sinks:
+                sink(result)
+            yield result
 
 
 def select_frames(text: str, count: int) -> range:
@@ -73,87 +95,3 @@ def provenance(
         "warm": warm,
         "setup": {"path": str(Path(setup_path).absolute()), "toml": setup.text},
     }
-
-
-def measure_each(
-    frames: Iterable[int],
-    read: Callable[[int], Frame],
-    setup: Setup,
-    settings: Settings,
-    correction: Callable[[int], Correction | None] = lambda _: None,
-    pool: Executor | None = None,
-) -> Iterator[tuple[int, float | None, Measurement]]:
-    """Measure frames; yields (frame, time in s, measurement) in their order.
-
-    Parameters
-    ----------
-    frames
-        Their numbers.
-    read
-        Reads a frame; one that raises `InputError` gets the status ``unreadable``.
-    setup, settings
-        What they are measured with.
-    correction
-        The dots and rows of a frame as they were corrected by hand, or None.
-    pool
-        Where to measure (`measuring_pool`), some frames ahead; None: here, one after the other.
-    """
-    waiting: deque[tuple[int, float | None, Future[Measurement]]] = deque()
-    try:
-        for number in frames:
-            try:
-                frame = read(number)
-            except InputError as error:
-                future: Future[Measurement] = Future()
-                future.set_result(Measurement("unreadable", str(error), settings.scheme))
-                waiting.append((number, None, future))
-            else:
-                given = (frame.image, setup.rig, setup.calibration, settings, correction(number))
-                waiting.append((number, frame.time_s, _begun(pool, given)))
-            while waiting and (pool is None or len(waiting) > AHEAD or waiting[0][2].done()):
-                first, time_s, future = waiting.popleft()
-                yield first, time_s, future.result()
-        for later, time_s, future in waiting:
-            yield later, time_s, future.result()
-    finally:
-        for _, _, future in waiting:
-            future.cancel()
-
-
-def measuring_pool(workers: int) -> ProcessPoolExecutor:
-    """Processes that measure: a window stays quick while they do."""
-    spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, spawn, initializer=begin_worker, initargs=(NICE,))
-
-
-def _begun(pool: Executor | None, given: tuple[Any, ...]) -> Future[Measurement]:
-    if pool is not None:
-        return pool.submit(_measured, *given)
-    future: Future[Measurement] = Future()
-    future.set_result(_measured(*given))
-    return future
-
-
-def _measured(*given: Any) -> Measurement:
-    # The matrices are small: more threads than one get in each other's way.
-    with ThreadpoolController().limit(limits=1, user_api="blas"):
-        return measure(*given)
-
-
-def measure_frames(
-    source: FrameSource,
-    frames: Iterable[int],
-    setup: Setup,
-    settings: Settings,
-    results: ResultsWriter,
-) -> Iterator[tuple[int, float | None, Measurement]]:
-    """Measure frames of a source and write each; yields as `measure_each` does, once written.
-
-    Raises
-    ------
-    InputError
-        If a frame's results cannot be written.
-    """
-    for number, time_s, measurement in measure_each(frames, source.frame, setup, settings):
-        results.write(number, time_s, measurement)
-        yield number, time_s, measurement

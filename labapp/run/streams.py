@@ -18,8 +18,8 @@ from collections.abc import Coroutine, Iterable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
-from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
+from labapp.export.frame_result import FrameResult
 from labapp.export.tables import SIZES, sigma_of
 from labapp.log import NAME
 from labapp.run.alarms import Alarm
@@ -47,16 +47,17 @@ PATIENCE_S = 1.0
 Values = Mapping[str, int | float | str | None]
 
 
-def told_values(frame: int, time_s: float | None, measurement: Measurement) -> Values:
+def told_values(result: FrameResult) -> Values:
     """What is told of a frame, with the names and units of ``measures.csv``; None: not known."""
+    measurement = result.measurement
 
     def number(name: str) -> float | None:
         value = float(getattr(measurement.measures, name, math.nan))
         return value if math.isfinite(value) else None
 
     return {
-        "frame": frame,
-        "time_s": time_s,
+        "frame": result.frame,
+        "time_s": result.time_s,
         "status": measurement.status,
         "reason": measurement.reason,
         "scheme": measurement.scheme,
@@ -65,16 +66,14 @@ def told_values(frame: int, time_s: float | None, measurement: Measurement) -> V
     }
 
 
-def live_values(
-    frame: int, time_s: float | None, measurement: Measurement, alarms: Iterable[Alarm]
-) -> Values:
+def live_values(result: FrameResult, alarms: Iterable[Alarm]) -> Values:
     """The same of a frame of a live camera, and the alarms by their codes, with spaces between.
 
     ``alarm``: what is so now; ``unacknowledged``: what the operator has not said to have seen.
     """
     shown = tuple(alarms)
     return {
-        **told_values(frame, time_s, measurement),
+        **told_values(result),
         ALARMS[0]: " ".join(each.code for each in shown if each.holds),
         ALARMS[1]: " ".join(each.code for each in shown if not each.acknowledged),
     }

@@ -9,9 +9,9 @@ from dataclasses import asdict
 
 import numpy as np
 
-from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.export.folder import ExportChoice, ExportedFile, export
+from labapp.export.frame_result import FrameResult
 from labapp.session.contents import SessionContents
 from labapp.session.frames import Progress
 from labapp.session.measured import Result, scheme_name
@@ -55,13 +55,13 @@ class _Measured:
     def __init__(self, session: SessionContents, scheme: str, numbers: Sequence[int]) -> None:
         self._session, self._scheme, self._numbers = session, scheme, numbers
 
-    def __iter__(self) -> Iterator[tuple[int, float | None, Measurement]]:
+    def __iter__(self) -> Iterator[FrameResult]:
         seen = self._session.overview(self._scheme)
         times_s = dict(zip(seen.frame.tolist(), seen.time_s.tolist(), strict=True))
         for number in self._numbers:
             measurement = _result(self._session, number, self._scheme).measurement
             time_s = times_s[number]
-            yield number, time_s if math.isfinite(time_s) else None, measurement
+            yield FrameResult(number, time_s if math.isfinite(time_s) else None, measurement)
 
 
 def _standing(session: SessionContents, scheme: str, frames: Sequence[int] | None) -> list[int]:

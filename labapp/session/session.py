@@ -23,8 +23,8 @@ from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows.correction import Correction
 from labapp.media import GreyImage, open_source
 from labapp.run.limits import Limits
-from labapp.run.runner import measure_each
-from labapp.run.sequence import follow_each
+from labapp.run.measurers import ColdMeasurer, WarmMeasurer
+from labapp.run.runner import Measurer, Sink, run
 from labapp.session.contents import SessionContents
 from labapp.session.documents import WHOLE, Change, Key
 from labapp.session.file.blobs import fingerprint
@@ -36,6 +36,7 @@ from labapp.session.signals import Signals
 
 if TYPE_CHECKING:
     from labapp.export.folder import ExportChoice, ExportedFile
+    from labapp.export.frame_result import FrameResult
 
 
 class Session(SessionContents):
@@ -227,6 +228,7 @@ class Session(SessionContents):
         pool: Executor | None = None,
         *,
         warm: bool = False,
+        sinks: Sequence[Sink] = (),
     ) -> Iterator[tuple[int, Measurement]]:
         """Measure frames and keep what they give; yields (frame, measurement) once it is kept.
 
@@ -238,9 +240,11 @@ class Session(SessionContents):
         frames
             Which ones; None: those not measured yet, or measured from what was changed since.
         pool
-            Processes to measure in (`run.measuring_pool`); None: here.
+            Processes to measure in (`run.measurers.measuring_pool`); None: here.
         warm
             Whether to measure each frame from the one before (`core.sequence.warm`), here.
+        sinks
+            Where else results go once they are kept (`run.runner.run`).
 
         Raises
         ------
@@ -251,24 +255,23 @@ class Session(SessionContents):
         chosen = self.stale_frames() if frames is None else frames
         basis = Basis(self.setup, self.settings)
         self._frames.refuse_missing()
-        corrections: dict[int, Correction | None] = {}
+        lost: list[int] = []
 
-        def correction(number: int) -> Correction | None:
-            return corrections.setdefault(number, self.correction(number))
-
-        numbers = (int(number) for number in chosen)
-        given = (numbers, self.frame, basis.setup, basis.settings, correction)
-        measured = follow_each(*given) if warm else measure_each(*given, pool)
-        lost = []
-        for number, _, measurement in measured:
-            # What it was measured with, whatever has been corrected meanwhile.
-            used = corrections.pop(number, None)
+        def keep(result: FrameResult) -> None:
+            number, measurement = result.frame, result.measurement
             if measurement.status == "unreadable" and self._frames.was_readable(number):
                 lost.append(number)
-            else:
-                made_with = None if used is None else fingerprint(used)
-                self._results.put(number, measurement, basis, made_with)
-            yield number, measurement
+                return
+            # What it was measured with, whatever has been corrected meanwhile.
+            used = measurement.correction
+            made_with = None if used is None else fingerprint(used)
+            self._results.put(number, measurement, basis, made_with)
+
+        given = (self.frame, basis.setup, basis.settings, self.correction)
+        measurer: Measurer = WarmMeasurer(*given) if warm else ColdMeasurer(*given, pool)
+        numbers = (int(number) for number in chosen)
+        for result in run(numbers, measurer, [keep, *sinks]):
+            yield result.frame, result.measurement
         self._frames.refuse_lost(lost)
 
     def export(

@@ -23,7 +23,8 @@ from labapp.core.values import FloatArray, IntArray
 from labapp.export.results import ResultsWriter
 from labapp.files import atomic_file
 from labapp.media import open_source
-from labapp.run.sequence import Job, await_ready, followers, measure_sequence
+from labapp.run.measurers import Recorded, WarmProcesses, await_loaded, stretch_pools
+from labapp.run.runner import run
 from labapp.simulated.simulate import simulate
 from labapp.simulated.simulated_pool import BENCH
 from labapp.simulation.parallel import Progress
@@ -256,16 +257,15 @@ def run_video(
     InputError
         If the folder cannot be written.
     """
-    frames, broke = len(video.height_mm), 0
+    frames, lost = len(video.height_mm), 0
     begun, used = time.perf_counter(), sum(os.times()[:4])
-    job = Job(video.path, None, video.setup, Settings())
-    with followers(frames, workers) as pools:
-        await_ready(pools)
+    recorded = Recorded(video.path, None, video.setup, Settings())
+    with stretch_pools(frames, workers) as pools:
+        await_loaded(pools)
         start_s = time.perf_counter() - begun
         with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
-            for one in measure_sequence(job, range(frames), pools):
-                results.write(one.frame, one.time_s, one.measurement, one.rows)
-                broke += one.broke is not None
+            for result in run(range(frames), WarmProcesses(recorded, pools), [results.write]):
+                lost += result.track_lost is not None
                 progress()
         seconds = time.perf_counter() - begun - start_s
     used = sum(os.times()[:4]) - used
@@ -287,7 +287,7 @@ def run_video(
         used,
         start_s,
         int(np.isfinite(heights).sum()),
-        broke,
+        lost,
         wrong,
         right / shown,
         float(np.sqrt(np.nanmean(np.square(normalized_error)))),

@@ -20,10 +20,11 @@ from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.export.film import Extent, film_scene, film_times, write_film, write_video
 from labapp.export.folder import ExportChoice, export, verify_export
+from labapp.export.frame_result import FrameResult
 from labapp.export.scene import Scene
 from labapp.export.studio import Picture, Studio
 
-Frames = list[tuple[int, float | None, Measurement]]
+Frames = list[FrameResult]
 SIZE = (480, 320)
 
 FILM = ExportChoice(
@@ -41,14 +42,15 @@ def frames(measured: Measurement, unmeasured: Measurement) -> Frames:
     assert measured.measures is not None
     sizes = replace(measured.measures, height_mm=0.3, depth_mm=0.0)
     pool = replace(measured, measures=sizes)
-    return [(3, 0.30, pool), (4, 0.32, unmeasured), (8, 0.40, pool)]
+    each = [(3, 0.30, pool), (4, 0.32, unmeasured), (8, 0.40, pool)]
+    return [FrameResult(*one) for one in each]
 
 
 @pytest.fixture
 def extent(frames: Frames) -> Extent:
     extent = Extent()
-    for _, _, measurement in frames:
-        extent.add(measurement)
+    for result in frames:
+        extent.add(result.measurement)
     return extent
 
 
@@ -80,7 +82,7 @@ def read(path: Path) -> tuple[list[float], list[float], list[np.ndarray]]:
 
 
 def test_frames_keep_their_times_and_what_is_left_out_leaves_its_own(frames: Frames) -> None:
-    numbered = [frame[:2] for frame in frames]
+    numbered = [(result.frame, result.time_s) for result in frames]
     np.testing.assert_allclose(film_times(numbered), [0, 0.02, 0.1, 0.12])
     np.testing.assert_allclose(film_times(numbered, 5.0), [0, 0.2, 1.0, 1.2])
     untimed = [(3, 0.3), (4, None), (8, 0.4)]
@@ -95,7 +97,7 @@ def test_the_film_has_every_frame_at_its_time(
     frames: Frames, extent: Extent, tmp_path: Path
 ) -> None:
     path, done = tmp_path / "film.mp4", list[int]()
-    times_s = film_times([frame[:2] for frame in frames])
+    times_s = film_times([(result.frame, result.time_s) for result in frames])
     write_film(path, iter(frames), times_s, extent, Here(), done.append)
     begins, lasts, pictures = read(path)
     np.testing.assert_allclose(begins, [0, 0.02, 0.1], atol=1e-9)
@@ -145,12 +147,12 @@ def test_all_frames_share_room_and_colours(frames: Frames, measured: Measurement
     )
     extent = Extent()
     assert not extent.known
-    shown = [*frames, (9, None, other)]
-    for _, _, measurement in shown:
-        extent.add(measurement)
+    shown = [*frames, FrameResult(9, None, other)]
+    for result in shown:
+        extent.add(result.measurement)
     assert extent.limits == (-0.4, 0.3)
     np.testing.assert_allclose(extent.within_mm, [[-3, -3, -0.4], [5, 3, 0.3]])
-    made = [film_scene(*frame, extent) for frame in shown]
+    made = [film_scene(result, extent) for result in shown]
     assert {scene.limits for scene in made} == {(-0.4, 0.3)}
     for scene in made:
         np.testing.assert_array_equal(scene.within_mm, extent.within_mm)
@@ -173,8 +175,7 @@ def test_all_frames_share_room_and_colours(frames: Frames, measured: Measurement
 def test_a_studio_draws_from_the_same_place_each_time(frames: Frames, extent: Extent) -> None:
     studio = Studio(SIZE, "free")
     first, words, again = (
-        studio.draw(film_scene(3, 0.3, measurement, extent))
-        for measurement in (frames[0][2], frames[1][2], frames[0][2])
+        studio.draw(film_scene(replace(frames[k], frame=3, time_s=0.3), extent)) for k in (0, 1, 0)
     )
     studio.plotter.close()
     assert first.shape == (320, 480, 3)
@@ -212,7 +213,7 @@ def test_an_export_has_the_film(
 def test_without_any_surface_there_is_no_film(
     unmeasured: Measurement, calibration: ImageCalibration, tmp_path: Path
 ) -> None:
-    written = export(tmp_path / "out", [(0, None, unmeasured)], calibration, {}, FILM)
+    written = export(tmp_path / "out", [FrameResult(0, None, unmeasured)], calibration, {}, FILM)
     assert [file.name for file in written] == ["measures.csv"]
 
 
@@ -231,7 +232,7 @@ def test_a_film_that_is_stopped_leaves_nothing(
         if done == at:
             raise Stopped
 
-    times_s = film_times([frame[:2] for frame in frames])
+    times_s = film_times([(result.frame, result.time_s) for result in frames])
     with pytest.raises(Stopped):
         write_film(tmp_path / "film.mp4", frames, times_s, extent, Here(), stop)
     assert not list(tmp_path.iterdir())
@@ -242,11 +243,11 @@ def test_a_film_is_begun_before_all_frames_are_read(
 ) -> None:
     taken = 0
 
-    def one_by_one() -> Iterator[tuple[int, float | None, Measurement]]:
+    def one_by_one() -> Iterator[FrameResult]:
         nonlocal taken
         for number in range(40):
             taken += 1
-            yield number, None, frames[0][2]
+            yield FrameResult(number, None, frames[0].measurement)
 
     ahead: list[int] = []
     write_film(

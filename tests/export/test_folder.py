@@ -25,6 +25,7 @@ from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
 from labapp.export import folder as module
 from labapp.export.folder import ExportChoice, ExportedFile, export, verify_export
+from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
 
 ALL = ExportChoice(
@@ -38,14 +39,13 @@ Run = Callable[..., tuple[ExportedFile, ...]]
 
 
 @pytest.fixture
-def frames(
-    measured: Measurement, unmeasured: Measurement
-) -> list[tuple[int, float | None, Measurement]]:
-    return [(3, 0.5, measured), (4, None, unmeasured), (12, 0.7, measured)]
+def frames(measured: Measurement, unmeasured: Measurement) -> list[FrameResult]:
+    each = [(3, 0.5, measured), (4, None, unmeasured), (12, 0.7, measured)]
+    return [FrameResult(*one) for one in each]
 
 
 @pytest.fixture
-def run(frames: list[tuple[int, float | None, Measurement]], calibration: ImageCalibration) -> Run:
+def run(frames: list[FrameResult], calibration: ImageCalibration) -> Run:
     """Export three frames, the second without a surface."""
     return lambda folder, choice=ALL, measured=frames, **others: export(
         folder, measured, calibration, ABOUT, choice, **others
@@ -101,12 +101,12 @@ def test_the_manifest_lists_every_file(run: Run, tmp_path: Path) -> None:
 def test_tables_and_surfaces_are_the_same_bytes_as_a_runs(
     run: Run,
     tmp_path: Path,
-    frames: list[tuple[int, float | None, Measurement]],
+    frames: list[FrameResult],
     calibration: ImageCalibration,
 ) -> None:
     with ResultsWriter(tmp_path / "run", calibration, {}) as writer:
         for each in frames:
-            writer.write(*each)
+            writer.write(each)
     run(tmp_path / "out", ExportChoice())
     expected, exported = contents(tmp_path / "run"), contents(tmp_path / "out")
     del expected["run.json"], exported["manifest.json"]
@@ -146,7 +146,7 @@ def test_dots_that_were_put_right_are_manual(
     assert measured.lattice is not None
     correction = Correction(measured.dots, measured.lattice, np.array([False, True, False]))
     corrected = replace(measured, correction=correction)
-    run(tmp_path / "out", measured=[(0, None, corrected)])
+    run(tmp_path / "out", measured=[FrameResult(0, None, corrected)])
     with (tmp_path / "out" / "dots.csv").open(newline="") as file:
         assert [row["source"] for row in csv.DictReader(file)] == ["auto", "manual", "auto"]
     with h5py.File(tmp_path / "out" / "results.h5") as file:
@@ -169,7 +169,7 @@ def test_pictures_are_drawn(run: Run, tmp_path: Path, unmeasured: Measurement) -
     assert contents(tmp_path / "out").keys() == names
     assert cv2.imread(str(tmp_path / "out" / "frame_000003.png")).shape == (120, 180, 3)
     unreadable = replace(unmeasured, status="unreadable", dots=None)
-    run(tmp_path / "out", choice, measured=[(5, None, unreadable)], image_of=image_of)
+    run(tmp_path / "out", choice, measured=[FrameResult(5, None, unreadable)], image_of=image_of)
     assert contents(tmp_path / "out").keys() == {"manifest.json"}
 
 
@@ -343,7 +343,7 @@ def huge(measured: Measurement, change: str) -> Measurement:
 def test_a_surface_too_large_to_be_written_is_refused(
     run: Run, tmp_path: Path, measured: Measurement, change: str
 ) -> None:
-    frames = [(0, None, huge(measured, change))]
+    frames = [FrameResult(0, None, huge(measured, change))]
     for choice in (
         ExportChoice(frozenset(), frozenset({"csv"})),
         ExportChoice(frozenset(), frozenset({"stl"})),
@@ -392,7 +392,7 @@ def test_somebodys_own_files_are_never_deleted(
 
 
 def test_a_file_put_there_meanwhile_is_kept(
-    run: Run, tmp_path: Path, frames: list[tuple[int, float | None, Measurement]]
+    run: Run, tmp_path: Path, frames: list[FrameResult]
 ) -> None:
     out = tmp_path / "out"
     run(out)
@@ -423,12 +423,12 @@ def test_a_run_of_the_command_line_is_not_replaced(run: Run, written: Path) -> N
 @pytest.fixture
 def written(tmp_path: Path, calibration: ImageCalibration, measured: Measurement) -> Path:
     with ResultsWriter(tmp_path / "run", calibration, {}) as writer:
-        writer.write(0, None, measured)
+        writer.write(FrameResult(0, None, measured))
     return tmp_path / "run"
 
 
 def test_a_second_export_to_the_same_place_waits_its_turn(
-    run: Run, tmp_path: Path, frames: list[tuple[int, float | None, Measurement]]
+    run: Run, tmp_path: Path, frames: list[FrameResult]
 ) -> None:
     def measured() -> Iterator[tuple[int, float | None, Measurement]]:
         with pytest.raises(InputError, match="is being written by another program"):
@@ -517,14 +517,15 @@ FULL_DISK = """
     from labapp.core.pipeline import Measurement
     from labapp.errors import InputError
     from labapp.export.folder import ExportChoice, export, verify_export
+    from labapp.export.frame_result import FrameResult
 
     found = Measurement("no-rows", "", "fit", Dots(*np.random.default_rng(0).random((7, 300))))
     arguments = ImageCalibration(np.eye(3)), {}, ExportChoice(hdf5=sys.argv[2] == "hdf5")
     out = Path(sys.argv[1])
-    export(out, [(0, None, found)], *arguments)
+    export(out, [FrameResult(0, None, found)], *arguments)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
     try:
-        export(out, ((frame, None, found) for frame in range(100)), *arguments)
+        export(out, (FrameResult(frame, None, found) for frame in range(100)), *arguments)
     except InputError as error:
         print(error)
     print(verify_export(out), [path.name for path in out.parent.iterdir()])

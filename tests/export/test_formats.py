@@ -23,6 +23,7 @@ from labapp.export.formats import (
     SurfaceFormat,
     mesh_formats,
 )
+from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import Mesh
 from tests.conftest import Run
 
@@ -78,7 +79,7 @@ def test_they_are_written_as_the_others_are(
         together=frozenset({"json"}),
         spacing_mm=0.5,
     )
-    frames = [(3, 0.5, measured), (4, None, unmeasured)]
+    frames = [FrameResult(3, 0.5, measured), FrameResult(4, None, unmeasured)]
     written = export(tmp_path / "out", frames, calibration, {}, choice)
     assert [file.name for file in written] == [
         *("frames.json", "solid_000003.off"),

@@ -15,6 +15,7 @@ import pytest
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
+from labapp.export.frame_result import FrameResult
 from labapp.export.hdf5 import Hdf5Writer
 from labapp.export.tables import TABLES, frame_tables
 
@@ -32,7 +33,8 @@ def written(
     path = tmp_path / "results.h5"
     with Hdf5Writer(path, ABOUT, 0.5) as file:
         for frame, time_s, each in [(12, 1 / 3, measured), (13, None, unmeasured)]:
-            file.write(frame, frame_tables(frame, time_s, each, calibration), each.reconstruction)
+            tables = frame_tables(FrameResult(frame, time_s, each), calibration)
+            file.write(frame, tables, each.reconstruction)
     return path
 
 
@@ -134,7 +136,8 @@ def test_the_same_results_give_the_same_bytes(
     contents = []
     for name in ("a.h5", "b.h5"):
         with Hdf5Writer(tmp_path / name, ABOUT, 0.5) as file:
-            file.write(0, frame_tables(0, 0.0, measured, calibration), measured.reconstruction)
+            tables = frame_tables(FrameResult(0, 0.0, measured), calibration)
+            file.write(0, tables, measured.reconstruction)
         contents.append((tmp_path / name).read_bytes())
     assert contents[0] == contents[1]
 
@@ -153,7 +156,7 @@ def test_text_that_is_no_text_does_not_stop_it(
     odd = b"caf\xe9.avi and\0 more".decode("utf-8", "surrogateescape")
     with Hdf5Writer(tmp_path / "a.h5", {"source": {"path": odd}, "name": odd}, 0.5) as file:
         each = replace(unmeasured, reason=odd)
-        file.write(0, frame_tables(0, None, each, calibration), None)
+        file.write(0, frame_tables(FrameResult(0, None, each), calibration), None)
     with h5py.File(tmp_path / "a.h5") as file:
         for text in (file["measures/reason"].asstr()[0], file.attrs["name"]):
             assert text == r"caf\udce9.avi and\0 more"
@@ -184,7 +187,7 @@ def test_an_error_while_hdf5_writes_comes_out_once_it_has_closed(
 ) -> None:
     Pulled.room, Pulled.failure = room, failure
     path = tmp_path / "a.h5"
-    tables = frame_tables(0, 0.0, measured, calibration)
+    tables = frame_tables(FrameResult(0, 0.0, measured), calibration)
 
     def write_many() -> None:
         with Hdf5Writer(path, ABOUT, 0.2) as file:
@@ -204,11 +207,13 @@ FULL_DISK = """
     from labapp.core.geometry.coordinates import ImageCalibration
     from labapp.core.images.dots import Dots
     from labapp.core.pipeline import Measurement
+    from labapp.export.frame_result import FrameResult
     from labapp.export.hdf5 import Hdf5Writer
     from labapp.export.tables import frame_tables
 
     dots = Dots(*np.random.default_rng(0).random((7, 300)))
-    tables = frame_tables(0, 0.0, Measurement("ok", "", "fit", dots), ImageCalibration(np.eye(3)))
+    found = FrameResult(0, 0.0, Measurement("ok", "", "fit", dots))
+    tables = frame_tables(found, ImageCalibration(np.eye(3)))
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
     try:
         with Hdf5Writer(Path(sys.argv[1]), {}, 0.1) as file:

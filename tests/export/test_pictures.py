@@ -13,6 +13,7 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.export import pictures
+from labapp.export.frame_result import FrameResult
 from labapp.export.summary import Summary
 from labapp.session.record import Record
 from labapp.session.session import Session
@@ -24,9 +25,9 @@ IMAGE = np.full((40, 60), 20, np.uint8)
 @pytest.fixture
 def summary(measured: Measurement, unmeasured: Measurement) -> Summary:
     summary = Summary()
-    summary.add(0, 0.0, unmeasured)
-    summary.add(1, 0.1, measured)
-    summary.add(2, 0.2, measured)
+    summary.add(FrameResult(0, 0.0, unmeasured))
+    summary.add(FrameResult(1, 0.1, measured))
+    summary.add(FrameResult(2, 0.2, measured))
     return summary
 
 
@@ -58,7 +59,7 @@ def test_the_summary_counts_and_averages(summary: Summary) -> None:
 
 def test_one_frame_is_told_with_its_uncertainty(measured: Measurement) -> None:
     summary = Summary()
-    summary.add(0, None, measured)
+    summary.add(FrameResult(0, None, measured))
     assert summary.text().splitlines()[1] == "width    1.2500 ± 1.2500 mm"
 
 
@@ -67,7 +68,7 @@ def test_a_size_that_rounds_to_nothing_has_no_sign(measured: Measurement) -> Non
     summary = Summary()
     for frame in range(2):
         sizes = replace(measured.measures, depth_mm=-1e-9)
-        summary.add(frame, None, replace(measured, measures=sizes))
+        summary.add(FrameResult(frame, None, replace(measured, measures=sizes)))
         assert re.search(r"^depth +0\.0000 ", summary.text(), re.MULTILINE)
 
 

@@ -19,6 +19,7 @@ from labapp.core.pipeline import Measurement, Settings, reconstruct
 from labapp.core.surface.measures import measure
 from labapp.errors import InputError
 from labapp.export import results
+from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
 from labapp.export.tables import TABLES
 from labapp.simulation.forward import exact_match, trace
@@ -50,8 +51,8 @@ def out(tmp_path: Path) -> Path:
 @pytest.fixture
 def written(out: Path, writer: Writer, measured: Measurement, unmeasured: Measurement) -> Path:
     with writer(out) as files:
-        files.write(0, 0.0, measured)
-        files.write(7, None, unmeasured)
+        files.write(FrameResult(0, 0.0, measured))
+        files.write(FrameResult(7, None, unmeasured))
     return out
 
 
@@ -128,7 +129,8 @@ def test_are_is_reckoned_from_the_points(out: Path, writer: Writer, scheme: str)
     made = reconstruct(match, rig, Settings(scheme=scheme))
     size = measure(made, match, rig)
     with writer(out) as files:
-        files.write(0, 0.0, Measurement("ok", "", scheme, dots(1), None, match, made, size))
+        found = Measurement("ok", "", scheme, dots(1), None, match, made, size)
+        files.write(FrameResult(0, 0.0, found))
     told = table(out / "measures.csv")[0]
     points = [row for row in table(out / "points.csv") if row["residual_mm"]]
     names = ("residual_mm", "residual_x_mm", "residual_z_mm", "error_x_mm", "error_y_mm")
@@ -193,7 +195,7 @@ def test_run_json_tells_where_results_come_from(written: Path) -> None:
 
 def test_surfaces_can_be_left_out(out: Path, measured: Measurement, calibration: object) -> None:
     with ResultsWriter(out, calibration, {}, surfaces=False) as files:
-        files.write(0, 0.0, measured)
+        files.write(FrameResult(0, 0.0, measured))
     assert not list(out.glob("surface_*"))
     assert table(out / "measures.csv")[0]["status"] == "ok"
 
@@ -203,7 +205,7 @@ def test_a_former_run_is_replaced_and_nothing_else(
 ) -> None:
     (written / "notes.csv").write_text("mine")
     with writer(written) as files:
-        files.write(3, None, unmeasured)
+        files.write(FrameResult(3, None, unmeasured))
     assert sorted(path.name for path in written.iterdir()) == [
         "boundary.csv",
         "dots.csv",
@@ -235,8 +237,8 @@ def test_text_is_no_formula_and_numbers_are_numbers(
     """A spreadsheet runs what begins so; a recording's name may be in the reason."""
     reason = f"{start}HYPERLINK(A1)"
     with writer(out) as files:
-        files.write(0, -1.5, replace(unmeasured, reason=reason))
-        files.write(1, 0.5, replace(unmeasured, reason="'quoted' - said"))
+        files.write(FrameResult(0, -1.5, replace(unmeasured, reason=reason)))
+        files.write(FrameResult(1, 0.5, replace(unmeasured, reason="'quoted' - said")))
     first, second = table(out / "measures.csv")
     assert first["reason"] == f"'{reason}"
     assert (first["time_s"], second["reason"]) == ("-1.500000", "'quoted' - said")
@@ -291,13 +293,13 @@ def test_a_frame_that_fails_leaves_no_trace(
 
     expected = InputError if isinstance(failure, OSError) else type(failure)
     with pytest.raises(expected), writer(out) as files:  # noqa: PT012 - the frame before counts
-        files.write(0, 0.0, measured)
+        files.write(FrameResult(0, 0.0, measured))
         before = {path: path.read_bytes() for path in out.iterdir()}
         with (
             mock.patch.object(results, "write_atomically", fail_whole),
             mock.patch.object(results, "_append", fail_append),
         ):
-            files.write(1, 0.1, measured)
+            files.write(FrameResult(1, 0.1, measured))
     after = {path: path.read_bytes() for path in out.iterdir()}
     run = json.loads(after.pop(out / "run.json"))
     del before[out / "run.json"]
@@ -320,6 +322,7 @@ FULL_DISK = """
     from labapp.core.pipeline import Measurement
     from labapp.core.images.dots import Dots
     from labapp.errors import InputError
+    from labapp.export.frame_result import FrameResult
     from labapp.export.results import ResultsWriter
     from pathlib import Path
     import numpy as np
@@ -331,7 +334,7 @@ FULL_DISK = """
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
         try:
             for frame in range(1000):
-                files.write(frame, None, found)
+                files.write(FrameResult(frame, None, found))
         except InputError as error:
             print(error)
 """

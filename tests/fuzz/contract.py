@@ -23,6 +23,7 @@ from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.export.folder import verify_export
+from labapp.export.frame_result import FrameResult
 from labapp.export.results import surface_files
 from labapp.export.tables import csv_rows, frame_tables
 from labapp.media import open_source
@@ -201,7 +202,7 @@ def look(session: Session, tally: Tally) -> None:
 
 def _show(frame: int, measurement: Measurement, calibration: Any) -> None:
     if calibration is not None:
-        for name, table in frame_tables(frame, None, measurement, calibration).items():
+        for name, table in frame_tables(FrameResult(frame, None, measurement), calibration).items():
             csv_rows(name, table)
     if measurement.reconstruction is not None:
         with contextlib.suppress(InputError, CannotMeasure):

@@ -29,6 +29,7 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.surface.surface import Surface
 from labapp.export.folder import ExportChoice, export
+from labapp.export.frame_result import FrameResult
 from labapp.session.measured import Basis
 from labapp.session.record import PlanePicture, Record
 from labapp.session.session import Session
@@ -267,7 +268,7 @@ def _tables(folder: Path) -> tuple[Path, ...]:
 def _export(folder: Path) -> Path:
     from labapp.config.setup import read_setup
 
-    measured = [(k, k / 100, measurement_of(k)) for k in range(2)]
+    measured = [FrameResult(k, k / 100, measurement_of(k)) for k in range(2)]
     choice = ExportChoice(surfaces=frozenset({"csv", "stl"}), spacing_mm=0.5)
     about = {"source": {"path": "v.avi"}}
     export(folder, measured, read_setup(SETUP).calibration, about, choice)

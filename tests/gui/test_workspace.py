@@ -12,7 +12,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui.workspace import Workspace
 from labapp.log import NAME
-from labapp.run import runner as run
+from labapp.run import measurers
 from labapp.simulation import parallel
 from tests.gui.conftest import CopySample
 from tests.gui.watching import Noting
@@ -39,7 +39,7 @@ def test_measuring_that_is_left_for_another_session_is_no_fault(
 ) -> None:  # fmt: skip
     faults: list[str] = []
     stuck, noting, log = Stuck(), Noting(faults), logging.getLogger(NAME)
-    monkeypatch.setattr(run, "measuring_pool", lambda _: stuck)
+    monkeypatch.setattr(measurers, "measuring_pool", lambda _: stuck)
     monkeypatch.setattr(parallel, "end_processes", Stuck.end)
     log.addHandler(noting)
     space = Workspace()

@@ -12,6 +12,7 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures
 from labapp.errors import InputError
+from labapp.export.frame_result import FrameResult
 from labapp.run.alarms import Alarm, Alarms
 from labapp.run.limits import Limits, Size, sizes_of, standing
 from labapp.run.streams import live_values
@@ -169,12 +170,13 @@ def test_alarms_are_told_by_their_codes():
     alarms = Alarms(Limits(width_mm=(None, 6.9), length_mm=(None, 7.0)))
     alarms.judge(3, 0.0, measured(7.2), "")
     alarms.judge(4, 1.0, measured(6.8), "")
-    told = live_values(4, 0.0, Measurement("ok", "", "fit", measures=MEASURES), alarms.shown)
+    measured_ok = Measurement("ok", "", "fit", measures=MEASURES)
+    told = live_values(FrameResult(4, 0.0, measured_ok), alarms.shown)
     assert told["alarm"] == "length-high"
     assert told["unacknowledged"] == "width-high length-high"
     assert told["width_mm"] == MEASURES.width_mm
     alarms.acknowledge()
-    told = live_values(5, 0.0, Measurement("ok", "", "fit"), alarms.shown)
+    told = live_values(FrameResult(5, 0.0, Measurement("ok", "", "fit")), alarms.shown)
     assert (told["alarm"], told["unacknowledged"]) == ("length-high", "")
 
 

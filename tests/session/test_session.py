@@ -18,9 +18,10 @@ from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.export.folder import ExportChoice, verify_export
+from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
 from labapp.media import open_source
-from labapp.run.runner import measuring_pool
+from labapp.run.measurers import measuring_pool
 from labapp.session.file.blobs import pack
 from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
@@ -462,7 +463,8 @@ def test_what_is_exported_is_what_the_command_line_writes(session: Session, tmp_
         for number in (0, 2):
             result = session.result(number)
             assert result is not None
-            results.write(number, source.frame(number).time_s, result.measurement)
+            time_s = source.frame(number).time_s
+            results.write(FrameResult(number, time_s, result.measurement))
     session.export(tmp_path / "out")
     names = {path.name for path in direct.iterdir()} - {"run.json"}
     assert {"measures.csv", "dots.csv", "surface_000002.stl", "surface_000002.csv"} <= names

@@ -14,7 +14,7 @@ from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.presenter import Shown
 from labapp.gui.tasks import Cancelled, Control, Task
 from labapp.gui.workspace import Workspace
-from labapp.run.runner import measuring_pool
+from labapp.run.measurers import measuring_pool
 from labapp.simulation.parallel import end_processes
 
 WARM_MS = 1500

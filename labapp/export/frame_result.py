@@ -1,0 +1,36 @@
+"""What one frame gave: one value, from what measures to all that keeps, writes or shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from labapp.core.pipeline import Measurement
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What one frame gave.
+
+    Parameters
+    ----------
+    frame, time_s
+        Its number, and its time where it has one, s.
+    measurement
+        What was measured.
+    track_lost
+        Why it was not measured from the frame before; None if it was, or was not to be.
+    rows
+        Its rows of each table as CSV text (`tables.table_rows`), where they are made already.
+    """
+
+    frame: int
+    time_s: float | None
+    measurement: Measurement
+    track_lost: str | None = None
+    rows: Mapping[str, str] | None = None
+
+
+def without_surface(measurement: Measurement) -> Measurement:
+    """Status, reason and measures alone: little to hand from one process to another."""
+    return replace(measurement, dots=None, lattice=None, match=None, reconstruction=None)

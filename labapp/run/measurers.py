@@ -1,0 +1,322 @@
+"""What measures the frames of a run (`runner.Measurer`).
+
+`ColdMeasurer` measures each frame as if it were the first, here or in a pool of processes.
+`WarmMeasurer` measures each from the one before, here; `WarmProcesses` does so with stretches of a
+recording, each in a process that opens the recording itself and makes the rows of the tables, too.
+
+Stretches are of one length, however many processes there are, and begin with a cold frame each:
+results do not depend on the machine.
+"""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+from threadpoolctl import ThreadpoolController
+
+from labapp.config.setup import Setup
+from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.rows.correction import Correction
+from labapp.errors import InputError
+from labapp.export.frame_result import FrameResult, without_surface
+from labapp.export.tables import table_rows
+from labapp.media import Frame, open_source
+from labapp.simulation.parallel import NICE, begin_worker
+
+T = TypeVar("T")
+
+AHEAD = 8
+"""So many frames are given to a pool before the first of them must be done."""
+
+STRETCH = 1000
+"""Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
+
+BATCH = 20
+"""Frames that a process gives back at a time."""
+
+Read = Callable[[int], Frame]
+Corrected = Callable[[int], Correction | None]
+
+
+# --- each frame by itself -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ColdMeasurer:
+    """Measures each frame as if it were the first.
+
+    Parameters
+    ----------
+    read
+        Reads a frame; one that raises `InputError` gets the status ``unreadable``.
+    setup, settings
+        What frames are measured with.
+    corrected
+        The dots and rows of a frame as they were corrected by hand, or None.
+    pool
+        Where to measure (`measuring_pool`), some frames ahead; None: here, one after the other.
+    """
+
+    read: Read
+    setup: Setup
+    settings: Settings
+    corrected: Corrected = lambda _: None
+    pool: Executor | None = None
+
+    def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        """Measure frames; see `runner.Measurer`."""
+        return _in_order(map(self._begun, frames), AHEAD)
+
+    def _begun(self, number: int) -> Future[FrameResult]:
+        frame = _read(self.read, number, self.settings)
+        if isinstance(frame, FrameResult):
+            return _here(lambda: frame)
+        submit = _here if self.pool is None else self.pool.submit
+        return submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
+
+
+def _here(work: Callable[..., T], *given: Any) -> Future[T]:
+    """Work that is done at once; what it raises is raised here."""
+    future: Future[T] = Future()
+    future.set_result(work(*given))
+    return future
+
+
+def _read(read: Read, number: int, settings: Settings) -> Frame | FrameResult:
+    """The frame, or what one gives that cannot be read."""
+    try:
+        return read(number)
+    except InputError as error:
+        return FrameResult(number, None, Measurement("unreadable", str(error), settings.scheme))
+
+
+def _cold(
+    number: int, frame: Frame, setup: Setup, settings: Settings, correction: Correction | None
+) -> FrameResult:
+    """What a frame gives by itself, with its dots and rows as they were corrected."""
+    with _one_thread():
+        found = measure(frame.image, setup.rig, setup.calibration, settings, correction)
+    return FrameResult(number, frame.time_s, found)
+
+
+def _one_thread() -> AbstractContextManager[object]:
+    """Have matrices multiplied in one thread: they are small, and more get in each other's way."""
+    limited: AbstractContextManager[object] = _threads().limit(limits=1, user_api="blas")
+    return limited
+
+
+@functools.cache
+def _threads() -> ThreadpoolController:
+    """What measures is loaded when this is first asked for; to look through it takes long."""
+    return ThreadpoolController()
+
+
+def measuring_pool(workers: int) -> ProcessPoolExecutor:
+    """Processes that measure: a window stays quick while they do."""
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, spawn, initializer=begin_worker, initargs=(NICE,))
+
+
+def _in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
+    """Results in their order, so many of them begun ahead; closed early, those are cancelled."""
+    waiting: deque[Future[T]] = deque()
+    try:
+        for future in begun:
+            waiting.append(future)
+            while waiting and (len(waiting) > ahead or waiting[0].done()):
+                result = waiting[0].result()
+                waiting.popleft()
+                yield result
+        while waiting:
+            yield waiting[0].result()
+            waiting.popleft()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+# --- each frame from the one before -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class WarmMeasurer:
+    """Measures each frame from the one before, here, in stretches (`core.sequence.warm`).
+
+    A frame that was corrected by hand is measured by itself, as it was corrected.
+
+    Parameters
+    ----------
+    read, setup, settings, corrected
+        As of `ColdMeasurer`.
+    """
+
+    read: Read
+    setup: Setup
+    settings: Settings
+    corrected: Corrected = lambda _: None
+
+    def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        """Measure frames; see `runner.Measurer`."""
+        from labapp.core.sequence.warm import WarmChain
+
+        given = (self.setup.rig, self.setup.calibration, self.settings)
+        for place, number in enumerate(frames):
+            if place % STRETCH == 0:
+                chain = WarmChain(*given)
+            frame = _read(self.read, number, self.settings)
+            if isinstance(frame, FrameResult):
+                yield frame
+            elif (correction := self.corrected(number)) is not None:
+                yield _cold(number, frame, self.setup, self.settings, correction)
+            else:
+                with _one_thread():
+                    found = chain.measure(frame.image)
+                yield FrameResult(number, frame.time_s, found, chain.broke)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording, and what it is measured with.
+
+    Parameters
+    ----------
+    path, index
+        The recording, and what opening it found out (`FrameSource.index`), where it was.
+    setup, settings
+        What it is measured with.
+    whole
+        Whether dots, rays and surface are handed over besides the rows: that takes a twentieth of
+        the time that it took to measure them.
+    """
+
+    path: Path
+    index: bytes | None
+    setup: Setup
+    settings: Settings
+    whole: bool = False
+
+
+@dataclass(frozen=True)
+class WarmProcesses:
+    """Measures each frame of a recording from the one before, many stretches at once.
+
+    Results have their rows, and dots, rays and surface only if they are asked for (`Recorded`).
+
+    Parameters
+    ----------
+    recorded
+        What to measure.
+    pools
+        Where to measure (`stretch_pools`); none: here.
+
+    Raises
+    ------
+    InputError
+        While frames are measured, if the recording cannot be opened.
+    """
+
+    recorded: Recorded
+    pools: Sequence[Executor] = ()
+
+    def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        """Measure frames; see `runner.Measurer`."""
+        if not self.pools:
+            return _with_rows(self.recorded, frames)
+        return self._measured(list(frames))
+
+    def _measured(self, frames: Sequence[int]) -> Generator[FrameResult]:
+        recorded = self.recorded
+        if recorded.index is None:  # found out once, for all of them
+            with open_source(recorded.path) as source:
+                recorded = replace(recorded, index=source.index)
+        ahead = len(self.pools) * -(-STRETCH // BATCH)  # each has a stretch
+        for batch in _in_order(self._begun(recorded, frames), ahead):
+            yield from batch
+
+    def _begun(
+        self, recorded: Recorded, frames: Sequence[int]
+    ) -> Iterator[Future[list[FrameResult]]]:
+        """Give stretch after stretch to one process after the other, batch by batch."""
+        for k, at in enumerate(range(0, len(frames), STRETCH)):
+            pool, stretch = self.pools[k % len(self.pools)], frames[at : at + STRETCH]
+            yield pool.submit(_first_batch, recorded, stretch)
+            for _ in range(BATCH, len(stretch), BATCH):
+                yield pool.submit(_next_batch)
+
+
+def _with_rows(recorded: Recorded, frames: Iterable[int]) -> Generator[FrameResult]:
+    """What frames of a recording give, each from the one before, with the rows of the tables."""
+    setup, settings = recorded.setup, recorded.settings
+    with open_source(recorded.path, recorded.index) as source:
+        for result in WarmMeasurer(source.frame, setup, settings)(frames):
+            found = result.measurement
+            yield replace(
+                result,
+                measurement=found if recorded.whole else without_surface(found),
+                rows=table_rows(result, setup.calibration),
+            )
+
+
+_stretch: Generator[FrameResult] | None = None
+"""The stretch that this process is at."""
+
+
+def _first_batch(recorded: Recorded, frames: Sequence[int]) -> list[FrameResult]:
+    """Begin a stretch in this process, in place of the one that it was at."""
+    global _stretch  # noqa: PLW0603 - a stretch stays in the process that began it
+    if _stretch is not None:
+        _stretch.close()
+    cv2.setNumThreads(1)
+    _stretch = _with_rows(recorded, frames)
+    return _next_batch()
+
+
+def _next_batch() -> list[FrameResult]:
+    assert _stretch is not None
+    return list(islice(_stretch, BATCH))
+
+
+@contextmanager
+def stretch_pools(frames: int, workers: int | None = None) -> Iterator[list[Executor]]:
+    """Begin processes for `WarmProcesses`; they load meanwhile what they need.
+
+    Parameters
+    ----------
+    frames
+        How many are to be measured: there are no more processes than stretches.
+    workers
+        How many processes; None: one a core; 0: none.
+    """
+    stretches = -(-frames // STRETCH)
+    with ExitStack() as at_end:
+        pools: list[Executor] = []
+        for _ in range(min(os.cpu_count() or 1 if workers is None else workers, stretches)):
+            pools.append(pool := measuring_pool(1))
+            at_end.callback(pool.shutdown, cancel_futures=True)
+            pool.submit(_load)
+        yield pools
+
+
+def await_loaded(pools: Sequence[Executor]) -> None:
+    """Wait until processes have loaded what they need."""
+    for loaded in [pool.submit(_load) for pool in pools]:
+        loaded.result()
+
+
+def _load() -> None:
+    """Have a process start, and load what it measures with."""
+    import labapp.core.matching.match_kernels
+    import labapp.core.rows.lattice_kernels
+    import labapp.core.sequence.warm
+    import labapp.export.fixed_point  # noqa: F401
