@@ -1,4 +1,4 @@
-"""Make the guide's pictures anew: those of `labapp tour` that its pages show, in few colours.
+"""Make the guide's pictures anew: those of `tests/tour` that its pages show, in few colours.
 
 Needs a display, or `xvfb-run -a -s "-screen 0 1366x768x24" .venv/bin/python THIS`.
 """
@@ -23,7 +23,8 @@ def main() -> None:
     for old in PICTURES.glob("*.png"):
         old.unlink()
     with tempfile.TemporaryDirectory() as out:
-        subprocess.run([sys.executable, "-m", "labapp", "tour", "--out", out], check=True)
+        tour = [sys.executable, "-m", "tests.tour", "--out", out]
+        subprocess.run(tour, cwd=GUIDE.parents[1], check=True)
         for name in sorted(wanted):
             (taken,) = Path(out).glob(f"[0-9][0-9]-{name}.png")
             picture = Image.open(taken).convert("RGB")

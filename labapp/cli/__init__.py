@@ -38,7 +38,7 @@ from labapp.cli.shared import (
     progress_bar,
     shown,
 )
-from labapp.cli.window import asks_for_app, open_app, show_in_app, tour
+from labapp.cli.window import asks_for_app, open_app, show_in_app
 from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError
 from labapp.log import log_file, start_log
@@ -75,7 +75,6 @@ app.command()(advise.advise)
 app.command()(cameras.cameras)
 app.command()(cameras.record)
 app.command()(benchmark.benchmark)
-app.command()(tour)
 
 SetupToChange = Annotated[
     Path | None,

@@ -32,7 +32,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.help import guide, keys
-from labapp.gui.tour import way
+from tests.tour import way
 
 
 class ToyPage(Page):

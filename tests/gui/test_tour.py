@@ -1,4 +1,4 @@
-"""`labapp tour` under Xvfb: every page and every dialog has a picture that shows something."""
+"""The tour under Xvfb: every page and every dialog has a picture that shows something."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from labapp.gui.pages import PAGES
 from labapp.gui.shell.action import MENUS
 from labapp.gui.shell.help import TITLES
 from labapp.gui.tools import TOOLS
-from tests.conftest import Run
 from tests.screen import screen
 from tests.waiting import PATIENCE_S
 
 GUI = Path(labapp.__file__).parent / "gui"
+TOUR = (sys.executable, "-m", "tests.tour")
+ROOT = Path(__file__).parents[2]
 SIZE = (1280, 760)
 ASKING = ("getOpenFileName", "getSaveFileName", "getExistingDirectory")
 
@@ -41,7 +42,8 @@ def taken(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     out, home = tmp_path_factory.mktemp("tour"), tmp_path_factory.mktemp("home")
     with screen(*SIZE) as display:
         done = subprocess.run(
-            [sys.executable, "-m", "labapp", "tour", "--out", out, "--size", "{}x{}".format(*SIZE)],
+            [*TOUR, "--out", out, "--size", "{}x{}".format(*SIZE)],
+            cwd=ROOT,
             env={**environment(home, "xcb"), "DISPLAY": display},
             capture_output=True,
             text=True,
@@ -102,8 +104,6 @@ def test_every_menu_has_a_picture(taken: tuple[Path, str, Path]):
 def asked_titles() -> Iterator[str]:
     """How the title begins of each dialog that the app opens, read from its source."""
     for path in sorted(GUI.rglob("*.py")):
-        if "tour" in path.parts:
-            continue
         tree = ast.parse(path.read_text("utf-8"))
         for function in ast.walk(tree):
             if isinstance(function, ast.FunctionDef):
@@ -190,36 +190,46 @@ def test_nothing_is_left_in_the_home_folder_but_the_log(taken: tuple[Path, str, 
     assert {parts for parts in left if not parts[0].startswith(".cache")} <= {("state", "labapp")}
 
 
-def test_without_a_display_it_says_so(labapp: Run, tmp_path: Path):
-    code, _, err = labapp("tour", "--out", tmp_path / "out")
-    assert code == 2
-    assert "display" in err
-    assert "Traceback" not in err
+def refused(home: Path, *arguments: object) -> str:
+    """What the tour says that does not begin, where there is no display."""
+    displays = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
+    done = subprocess.run(
+        [*TOUR, *map(str, arguments)],
+        cwd=ROOT,
+        env={k: v for k, v in environment(home, "").items() if k not in displays},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+def test_without_a_display_it_says_so(tmp_path: Path):
+    assert "display" in refused(tmp_path, "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize("size", ["large", "1366", "1366x", "0x0", "99999x10"])
-def test_a_size_that_is_none_is_refused(labapp: Run, tmp_path: Path, size: str):
-    code, _, err = labapp("tour", "--out", tmp_path / "out", "--size", size)
-    assert code == 2
-    assert "1366x768" in err
+def test_a_size_that_is_none_is_refused(tmp_path: Path, size: str):
+    assert "1366x768" in refused(tmp_path, "--out", tmp_path / "out", "--size", size)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_is_refused(labapp: Run, tmp_path: Path):
+def test_a_folder_that_cannot_be_is_refused(tmp_path: Path):
     (tmp_path / "file").write_text("")
-    code, _, err = labapp("tour", "--out", tmp_path / "file" / "out")
-    assert code == 2
-    assert "--out" in err
+    assert "folder that can be written" in refused(tmp_path, "--out", tmp_path / "file" / "out")
 
 
 BROKEN = """
 import sys
-from labapp import cli
+from tests.tour.__main__ import main
 from labapp.gui.pages.{page} import {kind} as Kind
 def fail(*_):
     raise RuntimeError("not today")
 Kind.{method} = fail
-cli.main(["tour", "--out", sys.argv[1]])
+sys.exit(main(["--out", sys.argv[1]]))
 """
 
 
@@ -235,6 +245,7 @@ def test_a_page_that_throws_ends_it_and_is_named(tmp_path: Path, page: str, kind
     code = BROKEN.format(page=page, kind=kind, method=method)
     done = subprocess.run(
         [sys.executable, "-c", code, tmp_path / "out"],
+        cwd=ROOT,
         env=environment(tmp_path / "home", "offscreen"),
         capture_output=True,
         text=True,

@@ -324,7 +324,7 @@ STEPS = (
         _export,
     ),
 )
-"""The registry of the app's pages: list, menu, keys, guide, window and tour are made from it."""
+"""The registry of the app's pages: list, menu, keys, guide and window are made from it."""
 
 
 def states(session: Session | None, seen: Overview | None = None) -> dict[str, State]:

@@ -1,10 +1,18 @@
-"""`labapp tour`: the real window driven through the whole guided way, a picture of each view."""
+"""Drive the real window through the whole guided way, and save a picture of each page and dialog.
+
+`python -m tests.tour --out FOLDER` from the checkout; copied beside an installed labapp,
+`python -m tour --out FOLDER`. It needs a display. A page that goes wrong ends it: it is named,
+and the exit code is 1.
+"""
 
 from __future__ import annotations
 
+import argparse
 import os
+import re
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,13 +39,7 @@ class BorrowedPreferences(Preferences):
         return Path(self.tour_folder) / "samples"
 
 
-def tour(
-    out: Path,
-    size_px: tuple[int, int],
-    theme: str,
-    scale: float,
-    tell: Callable[[str], None],
-) -> str:
+def tour(out: Path, size_px: tuple[int, int], theme: str) -> str:
     """Go through the app as an operator does, and write a picture of every page and dialog.
 
     Nothing of the user's is read or changed.
@@ -50,10 +52,6 @@ def tour(
         Width and height of the window, px of the screen.
     theme
         ``light`` or ``dark``.
-    scale
-        Screen pixels to a pixel of the layout.
-    tell
-        Called with a line for every picture.
 
     Returns
     -------
@@ -66,15 +64,15 @@ def tour(
         If the folder cannot be written, there is no display, or nothing can be drawn in 3-D.
     """
     _make_room(out)
-    os.environ["QT_SCALE_FACTOR"] = f"{scale:g}"
     app = start_app()
 
     from PySide6.QtCore import QSettings, Qt
 
     from labapp.export.drawing import can_draw
-    from labapp.gui.tour.bench import lay_out
-    from labapp.gui.tour.hands import Hands, TourFailed
-    from labapp.gui.tour.way import go_through
+
+    from .bench import lay_out
+    from .hands import Hands, TourFailed
+    from .way import go_through
 
     if not can_draw():
         raise InputError("the tour", "3-D", "nothing can be drawn here", "OpenGL, or Mesa's")
@@ -89,7 +87,7 @@ def tour(
         )
         with open_window(app, preferences, folder / "preferences.json") as window:
             try:
-                go_through(Hands(window, out, size_px, tell), folder)
+                go_through(Hands(window, out, size_px), folder)
             except TourFailed as failure:
                 return str(failure)
             finally:
@@ -105,3 +103,34 @@ def _make_room(out: Path) -> None:
             picture.unlink()
     except OSError as error:
         raise InputError(out, "--out", error.strerror, "a folder that can be written") from error
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"([1-9]\d{2,3})x([1-9]\d{2,3})", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT in px, such as 1366x768")
+    return int(found[1]), int(found[2])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Take the tour; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for the pictures")
+    parser.add_argument("--size", type=_size, default="1366x768", help="of the window, screen px")
+    parser.add_argument("--theme", choices=("light", "dark"), default="dark")
+    parser.add_argument("--scale", type=float, default=1.0, help="screen pixels to a layout pixel")
+    given = parser.parse_args(arguments)
+    os.environ["QT_SCALE_FACTOR"] = f"{given.scale:g}"
+    try:
+        wrong = tour(given.out.absolute(), given.size, given.theme)
+    except InputError as error:
+        parser.error(str(error))
+    if wrong:
+        print(f"the tour ended early. {wrong}", file=sys.stderr)
+        return 1
+    print(f"The pictures are in {given.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

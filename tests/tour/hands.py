@@ -85,8 +85,6 @@ class Hands:
         Folder for the pictures.
     size_px
         Width and height of the pictures, px of the screen.
-    tell
-        Called with a line for every picture.
 
     Attributes
     ----------
@@ -97,7 +95,6 @@ class Hands:
     window: MainWindow
     out: Path
     size_px: tuple[int, int]
-    tell: Callable[[str], None]
     count: int = field(default=0, init=False)
     pictures: dict[bytes, str] = field(default_factory=dict, init=False)
     pages: set[str] = field(default_factory=set, init=False)
@@ -312,7 +309,7 @@ class Hands:
         if not image.save(str(file)):
             raise self.fail(f"{file} cannot be written")
         titles = [widget.windowTitle() for widget in _over(self.window)]
-        self.tell("  ".join(filter(None, (file.name, *titles))))
+        print("  ".join(filter(None, (file.name, *titles))), flush=True)
 
     def _seen(self) -> QImage:
         image = self.window.grab().toImage().convertToFormat(QImage.Format.Format_RGB32)

@@ -21,9 +21,10 @@ from labapp.gui.tools.adviser import AdviserWindow
 from labapp.gui.tools.analysis import AnalysisWindow
 from labapp.gui.tools.simulator import SimulatorWindow
 from labapp.gui.tools.tool import ToolWindow
-from labapp.gui.tour.bench import CROSS_MM, places
-from labapp.gui.tour.hands import CTRL, Hands, give
 from labapp.session.session import Session
+
+from .bench import CROSS_MM, places
+from .hands import CTRL, Hands, give
 
 T = TypeVar("T", bound=ToolWindow)
 
