@@ -167,6 +167,7 @@ def _film(hands: Hands) -> None:
     hands.press("● Record")
     hands.wait(lambda: view.live and view.live.takes[0].frames > 150, "frames to be recorded")
     hands.picture("recording")
+    hands.asked("recording-runs", lambda: hands.do("close"))
     hands.press("■ End the recording")
     hands.press("Stop the camera")
     hands.settle()
