@@ -9,13 +9,13 @@ from functools import partial
 from typing import Any
 
 from PySide6.QtCore import QObject, Signal
-from PySide6.QtWidgets import QHBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
 from labapp.errors import InputError
 from labapp.gui.shell.steps import calibrations_in_use
-from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
-from labapp.gui.widgets.labels import wrapped
+from labapp.gui.widgets.labels import selectable_label
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
 from labapp.session.session import Session
 
@@ -93,12 +93,9 @@ class CameraFields(QObject):
             "Take a frame", "Have the camera take a frame now", self._take_frame
         )
         row = QWidget()
-        line = QHBoxLayout(row)
-        line.setContentsMargins(0, 0, 0, 0)
-        for each in (self.shoot_button, self.whole_button):
-            line.addWidget(each)
+        row.setLayout(button_row(self.shoot_button, self.whole_button))
         form.add_wide(row)
-        self.part_words = wrapped()
+        self.part_words = selectable_label()
         form.add_wide(self.part_words)
 
     # --- what the camera is set to ------------------------------------------------------------

@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QFrame, QGridLayout, QHBoxLayout, QLabel, QVBoxLay
 from labapp.gui.digits import NOTHING, plain
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import Message, plain_label, wrapped
+from labapp.gui.widgets.labels import Message, plain_label, selectable_label
 from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_watch import Followed, Pace
@@ -207,7 +207,7 @@ class AlarmStrip(QFrame):
     def __init__(self, acknowledge: Callable[[], None]) -> None:
         super().__init__()
         self.setFrameShape(QFrame.Shape.Box)
-        self.words = wrapped()
+        self.words = selectable_label()
         font = self.words.font()
         font.setBold(True)
         self.words.setFont(font)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import wrapped
+from labapp.gui.widgets.labels import selectable_label
 from labapp.media.recording.nut import Codec
 from labapp.media.recording.recorder import Plan
 from labapp.text import format_bytes
@@ -75,7 +75,7 @@ class PlanFields(QObject):
         for field in (self.before, self.after, self.every, self.codec):
             field.edited.connect(lambda _: self.edited.emit())
             form.add(field)
-        self.cost = wrapped()
+        self.cost = selectable_label()
         form.add_wide(self.cost)
 
     def plan(self) -> Plan:

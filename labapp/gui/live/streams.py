@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QCheckBox, QGridLayout, QVBoxLayout, QWidget
 from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task
 from labapp.gui.widgets.fields import NumberField
-from labapp.gui.widgets.labels import Message, headed, wrapped
+from labapp.gui.widgets.labels import Message, headed, selectable_label
 from labapp.gui.workspace import Workspace
 from labapp.run.live_watch import LiveWatch
 from labapp.run.streams import Stream, open_stream
@@ -85,7 +85,7 @@ class LiveStreams(QWidget):
         self.anywhere = QCheckBox("Other machines may connect")
         self.anywhere.setToolTip("Otherwise only programs on this machine can")
         self.anywhere.toggled.connect(lambda _: self._open_to_all())
-        self.warning = wrapped()
+        self.warning = selectable_label()
         layout.addWidget(self.anywhere)
         layout.addWidget(self.warning)
         outer.addStretch(1)

@@ -8,7 +8,7 @@ from functools import partial
 
 import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
-from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
@@ -26,7 +26,7 @@ from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.picture import PictureView
-from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.exposure import ExposureBars
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
 from labapp.gui.widgets.labels import Message, headed
@@ -427,14 +427,11 @@ class LiveView(QObject):
         )
         form.add(self.camera)
         layout.addWidget(form)
-        row = QHBoxLayout()
         self.start_button = button("Start", "Show live what the camera sees", self.start)
         self.find_button = button(
             "Look for cameras", "Find the cameras that are connected", self.find
         )
-        row.addWidget(self.start_button)
-        row.addWidget(self.find_button)
-        layout.addLayout(row)
+        layout.addLayout(button_row(self.start_button, self.find_button))
         self.refused = Message(2)
         layout.addWidget(self.refused)
         self.settings = QWidget()

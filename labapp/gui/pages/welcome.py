@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QEvent, QSize, Qt, Signal
@@ -19,7 +20,8 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
 from labapp.gui.tasks import Control
-from labapp.gui.widgets.labels import plain_label, plain_tip
+from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
 from labapp.gui.workspace import Workspace
 
 BUTTONS = (
@@ -64,21 +66,15 @@ class Welcome(QWidget):
         font.setPointSizeF(font.pointSizeF() * 2.2)
         title.setFont(font)
         column.addWidget(title)
-        about = plain_label(
+        about = wrapping_label(
             "The surface of a molten weld pool, measured from the reflections of a laser dot "
             "matrix. An experiment is one session file; everything you do is saved in it at once."
         )
-        about.setWordWrap(True)
         column.addWidget(about)
-        row = QHBoxLayout()
         for name, text, tip in BUTTONS:
-            button = QPushButton(text)
-            button.setToolTip(tip)
-            button.setMinimumHeight(button.fontMetrics().height() * 2)
-            button.clicked.connect(lambda *_, asked=name: self.asked.emit(asked))
-            self.buttons[name] = button
-            row.addWidget(button)
-        column.addLayout(row)
+            made = self.buttons[name] = button(text, tip, partial(self.asked.emit, name))
+            made.setMinimumHeight(made.fontMetrics().height() * 2)
+        column.addLayout(button_row(*self.buttons.values()))
         self.label = plain_label("&Recent sessions")
         column.addWidget(self.label)
         self.list = QListWidget()
@@ -93,11 +89,10 @@ class Welcome(QWidget):
         self.list.itemActivated.connect(self._open)
         self.label.setBuddy(self.list)
         column.addWidget(self.list, 1)
-        self.nothing = plain_label(
+        self.nothing = wrapping_label(
             "No session was opened yet. Drop a video, an image, a folder of images or a session "
             "anywhere on this window to begin, or try the sample."
         )
-        self.nothing.setWordWrap(True)
         column.addWidget(self.nothing)
         column.addStretch(0)
         layout = QHBoxLayout(self)

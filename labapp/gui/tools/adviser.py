@@ -19,7 +19,7 @@ from labapp.gui.tools import advising
 from labapp.gui.tools.tool import ToolWindow, told
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField
-from labapp.gui.widgets.labels import headed, plain_label
+from labapp.gui.widgets.labels import headed, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
@@ -104,8 +104,7 @@ class AdviserWindow(ToolWindow):
         self.form.add(self.effort)
 
     def _make_results(self) -> None:
-        self.headline = plain_label("Enter pools and limits, then press Advise.")
-        self.headline.setWordWrap(True)
+        self.headline = wrapping_label("Enter pools and limits, then press Advise.")
         self.place = ResultTable("Recommended set-up")
         self.kept = ResultTable("What it must keep, and by how much it does")
         self.costs = CellTable("What each mm and degree away costs")

@@ -13,7 +13,7 @@ from labapp.gui.tools import analysing
 from labapp.gui.tools.analysing import BUDGET, OPENED, PARTS, USUAL
 from labapp.gui.tools.tool import ToolWindow, told
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEMES
@@ -74,7 +74,6 @@ class AnalysisWindow(ToolWindow):
         for key, words, tip in PARTS:
             box = QCheckBox(words)
             box.setToolTip(tip)
-            box.setAccessibleDescription(tip)
             box.setChecked(key == BUDGET)
             box.toggled.connect(lambda _: self.show_state())
             self.parts[key] = box
@@ -126,11 +125,10 @@ class AnalysisWindow(ToolWindow):
         self.which.edited.connect(lambda _: self._show_chosen())
         line = FieldForm()
         line.add(self.which)
-        self.words = plain_label(
+        self.words = wrapping_label(
             "Tick what is to be worked out, then press Work out. All of it is simulated; the "
             "calibration is taken to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
         )
-        self.words.setWordWrap(True)
         self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.table = CellTable("Table of the error analysis")
         self.sheet = Sheet("Picture of the error analysis")

@@ -19,7 +19,7 @@ from labapp.gui.tools.simulating import Preview
 from labapp.gui.tools.tool import ToolWindow, told
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.fields import ChoiceField, NumberField
-from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.simulated.simulate import begin_session, simulate
@@ -74,8 +74,7 @@ class SimulatorWindow(ToolWindow):
             "Scenario", simulating.choices(None), tooltip="The pool, the bench and the camera"
         )
         self.scenario.edited.connect(lambda _: self.show_scenario())
-        self.words = plain_label()
-        self.words.setWordWrap(True)
+        self.words = wrapping_label()
         self.frames = NumberField(
             "Frames", lowest=1, highest=1_000_000, decimals=0, tooltip="How many are rendered"
         )

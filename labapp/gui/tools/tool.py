@@ -25,6 +25,7 @@ from labapp.errors import InputError
 from labapp.files import write_atomically
 from labapp.gui.shell.messages import PROBLEM, ElidedLabel
 from labapp.gui.tasks import Control, Task, Tasks
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm
 from labapp.simulation.parallel import Progress, behind_a_window
 
@@ -129,13 +130,13 @@ class ToolWindow(QDialog):
 
     def add_button(self, words: str, tip: str, do: Callable[[], object]) -> QPushButton:
         """Put a button before those that are there."""
-        button = _button(words, tip, do)
-        self.buttons.insertWidget(0, button)
-        return button
+        made = button(words, tip, do)
+        self.buttons.insertWidget(0, made)
+        return made
 
     def add_to_form(self, words: str, tip: str, do: Callable[[], object]) -> None:
         """Put a button below the fields that are there."""
-        self.form.add_wide(_button(words, tip, do))
+        self.form.add_wide(button(words, tip, do))
 
     # --- what tools say for themselves ---------------------------------------------------------
 
@@ -272,14 +273,6 @@ class ToolWindow(QDialog):
             self._task = None
             if stopping:
                 self.say("Stopped")
-
-
-def _button(words: str, tip: str, do: Callable[[], object]) -> QPushButton:
-    button = QPushButton(words)
-    button.setToolTip(tip)
-    button.setAutoDefault(False)  # Enter finishes a field
-    button.clicked.connect(lambda *_: do())
-    return button
 
 
 def told(control: Control) -> Progress:

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout
 from labapp.core.values import FloatArray
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Drawn
-from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.labels import wrapping_label
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
@@ -30,8 +30,7 @@ class BenchView(Drawn):
     def __init__(self) -> None:
         super().__init__("Side view of the bench")
         self._view: SideView | None = None
-        self.words = plain_label()
-        self.words.setWordWrap(True)
+        self.words = wrapping_label()
         self.words.setMargin(6)
         self.whole = make_plot("Y, welding direction, mm", "Z, mm")
         self.near = make_plot("enlarged, mm")

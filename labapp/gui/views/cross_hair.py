@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QVBoxLayout
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Drawn
-from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.labels import wrapping_label
 
 
 class CrossHairView(Drawn):
@@ -20,8 +20,7 @@ class CrossHairView(Drawn):
     def __init__(self) -> None:
         super().__init__("Drawing of the laser and its cross hair")
         self.plot = make_plot("Y, mm", "Z, mm")
-        self.words = plain_label()
-        self.words.setWordWrap(True)
+        self.words = wrapping_label()
         self.words.setMargin(6)
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)

@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
 from labapp.core.values import BoolArray
 from labapp.gui.views.canvas import Drawn
 from labapp.gui.views.drag_point import ALT, CONTROL, SHIFT, DragPoint, arrow_step
-from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.labels import plain_label, wrapping_label
 from labapp.media import GreyImage
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -114,9 +114,8 @@ class PictureView(Drawn):
         self._place = plain_label()
         # Or the window would grow as the pointer comes.
         self._place.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
-        self._empty = plain_label("", self.canvas)
+        self._empty = wrapping_label("", self.canvas)
         self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self._empty.setWordWrap(True)
         # It lies over the whole canvas, which takes the mouse.
         self._empty.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         layout = QVBoxLayout(self)

@@ -28,7 +28,7 @@ from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
-from labapp.gui.widgets.labels import plain_label, plain_tip
+from labapp.gui.widgets.labels import plain_tip, wrapping_label
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
@@ -84,12 +84,10 @@ class PlotStack(Plotted):
         area.setFrameShape(QFrame.Shape.NoFrame)
         area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         area.setMinimumSize(240, 110)
-        self.legend = plain_label()
-        self.legend.setWordWrap(True)
+        self.legend = wrapping_label()
         self.legend.setContentsMargins(8, 0, 8, 0)
-        self.read_out = plain_label(" ")
+        self.read_out = wrapping_label(" ")
         self.read_out.setContentsMargins(8, 0, 8, 4)
-        self.read_out.setWordWrap(True)
         self.read_out.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.read_out.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
         layout = QVBoxLayout(self)

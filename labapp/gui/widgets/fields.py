@@ -32,7 +32,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import entered, parsed
-from labapp.gui.widgets.labels import heading, plain_label, plain_tip
+from labapp.gui.widgets.labels import heading, plain_label, plain_tip, wrapping_label
 
 MOUSE_MS = 20
 """How often it is asked whether the mouse is let go."""
@@ -61,8 +61,7 @@ class Field(QWidget):
 
     def __init__(self, label: str, editor: QWidget, tooltip: str, unit: str = "") -> None:
         super().__init__()
-        self.label = plain_label(label)
-        self.label.setWordWrap(True)
+        self.label = wrapping_label(label)
         self.label.setBuddy(editor)
         self.label.setToolTip(tooltip)
         self.editor = editor
@@ -71,8 +70,7 @@ class Field(QWidget):
         self._tooltip = tooltip
         self._refusal = self._fault = ""
         self.unit = plain_label(unit)
-        self.problem = plain_label()
-        self.problem.setWordWrap(True)
+        self.problem = wrapping_label()
         self.problem.hide()
         self.setFocusProxy(editor)
         line = QHBoxLayout()

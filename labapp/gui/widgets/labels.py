@@ -1,4 +1,4 @@
-"""Labels as all pages and windows have them: headings, words that wrap, and messages."""
+"""Labels of pages and windows: headings, text that wraps, and messages."""
 
 from __future__ import annotations
 
@@ -8,50 +8,48 @@ from PySide6.QtGui import QPainter, QPaintEvent, QResizeEvent, QTextLayout, QTex
 from PySide6.QtWidgets import QLabel, QSizePolicy, QVBoxLayout, QWidget
 
 
-def plain_label(words: str = "", parent: QWidget | None = None) -> QLabel:
-    """Words as they are: by itself a label would take some for HTML, and load its pictures."""
+def plain_label(text: str = "", parent: QWidget | None = None) -> QLabel:
+    """A label of plain text: by itself a QLabel guesses, and loads pictures that HTML names."""
     label = QLabel(parent)
     label.setTextFormat(Qt.TextFormat.PlainText)
-    label.setText(words)
+    label.setText(text)
     return label
 
 
-def plain_tip(words: str) -> str:
-    """What a tooltip says to show words as they are, HTML or not."""
-    rich = QtGui.Qt.mightBeRichText(words)
-    return QtGui.Qt.convertFromPlainText(words) if rich else words
-
-
-def heading(words: str) -> QLabel:
-    """Words above what belongs together, in bold."""
-    label = plain_label(words)
-    font = label.font()
-    font.setBold(True)
-    label.setFont(font)
+def wrapping_label(text: str = "", parent: QWidget | None = None) -> QLabel:
+    """A label of plain text that wraps."""
+    label = plain_label(text, parent)
     label.setWordWrap(True)
     return label
 
 
-def headed(words: str) -> tuple[QWidget, QVBoxLayout]:
+def plain_tip(text: str) -> str:
+    """Text for a tooltip that shows it literally, even where it looks like HTML."""
+    rich = QtGui.Qt.mightBeRichText(text)
+    return QtGui.Qt.convertFromPlainText(text) if rich else text
+
+
+def heading(text: str) -> QLabel:
+    """A heading above a group of widgets, in bold."""
+    label = wrapping_label(text)
+    font = label.font()
+    font.setBold(True)
+    label.setFont(font)
+    return label
+
+
+def headed(text: str) -> tuple[QWidget, QVBoxLayout]:
     """A group of widgets under a heading, and its layout."""
     group = QWidget()
     layout = QVBoxLayout(group)
     layout.setContentsMargins(0, 6, 0, 0)
-    layout.addWidget(heading(words))
+    layout.addWidget(heading(text))
     return group, layout
 
 
-def plain_words() -> QLabel:
-    """Words as they are, wrapped; none yet."""
-    label = plain_label()
-    label.setWordWrap(True)
-    return label
-
-
-def wrapped(text: str = "") -> QLabel:
-    """Words that wrap, even a SHA-256, and can be copied."""
-    label = plain_label(breakable(text))
-    label.setWordWrap(True)
+def selectable_label(text: str = "") -> QLabel:
+    """Text that wraps, even a SHA-256, and can be selected and copied."""
+    label = wrapping_label(breakable(text))
     label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
     label.setToolTip(plain_tip(text))
     return label
@@ -73,12 +71,12 @@ def keep_room(*widgets: QWidget) -> None:
 
 
 class Message(QLabel):
-    """Words that come and go in room of their own: nothing round them moves, whatever they say.
+    """A message of fixed height: nothing around it moves, whatever it says.
 
     Parameters
     ----------
     lines
-        There is room for so many; what is longer ends in …, and the tip has all of it.
+        How many lines fit. A longer text ends in …, and the tooltip has all of it.
     """
 
     def __init__(self, lines: int) -> None:

@@ -6,12 +6,12 @@ from functools import partial
 from typing import cast
 
 from PySide6.QtGui import QGuiApplication, QTextOption
-from PySide6.QtWidgets import QHBoxLayout, QLabel, QPlainTextEdit, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QLabel, QPlainTextEdit, QVBoxLayout, QWidget
 
 from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
-from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import headed, wrapped
+from labapp.gui.widgets.labels import headed, selectable_label
 from labapp.media.devices.foot_switch import Action
 from labapp.media.devices.hid import commands
 
@@ -44,7 +44,7 @@ class FootSwitchPanel(QWidget):
         outer.setContentsMargins(0, 0, 0, 0)
         group, self._layout = headed("Foot switch")
         outer.addWidget(group)
-        self.words = wrapped()
+        self.words = selectable_label()
         self.rows = QWidget()
         self.pedals: dict[tuple[str, int], ChoiceField] = {}
         self._layout.addWidget(self.words)
@@ -55,17 +55,15 @@ class FootSwitchPanel(QWidget):
         self.refresh()
 
     def _make_learning(self) -> None:
-        row = QHBoxLayout()
         self.learn_button = button(
             "Learn a pedal", "Wait until a pedal is stepped on, of whatever device", self._learn
         )
         self.look_button = button(
             "Look for devices", "See which foot switches are plugged in", self.switches.look
         )
-        row.addWidget(self.learn_button)
-        row.addWidget(self.look_button)
-        self._layout.insertLayout(1, row)  # above the words, which need more or less room
-        self.learned_words = wrapped()
+        # Above the words, which need more or less room.
+        self._layout.insertLayout(1, button_row(self.learn_button, self.look_button))
+        self.learned_words = selectable_label()
         self._layout.addWidget(self.learned_words)
         self.learned = QWidget()
         inner = QVBoxLayout(self.learned)
@@ -76,11 +74,9 @@ class FootSwitchPanel(QWidget):
         )
         form.add(self.action)
         inner.addWidget(form)
-        row = QHBoxLayout()
         self.use_button = button("Use it", "Use the pedal so, now and after each start", self._use)
-        row.addWidget(self.use_button)
-        row.addWidget(button("Not this one", "Leave this pedal as it is", self.switches.give_up))
-        inner.addLayout(row)
+        leave = button("Not this one", "Leave this pedal as it is", self.switches.give_up)
+        inner.addLayout(button_row(self.use_button, leave))
         self._layout.addWidget(self.learned)
 
     def _make_rights(self) -> None:
@@ -108,7 +104,7 @@ class FootSwitchPanel(QWidget):
         )
         inner.addWidget(self.copy_button)
         self.closed.edited.connect(lambda _: self._show_commands())
-        inner.addWidget(wrapped("Then plug it in anew."))
+        inner.addWidget(selectable_label("Then plug it in anew."))
         self._layout.addWidget(self.rights)
 
     # --- what is shown ------------------------------------------------------------------------

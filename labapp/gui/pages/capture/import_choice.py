@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from PySide6.QtCore import Signal
-from PySide6.QtWidgets import QCheckBox, QHBoxLayout, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QCheckBox, QVBoxLayout, QWidget
 
 from labapp.gui.pages.capture.presenter import Choice, Preview, choice_in_words, refusal
-from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.fields import FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import Message, headed, plain_tip, wrapped
+from labapp.gui.widgets.labels import Message, headed, plain_tip, selectable_label
 from labapp.session.session import Session
 
 MOST_HZ = 1e7
@@ -54,7 +54,7 @@ class ImportChoice(QWidget):
         outer.setContentsMargins(0, 0, 0, 0)
         group, layout = headed("To be imported")
         outer.addWidget(group)
-        self.source_words = wrapped()
+        self.source_words = selectable_label()
         layout.addWidget(self.source_words)
         layout.addWidget(self._form())
         self.embed = QCheckBox("Keep the frames in the session")
@@ -66,15 +66,13 @@ class ImportChoice(QWidget):
         layout.addWidget(self.embed)
         self.choice_words = Message(2)
         layout.addWidget(self.choice_words)
-        row = QHBoxLayout()
         self.import_button = button("Import", "", do_import)
         self.import_button.setDefault(True)
-        row.addWidget(self.import_button)
-        row.addWidget(button("Not this one", "Leave it, and see the session's frames", leave))
-        layout.addLayout(row)
+        stop = button("Not this one", "Leave it, and see the session's frames", leave)
+        layout.addLayout(button_row(self.import_button, stop))
         self.next_button = button(NEXT, NEXT_TIP, begin_next)
         layout.addWidget(self.next_button)
-        self.replace_words = wrapped()
+        self.replace_words = selectable_label()
         layout.addWidget(self.replace_words)
         self.hide()
 

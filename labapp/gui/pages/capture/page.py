@@ -9,7 +9,6 @@ from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import (
     QFileDialog,
     QGridLayout,
-    QHBoxLayout,
     QSlider,
 )
 
@@ -31,9 +30,16 @@ from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Mark, State
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.picture import PictureView
-from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.exposure import ExposureBars
-from labapp.gui.widgets.labels import Message, headed, keep_room, plain_label, wrapped
+from labapp.gui.widgets.labels import (
+    Message,
+    headed,
+    keep_room,
+    plain_label,
+    selectable_label,
+    wrapping_label,
+)
 from labapp.gui.workspace import MISSING, Workspace
 from labapp.media.recording.take_files import Take
 from labapp.session.record import Recording
@@ -72,9 +78,8 @@ class CapturePage(Page):
         self._last_folder = Path()
         self._listed: Session | None = None
         """The session that recordings beside it are listed of."""
-        self.title = plain_label()
+        self.title = wrapping_label()
         self.title.setContentsMargins(8, 4, 8, 0)
-        self.title.setWordWrap(True)
         self.picture_view = PictureView("Frame of the recording")
         self.slider = QSlider(Qt.Orientation.Horizontal)
         self.slider.setAccessibleName("Frame of the preview")
@@ -208,11 +213,11 @@ class CapturePage(Page):
         rows = recording_in_words(recording)
         for row, (name, words) in enumerate(rows):
             self.told.addWidget(plain_label(f"{name}:"), row, 0)
-            self.told.addWidget(wrapped(words), row, 1)
+            self.told.addWidget(selectable_label(words), row, 1)
         unlike = other_size(calibrated_px(session), (recording.rows, recording.columns))
         warnings = (*recording.warnings, *[unlike] * bool(unlike))
         for row, sentence in enumerate(warnings, len(rows)):
-            self.told.addWidget(wrapped(f"⚠ {sentence}"), row, 0, 1, 2)
+            self.told.addWidget(selectable_label(f"⚠ {sentence}"), row, 0, 1, 2)
 
     def _show_import(self) -> None:
         working = self._importing in self.workspace.tasks.active
@@ -460,12 +465,12 @@ class CapturePage(Page):
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        row = QHBoxLayout()
-        row.addWidget(button("Choose a file …", "A video, an image or a stack", self.choose_file))
-        row.addWidget(
-            button("Choose a folder …", "A folder of images in order", self.choose_folder)
+        self.panel_layout.addLayout(
+            button_row(
+                button("Choose a file …", "A video, an image or a stack", self.choose_file),
+                button("Choose a folder …", "A folder of images in order", self.choose_folder),
+            )
         )
-        self.panel_layout.addLayout(row)
         self.refused = Message(2)
         self.panel_layout.addWidget(self.refused)
         self.panel_layout.addWidget(self.live_view.group)
@@ -491,7 +496,7 @@ class CapturePage(Page):
         self.panel_layout.addStretch(1)
 
     def _make_missing(self) -> None:
-        self.missing = wrapped()
+        self.missing = selectable_label()
         self.find_button = button(
             "Say where it is …", "Find the recording in its new place", self.find_recording
         )

@@ -22,7 +22,7 @@ from labapp.core.pipeline import Settings
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, heading, plain_label, plain_tip, plain_words
+from labapp.gui.widgets.labels import Message, heading, plain_label, plain_tip, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
 
 MOST_ROWS = 60
@@ -58,7 +58,7 @@ class DotsPanel(QWidget):
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         # The buttons stay under the hand, whatever there is to say.
-        self.seen, self.chosen, self.why = Message(3), Message(2), plain_words()
+        self.seen, self.chosen, self.why = Message(3), Message(2), wrapping_label()
         self.fit = ResultTable("Fit before the last edit and after it")
         layout.addWidget(self.seen)
         layout.addWidget(heading("Put right"))

@@ -14,7 +14,6 @@ from PySide6.QtWidgets import (
     QFrame,
     QGridLayout,
     QHBoxLayout,
-    QPushButton,
     QScrollArea,
     QVBoxLayout,
     QWidget,
@@ -37,8 +36,9 @@ from labapp.gui.pages.export.presenter import (
 )
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import heading, keep_room, plain_tip, plain_words
+from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
@@ -222,7 +222,6 @@ class ExportPage(Page):
             for item in items:
                 box = QCheckBox(item.name)
                 box.setToolTip(item.tip)
-                box.setAccessibleDescription(item.tip)
                 box.setChecked(item.key in USUAL)
                 box.toggled.connect(lambda _: self._ticked())
                 self._boxes[item.key] = box
@@ -231,7 +230,7 @@ class ExportPage(Page):
             grid.addLayout(column, number // 2, number % 2)
         will = QVBoxLayout()
         will.addWidget(heading("In the folder there will be"))
-        self.files = plain_words()
+        self.files = wrapping_label()
         will.addWidget(self.files)
         grid.addLayout(will, 2, 0, 1, 2)
         grid.addWidget(self._make_result(), 3, 0, 1, 2)
@@ -251,10 +250,10 @@ class ExportPage(Page):
         layout = QVBoxLayout(self.result_group)
         layout.setContentsMargins(0, 8, 0, 0)
         layout.addWidget(heading("Written"))
-        self.result = plain_words()
+        self.result = wrapping_label()
         layout.addWidget(self.result)
         row = QHBoxLayout()
-        row.addWidget(_button("Open the folder", "Show it in the file manager", self.open_folder))
+        row.addWidget(button("Open the folder", "Show it in the file manager", self.open_folder))
         row.addStretch(1)
         layout.addLayout(row)
         self.result_group.hide()
@@ -298,17 +297,17 @@ class ExportPage(Page):
         self.panel_layout.addWidget(self.folder.label)
         self.panel_layout.addWidget(self.folder)
         self.panel_layout.addWidget(
-            _button("Choose a folder …", "Choose where to write", self.choose_folder)
+            button("Choose a folder …", "Choose where to write", self.choose_folder)
         )
-        self.notes = plain_words()
-        self.why_not = plain_words()
-        self.again_button = _button(
+        self.notes = wrapping_label()
+        self.why_not = wrapping_label()
+        self.again_button = button(
             "Measure now",
             "Measure the chosen frames that are not measured, or no longer stand",
             self.measure_again,
         )
         keep_room(self.again_button)
-        self.export_button = _button("Export", "", self.export)
+        self.export_button = button("Export", "", self.export)
         # The buttons stand above the words, which need more or less room.
         for widget in (self.export_button, self.again_button, self.why_not, self.notes):
             self.panel_layout.addWidget(widget)
@@ -343,10 +342,3 @@ def _whole(label: str, lowest: int, tip: str, name: str, wish: Callable[..., Non
     field = NumberField(label, lowest=lowest, highest=10**9, decimals=0, tooltip=tip)
     field.edited.connect(lambda value: wish(**{name: value}) if value is not None else None)
     return field
-
-
-def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
-    button = QPushButton(words)
-    button.setToolTip(tip)
-    button.clicked.connect(lambda _: work())
-    return button

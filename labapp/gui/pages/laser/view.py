@@ -9,7 +9,6 @@ from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import (
     QFileDialog,
     QHeaderView,
-    QPushButton,
     QStackedWidget,
     QTableWidget,
     QTableWidgetItem,
@@ -22,8 +21,9 @@ from labapp.gui.pages.page import Page
 from labapp.gui.views.cross_hair import CrossHairView
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -131,15 +131,12 @@ class LaserPage(Page):
         self.panel_layout.addWidget(self._picture_part())
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
-        readings = plain_label("Readings, mm: a line each, as often as you like")
-        readings.setWordWrap(True)
+        readings = wrapping_label("Readings, mm: a line each, as often as you like")
         self.panel_layout.addWidget(readings)
         self.panel_layout.addWidget(self.table)
-        self.use_button = QPushButton("Use these")
-        self.use_button.clicked.connect(self.use)
+        self.use_button = button("Use these", "", self.use)
         self.panel_layout.addWidget(self.use_button)
-        self.words = plain_label()
-        self.words.setWordWrap(True)
+        self.words = wrapping_label()
         self.panel_layout.addWidget(self.words)
         self.result = ResultTable("The laser that follows")
         self.panel_layout.addWidget(self.result)
@@ -151,10 +148,8 @@ class LaserPage(Page):
 
     def _picture_part(self) -> QWidget:
         self.picture_part = FieldForm()
-        load = QPushButton("Load picture…")
-        load.setToolTip("A picture of the cross hair beside a scale")
-        load.clicked.connect(self._choose_picture)
-        self.picture_part.add_wide(load)
+        tip = "A picture of the cross hair beside a scale"
+        self.picture_part.add_wide(button("Load picture…", tip, self._choose_picture))
         self.refused = Message(2)
         self.workspace.opened.connect(lambda: self.refused.setText(""))
         self.picture_part.add_wide(self.refused)
@@ -172,9 +167,8 @@ class LaserPage(Page):
         self.picture_part.add(self.scale)
         self.lengths = Message(2)
         self.picture_part.add_wide(self.lengths)
-        self.add_button = QPushButton("Add as a reading")
-        self.add_button.setToolTip("Put these lengths into the table, as one more reading")
-        self.add_button.clicked.connect(self.add_reading)
+        tip = "Put these lengths into the table, as one more reading"
+        self.add_button = button("Add as a reading", tip, self.add_reading)
         self.picture_part.add_wide(self.add_button)
         return self.picture_part
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pyqtgraph as pg
-from PySide6.QtWidgets import QFileDialog, QPushButton
+from PySide6.QtWidgets import QFileDialog
 
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
@@ -16,8 +16,9 @@ from labapp.gui.pages.plane.presenter import POINTS
 from labapp.gui.tasks import Control
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -142,13 +143,13 @@ class PlanePage(Page):
     def _make_panel(self) -> None:
         form = FieldForm()
         form.add_wide(
-            self._button(
+            button(
                 "Load picture…",
                 "A picture of the target, taken by the camera in its place",
                 self._choose,
             )
         )
-        self.kept_button = self._button("Picture in use", "", self.take_kept)
+        self.kept_button = button("Picture in use", "", self.take_kept)
         form.add_wide(self.kept_button)
         self.unit = NumberField(
             "Unit of the axes",
@@ -162,7 +163,7 @@ class PlanePage(Page):
         self.unit.set_value(presenter.UNIT_MM)
         self.unit.edited.connect(lambda _: self._unit_changed())
         form.add(self.unit)
-        self.find_button = self._button(
+        self.find_button = button(
             "Find O′ and the axes",
             "Look for the dot and the two bars in the picture",
             self.find_axes,
@@ -172,18 +173,17 @@ class PlanePage(Page):
         self.workspace.opened.connect(lambda: self.refused.setText(""))
         form.add_wide(self.refused)
         form.add_wide(
-            self._button(
+            button(
                 "Save the target for printing…",
                 "The target at true size (SVG): print it at 100 % and measure its unit",
                 self._choose_target,
             )
         )
         self.panel_layout.addWidget(form)
-        help_text = plain_label(
+        help_text = wrapping_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
             "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
         )
-        help_text.setWordWrap(True)
         self.panel_layout.addWidget(help_text)
         self._make_results()
         self.panel_layout.addStretch(1)
@@ -199,25 +199,17 @@ class PlanePage(Page):
         self.model.edited.connect(self.choose_model)
         model.add(self.model)
         self.panel_layout.addWidget(model)
-        self.use_button = self._button("Use", "", self.use)
+        self.use_button = button("Use", "", self.use)
         self.panel_layout.addWidget(self.use_button)
-        self.words = plain_label()
-        self.words.setWordWrap(True)
+        self.words = wrapping_label()
         self.panel_layout.addWidget(self.words)
         self.result = ResultTable("What follows from the points and marks")
         self.panel_layout.addWidget(self.result)
-        self.why = plain_label()
-        self.why.setWordWrap(True)
+        self.why = wrapping_label()
         self.panel_layout.addWidget(self.why)
         self.panel_layout.addWidget(plain_label("In use now"))
         self.in_use = ResultTable("Image calibration in use")
         self.panel_layout.addWidget(self.in_use)
-
-    def _button(self, words: str, tooltip: str, work: object) -> QPushButton:
-        button = QPushButton(words)
-        button.setToolTip(tooltip)
-        button.clicked.connect(lambda _: work())  # type: ignore[operator]
-        return button
 
     def _choose(self) -> None:
         path, _ = QFileDialog.getOpenFileName(self, "Picture of the target", str(self._folder()))

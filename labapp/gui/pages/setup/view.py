@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
 from PySide6.QtWidgets import (
     QCheckBox,
     QFileDialog,
-    QHBoxLayout,
     QLabel,
-    QPushButton,
     QTabWidget,
     QVBoxLayout,
     QWidget,
@@ -21,8 +18,9 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
 from labapp.gui.views.bench import BenchView
+from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.fields import FieldForm, NumberField, TextField
-from labapp.gui.widgets.labels import Message, plain_label
+from labapp.gui.widgets.labels import Message, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 
@@ -150,8 +148,7 @@ class SetupPage(Page):
             box.setAccessibleDescription(meaning)
             box.clicked.connect(lambda on, item=item: self._tick(item, on))
             layout.addWidget(box)
-            time, means = Message(1), plain_label(meaning)
-            means.setWordWrap(True)
+            time, means = Message(1), wrapping_label(meaning)
             for label in (means, time):
                 label.setIndent(24)
                 layout.addWidget(label)
@@ -166,16 +163,16 @@ class SetupPage(Page):
 
     def _bench(self) -> QWidget:
         form = FieldForm()
-        row, (load, _, usual) = _buttons(
-            ("Load…", "Take the whole set-up from a setup file (TOML)", self._choose_load),
-            ("Save…", "Write the set-up to a file, for another session", self._choose_save),
-            (
-                "Usual values",
-                "Put the usual values in where something is missing; check each of them",
-                lambda: self.workspace.attempt(presenter.put_usual),
-            ),
+        load = button("Load…", "Take the whole set-up from a setup file (TOML)", self._choose_load)
+        save = button("Save…", "Write the set-up to a file, for another session", self._choose_save)
+        usual = button(
+            "Usual values",
+            "Put the usual values in where something is missing; check each of them",
+            lambda: self.workspace.attempt(presenter.put_usual),
         )
         self._filling = load, usual
+        row = QWidget()
+        row.setLayout(button_row(load, save, usual))
         form.add_wide(row)
         self.refused = Message(2)
         form.add_wide(self.refused)
@@ -186,18 +183,16 @@ class SetupPage(Page):
         form.add_heading("Expected pool")
         for entry in POOL:
             self._add_noted(form, entry)
-        row, _ = _buttons(
-            (
+        form.add_wide(
+            button(
                 "Advise …",
                 "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
                 lambda: self.workspace.asked.emit("adviser"),
             )
         )
-        form.add_wide(row)
         self.table = ResultTable("What the bench lets through")
         form.add_wide(self.table)
-        self.others = plain_label()
-        self.others.setWordWrap(True)
+        self.others = wrapping_label()
         form.add_wide(self.others)
         return form
 
@@ -241,22 +236,6 @@ def _number(entry: Entry) -> NumberField:
         tooltip=entry.tooltip,
         optional=True,
     )
-
-
-def _buttons(
-    *wanted: tuple[str, str, Callable[[], object]],
-) -> tuple[QWidget, list[QPushButton]]:
-    """Buttons beside each other, and each of them."""
-    row, made = QWidget(), []
-    layout = QHBoxLayout(row)
-    layout.setContentsMargins(0, 0, 0, 0)
-    for words, tooltip, work in wanted:
-        button = QPushButton(words)
-        button.setToolTip(tooltip)
-        button.clicked.connect(lambda _, work=work: work())
-        layout.addWidget(button)
-        made.append(button)
-    return row, made
 
 
 def _top(content: QWidget) -> QWidget:

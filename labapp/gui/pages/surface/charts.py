@@ -16,7 +16,7 @@ from labapp.export.heights import Profile
 from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
-from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.labels import wrapping_label
 from labapp.text import SIGMA_OF
 
 BAND_ALPHA = 70
@@ -41,8 +41,7 @@ class Chart(Plotted):
     def __init__(self, name: str, x_label: str, y_label: str, equal: bool) -> None:
         super().__init__(name, KEYS)
         self.setToolTip(f"{name}: wheel to zoom, drag to move; {KEYS}")
-        self.title = plain_label(name)
-        self.title.setWordWrap(True)
+        self.title = wrapping_label(name)
         self.plot = make_plot(x_label, y_label, equal)
         self.plot.setMinimumSize(88, 80)
         layout = QVBoxLayout(self)

@@ -20,7 +20,7 @@ from labapp.gui.pages.surface.presenter import SCHEME_CHOICES, Options
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.widgets.fields import ChoiceField
-from labapp.gui.widgets.labels import plain_label, plain_tip
+from labapp.gui.widgets.labels import plain_tip, wrapping_label
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 
@@ -48,8 +48,7 @@ class CompareView(QWidget):
         self.workspace = workspace
         self.first, self.second = (_SchemeBox(order) for order in ("First", "Second"))
         self.difference = make_view3d("Difference of the two surfaces")
-        self.words = plain_label()
-        self.words.setWordWrap(True)
+        self.words = wrapping_label()
         self.table = _table()
         self._options = Options()
         self._shown_for: object = None

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
-from PySide6.QtWidgets import QGridLayout, QLabel, QProgressBar, QPushButton, QVBoxLayout
+from PySide6.QtWidgets import QGridLayout, QProgressBar, QVBoxLayout
 
 from labapp.gui.pages.surface.presenter import (
     CORRESPONDENCES,
@@ -16,8 +15,9 @@ from labapp.gui.pages.surface.presenter import (
     with_scheme,
 )
 from labapp.gui.tasks import Task
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import heading, keep_room, plain_label, plain_tip
+from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
@@ -53,9 +53,9 @@ class SurfacePanel:
         form = FieldForm()
         form.add(self.scheme)
         form.add(self.correspondence)
-        self.status, self.provenance, self.verdict = (_words() for _ in range(3))
+        self.status, self.provenance, self.verdict = (wrapping_label() for _ in range(3))
         self.status.setAccessibleName("How this frame stands")
-        self.again = _button(
+        self.again = button(
             "Measure &again", "Measure this frame anew: its figures no longer stand", self.this_one
         )
         self.sizes = ResultTable("Size of the pool")
@@ -63,6 +63,8 @@ class SurfacePanel:
         self.trials = ResultTable("Errors of the correspondences tried")
         layout.addWidget(form)
         layout.addLayout(self._measuring())
+        measuring = (self.one, self.missing, self.all, self.again)
+        self._tips = {each: each.toolTip() for each in measuring}
         keep_room(self.progress, self.cancel, self.again)
         for widget in (self.again, self.status, self.sizes, self.errors, self.provenance):
             layout.addWidget(widget)
@@ -73,17 +75,17 @@ class SurfacePanel:
         workspace.tasks.progressed.connect(self._show_progress)
 
     def _measuring(self) -> QGridLayout:
-        self.one = _button("&This frame", "Measure the frame in view (Shift+F5)", self.this_one)
-        self.missing = _button(
+        self.one = button("&This frame", "Measure the frame in view (Shift+F5)", self.this_one)
+        self.missing = button(
             "&Not measured",
             "Measure every frame that is not measured, or no longer stands (F5)",
             self.not_measured,
         )
-        self.all = _button("A&ll frames", "Measure every frame anew", self.all_frames)
+        self.all = button("A&ll frames", "Measure every frame anew", self.all_frames)
         self.progress = QProgressBar()
         self.progress.setAccessibleName("How far the measurement is")
         self.progress.setToolTip("How far the measurement is")
-        self.cancel = _button("&Cancel", "Stop measuring; what is done stays (Ctrl+.)", self.stop)
+        self.cancel = button("&Cancel", "Stop measuring; what is done stays (Ctrl+.)", self.stop)
         grid = QGridLayout()
         grid.addWidget(heading("Measure"), 0, 0)
         grid.addWidget(self.one, 0, 1)
@@ -125,10 +127,10 @@ class SurfacePanel:
         why = "Measuring is under way" if working else "No session is open"
         if session is not None and not working:
             why = why_not(session)
-        for button in (self.one, self.missing, self.all, self.again):
-            button.setEnabled(not why)
-            tooltip = button.property("what")
-            button.setToolTip(plain_tip(f"{tooltip}. {why}" if why else tooltip))
+        for each in self._tips:
+            each.setEnabled(not why)
+            tip = self._tips[each]
+            each.setToolTip(plain_tip(f"{tip}. {why}" if why else tip))
         self.progress.setVisible(working)
         self.cancel.setVisible(working)
         if working and task is not None:
@@ -173,19 +175,3 @@ class SurfacePanel:
                 f"correspondence {choice}",
             )
         )
-
-
-def _button(text: str, what: str, work: Callable[[], None]) -> QPushButton:
-    button = QPushButton(text)
-    button.setToolTip(what)
-    button.setProperty("what", what)
-    button.setAccessibleName(text.replace("&", ""))
-    button.setAccessibleDescription(what)
-    button.clicked.connect(work)
-    return button
-
-
-def _words() -> QLabel:
-    label = plain_label()
-    label.setWordWrap(True)
-    return label

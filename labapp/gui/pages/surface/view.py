@@ -413,8 +413,6 @@ def _tool(
     button = button or QToolButton()
     button.setText(words)
     button.setToolTip(what)
-    button.setAccessibleName(words)
-    button.setAccessibleDescription(what)
     button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
     button.clicked.connect(lambda _: work())
     return button

@@ -13,7 +13,6 @@ from PySide6.QtWidgets import (
     QFileDialog,
     QGridLayout,
     QHBoxLayout,
-    QPushButton,
     QSplitter,
     QWidget,
 )
@@ -22,8 +21,9 @@ from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
 from labapp.gui.tasks import Control
 from labapp.gui.views.plots import PlotStack
+from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.fields import ChoiceField, NumberField
-from labapp.gui.widgets.labels import Message, heading, keep_room, plain_label, plain_words
+from labapp.gui.widgets.labels import Message, heading, keep_room, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.signals import Signals, read_signals
@@ -171,11 +171,10 @@ class TrendsPage(Page):
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        self.nothing = plain_label(
+        self.nothing = wrapping_label(
             "Nothing to show yet: tick a measure at the right, or measure some frames first."
         )
         self.nothing.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self.nothing.setWordWrap(True)
         self.canvas_layout.addWidget(self.nothing, 1)
         layout = self.panel_layout
         layout.addWidget(heading("Shown"))
@@ -193,13 +192,13 @@ class TrendsPage(Page):
         self.without.toggled.connect(lambda on: self._wish(without_doubtful=on))
         layout.addWidget(self.without)
         layout.addLayout(
-            _buttons(
-                (
+            button_row(
+                button(
                     "Copy values",
                     "Copy the values of all frames shown, for a spreadsheet",
                     self.plots.copy_table,
                 ),
-                ("Copy picture", "Copy the plots as a picture", self.plots.copy_picture),
+                button("Copy picture", "Copy the plots as a picture", self.plots.copy_picture),
             )
         )
         self._make_spectrum()
@@ -231,7 +230,7 @@ class TrendsPage(Page):
 
     def _make_signals(self) -> None:
         self.panel_layout.addWidget(heading("Current and voltage"))
-        self.signals_words = plain_words()
+        self.signals_words = wrapping_label()
         self.start = NumberField(
             "Starts at",
             "s",
@@ -243,37 +242,19 @@ class TrendsPage(Page):
         )
         self.start.edited.connect(self._start_at)
         self.panel_layout.addLayout(_labelled(self.start))
-        row = QHBoxLayout()
-        self.read_button = _button(
+        self.read_button = button(
             "Read a table …",
             "Read current and voltage from a CSV table and keep them in the session",
             self.choose_signals,
         )
-        self.forget_button = _button(
+        self.forget_button = button(
             "Remove",
             "Take current and voltage out of the session; undo brings them back",
             lambda: self.workspace.attempt(lambda session: session.set_signals(None)),
         )
-        row.addWidget(self.read_button)
-        row.addWidget(self.forget_button)
         keep_room(self.start, self.start.label, self.forget_button)
-        self.panel_layout.addLayout(row)
+        self.panel_layout.addLayout(button_row(self.read_button, self.forget_button))
         self.panel_layout.addWidget(self.signals_words)
-
-
-def _button(words: str, tip: str, work: Callable[[], object]) -> QPushButton:
-    button = QPushButton(words)
-    button.setToolTip(tip)
-    button.setAccessibleDescription(tip)
-    button.clicked.connect(lambda _: work())
-    return button
-
-
-def _buttons(*buttons: tuple[str, str, Callable[[], object]]) -> QHBoxLayout:
-    row = QHBoxLayout()
-    for words, tip, work in buttons:
-        row.addWidget(_button(words, tip, work))
-    return row
 
 
 def _labelled(field: ChoiceField | NumberField) -> QHBoxLayout:
