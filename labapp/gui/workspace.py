@@ -98,6 +98,11 @@ class Workspace(QObject):
         made.kept.connect(self.pedals_kept)
         return made
 
+    @property
+    def folder(self) -> Path:
+        """Where a file dialog begins: the session's folder; without a session the home folder."""
+        return Path.home() if self.session is None else self.session.path.parent
+
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""
         for cause in list(self._problems):

@@ -8,19 +8,11 @@ from functools import partial
 
 from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout, QWidget
 
-from labapp.export.drawing import Direction
 from labapp.export.scene import Scene
 from labapp.gui.live.figures import OLD_S
-from labapp.gui.views.view3d import make_view3d
+from labapp.gui.views.view3d import LOOKS, make_view3d
 from labapp.gui.widgets.buttons import button
 from labapp.run.live_watch import Followed, LiveWatch
-
-LOOKS: dict[Direction, tuple[str, str]] = {
-    "top": ("Top", "Look from the top (1 in the view)"),
-    "side": ("Side", "Look from the side, along −X (2 in the view)"),
-    "front": ("Front", "Look as the camera does, along Y (3 in the view)"),
-    "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
-}
 
 LASTS_S = 1.0
 """A surface is shown so long where the frames after it cannot be measured; `OLD_S`, where no more

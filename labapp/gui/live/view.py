@@ -258,6 +258,11 @@ class LiveView(QObject):
         """Whether frames come, or will when the camera is back."""
         return self.live is not None and self.live.is_open
 
+    @property
+    def recording(self) -> Take | None:
+        """The recording that runs; None if none does."""
+        return None if self.live is None else self.live.running
+
     def trigger(self) -> None:
         """Begin a recording, or end the one that runs."""
         live = self.live
@@ -273,10 +278,10 @@ class LiveView(QObject):
 
     def mark(self) -> bool:
         """Note the present frame beside the recording that runs; False if none does."""
-        recorded = self.live is not None and self.live.running is not None
-        if self.live is not None and recorded:
-            self.live.mark()
-        return recorded
+        if self.live is None or self.recording is None:
+            return False
+        self.live.mark()
+        return True
 
     def acknowledge(self) -> None:
         """Take it that the operator has seen the alarms."""
@@ -405,7 +410,7 @@ class LiveView(QObject):
             self.changed.emit()
         live = self.live
         runs = live is not None and live.is_open
-        self._shown = recording = live is not None and live.running is not None
+        self._shown = recording = self.recording is not None
         self.camera.setEnabled(live is None)
         for each in (self.start_button, self.find_button):
             each.setVisible(live is None)

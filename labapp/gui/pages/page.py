@@ -13,7 +13,7 @@ from labapp.gui.widgets.fields import Field
 from labapp.gui.workspace import Workspace
 
 if TYPE_CHECKING:
-    from labapp.media.recording.take_files import Take
+    from labapp.gui.live.view import LiveView
 
 
 class Page(QWidget):
@@ -95,24 +95,9 @@ class Page(QWidget):
         """
 
     @property
-    def live(self) -> bool:
-        """Whether the page watches a camera that it can record from."""
-        return False
-
-    def trigger(self) -> None:
-        """Begin a recording, or end the one that runs; while `live`."""
-
-    @property
-    def recording(self) -> Take | None:
-        """The recording that runs; None if none does."""
+    def camera(self) -> LiveView | None:
+        """The live camera that the page watches, in view or not; None if it watches none."""
         return None
-
-    def discard(self, take: Take) -> None:
-        """Delete a recording that runs as soon as the camera is let go."""
-
-    def mark(self) -> bool:
-        """Note the present moment beside the recording that runs; False if none does."""
-        return False
 
     def takes_key(self, event: QKeyEvent) -> bool:
         """Do what a plain key means here that nothing in view has taken; whether it did."""

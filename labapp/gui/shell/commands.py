@@ -11,7 +11,6 @@ from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QApplication, QTableView
 
 from labapp.gui.preferences import THEMES, Preferences, PreferencesStore
-from labapp.gui.shell import filming
 from labapp.gui.shell.focus import go_to_part
 from labapp.gui.shell.help import TITLES, HelpDialog
 from labapp.gui.shell.steps import STEPS
@@ -22,6 +21,8 @@ from labapp.log import log_file
 
 FAR = 10**9
 """More frames than there are."""
+
+NO_CAMERA = "No camera is watched: start one in the step Recording"
 
 
 def make_window(preferences: Preferences, file: Path) -> MainWindow:
@@ -40,7 +41,6 @@ def make_window(preferences: Preferences, file: Path) -> MainWindow:
 def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
     """What the actions do in a window, by their names."""
     files, workspace, timeline = window.files, window.workspace, window.timeline
-    pages, say = window.pages.values(), window.say
     parts = (
         window.step_list,
         window.stack,
@@ -73,8 +73,8 @@ def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
         "first": lambda: timeline.step(-FAR),
         "last": lambda: timeline.step(FAR),
         "play": lambda: timeline.set_playing(not timeline.playing),
-        "record": lambda: filming.trigger(pages, say),
-        "mark": lambda: filming.mark(pages, say),
+        "record": lambda: record(window),
+        "mark": lambda: mark(window),
         "next_doubtful": lambda: window.jump("doubtful", True),
         "previous_doubtful": lambda: window.jump("doubtful", False),
         "next_corrected": lambda: window.jump("corrected", True),
@@ -92,6 +92,22 @@ def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
         **{kind: partial(show_help, window, kind) for kind in TITLES},
         "log_folder": lambda: show_log_folder(window),
     }
+
+
+def record(window: MainWindow) -> None:
+    """Begin a recording of the live camera, or end it, whatever page is in view."""
+    if window.camera is None:
+        window.say(NO_CAMERA, True)
+    else:
+        window.camera.trigger()
+
+
+def mark(window: MainWindow) -> None:
+    """Mark the present moment in the recording that runs."""
+    if window.camera is None:
+        window.say(NO_CAMERA, True)
+    elif not window.camera.mark():
+        window.say("Nothing is being recorded: there is nothing to mark")
 
 
 def copy_picture(window: MainWindow) -> None:

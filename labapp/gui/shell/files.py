@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui import dialogs
-from labapp.gui.shell.filming import live_page
 from labapp.gui.workspace import MISSING
 from labapp.session.file.database import SUFFIX, SessionInUse
 
 if TYPE_CHECKING:
     from PySide6.QtWidgets import QWidget
 
-    from labapp.gui.pages.page import Page
+    from labapp.gui.live.view import LiveView
     from labapp.gui.preferences import PreferencesStore
     from labapp.gui.workspace import Workspace
     from labapp.session.session import Session
@@ -34,8 +33,8 @@ class Files(QObject):
         Where sessions are shown.
     preferences
         Where a question for a file begins, and what was opened last.
-    pages
-        Those made by now, by their keys: one of them may be recording.
+    camera
+        Gives the live camera, which may be recording; None while none is watched.
 
     Signals
     -------
@@ -53,13 +52,13 @@ class Files(QObject):
         window: QWidget,
         workspace: Workspace,
         preferences: PreferencesStore,
-        pages: Mapping[str, Page],
+        camera: Callable[[], LiveView | None],
     ) -> None:
         super().__init__(window)
         self._window = window
         self.workspace = workspace
         self.preferences = preferences
-        self._pages = pages
+        self._camera = camera
 
     def new(self) -> bool:
         """Ask for a file and make a session in it."""
@@ -159,13 +158,13 @@ class Files(QObject):
 
     def may_close(self) -> bool:
         """Ask what becomes of a recording that runs; False if it is to go on, nothing closed."""
-        page = live_page(self._pages.values())
-        take = None if page is None else page.recording
-        if page is None or take is None:
+        camera = self._camera()
+        take = None if camera is None else camera.recording
+        if camera is None or take is None:
             return True
         answer = dialogs.ask_recording_end(self._window, take.path.name)
         if answer == "discard":
-            page.discard(take)
+            camera.discard(take)
         return answer != "go on"
 
     def _create(self, proposed: Path) -> bool:

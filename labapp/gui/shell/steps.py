@@ -77,6 +77,27 @@ def recording_gone(session: Session) -> str:
     return "" if missing is None else f"{missing.name} is not where it was: say where it is now"
 
 
+def why_not_measurable(session: Session) -> str:
+    """Why no frame can be measured now, and what to do; empty if frames can be."""
+    if session.read_only:
+        return READ_ONLY
+    if not len(session.frames):
+        return "Import a recording first"
+    if gone := recording_gone(session):
+        return gone
+    to_do = setup_to_do(setup_problems(session))
+    return f"The set-up is not complete. {to_do}" if to_do else ""
+
+
+def setup_problems(session: Session) -> tuple[InputError, ...]:
+    """What is missing or wrong in the set-up; empty if it is complete."""
+    try:
+        _ = session.setup
+    except InputError as error:
+        return error.problems
+    return ()
+
+
 def calibrations_in_use(session: Session) -> tuple[bool, bool]:
     """Whether the set-up has the laser, and the imaging plane, that the calibrations found.
 
@@ -139,11 +160,7 @@ class Facts:
 
 
 def _facts(session: Session, seen: Overview | None) -> Facts:
-    problems: tuple[InputError, ...] = ()
-    try:
-        _ = session.setup
-    except InputError as error:
-        problems = error.problems
+    problems = setup_problems(session)
     if session.recording is None:
         return Facts(session, problems)
     seen = seen or session.overview()

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QByteArray, QEvent, QSize, Qt, QTimer
@@ -20,7 +21,6 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.core.values import IntArray
-from labapp.errors import InputError
 from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.welcome import Welcome
@@ -28,16 +28,18 @@ from labapp.gui.preferences import THEMES, PreferencesStore
 from labapp.gui.shell.action import Needs
 from labapp.gui.shell.actions import ACTIONS
 from labapp.gui.shell.files import Files, title
-from labapp.gui.shell.filming import live_page
 from labapp.gui.shell.focus import finish_edit
 from labapp.gui.shell.menus import Menus, steps_of
 from labapp.gui.shell.messages import LogPanel, StatusLine
 from labapp.gui.shell.standing import DOUBTFUL, TICKS, next_frame, standings
 from labapp.gui.shell.step_list import SidePanel, StepList
-from labapp.gui.shell.steps import STEPS, first_step, read_only, states
+from labapp.gui.shell.steps import STEPS, first_step, read_only, states, why_not_measurable
 from labapp.gui.theme import apply_theme
 from labapp.gui.widgets.timeline import Timeline
 from labapp.gui.workspace import MEASURING, Workspace
+
+if TYPE_CHECKING:
+    from labapp.gui.live.view import LiveView
 
 Commands = Callable[["MainWindow"], Mapping[str, Callable[[], object]]]
 """What each action does in a window, by its name."""
@@ -86,7 +88,7 @@ class MainWindow(QMainWindow):
         preferences.setParent(self)
         self.workspace = Workspace(self)
         self.pages: dict[str, Page] = {}
-        self.files = Files(self, self.workspace, preferences, self.pages)
+        self.files = Files(self, self.workspace, preferences, lambda: self.camera)
         self.standings: IntArray = np.zeros(0, np.int64)
         self.page: Page | None = None
         self._steps = tuple(step for step in STEPS if step.key in PAGES)
@@ -187,7 +189,7 @@ class MainWindow(QMainWindow):
             "undo": bool(undo),
             "redo": bool(redo),
             "work": bool(self.workspace.tasks.active),
-            "live": live_page(self.pages.values()) is not None,
+            "live": self.camera is not None,
         }
         on = {
             **self._wanted,
@@ -237,6 +239,11 @@ class MainWindow(QMainWindow):
         self.step_list.show_step(key)
         self._show_page()
         self._show_actions()
+
+    @property
+    def camera(self) -> LiveView | None:
+        """The live camera, whatever page is in view; None while none is watched."""
+        return next((page.camera for page in self.pages.values() if page.camera), None)
 
     def go_step(self, by: int) -> None:
         """Go some steps on, or back."""
@@ -380,10 +387,8 @@ class MainWindow(QMainWindow):
         if any(task.title == MEASURING for task in self.workspace.tasks.active):
             self.say("Frames are being measured already")
             return
-        try:
-            _ = session.setup
-        except InputError as error:
-            self.workspace.say_wrong(MEASURING, f"The set-up is not complete: {error}")
+        if why := why_not_measurable(session):
+            self.workspace.say_wrong(MEASURING, why)
             return
         self.workspace.measure(frames)
 

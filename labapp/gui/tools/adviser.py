@@ -210,7 +210,9 @@ class AdviserWindow(ToolWindow):
 
     def choose_folder(self) -> None:
         """Ask where to write the files."""
-        name = QFileDialog.getExistingDirectory(self, "Save the advice in", self.folder_near)
+        name = QFileDialog.getExistingDirectory(
+            self, "Save the advice in", str(self.workspace.folder)
+        )
         if name:
             self.save(Path(name))
 

@@ -232,6 +232,8 @@ class AnalysisWindow(ToolWindow):
 
     def choose_folder(self) -> None:
         """Ask where to write the files."""
-        name = QFileDialog.getExistingDirectory(self, "Save the results in", self.folder_near)
+        name = QFileDialog.getExistingDirectory(
+            self, "Save the results in", str(self.workspace.folder)
+        )
         if name:
             self.save(Path(name))

@@ -21,8 +21,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.errors import InputError
-from labapp.files import write_atomically
+from labapp.gui.dialogs import refused_as_input, write_file
 from labapp.gui.shell.messages import PROBLEM, ElidedLabel
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
@@ -219,34 +218,22 @@ class ToolWindow(QDialog):
             task.cancel()
         self._show_progress()
 
-    @property
-    def folder_near(self) -> str:
-        """Where a question for a folder begins."""
-        session = self.workspace.session
-        return str(Path.home() if session is None else session.path.parent)
-
     def save(self, folder: Path) -> None:
         """Write what was found, as the command does; each file is whole."""
 
-        def write() -> None:
-            try:
+        def write() -> Path:
+            with refused_as_input(folder, "folder"):
                 folder.mkdir(parents=True, exist_ok=True)
-                for name, content in self.files.items():
-                    write_atomically(folder / name, content)
-            except OSError as error:
-                expected = "one that can be written"
-                raise InputError(folder, "folder", error.strerror, expected) from error
+            for name, content in self.files.items():
+                write_file(folder / name, content)
+            return folder
 
-        if self.tried(write):
+        if self.workspace.tried(write):
             self.say(f"Saved in {folder}")
 
     def say(self, text: str, problem: bool = False) -> None:
         """Tell something on the line below."""
         self.message.setText(f"{PROBLEM} {text}" if problem else text)
-
-    def tried(self, work: Callable[[], object]) -> bool:
-        """Do something short; a refusal is said in words, and False."""
-        return self.workspace.tried(lambda: (work(),)) is not None
 
     def _heard(self, text: str, problem: bool) -> None:
         """What is said behind this window is said here too."""

@@ -37,9 +37,7 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
     Signals
     -------
     moved
-        It is under way: u, v.
-    dropped
-        It was let go, or nudged: u, v.
+        It was dragged or nudged, or is being dragged: u, v.
 
     Parameters
     ----------
@@ -52,7 +50,6 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
     """
 
     moved = Signal(float, float)
-    dropped = Signal(float, float)
 
     def __init__(self, name: str, u: float, v: float, color: str = "#ffb000") -> None:
         self.name = name
@@ -68,7 +65,6 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
         )
         self.setToolTip(f"{name}: drag it, or use the arrow keys (Shift: {FAR_NUDGE_PX:g} px)")
         self.sigPositionChanged.connect(lambda *_: self.moved.emit(*self.place))
-        self.sigPositionChangeFinished.connect(lambda *_: self.dropped.emit(*self.place))
 
     @property
     def place(self) -> tuple[float, float]:
@@ -89,7 +85,6 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
             return
         u, v = self.place
         self.setPos(u + du, v + dv)
-        self.dropped.emit(*self.place)
 
     def show_chosen(self, chosen: bool) -> None:
         """Show whether the arrow keys move it."""

@@ -177,15 +177,6 @@ class PictureView(Drawn):
         point.moved.connect(lambda *_: self.choose_point(point))
         self.choose_point(self._current or point)
 
-    def remove_point(self, point: DragPoint) -> None:
-        """Take a point away."""
-        self.points.remove(point)
-        self.remove(point)
-        if self._current is point:
-            self._current = None
-            if self.points:
-                self.choose_point(self.points[0])
-
     def choose_point(self, point: DragPoint) -> None:
         """Let the arrow keys move a point."""
         self._current = point

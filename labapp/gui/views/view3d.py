@@ -34,6 +34,14 @@ from labapp.export.drawing import USUAL_DPI, Direction, Drawing, build_scene, ca
 from labapp.export.scene import Scene
 from labapp.gui.views.canvas import Drawn
 
+LOOKS: dict[Direction, tuple[str, str]] = {
+    "top": ("Top", "Look from the top (1 in the view)"),
+    "side": ("Side", "Look from the side, along −X (2 in the view)"),
+    "front": ("Front", "Look as the camera does, along Y (3 in the view)"),
+    "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
+}
+"""Text and tooltip of the buttons for the directions of view."""
+
 TURN_DEG = 10.0
 """An arrow key turns the scene so far."""
 

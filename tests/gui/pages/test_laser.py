@@ -96,7 +96,7 @@ def test_what_is_used_comes_back_with_its_readings(tmp_path: Path) -> None:
         assert presenter.kept(session) is None
         assert [row.value for row in presenter.in_use(session)] == [None, None]
         readings = Readings(CROSS, 10.0)
-        presenter.use(session, readings)
+        session.calibrate_laser(*readings.lengths_mm, readings.fan_angle_deg)
         assert presenter.kept(session) == readings
         angle, distance = (row.value for row in presenter.in_use(session))
         assert angle == pytest.approx(30.0, abs=0.01)
@@ -196,8 +196,9 @@ def test_lengths_from_a_picture_are_a_reading_and_the_picture_is_kept(
     page.load_picture(tmp_path / "cross.png")
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
     page.scale.set_value(25.0)
+    points = {point.name: point for point in page.picture_view.points}
     for name, (u, v) in cross_places(12.0).items():
-        page.move_point(name, u, v)
+        points[name].setPos(u, v)
     assert page.lengths.text() == "l₁ 13.68 mm,  l₂ 18.56 mm,  l₃ 7.87 mm"
     page.add_button.click()
     assert page.readings().lengths_mm == ((13.68,), (18.56,), (7.87,))

@@ -585,7 +585,7 @@ def test_an_opening_that_is_cancelled(
     gate.set()
     qtbot.waitUntil(lambda: page.live_view.live is None)
     assert page.live_view.start_button.isVisible()
-    assert not page.live
+    assert page.camera is None
 
 
 def test_cameras_are_looked_for(window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch):

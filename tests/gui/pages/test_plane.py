@@ -16,7 +16,6 @@ from pytestqt.qtbot import QtBot
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
-from labapp.errors import InputError
 from labapp.gui.pages.plane import PlanePage, presenter
 from labapp.gui.shell.steps import states
 from labapp.gui.workspace import Workspace
@@ -86,7 +85,7 @@ def test_the_model_is_proposed_with_its_reason_and_can_be_overridden() -> None:
     assert presenter.choices(SQUARE) == (("three points", "Three points"),)
     rows = {row.name: row.value for row in presenter.result(tilted).rows}
     assert 0.03 < rows["Homography residual"] < 0.1 < rows["Affine residual"]
-    used = presenter.with_model(tilted, "homography").image_calibration
+    used = replace(tilted, model="homography").image_calibration
     np.testing.assert_allclose(used.to_image(np.array([[100.0, 0.0]])), [[590.9, 363.6]], atol=0.3)
     by_hand = presenter.moved(tilted, 0, (51.0, 400.0))
     assert (by_hand.model, by_hand.marks) == ("three points", ())
@@ -141,7 +140,7 @@ def test_what_is_in_use_is_told_whichever_form_it_has(tmp_path: Path) -> None:
     with Session.create(tmp_path / "new.labsession") as session:
         assert all(np.isnan(row.value) for row in presenter.in_use(session))
         image = cv2.imread(str(GTAW / "calibration.png"), cv2.IMREAD_UNCHANGED)
-        presenter.use(session, SQUARE, 10.0, image, "by hand")
+        session.use_plane(SQUARE, 10.0, image, "by hand")
         assert [row.value for row in presenter.in_use(session)] == pytest.approx([6, 6, 90])
         sigmas = [row.sigma for row in presenter.in_use(session)]
         assert sigmas == pytest.approx(SQUARE.scales_and_angle_sigma.tolist())
@@ -154,13 +153,6 @@ def test_what_is_in_use_is_told_whichever_form_it_has(tmp_path: Path) -> None:
         assert [row.value for row in presenter.in_use(session)] == pytest.approx([6, 6, 90])
         assert [row.sigma for row in presenter.in_use(session)] == [None] * 3
         assert states(session)["plane"].why == "Other values were entered after the calibration"
-
-
-def test_the_target_is_written_for_the_printer(tmp_path: Path) -> None:
-    presenter.save_target(tmp_path / "target.svg")
-    assert (tmp_path / "target.svg").read_text("utf-8") == target_svg(Target())
-    with pytest.raises(InputError, match="can be written"):
-        presenter.save_target(tmp_path / "not there" / "target.svg")
 
 
 def test_a_picture_without_a_target_is_refused_in_words() -> None:
@@ -186,6 +178,17 @@ def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage
     workspace.close()
     made.hide()
     made.panel.hide()
+
+
+def test_the_target_is_written_for_the_printer(page: PlanePage, tmp_path: Path) -> None:
+    said: list[tuple[str, bool]] = []
+    page.workspace.said.connect(lambda text, problem: said.append((text, problem)))
+    page.save_target(tmp_path / "target.svg")
+    assert (tmp_path / "target.svg").read_text("utf-8") == target_svg(Target())
+    assert not said[-1][1]
+    page.save_target(tmp_path / "not there" / "target.svg")
+    assert said[-1][1]
+    assert "can be written" in said[-1][0]
 
 
 def test_a_picture_is_loaded_found_used_and_undone(qtbot: QtBot, page: PlanePage) -> None:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from PySide6.QtCore import QPointF, Qt
-from PySide6.QtGui import QGuiApplication, QImage
+from PySide6.QtGui import QAccessible, QGuiApplication, QImage
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractButton,
@@ -275,7 +275,9 @@ def test_every_control_can_be_named_and_reached(page: SurfacePage) -> None:
             if not each.text():
                 continue  # of a spin box or a header
             assert each.toolTip(), each.text()
-            assert each.accessibleName(), each.text()
+            spoken = QAccessible.queryAccessibleInterface(each)
+            for part in (QAccessible.Text.Name, QAccessible.Text.Description):
+                assert spoken.text(part), each.text()
             assert each.focusPolicy() & Qt.FocusPolicy.TabFocus, each.text()
 
 

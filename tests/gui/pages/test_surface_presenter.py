@@ -10,6 +10,7 @@ from labapp.core.values import CannotMeasure
 from labapp.export.heights import profile
 from labapp.gui.pages.surface import comparison, presenter
 from labapp.gui.pages.surface.presenter import Options
+from labapp.gui.shell.steps import why_not_measurable
 from labapp.session.measured import scheme_name
 from labapp.session.session import Session
 from tests.gui.conftest import CopySample
@@ -175,17 +176,17 @@ def test_a_scheme_compared_with_itself_does_not_differ(session: Session) -> None
 
 
 def test_why_nothing_can_be_measured(session: Session, copy_sample: CopySample) -> None:
-    assert presenter.why_not(session) == ""
+    assert why_not_measurable(session) == ""
     session.update_setup({"laser": {"distance_mm": None}})
-    assert "Enter the laser" in presenter.why_not(session)
+    assert "Enter the laser" in why_not_measurable(session)
     session.undo()
     with Session.create(session.path.with_name("empty.labsession")) as empty:
-        assert presenter.why_not(empty) == "Import a recording first"
+        assert why_not_measurable(empty) == "Import a recording first"
         assert presenter.shown(empty, 0).state == "unmeasured"
     path = copy_sample("concave")
     (path.parent / "recording").rename(path.parent / "elsewhere")
     with Session.open(path) as lost:
-        assert "is not where it was" in presenter.why_not(lost)
+        assert "is not where it was" in why_not_measurable(lost)
 
 
 def test_surfaces_that_do_not_overlap_are_said_to(

@@ -137,31 +137,14 @@ class CapturePage(Page):
     # --- live ---------------------------------------------------------------------------------
 
     @property
-    def live(self) -> bool:
-        """Whether a camera is watched."""
-        return self.live_view.is_live
-
-    def trigger(self) -> None:
-        """Begin a recording, or end the one that runs."""
-        self.live_view.trigger()
-
-    @property
-    def recording(self) -> Take | None:
-        """The recording that runs; None if none does."""
-        return None if self.live_view.live is None else self.live_view.live.running
-
-    def discard(self, take: Take) -> None:
-        """Delete a recording that runs as soon as the camera is let go."""
-        self.live_view.discard(take)
-
-    def mark(self) -> bool:
-        """Note the present moment beside the recording that runs; False if none does."""
-        return self.live_view.mark()
+    def camera(self) -> LiveView | None:
+        """The live camera; None while none is watched."""
+        return self.live_view if self.live_view.is_live else None
 
     def takes_key(self, event: QKeyEvent) -> bool:
         """Space records, M marks and A acknowledges alarms while a camera is watched."""
         plain = event.modifiers() in (Qt.KeyboardModifier.NoModifier, KEYPAD)
-        if not plain or not self.live:
+        if not plain or self.camera is None:
             return False
         return event.isAutoRepeat() or self.live_view.take_key(Qt.Key(event.key()))
 
@@ -229,7 +212,7 @@ class CapturePage(Page):
         self.slider.setVisible(self.preview is not None and self.preview.frames > 1)
         if session is not None and session is not self._listed and not working:
             self._listed = session
-            self.kept.list_beside(session, self.recording)
+            self.kept.list_beside(session, self.live_view.recording)
 
     def _show_seen(self, seen: Seen) -> None:
         self.title.setText(seen.title)
@@ -309,10 +292,7 @@ class CapturePage(Page):
             self.choose(Path(name))
 
     def _folder(self) -> Path:
-        session = self.workspace.session
-        if self._last_folder.name or session is None:
-            return self._last_folder
-        return session.path.parent
+        return self._last_folder if self._last_folder.name else self.workspace.folder
 
     def choose(self, path: Path) -> None:
         """Look at a recording, to import it."""

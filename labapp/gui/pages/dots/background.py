@@ -7,7 +7,7 @@ from PySide6.QtCore import QObject, QTimer, Signal
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.presenter import Carried, Found, Shown
-from labapp.gui.shell.steps import recording_gone
+from labapp.gui.shell.steps import recording_gone, why_not_measurable
 from labapp.gui.tasks import Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -122,7 +122,7 @@ def carry_on(workspace: Workspace, seen: Shown, most: int | None) -> None:
         ):
             return
         workspace.said.emit(carried.words, not carried.corrections)
-        if carried.corrections and not presenter.why_no_fit(session):
+        if carried.corrections and not why_not_measurable(session):
             workspace.measure(list(carried.corrections))
 
     workspace.tasks.start(

@@ -12,6 +12,7 @@ from PySide6.QtCore import QTimer
 from labapp.core.pipeline import Settings
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.presenter import Shown
+from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.tasks import Cancelled, Control, Task
 from labapp.gui.workspace import Workspace
 from labapp.run.measurers import measuring_pool
@@ -100,7 +101,7 @@ class Refit:
     def want(self, seen: Shown) -> None:
         """Fit a frame if what it was measured from has been changed."""
         session = self._space.session
-        if session is None or presenter.why_no_fit(session):
+        if session is None or why_not_measurable(session):
             return
         self._seen = seen
         if not self.processes.begun and not self._warm.isActive():

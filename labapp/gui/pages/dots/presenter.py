@@ -19,7 +19,6 @@ from labapp.core.rows.tracking import carry_on
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow, plain
-from labapp.gui.shell.steps import recording_gone
 from labapp.gui.tasks import Cancelled, Control
 from labapp.session.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
@@ -207,20 +206,6 @@ def needs_fit(seen: Shown) -> bool:
     if seen.result is None:
         return seen.origin == "corrected"
     return CORRECTION_CHANGED in seen.result.stale
-
-
-def why_no_fit(session: Session) -> str:
-    """Why no fit can be made at all, a sentence; empty if it can."""
-    if session.read_only:
-        return "The session is open read-only: nothing can be changed or measured"
-    if gone := recording_gone(session):
-        return gone
-    try:
-        _ = session.setup
-    except InputError as error:
-        problem = error.problems[0]
-        return f"The set-up is not complete ({problem.field}): no fit yet"
-    return ""
 
 
 # --- in words and numbers ---------------------------------------------------------------------

@@ -19,6 +19,7 @@ from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
 from labapp.gui.pages.dots.presenter import Figures, Need, Shown
 from labapp.gui.pages.page import Page
+from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.views.drag_point import SHIFT, arrow_step
 from labapp.gui.views.picture import PictureView, Tool
 from labapp.gui.workspace import Workspace
@@ -130,7 +131,7 @@ class DotsPage(Page):
         figures = presenter.figures(seen.result)
         stands = seen.result is not None and not seen.result.stale
         pending = "fitting …" if self.refit.pending else "" if stands else "–"
-        why = seen.why or (presenter.why_no_fit(session) if not stands else "")
+        why = seen.why or (why_not_measurable(session) if not stands else "")
         dots = seen.correction
         if seen.why and dots is not None and dots.lattice.reference is None:
             why = f"{why}. {NO_REFERENCE}"

@@ -144,11 +144,6 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     )
 
 
-def use(session: Session, readings: Readings, picture: GreyImage | None = None) -> None:
-    """Put the laser that follows from the readings into the rig."""
-    session.calibrate_laser(*readings.lengths_mm, readings.fan_angle_deg, picture)
-
-
 # --- a picture of the cross -------------------------------------------------------------------
 
 

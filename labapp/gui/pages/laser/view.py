@@ -105,7 +105,10 @@ class LaserPage(Page):
         """Put the laser that follows into the rig."""
         readings = self.readings()
         picture = self._from_picture
-        if self.workspace.attempt(lambda session: presenter.use(session, readings, picture)):
+        lengths_mm, fan_deg = readings.lengths_mm, readings.fan_angle_deg
+        if self.workspace.attempt(
+            lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture)
+        ):
             self.workspace.said.emit("The laser is in the rig; undo brings the former back", False)
 
     # --- the panel --------------------------------------------------------------------------
@@ -243,8 +246,7 @@ class LaserPage(Page):
     # --- the picture ------------------------------------------------------------------------
 
     def _choose_picture(self) -> None:
-        session = self.workspace.session
-        folder = "" if session is None else str(Path(session.path).parent)
+        folder = str(self.workspace.folder)
         path, _ = QFileDialog.getOpenFileName(self, "Picture of the cross hair", folder)
         if path:
             self.load_picture(Path(path))
@@ -269,11 +271,6 @@ class LaserPage(Page):
     def places(self) -> dict[str, Place]:
         """(u, v) of the points, by name, px."""
         return {name: point.place for name, point in self._points.items()}
-
-    def move_point(self, name: str, u: float, v: float) -> None:
-        """Put a point somewhere, as a drag does."""
-        self._points[name].set_place(u, v)
-        self._dragged()
 
     def _cross(self) -> tuple[float, float, float] | None:
         if not self._points:

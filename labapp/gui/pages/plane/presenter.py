@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -16,13 +15,11 @@ from labapp.core.calibration.plane_calibration import (
 )
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
-from labapp.files import write_atomically
 from labapp.gui.digits import ResultRow
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage
 from labapp.session.session import Session
-from labapp.simulation.target import Target, target_svg
+from labapp.simulation.target import Target
 
 POINTS = ("O′", "O′X′", "O′Z′")
 """Names of the three points: the origin, and the middles of the two bars."""
@@ -181,11 +178,6 @@ def choices(found: PlaneCalibration | None) -> tuple[tuple[Model, str], ...]:
     return (*told, ("three points", "Three points"))
 
 
-def with_model(found: PlaneCalibration, model: Model) -> PlaneCalibration:
-    """The same marks with another model."""
-    return replace(found, model=model)
-
-
 def why(found: PlaneCalibration | None) -> str:
     """Why the model that is proposed is."""
     if found is None or UNPLACED in found.sigma_px:
@@ -278,27 +270,6 @@ def axes(found: PlaneCalibration, unit_mm: float) -> tuple[FloatArray, FloatArra
     marks += [(0, n) for n in range(1, int(z_end) + 1)]
     calibration = found.image_calibration
     return calibration.to_image(line), calibration.to_image(np.array(marks, float) * unit_mm)
-
-
-def use(
-    session: Session, found: PlaneCalibration, unit_mm: float, image: GreyImage, name: str
-) -> None:
-    """Use the calibration and keep its picture."""
-    session.use_plane(found, unit_mm, image, name)
-
-
-def save_target(path: Path) -> None:
-    """Write the target at true size, to be printed at 100 % (SVG).
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    try:
-        write_atomically(path, target_svg(Target()).encode())
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that can be written") from error
 
 
 def _place(point: FloatArray) -> Place:

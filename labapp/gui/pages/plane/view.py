@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pyqtgraph as pg
@@ -9,6 +10,7 @@ from PySide6.QtWidgets import QFileDialog
 
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.gui.dialogs import write_file
 from labapp.gui.pages.laser.presenter import read_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
@@ -22,6 +24,7 @@ from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
+from labapp.simulation.target import Target, target_svg
 
 NO_PICTURE = "Load a picture of the target on the imaging plane, taken by the camera in its place."
 
@@ -128,7 +131,7 @@ class PlanePage(Page):
         if image is None or found is None:
             return
         if self.workspace.attempt(
-            lambda session: presenter.use(session, found, unit, image, self._name)
+            lambda session: session.use_plane(found, unit, image, self._name)
         ):
             self.workspace.said.emit(
                 "The imaging plane is in use; undo brings the former back", False
@@ -212,29 +215,22 @@ class PlanePage(Page):
         self.panel_layout.addWidget(self.in_use)
 
     def _choose(self) -> None:
-        path, _ = QFileDialog.getOpenFileName(self, "Picture of the target", str(self._folder()))
+        path, _ = QFileDialog.getOpenFileName(
+            self, "Picture of the target", str(self.workspace.folder)
+        )
         if path:
             self.load(Path(path))
 
     def _choose_target(self) -> None:
-        proposed = self._folder() / "imaging_plane_4_inch.svg"
+        proposed = self.workspace.folder / "imaging_plane_4_inch.svg"
         path, _ = QFileDialog.getSaveFileName(self, "Save target", str(proposed), "SVG (*.svg)")
         if path:
             self.save_target(Path(path))
 
     def save_target(self, path: Path) -> None:
         """Write the target for the printer."""
-
-        def saved() -> bool:
-            presenter.save_target(path)
-            return True
-
-        if self.workspace.tried(saved):
+        if self.workspace.tried(lambda: write_file(path, target_svg(Target()).encode())):
             self.workspace.said.emit(f"Target saved as {path.name}: print it at 100 %", False)
-
-    def _folder(self) -> Path:
-        session = self.workspace.session
-        return Path.home() if session is None else Path(session.path).parent
 
     # --- the picture ------------------------------------------------------------------------
 
@@ -279,7 +275,7 @@ class PlanePage(Page):
     def choose_model(self, model: Model) -> None:
         """Use another model than is proposed."""
         if self.found is not None:
-            self._place(presenter.with_model(self.found, model))
+            self._place(replace(self.found, model=model))
 
     def _show_residuals(self) -> None:
         """Draw the residual map anew."""

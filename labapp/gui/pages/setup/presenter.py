@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-from labapp.config.setup import parse_setup, read_setup, updated_setup
+from labapp.config.setup import parse_setup, updated_setup
 from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.rig import Rig
 from labapp.errors import InputError
-from labapp.files import write_atomically
 from labapp.gui.digits import ResultRow
+from labapp.gui.shell.steps import setup_problems
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.positioning import (
@@ -266,7 +265,7 @@ def shown(session: Session) -> Shown:
     values = {key: _number(sections, key) for key in keys}
     problems: dict[str, str] = {}
     others = []
-    for problem in _problems(session):
+    for problem in setup_problems(session):
         words = "missing"
         if problem.value != words:
             words = f"{problem.value}; expected {problem.expected}"
@@ -280,14 +279,6 @@ def shown(session: Session) -> Shown:
         else:
             others.append(f"{problem.field}: {words}")
     return Shown(values, problems, tuple(dict.fromkeys(others)), session.record)
-
-
-def _problems(session: Session) -> tuple[InputError, ...]:
-    try:
-        _ = session.setup
-    except InputError as error:
-        return error.problems
-    return ()
 
 
 def _number(sections: dict[str, Any], key: str) -> float | None:
@@ -400,22 +391,3 @@ def tick(session: Session, item: str, ticked: bool, now: str) -> None:
     kept = tuple(pair for pair in session.record.safety if pair[0] != item)
     safety = (*kept, (item, now)) if ticked else kept
     session.set_record(replace(session.record, safety=safety))
-
-
-def load_setup(session: Session, path: Path) -> None:
-    """Take the whole setup from a setup file; refused in words that name the file."""
-    session.set_setup(read_setup(path).text, f"set-up from {path.name}")
-
-
-def save_setup(session: Session, path: Path) -> None:
-    """Write the setup, as far as it goes, to a setup file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    try:
-        write_atomically(path, session.setup_text.encode())
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that can be written") from error

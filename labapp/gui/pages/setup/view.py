@@ -14,6 +14,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.config.setup import read_setup
+from labapp.gui.dialogs import write_file
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
@@ -99,7 +101,9 @@ class SetupPage(Page):
     def load(self, path: Path) -> None:
         """Take the setup from a file."""
         if self.workspace.attempt(
-            lambda session: presenter.load_setup(session, path), "Loading", self.refused.setText
+            lambda session: session.set_setup(read_setup(path).text, f"set-up from {path.name}"),
+            "Loading",
+            self.refused.setText,
         ):
             self.workspace.said.emit(f"Set-up loaded from {path.name}", False)
 
@@ -108,12 +112,8 @@ class SetupPage(Page):
         session = self.workspace.session
         if session is None:
             return
-
-        def saved() -> bool:
-            presenter.save_setup(session, path)
-            return True
-
-        if self.workspace.tried(saved, "Saving", self.refused.setText):
+        content = session.setup_text.encode()
+        if self.workspace.tried(lambda: write_file(path, content), "Saving", self.refused.setText):
             self.workspace.said.emit(f"Set-up saved as {path.name}", False)
 
     # --- within -----------------------------------------------------------------------------
@@ -208,21 +208,17 @@ class SetupPage(Page):
 
     def _choose_load(self) -> None:
         path, _ = QFileDialog.getOpenFileName(
-            self, "Load set-up", str(self._folder()), f"{SETUP_FILES};;All files (*)"
+            self, "Load set-up", str(self.workspace.folder), f"{SETUP_FILES};;All files (*)"
         )
         if path:
             self.load(Path(path))
 
     def _choose_save(self) -> None:
         path, _ = QFileDialog.getSaveFileName(
-            self, "Save set-up", str(self._folder() / "setup.toml"), SETUP_FILES
+            self, "Save set-up", str(self.workspace.folder / "setup.toml"), SETUP_FILES
         )
         if path:
             self.save(Path(path))
-
-    def _folder(self) -> Path:
-        session = self.workspace.session
-        return Path.home() if session is None else Path(session.path).parent
 
 
 def _number(entry: Entry) -> NumberField:

@@ -11,9 +11,9 @@ from labapp.gui.pages.surface.presenter import (
     SCHEME_CHOICES,
     SCHEMES,
     Shown,
-    why_not,
     with_scheme,
 )
+from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.tasks import Task
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
@@ -126,7 +126,7 @@ class SurfacePanel:
         working = task is not None and task in self.workspace.tasks.active
         why = "Measuring is under way" if working else "No session is open"
         if session is not None and not working:
-            why = why_not(session)
+            why = why_not_measurable(session)
         for each in self._tips:
             each.setEnabled(not why)
             tip = self._tips[each]

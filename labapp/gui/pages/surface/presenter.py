@@ -16,11 +16,9 @@ from labapp.core.schemes import scheme_words
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
 from labapp.export.heights import Profile
 from labapp.export.scene import Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
-from labapp.gui.shell.steps import READ_ONLY, recording_gone, setup_to_do
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
 from labapp.text import SIGMA_OF
@@ -308,21 +306,6 @@ def reflected_dots(measurement: Measurement) -> tuple[FloatArray, FloatArray] | 
     if match is None or reconstruction is None:
         return None
     return match.plane_mm, match.plane_mm + reconstruction.residual_mm
-
-
-def why_not(session: Session) -> str:
-    """Why nothing can be measured now; empty if it can."""
-    if session.read_only:
-        return READ_ONLY
-    if not len(session.frames):
-        return "Import a recording first"
-    if gone := recording_gone(session):
-        return gone
-    try:
-        _ = session.setup
-    except InputError as error:
-        return f"The set-up is not complete. {setup_to_do(error.problems)}"
-    return ""
 
 
 def error_scale(captured: FloatArray, computed: FloatArray) -> float:

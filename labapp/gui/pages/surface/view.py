@@ -49,18 +49,11 @@ from labapp.gui.pages.surface.presenter import (
     shown,
 )
 from labapp.gui.views.steering import Steering
-from labapp.gui.views.view3d import View3d, make_view3d
+from labapp.gui.views.view3d import LOOKS, View3d, make_view3d
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
-
-LOOKS: dict[Direction, tuple[str, str]] = {
-    "top": ("Top", "Look from the top (1 in the view)"),
-    "side": ("Side", "Look from the side, along −X (2 in the view)"),
-    "front": ("Front", "Look as the camera does, along Y (3 in the view)"),
-    "free": ("Oblique", "Look obliquely from the camera's side (4 in the view)"),
-}
 
 LEAST_PLAN_WIDTH = 100
 """In a narrow window the section's fields would leave it less, too little to drag the line."""
@@ -267,9 +260,7 @@ class SurfacePage(Page):
 
     def save_picture(self) -> None:
         """Ask for a file and write the picture to it."""
-        session = self.workspace.session
-        folder = Path() if session is None else session.path.parent
-        name = str(folder / f"surface_{self.workspace.frame:06d}.png")
+        name = str(self.workspace.folder / f"surface_{self.workspace.frame:06d}.png")
         chosen, _ = QFileDialog.getSaveFileName(self, "Save picture", name, "PNG (*.png)")
         if chosen:
             self.write_picture(Path(chosen))

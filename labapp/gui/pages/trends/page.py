@@ -119,10 +119,7 @@ class TrendsPage(Page):
 
     def choose_signals(self) -> None:
         """Ask for a table with current and voltage."""
-        session = self.workspace.session
-        if session is None:
-            return
-        folder = self._last_folder if self._last_folder.name else session.path.parent
+        folder = self._last_folder if self._last_folder.name else self.workspace.folder
         name, _ = QFileDialog.getOpenFileName(
             self,
             "Read current and voltage",
