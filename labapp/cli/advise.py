@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING, progress_told, results_folder, write_file
+from labapp.cli.shared import NOTHING, progress_shown, writable_folder, write_file
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,10 +85,9 @@ def _advised(
     from labapp.studies.adviser.files import advice_files
     from labapp.studies.adviser.report import advice_text, cost_table
 
-    folder = results_folder(out)
-    assert folder is not None
+    folder = writable_folder(out)
     effort = adviser.QUICK if quick else adviser.Effort()
-    with progress_told() as progress:
+    with progress_shown() as progress:
         advice = adviser.advise(expected, limits, effort, seed, progress)
         typer.echo(advice_text(advice))
         for name, content in advice_files(advice).items():

@@ -7,7 +7,13 @@ from typing import Annotated, Literal, TypeVar
 
 import typer
 
-from labapp.cli.shared import progress_told, results_folder, write_figure, write_file
+from labapp.cli.shared import (
+    progress_shown,
+    results_folder,
+    writable_folder,
+    write_figure,
+    write_file,
+)
 from labapp.errors import InputError
 from labapp.studies import SCHEMES
 from labapp.studies.analysis import (
@@ -110,8 +116,8 @@ def errors(
         draws,
         picture,
     )
-    folder = results_folder(out)
-    with progress_told() as progress:
+    folder = writable_folder(out)
+    with progress_shown() as progress:
         for made in analyze_errors(question, progress):
             _keep(folder, made)
 
@@ -138,7 +144,7 @@ def budget(
     read = None if setup is None else read_setup(setup)
     pool = expected_pool(width, length, height)
     folder = results_folder(out)
-    with progress_told() as progress:
+    with progress_shown() as progress:
         _keep(folder, analyze_budget(read, pool, progress))
 
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import progress_told
-from labapp.errors import InputError
+from labapp.cli.shared import progress_shown, writable_folder
 
 if TYPE_CHECKING:
     from labapp.simulated.benchmark import Latency, Run, Spread
@@ -37,16 +36,11 @@ def benchmark(
     from labapp.simulated.benchmark import make_video, run_video, time_frames
 
     folder = cache or Path(platformdirs.user_cache_dir("labapp")) / "benchmark"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            folder, "--cache", error.strerror, "a folder that can be written"
-        ) from error
-    with progress_told() as progress:
+    writable_folder(folder, "--cache")
+    with progress_shown() as progress:
         video = make_video(folder, frames, workers or None, progress)
     typer.echo(f"{frames} frames of 480 × 640 px, 200 frames/s: {video.path}")
-    with tempfile.TemporaryDirectory(dir=folder) as out, progress_told() as progress:
+    with tempfile.TemporaryDirectory(dir=folder) as out, progress_shown() as progress:
         done = 0
 
         def advance() -> None:

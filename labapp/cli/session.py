@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,7 +17,6 @@ from labapp.cli.shared import (
     ABOUT_SCHEMES,
     FRAMES_HELP,
     FRAMES_METAVAR,
-    INTERRUPTED,
     NOTHING,
     RECORDING_HELP,
     Algorithm,
@@ -27,8 +27,7 @@ from labapp.cli.shared import (
     finite,
     frames_text,
     measure_frames,
-    note,
-    progress_bar,
+    progress_shown,
     told_effect,
 )
 from labapp.core.schemes import SCHEMES, scheme_words
@@ -420,10 +419,5 @@ def _counted(what: str) -> Iterator[Progress]:
 
     Yields what is to be called with done and total.
     """
-    with progress_bar() as progress:
-        task = progress.add_task(what, total=None)
-        try:
-            yield lambda done, total: progress.update(task, completed=done, total=total)
-        except KeyboardInterrupt:
-            note(progress.console, f"stopped {what}; nothing was changed")
-            raise typer.Exit(INTERRUPTED) from None
+    with progress_shown(f"stopped {what}; nothing was changed") as progress:
+        yield partial(progress, what)

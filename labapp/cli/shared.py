@@ -187,17 +187,28 @@ def results_folder(out: Path | None, tables: bool = True) -> Path | None:
     InputError
         If it cannot be written, or there is to be neither a folder nor printed ``tables``.
     """
-    if out is None:
-        if not tables:
-            raise InputError("--out", "folder", "none", "one for tables and pictures, or --tables")
-        return None
+    if out is not None:
+        return writable_folder(out)
+    if not tables:
+        raise InputError("--out", "folder", "none", "one for tables and pictures, or --tables")
+    return None
+
+
+def writable_folder(folder: Path, option: str = "--out") -> Path:
+    """A folder that was given by an option, made if it is not there.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / ".write").touch()
-        (out / ".write").unlink()
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ".write").touch()
+        (folder / ".write").unlink()
     except OSError as error:
-        raise InputError(out, "--out", error.strerror, "a folder that can be written") from error
-    return out
+        raise InputError(folder, option, error.strerror, "a folder that can be written") from error
+    return folder
 
 
 def write_figure(folder: Path, name: str, figure: Figure, kind: str) -> None:
@@ -224,18 +235,20 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def progress_told() -> Iterator[parallel.Progress]:
-    """Show progress on stderr; Ctrl-C leaves what was written and says so."""
+def progress_shown(
+    stopped: str = "stopped: the tables and pictures that were finished are kept",
+) -> Iterator[parallel.Progress]:
+    """Show progress on stderr; Ctrl-C ends the program, and ``stopped`` says what is kept."""
     with progress_bar() as bar:
         tasks: dict[str, TaskID] = {}
 
         def tell(what: str, done: int, count: int) -> None:
             if what not in tasks:
                 tasks[what] = bar.add_task(what, total=count)
-            bar.update(tasks[what], completed=done)
+            bar.update(tasks[what], completed=done, total=count)
 
         try:
             yield tell
         except KeyboardInterrupt:
-            note(bar.console, "stopped: the tables and pictures that were finished are kept")
+            note(bar.console, stopped)
             raise typer.Exit(INTERRUPTED) from None

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from labapp.cli.shared import INTERRUPTED, note, progress_bar
+from labapp.cli.shared import progress_shown
 from labapp.text import pluralize
 
 
@@ -41,13 +41,8 @@ def simulate(
 
     read = read_scenario(find_scenario(scenario), frames, seed)
     count = len(read.recording.pools)
-    with progress_bar() as bar:
-        task = bar.add_task(scenario.name, total=count)
-        try:
-            write(read, out, progress=lambda _, done, __: bar.update(task, completed=done))
-        except KeyboardInterrupt:
-            note(bar.console, f"stopped: nothing is written in {out}")
-            raise typer.Exit(INTERRUPTED) from None
+    with progress_shown(f"stopped: nothing is written in {out}") as progress:
+        write(read, out, progress=progress)
     name = read.recording.file
     typer.echo(f"{pluralize(count, 'frame')}, setup, calibration picture and truth are in {out}")
     typer.echo(f"  labapp reconstruct {out / name} --setup {out / 'setup.toml'} --out results")

@@ -23,7 +23,10 @@ from labapp.log import NAME
 POLL_MS = 10
 
 PROGRESS_MS = 100
-"""How far tasks are is told no more often."""
+"""Progress is reported no more often."""
+
+STOP_S = 5.0
+"""A cancelled task is waited for so long."""
 
 
 class Cancelled(Exception):
@@ -178,12 +181,12 @@ class Tasks(QObject):
         self.changed.emit()
         return task
 
-    def cancel_all(self, wait_s: float = 5.0) -> None:
+    def cancel_all(self) -> None:
         """Cancel everything and wait until it has stopped; nothing is called afterwards."""
         for task in self.active:
             task.cancel()
         for task in self.active:
-            task.thread.join(wait_s)
+            task.thread.join(STOP_S)
         self.active.clear()
         self._timer.stop()
         self.changed.emit()

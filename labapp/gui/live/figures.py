@@ -156,10 +156,6 @@ class LiveFigures(QWidget):
                 label.setText(text)
                 self._dress(label, figure.look)
 
-    def show_words(self, words: str) -> None:
-        """Say how measuring keeps up."""
-        self.words.setText(words)
-
     def _label(self, row: int, column: int) -> QLabel:
         if (row, column) not in self._labels:
             label = self._labels[row, column] = plain_label()

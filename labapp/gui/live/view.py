@@ -205,7 +205,7 @@ class LiveView(QObject):
         self._rings.setData([])
         self.measured_s, self._followed = 0.0, None
         self.figures.show_figures(figures(None) if live.watch is not None else ())
-        self.figures.show_words(NO_SETUP if live.watch is None else "")
+        self.figures.words.setText(NO_SETUP if live.watch is None else "")
         self.canvas.set_live(live.watch is not None)
         self._rings.show()
         self._timer.start(TICK_MS)
@@ -390,7 +390,7 @@ class LiveView(QObject):
         if live.watch is not None:
             pace, came_hz = live.watch.pace(), live.rate_hz()
             self._show_figures(live.watch)
-            self.figures.show_words(pace_in_words(self._followed, pace, came_hz, self._age_s))
+            self.figures.words.setText(pace_in_words(self._followed, pace, came_hz, self._age_s))
             self.canvas.tell(live.watch)
         picture = self._picture.picture
         if live.feed is not None and picture is not None:

@@ -5,22 +5,20 @@ from __future__ import annotations
 import datetime
 
 from PySide6.QtCore import QSize, Qt, Signal
-from PySide6.QtGui import QKeyEvent, QKeySequence, QPainter, QPaintEvent, QResizeEvent
+from PySide6.QtGui import QKeyEvent, QKeySequence
 from PySide6.QtWidgets import (
     QAbstractItemView,
     QApplication,
     QHBoxLayout,
-    QLabel,
     QListWidget,
     QListWidgetItem,
     QProgressBar,
-    QPushButton,
-    QSizePolicy,
     QWidget,
 )
 
 from labapp.gui.tasks import Tasks
-from labapp.gui.widgets.labels import plain_label, plain_tip
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.labels import Message, plain_label
 
 KEPT_MESSAGES = 1000
 
@@ -31,51 +29,11 @@ TOLD = Qt.ItemDataRole.UserRole
 """Of a line of the log: what it tells, since when, and how often it was said."""
 
 
-class ElidedLabel(QLabel):
-    """A line of text that ends in … where there is no room for all of it; the tip has it all."""
-
-    def __init__(self, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
-        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
-        self.setTextFormat(Qt.TextFormat.PlainText)
-
-    def minimumSizeHint(self) -> QSize:
-        """Room for a word."""
-        return QSize(40, self.sizeHint().height())
-
-    def sizeHint(self) -> QSize:
-        """One line, however many the text has."""
-        return QSize(super().sizeHint().width(), self.fontMetrics().height())
-
-    def paintEvent(self, _event: QPaintEvent) -> None:
-        """Draw as much as there is room for."""
-        line = " ".join(self.text().split())
-        shown = self.fontMetrics().elidedText(line, Qt.TextElideMode.ElideRight, self.width())
-        with QPainter(self) as painter:
-            painter.setPen(self.palette().color(self.foregroundRole()))
-            painter.drawText(self.rect(), Qt.AlignmentFlag.AlignVCenter, shown)
-
-    def resizeEvent(self, event: QResizeEvent) -> None:
-        """Tell all of it where not all is shown."""
-        super().resizeEvent(event)
-        self._tell()
-
-    def setText(self, text: str) -> None:
-        """Show another text."""
-        super().setText(text)
-        self._tell()
-
-    def _tell(self) -> None:
-        line = " ".join(self.text().split())
-        too_long = self.fontMetrics().horizontalAdvance(line) > self.width()
-        self.setToolTip(plain_tip(self.text() if too_long else ""))
-
-
 class LogPanel(QListWidget):
     """Everything that was said, the last at the end."""
 
-    def __init__(self, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
+    def __init__(self) -> None:
+        super().__init__()
         self.setAccessibleName("Messages")
         self.setToolTip("What the app has said since it was started; Ctrl+C copies")
         self.setSelectionMode(QAbstractItemView.SelectionMode.ExtendedSelection)
@@ -134,25 +92,23 @@ class StatusLine(QWidget):
 
     read = Signal()
 
-    def __init__(self, tasks: Tasks, parent: QWidget | None = None) -> None:
-        super().__init__(parent)
+    def __init__(self, tasks: Tasks) -> None:
+        super().__init__()
         self._tasks = tasks
         self.unread: list[str] = []
-        self.message = ElidedLabel()
+        self.message = Message(1)
         self.message.setAccessibleName("Last message")
-        self.read_button = QPushButton("Read")
-        self.read_button.setToolTip("Show all messages, and take the problem off this line (F4)")
+        tip = "Show all messages, and take the problem off this line (F4)"
+        self.read_button = button("Read", tip, self.read.emit)
         self.read_button.setAccessibleName("Read the problem")
-        self.read_button.clicked.connect(self.read)
         self.title = plain_label()
         self.bar = QProgressBar()
         self.bar.setFixedWidth(180)
         self.bar.setFormat("%v of %m")
         self.bar.setAccessibleName("Progress")
-        self.cancel_button = QPushButton("Cancel")
-        self.cancel_button.setToolTip("Stop the work under way; what is finished is kept (Ctrl+.)")
+        tip = "Stop the work under way; what is finished is kept (Ctrl+.)"
+        self.cancel_button = button("Cancel", tip, self.cancel)
         self.cancel_button.setAccessibleName("Cancel the work under way")
-        self.cancel_button.clicked.connect(self.cancel)
         layout = QHBoxLayout(self)
         layout.setContentsMargins(6, 0, 6, 0)
         layout.addWidget(self.read_button)

@@ -19,7 +19,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.shell.steps import READ_ONLY, Mark, State, Step
 from labapp.gui.theme import is_dark
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
 
 ICON_PX = 18
 
@@ -89,9 +89,9 @@ class StepList(QListWidget):
 
     chosen = Signal(str)
 
-    def __init__(self, steps: Sequence[Step], parent: QWidget | None = None) -> None:
+    def __init__(self, steps: Sequence[Step]) -> None:
         self._states: Mapping[str, State] = {}
-        super().__init__(parent)
+        super().__init__()
         self._steps = tuple(steps)
         self.setAccessibleName("Steps")
         self.setToolTip("The steps from the bench to the results: ↑ and ↓ choose one")
@@ -146,20 +146,19 @@ class StepList(QListWidget):
 class SidePanel(QWidget):
     """What to do now, how far the step is, and the page's own panel, which scrolls."""
 
-    def __init__(self, parent: QWidget | None = None) -> None:
+    def __init__(self) -> None:
         self._shown: State | None = None
-        super().__init__(parent)
+        super().__init__()
         self.title = plain_label()
         font = self.title.font()
         font.setPointSizeF(font.pointSizeF() * 1.25)
         font.setBold(True)
         self.title.setFont(font)
-        self.hint = plain_label()
+        self.hint = wrapping_label()
         self.state = Message(STATE_LINES)
-        self.read_only = plain_label(f"⚠ {READ_ONLY} until it is opened again for changes.")
+        self.read_only = wrapping_label(f"⚠ {READ_ONLY} until it is opened again for changes.")
         self.read_only.hide()
         for label in (self.hint, self.read_only):
-            label.setWordWrap(True)
             label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.stack = QStackedWidget()
         self._areas: dict[QWidget, QScrollArea] = {}

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from PySide6.QtWidgets import (
     QFileDialog,
     QScrollArea,
-    QTableWidget,
     QTabWidget,
     QVBoxLayout,
     QWidget,
@@ -183,7 +182,8 @@ class AdviserWindow(ToolWindow):
         self.kept.set_rows(advising.kept_rows(advice))
         if advice.possible:
             self.costs.show_table(cost_table(advice))
-            _fit_rows(self.costs)
+            bar = self.costs.horizontalScrollBar().sizeHint().height()
+            self.costs.setFixedHeight(self.costs.full_height + bar)  # what is around it scrolls
         for group, shown in zip(self.groups, (True, True, advice.possible), strict=True):
             group.setVisible(shown)
         self.sheet.show_png(files["advice.png"], words)
@@ -222,11 +222,3 @@ def _titled(table: QWidget) -> QWidget:
     group, layout = headed(table.accessibleName())
     layout.addWidget(table)
     return group
-
-
-def _fit_rows(table: QTableWidget) -> None:
-    """Make a table as high as its rows: what is around it scrolls."""
-    rows = sum(table.rowHeight(row) for row in range(table.rowCount()))
-    bar = table.horizontalScrollBar().sizeHint().height()
-    around = table.horizontalHeader().sizeHint().height() + 2 * table.frameWidth()
-    table.setFixedHeight(rows + bar + around)

@@ -22,10 +22,11 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.dialogs import refused_as_input, write_file
-from labapp.gui.shell.messages import PROBLEM, ElidedLabel
+from labapp.gui.shell.messages import PROBLEM
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm
+from labapp.gui.widgets.labels import Message
 from labapp.simulation.parallel import Progress, behind_a_window
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class ToolWindow(QDialog):
         self.setWindowFlag(Qt.WindowType.WindowMaximizeButtonHint)
         self.form = FieldForm()
         self.results = QVBoxLayout()
-        self.message = ElidedLabel()
+        self.message = Message(1)
         self.message.setAccessibleName("Last message")
         self.bar = QProgressBar()
         self.bar.setFixedWidth(180)

@@ -14,7 +14,7 @@ class RangeField(Field):
     ----------
     label, unit, tooltip
         What it is; its unit; what it does.
-    lowest, highest, step, decimals
+    lowest, highest, step
         Of either, as in `NumberField`.
     """
 
@@ -26,7 +26,6 @@ class RangeField(Field):
         lowest: float,
         highest: float,
         step: float = 1.0,
-        decimals: int = 2,
         tooltip: str = "",
     ) -> None:
         self.least, self.most = (
@@ -36,7 +35,6 @@ class RangeField(Field):
                 lowest=lowest,
                 highest=highest,
                 step=step,
-                decimals=decimals,
                 tooltip=f"{tooltip}: {end}",
             )
             for end in ("least", "most")

@@ -290,8 +290,6 @@ class TextField(Field):
         What it is; what it is for.
     lines
         How many are shown; with more than one, Enter begins another and Ctrl+Enter finishes.
-    placeholder
-        Shown while it is empty.
     line
         Takes the keys if there is one line; None for a plain one.
     """
@@ -302,14 +300,12 @@ class TextField(Field):
         *,
         tooltip: str = "",
         lines: int = 1,
-        placeholder: str = "",
         line: QLineEdit | None = None,
     ) -> None:
         self._edit: QLineEdit | _Paragraphs = (
             line or QLineEdit() if lines == 1 else _Paragraphs(lines)
         )
         super().__init__(label, self._edit, tooltip)
-        self._edit.setPlaceholderText(placeholder)
         self._told = ""
         if isinstance(self._edit, QLineEdit):
             self._edit.editingFinished.connect(self.flush)
@@ -469,4 +465,4 @@ class FieldForm(QWidget):
 
 def whole(label: str, lowest: int, tip: str) -> NumberField:
     """A field for a whole number."""
-    return NumberField(label, lowest=lowest, highest=1, decimals=0, tooltip=tip)
+    return NumberField(label, lowest=lowest, highest=10**9, decimals=0, tooltip=tip)

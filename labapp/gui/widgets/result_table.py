@@ -6,10 +6,9 @@ from collections.abc import Iterable
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QHeaderView, QTableWidgetItem
+from PySide6.QtWidgets import QHeaderView
 
 from labapp.gui.digits import ResultRow, as_csv, as_text
-from labapp.gui.widgets.labels import plain_tip
 from labapp.gui.widgets.tables import ReadTable
 
 
@@ -23,10 +22,9 @@ class ResultTable(ReadTable):
     """
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, "Ctrl+C copies it; right click to copy it as CSV")
+        tip = f"{name}: Ctrl+C copies it; right click to copy it as CSV"
+        super().__init__(name, tip, ["", "Value", "±", "Unit"])
         self.rows: tuple[ResultRow, ...] = ()
-        self.setColumnCount(4)
-        self.setHorizontalHeaderLabels(["", "Value", "±", "Unit"])
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
@@ -43,23 +41,14 @@ class ResultTable(ReadTable):
         self.setRowCount(len(self.rows))
         for k, row in enumerate(self.rows):
             for column, text in enumerate(row.texts):
-                item = self.item(k, column)
-                if item is None:
-                    item = QTableWidgetItem()
-                    right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
-                    if column in (1, 2):
-                        item.setTextAlignment(right)
-                    self.setItem(k, column, item)
-                item.setText(text)
-                item.setToolTip(plain_tip(row.note or " ".join(row.texts)))
+                tip = row.note or " ".join(row.texts)
+                self.set_cell(k, column, text, number=column in (1, 2), tip=tip)
         self._fit_height()
 
     def _fit_height(self) -> None:
         """Give long names the lines that they take, and the table the height of all rows."""
         self.resizeRowsToContents()
-        height = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
-        height += sum(self.rowHeight(k) for k in range(len(self.rows)))
-        self.setFixedHeight(height)
+        self.setFixedHeight(self.full_height)
 
     def copy_text(self) -> None:
         """Put the selected rows, or all, on the clipboard, in tabs."""

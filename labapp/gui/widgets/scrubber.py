@@ -28,7 +28,6 @@ from PySide6.QtWidgets import (
     QStyle,
     QStyleOptionFocusRect,
     QToolTip,
-    QWidget,
 )
 
 GAP_FROM_PX = 4
@@ -95,8 +94,8 @@ class Scrubber(QAbstractSlider):
 
     moved = Signal(int)
 
-    def __init__(self, ticks: Sequence[Tick], parent: QWidget | None = None) -> None:
-        super().__init__(parent)
+    def __init__(self, ticks: Sequence[Tick]) -> None:
+        super().__init__()
         self._ticks = tuple(ticks)
         self._kinds: npt.NDArray[np.int64] = np.zeros(0, np.int64)
         self._picture: QImage | None = None

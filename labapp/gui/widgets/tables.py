@@ -22,21 +22,27 @@ if TYPE_CHECKING:
     from labapp.studies.tables import Table
 
 
+RIGHT = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+
+
 class ReadTable(QTableWidget):
-    """A table to read: its rows are chosen whole, and copied by keys and menu.
+    """A table to read: whole rows are selected, and copied by keys and menu.
 
     Parameters
     ----------
     name
         What it shows, for a screen reader.
-    copies
-        How it can be copied, for the tooltip.
+    tip
+        The tooltip.
+    columns
+        Header texts.
     """
 
-    def __init__(self, name: str, copies: str) -> None:
-        super().__init__()
+    def __init__(self, name: str, tip: str, columns: Sequence[str] = ()) -> None:
+        super().__init__(0, len(columns))
+        self.setHorizontalHeaderLabels(columns)
         self.setAccessibleName(name)
-        self.setToolTip(f"{name}: {copies}")
+        self.setToolTip(tip)
         self.verticalHeader().hide()
         self.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
         self.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
@@ -47,8 +53,33 @@ class ReadTable(QTableWidget):
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
         self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
 
+    def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
+        """Show a text in a cell, changed in place so that nothing jumps; numbers are right-aligned.
+
+        The tooltip is ``tip``, or the text itself.
+        """
+        item = self.item(row, column)
+        if item is None:
+            item = QTableWidgetItem()
+            self.setItem(row, column, item)
+        if number:
+            item.setTextAlignment(RIGHT)
+        if item.text() != text:
+            item.setText(text)
+        item.setToolTip(plain_tip(tip or text))
+
+    @property
+    def full_height(self) -> int:
+        """Height of the header and all rows, px."""
+        header = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
+        return header + sum(self.rowHeight(row) for row in range(self.rowCount()))
+
+    def copy_text(self) -> None:
+        """Copy what is shown to the clipboard, separated by tabs."""
+        QGuiApplication.clipboard().setText(table_text(self))
+
     def offer(self, *copies: tuple[str, Callable[[], None]]) -> None:
-        """Put ways to copy into the menu, by their words; Ctrl+C does the first."""
+        """Add ways to copy to the context menu, by their labels; Ctrl+C does the first."""
         for words, work in copies:
             action = QAction(words, self)
             action.triggered.connect(work)
@@ -68,7 +99,7 @@ class CellTable(ReadTable):
     """
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, "Ctrl+C copies it; right click for CSV and Markdown")
+        super().__init__(name, f"{name}: Ctrl+C copies it; right click for CSV and Markdown")
         self.table: Table | None = None
         self.setAccessibleDescription("Arrow keys move; Ctrl+C copies it")
         self.setAlternatingRowColors(True)
@@ -78,27 +109,18 @@ class CellTable(ReadTable):
             ("Copy table as Markdown", self.copy_markdown),
         )
 
-    def show_table(self, table: Table, columns: Sequence[int] | None = None) -> None:
-        """Show a table, or some of its columns."""
+    def show_table(self, table: Table) -> None:
+        """Show a table."""
         self.table = table
-        shown = list(range(len(table.columns))) if columns is None else list(columns)
         self.setAccessibleDescription(f"{table.caption}. Arrow keys move; Ctrl+C copies it")
-        self.setColumnCount(len(shown))
+        self.setColumnCount(len(table.columns))
         self.setRowCount(len(table.rows))
-        self.setHorizontalHeaderLabels([heading(table.columns[k]) for k in shown])
-        right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+        self.setHorizontalHeaderLabels([heading(column) for column in table.columns])
+        self.clearContents()  # a column of another table may have been right-aligned
         for row, cells in enumerate(table.rows):
-            for column, cell in enumerate(cells[k] for k in shown):
-                item = QTableWidgetItem(cell_text(cell))
-                if not isinstance(cell, str):
-                    item.setTextAlignment(right)
-                item.setToolTip(plain_tip(item.text()))
-                self.setItem(row, column, item)
+            for column, cell in enumerate(cells):
+                self.set_cell(row, column, cell_text(cell), number=not isinstance(cell, str))
         self.resizeRowsToContents()
-
-    def copy_text(self) -> None:
-        """Put what is shown on the clipboard, in tabs."""
-        QGuiApplication.clipboard().setText(table_text(self))
 
     def copy_csv(self) -> None:
         """Put all of it on the clipboard as CSV, as its file has it."""

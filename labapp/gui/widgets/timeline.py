@@ -42,8 +42,8 @@ class Timeline(QWidget):
     moved = Signal(int)
     jumped = Signal(str, bool)
 
-    def __init__(self, ticks: Sequence[Tick], parent: QWidget | None = None) -> None:
-        super().__init__(parent)
+    def __init__(self, ticks: Sequence[Tick]) -> None:
+        super().__init__()
         self._ticks = tuple(ticks)
         self._icons: dict[QToolButton, QStyle.StandardPixmap] = {}
         self._frames: npt.NDArray[np.int64] = np.zeros(0, np.int64)

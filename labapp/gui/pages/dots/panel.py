@@ -7,12 +7,9 @@ from collections.abc import Mapping, Sequence
 from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt, Signal, SignalInstance
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
-    QAbstractItemView,
     QGridLayout,
     QHeaderView,
     QSizePolicy,
-    QTableWidget,
-    QTableWidgetItem,
     QToolButton,
     QVBoxLayout,
     QWidget,
@@ -22,8 +19,9 @@ from labapp.core.pipeline import Settings
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, heading, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import Message, heading, plain_label, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
+from labapp.gui.widgets.tables import ReadTable
 
 MOST_ROWS = 60
 COLUMNS_OF_BUTTONS = 3
@@ -212,29 +210,18 @@ class DotsPanel(QWidget):
         return grid
 
 
-class _RowList(QTableWidget):
+class _RowList(ReadTable):
     """The rows from the top down; choosing a line chooses its dots."""
 
     def __init__(self) -> None:
-        super().__init__(0, 4)
-        self._numbers: list[int] = []
-        self.setAccessibleName("Rows")
-        self.setToolTip(
+        tip = (
             "The rows as they lie in the frame: ↑ and ↓ choose one, Shift adds; then shift it "
             "(Ctrl+← →), block it (B), merge two (M)"
         )
-        self.setHorizontalHeaderLabels(["Row", "Dots", "Columns", ""])
-        self.verticalHeader().hide()
-        self.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
-        self.setSelectionBehavior(QAbstractItemView.SelectionBehavior.SelectRows)
-        self.setSelectionMode(QAbstractItemView.SelectionMode.ExtendedSelection)
-        self.setTabKeyNavigation(False)
-        self.setShowGrid(False)
+        super().__init__("Rows", tip, ("Row", "Dots", "Columns", ""))
+        self._numbers: list[int] = []
         self.setWordWrap(False)
-        header = self.horizontalHeader()
-        header.setHighlightSections(False)
-        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-        header.setSectionResizeMode(3, QHeaderView.ResizeMode.Stretch)
+        self.horizontalHeader().setSectionResizeMode(3, QHeaderView.ResizeMode.Stretch)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.show_lines(())
 
@@ -248,22 +235,11 @@ class _RowList(QTableWidget):
             for k, line in enumerate(lines):
                 texts = (str(line.row or "–"), str(line.dots), line.columns, line.note)
                 for column, text in enumerate(texts):
-                    item = self.item(k, column)
-                    if item is None:
-                        item = QTableWidgetItem()
-                        if column < 3:
-                            right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
-                            item.setTextAlignment(right)
-                        self.setItem(k, column, item)
-                    if item.text() != text:
-                        item.setText(text)
-                        item.setToolTip(plain_tip(text))
+                    self.set_cell(k, column, text, number=column < 3)
         self.choose(chosen)
         self.resizeRowsToContents()
-        height = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
-        height += sum(self.rowHeight(k) for k in range(len(lines)))
         # What is below must not jump from frame to frame.
-        self.setFixedHeight(max(height, self.minimumHeight() if lines else 0))
+        self.setFixedHeight(max(self.full_height, self.minimumHeight() if lines else 0))
 
     def chosen(self) -> list[int]:
         """Rows of the chosen lines."""

@@ -37,7 +37,7 @@ from labapp.gui.pages.export.presenter import (
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import Control, Task
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, whole
 from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
@@ -339,6 +339,6 @@ class ExportPage(Page):
 
 
 def _whole(label: str, lowest: int, tip: str, name: str, wish: Callable[..., None]) -> NumberField:
-    field = NumberField(label, lowest=lowest, highest=10**9, decimals=0, tooltip=tip)
+    field = whole(label, lowest, tip)
     field.edited.connect(lambda value: wish(**{name: value}) if value is not None else None)
     return field

@@ -25,6 +25,7 @@ from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
 from labapp.gui.widgets.result_table import ResultTable
+from labapp.gui.widgets.tables import RIGHT
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 
@@ -204,7 +205,7 @@ class LaserPage(Page):
 
     def _cell_changed(self, item: QTableWidgetItem) -> None:
         self.table.blockSignals(True)
-        item.setTextAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+        item.setTextAlignment(RIGHT)
         self.table.blockSignals(False)
         self._from_picture = None
         self._grow()
@@ -321,5 +322,5 @@ class _ReadingsTable(QTableWidget):
 
 def _cell(text: str) -> QTableWidgetItem:
     item = QTableWidgetItem(text)
-    item.setTextAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
+    item.setTextAlignment(RIGHT)
     return item

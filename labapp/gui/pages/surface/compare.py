@@ -5,11 +5,8 @@ from __future__ import annotations
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import (
-    QAbstractItemView,
     QHBoxLayout,
     QHeaderView,
-    QTableWidget,
-    QTableWidgetItem,
     QVBoxLayout,
     QWidget,
 )
@@ -20,11 +17,14 @@ from labapp.gui.pages.surface.presenter import SCHEME_CHOICES, Options
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.widgets.fields import ChoiceField
-from labapp.gui.widgets.labels import plain_tip, wrapping_label
+from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.parts import PartsBar
+from labapp.gui.widgets.tables import ReadTable
 from labapp.gui.workspace import Workspace
 
 COLUMNS = ("", "First", "Second", "Difference", "Unit")
+NUMBERS = (1, 2, 3)
+"""Columns of numbers."""
 
 
 class CompareView(QWidget):
@@ -49,7 +49,7 @@ class CompareView(QWidget):
         self.first, self.second = (_SchemeBox(order) for order in ("First", "Second"))
         self.difference = make_view3d("Difference of the two surfaces")
         self.words = wrapping_label()
-        self.table = _table()
+        self.table = _FiguresTable()
         self._options = Options()
         self._shown_for: object = None
         self._task: Task | None = None
@@ -136,13 +136,9 @@ class CompareView(QWidget):
         self.table.setRowCount(len(comparison.rows))
         for k, row in enumerate(comparison.rows):
             for column, text in enumerate(row):
-                item = QTableWidgetItem(text)
-                if 0 < column < 4:
-                    right = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
-                    item.setTextAlignment(right)
-                tip = f"{row[0]}: {text} {row[4] if 0 < column < 4 else ''}".strip()
-                item.setToolTip(plain_tip(tip))
-                self.table.setItem(k, column, item)
+                number = column in NUMBERS
+                tip = f"{row[0]}: {text} {row[4] if number else ''}".strip()
+                self.table.set_cell(k, column, text, number=number, tip=tip)
         self.table.resizeRowsToContents()
         self._make_room()
 
@@ -153,9 +149,7 @@ class CompareView(QWidget):
         self._make_room()
 
     def _make_room(self) -> None:
-        rows = sum(self.table.rowHeight(k) for k in range(self.table.rowCount()))
-        header = self.table.horizontalHeader().sizeHint().height()
-        wanted = rows + header + 2 * self.table.frameWidth()
+        wanted = self.table.full_height
         self.table.setMinimumHeight(min(wanted, self.height() * 2 // 5))
 
 
@@ -185,21 +179,15 @@ class _SchemeBox(QWidget):
         layout.addWidget(self.view, 1)
 
 
-def _table() -> QTableWidget:
-    table = QTableWidget(0, len(COLUMNS))
-    table.setAccessibleName("Figures of both schemes and their difference")
-    table.setToolTip("Figures of both schemes, and the first minus the second")
-    table.setHorizontalHeaderLabels(list(COLUMNS))
-    table.verticalHeader().hide()
-    table.setEditTriggers(QAbstractItemView.EditTrigger.NoEditTriggers)
-    table.setTabKeyNavigation(False)
-    table.setShowGrid(False)
-    table.setWordWrap(False)
-    # All columns have room: the scroll bar would take a line's place.
-    table.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-    header = table.horizontalHeader()
-    header.setHighlightSections(False)
-    for column, of_numbers in enumerate((False, True, True, True, False)):
-        mode = QHeaderView.ResizeMode
-        header.setSectionResizeMode(column, mode.Stretch if of_numbers else mode.ResizeToContents)
-    return table
+class _FiguresTable(ReadTable):
+    """Sizes and errors of both schemes, and the first minus the second."""
+
+    def __init__(self) -> None:
+        name = "Figures of both schemes and their difference"
+        super().__init__(name, "Figures of both schemes, and the first minus the second", COLUMNS)
+        self.setWordWrap(False)
+        # All columns have room: the scroll bar would take a line's place.
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        for column in NUMBERS:
+            self.horizontalHeader().setSectionResizeMode(column, QHeaderView.ResizeMode.Stretch)
+        self.offer(("Copy table", self.copy_text))
