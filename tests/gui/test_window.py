@@ -524,7 +524,7 @@ def test_a_set_up_that_is_not_complete_is_said_before_measuring(
     plain.files.open(copy_sample("thumb_tack"))
     plain.workspace.attempt(lambda s: s.update_setup({"laser": {"distance_mm": None}}))
     plain.do("measure_frame")
-    assert "laser.distance_mm" in problems(plain)[0]
+    assert "the laser (distance mm)" in problems(plain)[0]
     assert plain.workspace.tasks.active == []
 
 

@@ -54,7 +54,7 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
         elif part not in PARTS:
             wrong.append(f"take out {problem.field}: {problem.expected}")
         elif problem.value == "missing":
-            enter.append(PARTS[part])
+            enter.append(f"{PARTS[part]} ({key.replace('_', ' ')})" if key else PARTS[part])
         else:
             told = f"{PARTS[part]}, {key.replace('_', ' ')}"
             wrong.append(f"put right {told}: {problem.value} is not {problem.expected}")
