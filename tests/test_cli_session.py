@@ -272,7 +272,7 @@ def test_ctrl_c_is_told_and_imports_nothing(
     def pressed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Frames, "take_in", pressed)
+    monkeypatch.setattr(Frames, "import_recording", pressed)
     answer = labapp("session", "import", file, SAMPLE / "recording.avi")
     assert answer == (130, "", "stopped reading recording.avi; nothing was changed\n")
     assert file.read_bytes() == before

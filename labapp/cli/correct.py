@@ -319,10 +319,10 @@ def _measure(session: Session, frames: list[int], before: Measurement | None) ->
 
 
 def _compared(before: Measures | None, after: Measures | None) -> str:
-    from labapp.export.summary import TOLD
+    from labapp.export.summary import MEANS
 
     lines = []
-    for label, name in TOLD.items():
+    for label, name in MEANS.items():
         values = [getattr(measures, name, math.nan) for measures in (before, after)]
         if name == "own_are_mm" and not any(map(math.isfinite, values)):
             continue  # the scheme has none

@@ -1,8 +1,8 @@
-"""Chosen results of many frames in one folder that is whole or not there, with a manifest.
+"""Export of many frames into one folder with a manifest, atomically.
 
-The folder is made beside its place, as ``.NAME.….part``, and renamed when all of it is there. An
-export that was there before is replaced then and not earlier, and only if it still is as it was
-written: somebody's own files are never deleted.
+The folder is written beside its place, as ``.NAME.….part``, and renamed when it is complete. An
+earlier export is replaced then and not before, and only if it is unchanged: files of others are
+never deleted.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ OWN_FOLDER = "a new or empty folder, or an earlier export that was not changed (
 
 @dataclass(frozen=True)
 class ExportChoice:
-    """What of the results is to be exported.
+    """Choice of what an export contains.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def export(
     extras: Mapping[str, Callable[[], bytes]] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[ExportedFile, ...]:
-    """Write results into a folder: all of them, or nothing and what was there stays.
+    """Write results into a folder, atomically: on an error the former content stays.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def export(
         raise InputError(target, "folder", "is the root of the disk", OWN_FOLDER)
     if "frames" in choice.pictures and image_of is None:
         raise InputError(target, "pictures", "frames", "a recording that can be read")
-    with _told(target, ROOM), _beside(target) as part:
+    with _translated_errors(target, ROOM), _beside(target) as part:
         files = _Files(part)
         for name, content_of in (extras or {}).items():
             files.new(name)
@@ -228,7 +228,7 @@ def export(
 
 
 def verify_export(folder: str | os.PathLike[str]) -> list[str]:
-    """What in a folder differs from its manifest, a sentence each; empty if nothing does.
+    """Sentences on differences between a folder and its manifest; empty if there are none.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def verify_export(folder: str | os.PathLike[str]) -> list[str]:
     """
     folder = Path(folder)
     listed = {file.name: file for file in _manifest(folder)}
-    with _told(folder, AN_EXPORT):
+    with _translated_errors(folder, AN_EXPORT):
         there = {path.name: path for path in folder.iterdir() if path.name != MANIFEST}
         problems = [f"{name} is not in the manifest" for name in sorted(there.keys() - listed)]
         for name, file in sorted(listed.items()):
@@ -254,7 +254,7 @@ def verify_export(folder: str | os.PathLike[str]) -> list[str]:
 
 
 class _Files:
-    """The folder in the making."""
+    """The folder while it is written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -267,7 +267,7 @@ class _Files:
             self._rows[name] = content.count(b"\n") - 1
 
     def new(self, name: str) -> Path:
-        """Where a file goes that is not there yet."""
+        """Path of a new file."""
         path = self.folder / name
         if path.name != name or name.startswith("."):
             raise InputError(self.folder, "name", name, "a plain file name")
@@ -282,7 +282,7 @@ class _Files:
         self._rows[name] += rows
 
     def finish(self, about: Mapping[str, object]) -> tuple[ExportedFile, ...]:
-        """Write the manifest; returns what it lists: every file, by name, on the disk for good."""
+        """Write the manifest and sync all files to the disk; returns the files, by name."""
         written = tuple(
             ExportedFile(path.name, path.stat().st_size, _synced(path), self._rows.get(path.name))
             for path in sorted(self.folder.iterdir())
@@ -303,7 +303,7 @@ def _write_results(
     image_of: Callable[[int], GreyImage] | None,
     progress: Callable[[int], None],
 ) -> tuple[Summary, Extent]:
-    """Everything that is chosen but a film, frame by frame; what frames there are, how large."""
+    """Write everything but a film, frame by frame; returns the summary and the common extent."""
     summary, extent = Summary(), Extent()
     for name in choice.tables:
         files.add(f"{name}.csv", csv_header(name).encode())
@@ -356,7 +356,7 @@ def _made() -> dict[str, object]:
 
 
 def _about(provenance: Mapping[str, object]) -> dict[str, object]:
-    """What a file of all frames says of its source; the setup as the TOML text it is."""
+    """Attributes of a file of all frames: program and provenance, the setup as TOML text."""
     about = {**_made(), **provenance}
     setup = about.get("setup")
     if isinstance(setup, Mapping) and "toml" in setup:
@@ -373,7 +373,7 @@ def _draw_trend(path: Path, summary: Summary) -> None:
 
 @contextmanager
 def _beside(target: Path) -> Iterator[Path]:
-    """A folder beside the target, which takes its place when all went well."""
+    """Temporary folder that replaces the target when the block ends without error."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with _alone(target):
         _check_replaceable(target)
@@ -390,7 +390,7 @@ def _beside(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def _alone(target: Path) -> Iterator[None]:
-    """Keep a second export to the same place out; tidy up after one that was killed."""
+    """Lock the target against a second export; clean up after one that was killed."""
     path = target.with_name(f".{target.name}.lock")
     lock = FileLock(path)
     try:
@@ -414,7 +414,7 @@ def _alone(target: Path) -> Iterator[None]:
 
 
 def _tidy(target: Path) -> None:
-    """Take away what a killed export left; put back what it was about to replace."""
+    """Delete what a killed export left; restore what it was about to replace."""
     ours = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.(part|old)")
     for path in target.parent.iterdir():
         if not ours.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
@@ -426,7 +426,7 @@ def _tidy(target: Path) -> None:
 
 
 def _swap(part: Path, target: Path, old: Path) -> None:
-    """Put the folder in its place; what was there is back if that fails, and gone if not."""
+    """Rename the folder to the target; the former one is restored on failure, else deleted."""
     try:
         if target.exists():
             target.rename(old)
@@ -439,7 +439,7 @@ def _swap(part: Path, target: Path, old: Path) -> None:
 
 
 def _check_replaceable(target: Path) -> None:
-    """Refuse to replace a folder that holds anything but an export as it was written."""
+    """Raise if the target holds anything but an unchanged export."""
     if not target.exists():
         return
     if not target.is_dir():
@@ -475,7 +475,7 @@ def _manifest(folder: Path) -> tuple[ExportedFile, ...]:
 
 
 def _synced(path: Path) -> str:
-    """SHA-256 of a file that is on the disk for good."""
+    """SHA-256 of a file, once it is synced to the disk."""
     with path.open("rb+") as file:  # to be written to: Windows syncs no other
         os.fsync(file.fileno())
     return _sha256(path)
@@ -487,8 +487,8 @@ def _sha256(path: Path) -> str:
 
 
 @contextmanager
-def _told(folder: Path, expected: str) -> Iterator[None]:
-    """Turn errors of the file system into what a user can act on."""
+def _translated_errors(folder: Path, expected: str) -> Iterator[None]:
+    """Translate errors of the file system into `InputError`."""
     try:
         yield
     except OSError as error:

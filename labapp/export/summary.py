@@ -1,4 +1,4 @@
-"""What a run came to, in a few lines."""
+"""Summary of a run: number of frames by status, mean sizes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
 
-TOLD = {
+MEANS = {
     "width": "width_mm",
     "length": "length_mm",
     "height": "height_mm",
@@ -24,14 +24,14 @@ TOLD = {
 
 @dataclass
 class Summary:
-    """Adds up a run, frame by frame.
+    """Accumulates measures and statuses of a run, frame by frame.
 
     Attributes
     ----------
     frames
         (frame, time in s, measures or None) of every frame, in order.
     statuses
-        How many frames ended with which status.
+        Number of frames by status.
     example
         The first frame with a surface.
     """
@@ -41,7 +41,7 @@ class Summary:
     example: FrameResult | None = None
 
     def add(self, result: FrameResult) -> None:
-        """Count one more frame."""
+        """Add a frame."""
         measurement = result.measurement
         self.frames.append((result.frame, result.time_s, measurement.measures))
         self.statuses[measurement.status] += 1
@@ -53,12 +53,12 @@ class Summary:
         return np.array([getattr(measures, name, np.nan) for _, _, measures in self.frames])
 
     def text(self) -> str:
-        """Lines for the user: how many frames, and the mean of their sizes."""
+        """Number of frames and mean sizes as text, a line each."""
         count = len(self.frames)
-        told = f"{count} frame{'s' * (count != 1)}, {self.statuses['ok']} with a surface"
+        total = f"{count} frame{'s' * (count != 1)}, {self.statuses['ok']} with a surface"
         without = [f"{n} {status}" for status, n in self.statuses.items() if status != "ok"]
-        lines = [f"{told} ({', '.join(without)})" if without else told]
-        for label, name in TOLD.items():
+        lines = [f"{total} ({', '.join(without)})" if without else total]
+        for label, name in MEANS.items():
             values = self._finite(name)
             if len(values) > 1:
                 spread = f"± {np.std(values):.4f} mm (mean, standard deviation)"
@@ -75,7 +75,7 @@ class Summary:
 
 
 def format_ranges(frames: Iterable[int], to: str = "–", most: int = 12) -> str:
-    """Frame numbers in short, so many runs of them at most: ``0–4, 7, 9–11``."""
+    """Frame numbers as ranges, at most ``most`` of them: ``0–4, 7, 9–11``."""
     runs: list[list[int]] = []
     for frame in sorted(frames):
         if runs and frame == runs[-1][-1] + 1:

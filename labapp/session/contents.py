@@ -1,4 +1,4 @@
-"""What a session file holds, read: set-up, calibrations, corrections, frames and results."""
+"""Reading a session: set-up, calibrations, corrections, frames and results."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from labapp.core.values import IntArray
 from labapp.errors import InputError
 from labapp.media import Frame, GreyImage
 from labapp.run.limits import Limits
-from labapp.session.documents import Change, Documents, KeptSignals
+from labapp.session.calibration_pictures import CalibrationPictures
+from labapp.session.documents import Change, Documents
 from labapp.session.file.database import Database
 from labapp.session.frames import Frames, Progress
-from labapp.session.kept_pictures import KeptPictures
 from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
 from labapp.session.overviews import Overviews
 from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
@@ -25,7 +25,7 @@ from labapp.session.signals import Signals
 
 
 class SessionContents:
-    """What a session holds; `Session` changes it.
+    """The contents of a session, read-only; `Session` adds the changes.
 
     Attributes
     ----------
@@ -40,11 +40,10 @@ class SessionContents:
         self.read_only = database.read_only
         self._database = database
         self._frames = Frames(database)
-        self._pictures = KeptPictures(database)
+        self._pictures = CalibrationPictures(database)
         self._results = Results(database)
-        self._documents = Documents(database, self._results.bring_back)
+        self._documents = Documents(database, self._results.restore)
         self._overviews = Overviews(database, self._results)
-        self._signals = KeptSignals(self._documents)
 
     def close(self) -> None:
         """Close the file. Closing twice does no harm."""
@@ -67,7 +66,7 @@ class SessionContents:
 
     @property
     def setup_text(self) -> str:
-        """The setup as TOML, as far as it goes."""
+        """The setup as TOML; it may be incomplete."""
         return self._documents.get("setup") or ""
 
     @property
@@ -77,7 +76,7 @@ class SessionContents:
         Raises
         ------
         InputError
-            If it is not complete yet; it says what is missing.
+            If it is incomplete; the error names what is missing.
         """
         return parse_setup(self.setup_text, self.path)
 
@@ -105,23 +104,24 @@ class SessionContents:
 
     @property
     def settings(self) -> Settings:
-        """How frames are measured."""
+        """Scheme and settings that frames are measured with."""
         found = self._documents.get("settings")
         return Settings() if found is None else found
 
     def correction(self, frame: int) -> Correction | None:
-        """A frame's dots and rows as they were corrected by hand; None where they were not."""
+        """Correction of a frame by hand; None where there is none."""
         found: Correction | None = self._documents.get("correction", frame)
         return found
 
     @property
     def signals(self) -> Signals | None:
-        """Current and voltage of the weld; None where none were read."""
-        return self._signals.get()
+        """Current and voltage of the weld; None where none are stored."""
+        found: Signals | None = self._documents.get("signals")
+        return found
 
     @property
     def limits(self) -> Limits:
-        """Between what the pool's sizes are to be while it is filmed."""
+        """Lower and upper limits of the pool's sizes while it is filmed."""
         found = self._documents.get("limits")
         return Limits() if found is None else found
 
@@ -134,12 +134,12 @@ class SessionContents:
 
     @property
     def recording(self) -> Recording | None:
-        """Where the frames come from; None before a recording was imported."""
+        """The recording that the frames come from; None before the import."""
         return self._frames.recording
 
     @property
     def missing_recording(self) -> Path | None:
-        """Where the recording should be and is not; None if frames can be read."""
+        """Path at which the recording is missing; None if its frames can be read."""
         return self._frames.missing
 
     @property
@@ -154,7 +154,7 @@ class SessionContents:
     # --- what was measured ------------------------------------------------------------------
 
     def result(self, frame: int, scheme: str | None = None) -> Result | None:
-        """What a frame gave, and what it was measured from; None if it was not measured.
+        """Result of a frame and what it was measured from; None if it was not measured.
 
         Parameters
         ----------
@@ -171,33 +171,33 @@ class SessionContents:
         )
 
     def overview(self, scheme: str | None = None) -> Overview:
-        """All frames at a glance: status, corrections, what no longer stands, measures."""
+        """Status, correction, staleness and measures of every frame."""
         return self._overviews.get(scheme or scheme_name(self.settings), self._basis())
 
     def corrected_frames(self) -> IntArray:
-        """Frames with a correction by hand, ascending, shape (n,)."""
+        """Numbers of the frames with a correction by hand, ascending, shape (n,)."""
         return np.array(sorted(self._documents.fingerprints("correction")), np.int64)
 
     def stale_frames(self) -> IntArray:
-        """Frames that are not measured, or whose measures no longer stand, shape (n,)."""
+        """Numbers of the frames that are not measured or whose result is stale, shape (n,)."""
         seen = self.overview()
         missing = np.array([status == "" for status in seen.status], bool)
         return np.asarray(seen.frame[seen.stale | missing], np.int64)
 
     @property
     def measured_by(self) -> dict[tuple[str, str], int]:
-        """How many results there are: (scheme, version of labapp) → count."""
+        """Number of results: (scheme, version of labapp) → count."""
         return self._results.counts()
 
     def problems(self, progress: Progress | None = None, recording: bool = True) -> list[str]:
-        """Check the whole session: what is wrong, a sentence each.
+        """Check the whole session; a sentence for each problem, empty if it is intact.
 
         Parameters
         ----------
         progress
             Called with frames done and frames in all.
         recording
-            Whether to read through the recording, or the frames kept in the session, too.
+            Whether to read the recording, or the embedded frames, through too.
         """
         return self._database.problems() or [
             *self._documents.problems(),

@@ -1,4 +1,4 @@
-"""Copies of sessions: saved as it is now, begun anew for another recording, or of a sample."""
+"""Copies of sessions: of the present state, as a template for another recording, of a sample."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from labapp.errors import InputError
 from labapp.files import atomic_file
-from labapp.session.documents import WHOLE, Key, Kind
+from labapp.session.documents import NO_FRAME, Key, Kind
 from labapp.session.file.database import SUFFIX, new_session_path
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
@@ -22,14 +22,14 @@ from labapp.session.session import Session
 BUSY_S = 30.0
 
 OF_A_RECORDING = ("correction", "signals")
-"""Kinds of documents that belong to what was filmed."""
+"""Kinds of documents that belong to the recording."""
 
 
 def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
     """Copy a session as it is now, even while it is open and written to.
 
-    The copy finds the recording where it is; it is read through once for that, unless the copy
-    stands beside the session.
+    The copy refers to the same recording, which is read through once to verify it, unless the copy
+    is in the same folder.
 
     Parameters
     ----------
@@ -64,15 +64,15 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
 
 
 def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
-    """Make a session like another for the next recording on the same bench.
+    """Create a session for the next recording on the same bench, with another as the template.
 
-    It has the other's record, set-up, calibrations with their pictures, settings and limits. The
-    safety list is to be gone through again; what was filmed and measured stays with the other.
+    Record, set-up, calibrations with their pictures, settings and limits are copied; the safety
+    list, the recording and what was measured from it are not.
 
     Parameters
     ----------
     session
-        The one it is to be like; it is not changed.
+        The template; it is not changed.
     path
         The new file.
 
@@ -82,15 +82,15 @@ def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
         If there is a file of that name, or it cannot be written, or the other is damaged.
     """
     held: dict[Key, Any] = {
-        (kind, WHOLE): session._documents.get(kind)
+        (kind, NO_FRAME): session._documents.get(kind)
         for kind in get_args(Kind)
         if kind not in OF_A_RECORDING
     }
-    if held["record", WHOLE] is not None:
-        held["record", WHOLE] = replace(session.record, safety=())
+    if held["record", NO_FRAME] is not None:
+        held["record", NO_FRAME] = replace(session.record, safety=())
     made = Session.create(path)
     try:
-        made._pictures.take_over(session._pictures)
+        made._pictures.copy_from(session._pictures)
         made._documents.change(f"as in {session.path.stem}", held)
     except BaseException:
         made.close()
@@ -100,7 +100,7 @@ def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
 
 
 def copy_sample(name: str, folder: Path) -> Path:
-    """Copy a sample's session and its recording into a folder; what is there already stays.
+    """Copy a sample's session and recording into a folder; files that are there already stay.
 
     Parameters
     ----------

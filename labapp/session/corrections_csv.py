@@ -1,4 +1,4 @@
-"""A table of dots as a correction: rows and columns put right in a spreadsheet or by a script.
+"""A table of dots (CSV) as a correction, edited in a spreadsheet or by a script.
 
 The columns are those that `labapp detect` writes and a session exports as `dots.csv`; what else a
 table holds is ignored.
@@ -26,8 +26,8 @@ from labapp.errors import InputError
 from labapp.session.csv_tables import (
     PROBLEMS_SHOWN,
     bounded_lines,
-    number_in,
-    opened_table,
+    open_table,
+    parse_number,
 )
 
 NEEDED = ("u_px", "v_px", "reflected_row", "reflected_column")
@@ -49,7 +49,7 @@ USUAL_SIZE_PX = 2.0
 
 @dataclass(frozen=True)
 class _Row:
-    """A dot as a line of the table has it; row and column are 0 where it has none."""
+    """A line of the table; row and column are 0 where the dot has none."""
 
     line: int
     u_px: float
@@ -62,11 +62,10 @@ class _Row:
 def read_correction(
     path: str | os.PathLike[str], frame: int, frame_shape: tuple[int, int], before: Correction
 ) -> Correction:
-    """Replace a frame's dots, rows and columns by those of a table.
+    """Correction of a frame with dots, rows and columns from a table.
 
-    A dot within 1 px of one that was there lends its uncertainty, and counts as changed by hand
-    only if its place, row or column differs; any other was placed by hand. The reference is left
-    to be found.
+    A dot within 1 px of a former one takes over its uncertainty, and is marked as manual only if
+    its place, row or column differs; any other dot is manual. The reference is left to be found.
 
     Parameters
     ----------
@@ -89,10 +88,10 @@ def read_correction(
     path = Path(path)
     rows = _read(path, frame, frame_shape)
     place = np.array([(row.u_px, row.v_px) for row in rows])
-    origin = _same_dots(place, before.dots.image_px)
+    origin = _match_dots(place, before.dots.image_px)
     known = origin >= 0
     source = np.where(known, origin, len(before.dots))  # the last: a dot placed by hand
-    old = _with_one_placed(before.dots)
+    old = _with_manual_dot(before.dots)
     dots = Dots(*(getattr(old, column.name)[source] for column in fields(Dots)))
     exact = known & (np.hypot(*(place - dots.image_px).T) <= UNMOVED_PX)
     u, v = np.where(exact, dots.image_px.T, place.T)
@@ -107,8 +106,8 @@ def read_correction(
     return set_reference(Correction(replace(dots, u_px=u, v_px=v), lattice, manual), None)
 
 
-def _same_dots(place: FloatArray, before: FloatArray) -> IntArray:
-    """For each dot the one that it was before, each at most once; -1 for none."""
+def _match_dots(place: FloatArray, before: FloatArray) -> IntArray:
+    """Index of the former dot of each dot, each used at most once; −1 for none, shape (n,)."""
     same = np.full(len(place), -1)
     if not len(before):
         return same
@@ -121,8 +120,8 @@ def _same_dots(place: FloatArray, before: FloatArray) -> IntArray:
     return same
 
 
-def _with_one_placed(dots: Dots) -> Dots:
-    """Dots, and behind them one as it looks where a hand places it; its place is not its own."""
+def _with_manual_dot(dots: Dots) -> Dots:
+    """Dots, with one appended that has the properties of a manual dot; its place is void."""
     size = float(np.median(dots.size_px)) if len(dots) else USUAL_SIZE_PX
     unsure = max(size, PLACED_PX)
     peak, snr = (float(np.median(x)) if len(dots) else 1.0 for x in (dots.peak, dots.snr))
@@ -134,7 +133,7 @@ def _read(path: Path, frame: int, frame_shape: tuple[int, int]) -> list[_Row]:
     """The table's rows of one frame; there is at least one."""
     problems: list[InputError] = []
     rows: list[_Row] = []
-    with opened_table(path, A_TABLE, LARGEST_FILE) as file:
+    with open_table(path, A_TABLE, LARGEST_FILE) as file:
         reader = _Reader(path, file, frame, frame_shape, problems)
         for line, cells in reader.lines():
             row = reader.row(line, cells)
@@ -154,7 +153,7 @@ def _read(path: Path, frame: int, frame_shape: tuple[int, int]) -> list[_Row]:
 
 
 class _Reader:
-    """Reads a table line by line and gathers what is wrong with it."""
+    """Reads a table line by line and collects its problems."""
 
     def __init__(
         self,
@@ -198,58 +197,59 @@ class _Reader:
                 continue
             if len(cells) != width:
                 hint = "; decimal commas need ; between the columns" * (self._separator == ",")
-                self._wrong(line, "cells", len(cells), f"{width}, as in the first line{hint}")
+                self._refuse(line, "cells", len(cells), f"{width}, as in the first line{hint}")
                 continue
             named = self._by_column(cells)
             wanted = "a number of a frame, from 0"
-            if place is None or self._whole(line, "frame", named, 0, wanted) == self._frame:
+            if place is None or self._integer(line, "frame", named, 0, wanted) == self._frame:
                 yield line, named
 
     def _by_column(self, cells: list[str]) -> dict[str, str]:
         return dict(zip(self._names, map(str.strip, cells), strict=True))
 
     def row(self, line: int, cells: dict[str, str]) -> _Row | None:
-        """The dot that a line describes; None if anything is wrong."""
+        """Parse a line; None if anything in it is wrong."""
         before = len(self._problems)
         u, v = (self._place(line, name, cells) for name in NEEDED[:2])
         expected = f"a whole number from 1 to {MOST}, or nothing for a dot in doubt"
         row, column = (
-            self._whole(line, name, cells, 1, expected) if cells[name] else 0 for name in NEEDED[2:]
+            self._integer(line, name, cells, 1, expected) if cells[name] else 0
+            for name in NEEDED[2:]
         )
         blocked = {"": None, "0": False, "1": True}.get(cells.get("blocked", ""))
         if blocked is None and cells.get("blocked", ""):
-            self._wrong(line, "blocked", cells["blocked"], "1, 0 or nothing")
+            self._refuse(line, "blocked", cells["blocked"], "1, 0 or nothing")
         if blocked and row == 0:
-            self._wrong(line, "blocked", "1", "a dot with a row, for it is rows that are blocked")
+            self._refuse(line, "blocked", "1", "a dot with a row, for it is rows that are blocked")
         if len(self._problems) > before or u is None or v is None or row is None or column is None:
             return None
         return _Row(line, u, v, row, column, blocked)
 
     def _place(self, line: int, name: str, cells: dict[str, str]) -> float | None:
-        value = number_in(cells[name], self._separator)
+        value = parse_number(cells[name], self._separator)
         if value is None or not -0.5 <= value <= self._bounds[name]:
             inside = f"a number from -0.5 to {self._bounds[name]:g} (px, within the frame)"
-            self._wrong(line, name, cells[name], inside)
+            self._refuse(line, name, cells[name], inside)
             return None
         return value
 
-    def _whole(
+    def _integer(
         self, line: int, name: str, cells: dict[str, str], least: int, expected: str
     ) -> int | None:
-        value = number_in(cells[name], self._separator)
+        value = parse_number(cells[name], self._separator)
         most = MOST if least else math.inf
         if value is None or value != math.floor(value) or not least <= value <= most:
-            self._wrong(line, name, cells[name], expected)
+            self._refuse(line, name, cells[name], expected)
             return None
         return int(value)
 
-    def _wrong(self, line: int, name: str, value: object, expected: str) -> None:
+    def _refuse(self, line: int, name: str, value: object, expected: str) -> None:
         shown = value if value != "" else "nothing"
         self._problems.append(InputError(self._path, f"line {line}, {name}", shown, expected))
 
 
 def _contradictions(path: Path, rows: list[_Row]) -> list[InputError]:
-    """Lines that are right by themselves and impossible together."""
+    """Problems of lines that are valid by themselves and contradict each other."""
     problems = []
     sites: dict[tuple[int, int], int] = {}
     places: dict[tuple[float, float], int] = {}

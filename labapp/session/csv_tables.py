@@ -1,4 +1,4 @@
-"""What readers of tables share: text that is no table, or has no end, is refused at once."""
+"""Reading of untrusted CSV tables: bounded in size, with errors a user can act on."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ LONGEST_LINE = 1 << 14
 HEAD_BYTES = 1 << 16
 
 PROBLEMS_SHOWN = 10
-"""Of all that is wrong with a table, so much is told together."""
+"""Most problems of a table that are reported together."""
 
 
 @contextmanager
-def opened_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
-    """Open a table as text; what is wrong with file, encoding or syntax is told.
+def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
+    """Open a table as UTF-8 text; errors of file, encoding and syntax become `InputError`.
 
     Parameters
     ----------
     path
         Where it is.
     wanted
-        What it should be.
+        What it should be, for the errors.
     largest
-        So many bytes it may have.
+        Largest size, bytes.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def opened_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
 
 
 def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
-    """The lines; one without an end is refused before it fills the memory."""
+    """Lines of a file; one longer than `LONGEST_LINE` raises before it fills the memory."""
     for number in itertools.count(1):
         text = file.readline(LONGEST_LINE)
         if len(text) >= LONGEST_LINE:
@@ -66,8 +66,8 @@ def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
         yield text
 
 
-def number_in(cell: str, separator: str) -> float | None:
-    """The finite number in a cell, with a decimal comma where no comma separates; None if none."""
+def parse_number(cell: str, separator: str) -> float | None:
+    """Parse a finite number; a decimal comma is allowed unless it is the separator. Else None."""
     if separator != ",":
         cell = cell.replace(",", ".")
     try:

@@ -1,6 +1,6 @@
-"""What the operator says, and every change of it: undo, redo, saved with the session.
+"""Documents of a session, with undo and redo that are saved with it.
 
-A document is one thing the operator decides: the record, the setup, the settings, a calibration,
+A document is one thing that the operator sets: the record, the setup, the settings, a calibration,
 the correction of one frame, the weld's current and voltage, the limits of its sizes. A change sets
 some of them, in one transaction with what they were before.
 """
@@ -18,7 +18,7 @@ from labapp.core.rows.correction import Correction
 from labapp.run.limits import Limits
 from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
 from labapp.session.file.database import Database
-from labapp.session.file.kept import Kept
+from labapp.session.file.read_cache import ReadCache
 from labapp.session.record import LaserReadings, PlanePicture, Record
 from labapp.session.signals import Signals
 
@@ -33,9 +33,9 @@ Kind = Literal[
     "limits",
 ]
 Key = tuple[Kind, int]
-"""Kind, and the frame of a correction; `WHOLE` for what belongs to no frame."""
+"""Kind, and the frame of a correction; `NO_FRAME` for what belongs to no frame."""
 
-WHOLE = -1
+NO_FRAME = -1
 
 CLASSES: dict[str, type] = {
     "record": Record,
@@ -47,13 +47,13 @@ CLASSES: dict[str, type] = {
     "signals": Signals,
     "limits": Limits,
 }
-"""What a document of each kind is."""
+"""Class of a document, by its kind."""
 
-Along = Callable[[Collection[Key]], object]
+OnChange = Callable[[Collection[Key]], object]
 
-KEPT_CHANGES = 500
-KEPT_BYTES = 64_000_000
-"""The history is cut at the older end to stay within both."""
+MAX_CHANGES = 500
+MAX_HISTORY_BYTES = 64_000_000
+"""The oldest changes are deleted so that the history stays within both."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,13 @@ class Change:
     number
         Counts up over the session's life.
     label
-        What was done, in words.
+        What was done.
     made
         When, ISO 8601.
     undone
-        Whether it was taken back, and can be made again.
+        Whether it was undone, and can be redone.
     keys
-        The documents it set.
+        The documents that it set.
     """
 
     number: int
@@ -88,41 +88,45 @@ class Documents:
     ----------
     database
         The session file.
-    along
-        What else belongs to a change, an undo or a redo: called with the documents it set, in the
-        same transaction.
+    on_change
+        Called with the documents that a change, an undo or a redo has set, in the same transaction.
     """
 
-    def __init__(self, database: Database, along: Along = lambda _: None) -> None:
+    def __init__(self, database: Database, on_change: OnChange = lambda _: None) -> None:
         self._database = database
-        self._along = along
-        self._kept = Kept(database)
+        self._on_change = on_change
+        self._cache = ReadCache(database)
+        self._values: dict[Kind, tuple[str, Any]] = {}
 
-    def get(self, kind: Kind, frame: int = WHOLE) -> Any:
-        """The document; None where there is none.
+    def get(self, kind: Kind, frame: int = NO_FRAME) -> Any:
+        """The document; None where there is none. One of no frame is unpacked once per content.
 
         Raises
         ------
         InputError
             If it is damaged.
         """
-        if frame != WHOLE:
-            return self._read(kind, frame)
-        return self._kept.get(kind, lambda: self._read(kind, frame))
-
-    def _read(self, kind: Kind, frame: int) -> Any:
-        blob = self._database.value(
-            "SELECT content FROM document WHERE kind = ? AND frame = ?", kind, frame
+        if frame == NO_FRAME:
+            sha256 = self.fingerprint(kind)
+            held = self._values.get(kind)
+            if held is not None and held[0] == sha256:
+                return held[1]
+        found = self._database.rows(
+            "SELECT sha256, content FROM document WHERE kind = ? AND frame = ?", kind, frame
         )
-        if blob is None:
+        if not found:
             return None
-        return unpack_from(self._database.path, _named(kind, frame), blob, CLASSES[kind])
+        sha256, content = found[0]
+        value = unpack_from(self._database.path, _named(kind, frame), content, CLASSES[kind])
+        if frame == NO_FRAME:
+            self._values[kind] = sha256, value
+        return value
 
     def fingerprints(self, kind: Kind) -> dict[int, str]:
         """SHA-256 of every document of a kind, by frame."""
         return dict(self._database.rows("SELECT frame, sha256 FROM document WHERE kind = ?", kind))
 
-    def fingerprint(self, kind: Kind, frame: int = WHOLE) -> str | None:
+    def fingerprint(self, kind: Kind, frame: int = NO_FRAME) -> str | None:
         """SHA-256 of a document; None where there is none."""
 
         def read() -> str | None:
@@ -131,15 +135,15 @@ class Documents:
             )
             return found
 
-        return read() if frame != WHOLE else self._kept.get((kind, "sha256"), read)
+        return read() if frame != NO_FRAME else self._cache.get((kind, "sha256"), read)
 
     def change(self, label: str, values: Mapping[Key, object]) -> bool:
-        """Set documents in one step; None takes one away. What was undone can no more be redone.
+        """Set documents in one step; None deletes one. Changes that were undone are discarded.
 
         Returns
         -------
         bool
-            False if everything was so already: then there is no step.
+            False if nothing differed: then there is no step.
 
         Raises
         ------
@@ -165,17 +169,17 @@ class Documents:
                 "INSERT INTO change_part VALUES (?, ?, ?, ?, ?)",
                 [(number, *part) for part in parts],
             )
-            _cut(connection)
-            self._along([part[:2] for part in parts])
-        self._kept.forget()
+            _prune(connection)
+            self._on_change([part[:2] for part in parts])
+        self._cache.clear()
         return True
 
     def undo(self) -> Change | None:
-        """Take back the last change that stands; None if none is left."""
+        """Undo the last change and return it; None if there is none."""
         return self._step(undone=False, order="DESC", side="before")
 
     def redo(self) -> Change | None:
-        """Make the last change again that was taken back; None if there is none."""
+        """Redo the change that was undone last and return it; None if there is none."""
         return self._step(undone=True, order="ASC", side="after")
 
     def _step(self, *, undone: bool, order: str, side: str) -> Change | None:
@@ -195,13 +199,13 @@ class Documents:
                     unpack_from(self._database.path, named, content, CLASSES.get(kind, Never))
                 _put(connection, kind, frame, content)
             connection.execute("UPDATE change SET undone = ? WHERE id = ?", (not undone, number))
-            self._along([part[:2] for part in parts])
-        self._kept.forget()
+            self._on_change([part[:2] for part in parts])
+        self._cache.clear()
         return next(change for change in self.history() if change.number == number)
 
     def history(self) -> tuple[Change, ...]:
-        """Every change that is kept, the oldest first."""
-        found: tuple[Change, ...] = self._kept.get("history", self._read_history)
+        """Changes in the history, the oldest first."""
+        found: tuple[Change, ...] = self._cache.get("history", self._read_history)
         return found
 
     def _read_history(self) -> tuple[Change, ...]:
@@ -218,7 +222,7 @@ class Documents:
         )
 
     def problems(self) -> list[str]:
-        """Documents that are damaged, or are not what the history says; empty if all is well."""
+        """Sentences on documents that are damaged or contradict the history; empty if none."""
         found = []
         expected = {
             (kind, frame): content
@@ -255,29 +259,8 @@ class Documents:
         return found
 
 
-class KeptSignals:
-    """The session's current and voltage: unpacking takes long, and is done once for each table.
-
-    Parameters
-    ----------
-    documents
-        Where they are.
-    """
-
-    def __init__(self, documents: Documents) -> None:
-        self._documents = documents
-        self._held: tuple[str | None, Signals | None] = (None, None)
-
-    def get(self) -> Signals | None:
-        """The signals; None where there are none. See `Documents.get`."""
-        sha256 = self._documents.fingerprint("signals")
-        if sha256 != self._held[0]:
-            self._held = sha256, self._documents.get("signals")
-        return self._held[1]
-
-
 def _named(kind: str, frame: int) -> str:
-    return kind if frame == WHOLE else f"{kind} of frame {frame}"
+    return kind if frame == NO_FRAME else f"{kind} of frame {frame}"
 
 
 def _content(connection: sqlite3.Connection, kind: str, frame: int) -> bytes | None:
@@ -297,8 +280,8 @@ def _put(connection: sqlite3.Connection, kind: str, frame: int, content: bytes |
         )
 
 
-def _cut(connection: sqlite3.Connection) -> None:
-    """Forget the oldest changes beyond what is kept; the newest always stays."""
+def _prune(connection: sqlite3.Connection) -> None:
+    """Delete the oldest changes beyond the limits; the newest always stays."""
     sizes = connection.execute(
         "SELECT change, sum(coalesce(length(before), 0) + coalesce(length(after), 0)) "
         "FROM change_part GROUP BY change ORDER BY change DESC"
@@ -306,6 +289,6 @@ def _cut(connection: sqlite3.Connection) -> None:
     total = 0
     for place, (number, size) in enumerate(sizes):
         total += size
-        if place and (place >= KEPT_CHANGES or total > KEPT_BYTES):
+        if place and (place >= MAX_CHANGES or total > MAX_HISTORY_BYTES):
             connection.execute("DELETE FROM change WHERE id <= ?", (number,))
             return

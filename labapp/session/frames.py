@@ -1,7 +1,7 @@
-"""The frames of a session: taken in once from a recording, checked at every reading.
+"""The frames of a session: imported once from a recording, verified at every reading.
 
-The recording stays where it is, named by its place relative to the session; or its frames are
-kept in the session itself, lossless.
+The recording stays where it is and is stored as a path relative to the session; or its frames are
+embedded in the session, lossless.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.run.runner import select_frames
 from labapp.session.file.blobs import MAGIC, pack, unpack_from
 from labapp.session.file.database import Database
-from labapp.session.file.kept import Kept
+from labapp.session.file.read_cache import ReadCache
 from labapp.session.record import Recording
 
 Progress = Callable[[int, int], None]
-"""Called with how much is done and of how much; may raise to stop."""
+"""Called with steps done and in all; may raise to stop."""
 
 THE_RECORDING = "the recording; `labapp session relink` says where it is now"
 
@@ -52,14 +52,14 @@ class Frames:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._turn = threading.RLock()
+        self._mutex = threading.RLock()
         self._source: FrameSource | None = None
-        self._kept = Kept(database)
+        self._cache = ReadCache(database)
 
     @property
     def recording(self) -> Recording | None:
         """The recording; None before one was imported."""
-        found: Recording | None = self._kept.get("recording", self._read_recording)
+        found: Recording | None = self._cache.get("recording", self._read_recording)
         return found
 
     def _read_recording(self) -> Recording | None:
@@ -72,7 +72,7 @@ class Frames:
     @property
     def numbers(self) -> IntArray:
         """Numbers of the session's frames in the recording, from 0, ascending, shape (n,)."""
-        found: IntArray = self._kept.get("numbers", self._read_numbers)
+        found: IntArray = self._cache.get("numbers", self._read_numbers)
         return found
 
     def _read_numbers(self) -> IntArray:
@@ -95,7 +95,7 @@ class Frames:
         (time_s,) = found[0]
         return None if time_s is None else float(self._database.array(time_s, np.float64))
 
-    def take_in(
+    def import_recording(
         self,
         path: str | os.PathLike[str],
         frames: str = ":",
@@ -104,18 +104,18 @@ class Frames:
         embed: bool = False,
         progress: Progress | None = None,
     ) -> Recording:
-        """Import a recording: read it through, check that it is frame-exact, note all of that.
+        """Import a recording: read it through, check that it is frame-exact, store both findings.
 
         Parameters
         ----------
         path
             A video, an image, a folder of images, a stack.
         frames
-            Which of its frames the session uses, ``A:B:STEP``.
+            Frames that the session uses, ``A:B:STEP``.
         frame_rate_hz
-            The rate it was filmed at, where the recording does not say so or says it wrongly.
+            Frame rate, Hz, where the recording states none or a wrong one.
         embed
-            Keep the frames in the session itself.
+            Store the frames in the session.
         progress
             Called with frames done and frames in all.
 
@@ -222,7 +222,7 @@ class Frames:
         return {frame for (frame,) in rows}
 
     def _fingerprint(self) -> str:
-        """SHA-256 of what is noted of every frame: its number, time and checksum."""
+        """SHA-256 of number, time and checksum of every frame."""
         rows = self._database.rows("SELECT number, time_s, checksum FROM frame ORDER BY number")
         return hashlib.sha256(repr(rows).encode()).hexdigest()
 
@@ -238,7 +238,7 @@ class Frames:
         time_s = self.time_s(number)
         (checksum,) = self._database.rows("SELECT checksum FROM frame WHERE number = ?", number)[0]
         held = self._database.value("SELECT content FROM frame_image WHERE frame = ?", number)
-        with self._turn:
+        with self._mutex:
             image = (
                 self._recorded(number)
                 if held is None
@@ -259,12 +259,12 @@ class Frames:
         return noted is not None
 
     def refuse_lost(self, numbers: Sequence[int]) -> None:
-        """Refuse frames that could be read at import and no longer can; none is none.
+        """Raise if there are frames that could be read at import and no longer can.
 
         Raises
         ------
         InputError
-            If there are any.
+            If ``numbers`` is not empty.
         """
         if numbers:
             raise InputError(
@@ -276,14 +276,14 @@ class Frames:
 
     @property
     def missing(self) -> Path | None:
-        """Where the recording should be and is not; None if frames can be read."""
+        """Path at which the recording is missing; None if its frames can be read."""
         recording = self.recording
         if recording is None or recording.embedded or self._place().exists():
             return None
         return self._place()
 
     def refuse_missing(self) -> None:
-        """Refuse to go on without the recording.
+        """Raise if the recording is missing.
 
         Raises
         ------
@@ -294,12 +294,12 @@ class Frames:
             raise InputError(missing, "recording", "is not there", THE_RECORDING)
 
     def relink(self, path: str | os.PathLike[str]) -> None:
-        """Say where the recording is now.
+        """Set the path of the recording.
 
         Raises
         ------
         InputError
-            If what is there is another recording.
+            If the file there is another recording.
         """
         path = Path(path).absolute()
         recording = self._imported()
@@ -317,15 +317,15 @@ class Frames:
         self.close()
 
     def close(self) -> None:
-        """Let go of the recording; it is opened again when needed."""
-        self._kept.forget()
-        with self._turn:
+        """Close the recording; it is opened again when needed."""
+        self._cache.clear()
+        with self._mutex:
             if self._source is not None:
                 self._source.close()
             self._source = None
 
     def problems(self, progress: Progress | None = None) -> list[str]:
-        """What is wrong with the recording or the frames kept; empty if all is well."""
+        """Sentences on problems of the recording or the embedded frames; empty if none."""
         try:
             recording = self.recording
         except InputError as error:
@@ -389,7 +389,7 @@ class Frames:
         return recording
 
     def _place(self) -> Path:
-        """Where the recording is: where it was, else beside the session."""
+        """Path of the recording: as imported, else in the session's folder."""
         recording = self._imported()
         folder = self._database.path.parent
         place = Path(os.path.normpath(folder / recording.path))
@@ -455,7 +455,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _encoded(image: npt.NDArray[Any]) -> bytes:
-    """A frame as a lossless blob: PNG where its levels fit."""
+    """Encode a frame without loss: PNG for 8 and 16 bit, else a packed array."""
     if image.dtype in (np.uint8, np.uint16):
         _, content = cv2.imencode(".png", image)
         return content.tobytes()

@@ -1,4 +1,4 @@
-"""The results of a session: what was measured, from what, and whether that still stands."""
+"""The results of a session: measurements, their inputs, and whether they are stale."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ SETUP_CHANGED = "the rig or a calibration was changed"
 SETTINGS_CHANGED = "the settings were changed"
 CORRECTION_CHANGED = "the dots or rows were corrected"
 
-ASIDE_BYTES = 64_000_000
-"""So much of what frames gave with other dots and rows is kept in memory, for undo and redo."""
+MAX_STASHED_BYTES = 64_000_000
+"""Memory for results of former corrections, which undo and redo restore."""
 
 
 @dataclass(frozen=True)
 class Basis:
-    """What a frame is measured from, besides its image.
+    """Inputs of a measurement besides the image.
 
     Parameters
     ----------
@@ -47,28 +47,28 @@ class Basis:
 
     @property
     def scheme(self) -> str:
-        """Name that results are kept under; see `scheme_name`."""
+        """Name of the scheme; see `scheme_name`."""
         return scheme_name(self.settings)
 
     def fingerprints(self) -> tuple[str, str]:
-        """SHA-256 of what the setup says (comments aside) and of the settings."""
-        return _said_by(self.setup.text), fingerprint(self.settings)
+        """SHA-256 of the setup's values (comments aside) and of the settings."""
+        return _setup_fingerprint(self.setup.text), fingerprint(self.settings)
 
 
 @dataclass(frozen=True)
 class Result:
-    """What is kept of one frame by one scheme.
+    """Stored result of one frame by one scheme.
 
     Parameters
     ----------
     frame
         Its number in the recording.
     measurement
-        What it gave.
+        Its measurement.
     scheme
         Name of the scheme, as in `Basis.scheme`.
     version
-        Of labapp, which measured it.
+        Version of labapp that measured it.
     measured
         When, ISO 8601.
     setup
@@ -76,7 +76,7 @@ class Result:
     settings
         The settings it was measured with.
     stale
-        Why it no longer stands, a clause each; empty while it does.
+        Why it is stale, a clause each; empty if it is not.
     """
 
     frame: int
@@ -91,7 +91,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Overview:
-    """All frames of a session at a glance; n frames.
+    """Status, staleness and measures of all frames of a session; n frames.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class Overview:
     corrected
         Which frames have a correction by hand, shape (n,).
     stale
-        Which results no longer stand, shape (n,).
+        Which results are stale, shape (n,).
     measures
         Name → values, shape (n,), of `Measures`; NaN where there is none.
     """
@@ -121,7 +121,7 @@ class Overview:
 
 
 class _Row(NamedTuple):
-    """A result as it is kept: what it was measured from, when, and the measurement, packed."""
+    """A stored result: its inputs, when it was measured, and the packed measurement."""
 
     version: str
     setup: bytes
@@ -142,22 +142,22 @@ class Results:
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._aside: OrderedDict[tuple[int, str, str | None], _Row] = OrderedDict()
+        self._stashed: OrderedDict[tuple[int, str, str | None], _Row] = OrderedDict()
 
     def put(
         self, frame: int, measurement: Measurement, basis: Basis, correction: str | None
     ) -> None:
-        """Keep what a frame gave; what the same scheme gave before is replaced.
+        """Store a result; it replaces an earlier one of the same frame and scheme.
 
-        What it gave with other dots and rows is put aside for `bring_back`. If that is what stands,
-        as the correction was taken back meanwhile, it stays, and the new is put aside.
+        An earlier one of another correction is stashed for `restore`. If that correction is the
+        present one, as the new one was undone meanwhile, it stays and the new one is stashed.
 
         Parameters
         ----------
         frame, measurement
-            The frame's number and what it gave.
+            The frame's number and its measurement.
         basis
-            What it was measured from.
+            Inputs of the measurement.
         correction
             SHA-256 of the correction it was measured with; None without.
 
@@ -175,13 +175,13 @@ class Results:
             former = self._row(frame, basis.scheme)
             if former is not None and self._differ_by_correction(former, row):
                 if former.correction == self._corrected(frame):
-                    self._put_aside(frame, basis.scheme, row)
+                    self._stash(frame, basis.scheme, row)
                     return
-                self._put_aside(frame, basis.scheme, former)
+                self._stash(frame, basis.scheme, former)
             _replace(connection, frame, basis.scheme, row, measurement)
 
-    def bring_back(self, changed: Collection[tuple[str, int]]) -> None:
-        """Have frames whose correction was changed give what they gave before with the same.
+    def restore(self, changed: Collection[tuple[str, int]]) -> None:
+        """Restore the stashed results of frames whose correction was changed.
 
         Parameters
         ----------
@@ -190,23 +190,23 @@ class Results:
         """
         for kind, frame in changed:
             if kind == "correction":
-                self._bring_back(frame)
+                self._restore(frame)
 
-    def _bring_back(self, frame: int) -> None:
-        """Have a frame give what it gave with the dots and rows that it has now, if that is known.
+    def _restore(self, frame: int) -> None:
+        """Restore the result that a frame had with its present correction, if it is stashed.
 
-        It is if it was measured since the session was opened, and set-up and settings are the same.
+        It is if it was measured since the session was opened, with the same set-up and settings.
         """
         present = self._corrected(frame)
         for (scheme,) in self._database.rows("SELECT scheme FROM result WHERE frame = ?", frame):
-            former, row = self._row(frame, scheme), self._aside.get((frame, scheme, present))
+            former, row = self._row(frame, scheme), self._stashed.get((frame, scheme, present))
             if former is None or row is None or not self._differ_by_correction(former, row):
                 continue
             try:
-                measurement = _unsealed(row.content, (frame, scheme, *row[:-1]))
+                measurement = _verified(row.content, (frame, scheme, *row[:-1]))
             except Damaged:
                 continue
-            self._put_aside(frame, scheme, former)
+            self._stash(frame, scheme, former)
             with self._database.transaction() as connection:
                 _replace(connection, frame, scheme, row, measurement)
 
@@ -228,7 +228,7 @@ class Results:
         return found
 
     def _differ_by_correction(self, one: _Row, other: _Row) -> bool:
-        """Whether two results were measured from the same, but for the correction."""
+        """Whether two results differ in the correction and in no other input."""
         try:
             one_inputs, other_inputs = (
                 self._inputs(row.setup, row.settings).fingerprints() for row in (one, other)
@@ -237,26 +237,26 @@ class Results:
             return False
         return one_inputs == other_inputs and one.correction != other.correction
 
-    def _put_aside(self, frame: int, scheme: str, row: _Row) -> None:
-        """Keep a result for `bring_back`; where there are many, the first goes."""
+    def _stash(self, frame: int, scheme: str, row: _Row) -> None:
+        """Hold a result for `restore`; beyond `MAX_STASHED_BYTES` the oldest are discarded."""
         key = frame, scheme, row.correction
-        self._aside.pop(key, None)
-        self._aside[key] = row
-        size = sum(len(kept.content) for kept in self._aside.values())
-        while size > ASIDE_BYTES:
-            size -= len(self._aside.popitem(last=False)[1].content)
+        self._stashed.pop(key, None)
+        self._stashed[key] = row
+        size = sum(len(kept.content) for kept in self._stashed.values())
+        while size > MAX_STASHED_BYTES:
+            size -= len(self._stashed.popitem(last=False)[1].content)
 
     def get(
         self, frame: int, scheme: str, basis: Basis | None, correction: str | None
     ) -> Result | None:
-        """What a scheme gave for a frame; None if it was not measured.
+        """Result of a frame by a scheme; None if it was not measured.
 
         Parameters
         ----------
         frame, scheme
             Which result.
         basis, correction
-            What it would be measured from now; no basis where the setup is not complete.
+            Present inputs, to tell whether it is stale; basis None where the setup is incomplete.
 
         Raises
         ------
@@ -268,7 +268,7 @@ class Results:
             return None
         path, named = self._database.path, f"result of frame {frame}"
         try:
-            measurement = _unsealed(row.content, (frame, scheme, *row[:-1]))
+            measurement = _verified(row.content, (frame, scheme, *row[:-1]))
         except Damaged as error:
             raise InputError(path, named, error, "what was written there") from error
         inputs = self._inputs(row.setup, row.settings)
@@ -285,7 +285,7 @@ class Results:
         )
 
     def counts(self) -> dict[tuple[str, str], int]:
-        """How many results there are: (scheme, version of labapp) → count."""
+        """Number of results: (scheme, version of labapp) → count."""
         rows = self._database.rows(
             "SELECT scheme, version, count(*) FROM result JOIN inputs ON inputs.id = result.inputs "
             "GROUP BY scheme, version ORDER BY scheme, version"
@@ -293,7 +293,7 @@ class Results:
         return {(scheme, version): count for scheme, version, count in rows}
 
     def problems(self) -> list[str]:
-        """Results that are damaged; empty if all is well."""
+        """Sentences on damaged results; empty if there are none."""
         found = []
         for number, version, setup, settings in self._database.rows("SELECT * FROM inputs"):
             try:
@@ -313,18 +313,18 @@ class Results:
                 result,
             )
             try:
-                measurement = _unsealed(kept[0][-1], kept[0][:-1])
+                measurement = _verified(kept[0][-1], kept[0][:-1])
             except Damaged as error:
                 found.append(f"{named} is damaged: {error}")
                 continue
-            held = [getattr(measurement.measures, name, None) for name in MEASURES]
-            held = [None if size is None or np.isnan(size) else size for size in held]
-            if (measurement.status, held) != (status, sizes):
+            expected = [getattr(measurement.measures, name, None) for name in MEASURES]
+            expected = [None if size is None or np.isnan(size) else size for size in expected]
+            if (measurement.status, expected) != (status, sizes):
                 found.append(f"{named} is not what its frame gave")
         return found
 
     def outdated(self, basis: Basis | None) -> frozenset[int]:
-        """Rows of `inputs` from which nothing would be measured now, whose results do not stand."""
+        """Rows of `inputs` that differ from the present ones: their results are stale."""
         found = set()
         for number, setup, settings in self._database.rows(
             "SELECT id, setup, settings FROM inputs"
@@ -348,7 +348,7 @@ class Results:
 def _replace(
     connection: sqlite3.Connection, frame: int, scheme: str, row: _Row, measurement: Measurement
 ) -> None:
-    """Put a result in the place of the one that the frame has by the same scheme, if any."""
+    """Insert a result, and delete an earlier one of the same frame and scheme."""
     key = row.version, row.setup, row.settings
     connection.execute(
         "INSERT OR IGNORE INTO inputs (version, setup, settings) VALUES (?, ?, ?)", key
@@ -373,17 +373,17 @@ def _replace(
     )
 
 
-def _unsealed(content: object, kept_with: tuple[object, ...]) -> Measurement:
-    """The measurement in a detail, which vouches for what stands beside it in the tables.
+def _verified(content: object, columns: tuple[object, ...]) -> Measurement:
+    """Measurement of a detail, once its seal is verified against the columns beside it.
 
     Raises
     ------
     Damaged
-        If it is, or if frame, scheme, version, set-up, settings, correction or time are others.
+        If it is damaged, or frame, scheme, version, set-up, settings, correction or time differ.
     """
     measurement: Measurement
     measurement, seal = unpack(content, tuple[Measurement, str])
-    if seal != fingerprint(kept_with):
+    if seal != fingerprint(columns):
         raise Damaged("it is of another frame, or was measured from something else")
     return measurement
 
@@ -394,8 +394,8 @@ def _read_inputs(setup: bytes, settings: bytes) -> Basis:
 
 
 @functools.lru_cache(maxsize=64)
-def _said_by(text: str) -> str:
-    """SHA-256 of what a setup says, comments aside."""
+def _setup_fingerprint(text: str) -> str:
+    """SHA-256 of a setup's values, comments aside."""
     setup = parse_setup(text, "setup")
     return fingerprint((setup.rig, setup.calibration))
 

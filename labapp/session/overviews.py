@@ -1,4 +1,4 @@
-"""All frames of a session at a glance, kept up to date: what did not change is not read again."""
+"""Overviews of all frames of a session, updated incrementally."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from labapp.session.file.schema import MEASURES
 from labapp.session.measured import Basis, Overview, Results
 
 MANY = 500
-"""Where more frames than this changed, all are read: it takes no longer."""
+"""If more frames than this changed, all are read: it takes no longer."""
 
 ALL_FRAMES = -2
 
@@ -28,7 +28,7 @@ WATCHING = (
         for frame in (whole or f"{row}.frame",)
     ),
 )
-"""Has SQLite note the frames of each change, undo and redo included, in memory."""
+"""Triggers by which SQLite records the frames of each change, undo and redo included, in memory."""
 
 QUERY = (
     "SELECT number, time_s, inputs, correction, status, sha256, "
@@ -40,20 +40,20 @@ QUERY = (
 
 @dataclass
 class _Table:
-    """What a scheme gave, a row a frame, as it was read last.
+    """Results of a scheme as last read, one row per frame.
 
     Parameters
     ----------
     number, time_s, inputs
         Of the frame; row of `inputs` that it was measured from, 0 where it was not; shape (n,).
     used, held
-        SHA-256 of the correction it was measured with, and of the one there is now; None without.
+        SHA-256 of the correction it was measured with, and of the present one; None without.
     status, sizes
         Of the result: shape (n,) and (n, number of measures).
     due
         Frames that have changed since.
     seen
-        What was made of it last, and the rows of `inputs` that did not stand then.
+        The overview made from it last, and the outdated rows of `inputs` then.
     """
 
     number: IntArray
@@ -68,7 +68,7 @@ class _Table:
 
 
 class Overviews:
-    """The overviews of a session, one a scheme; may be used from several threads.
+    """The overviews of a session, one per scheme; thread-safe.
 
     Parameters
     ----------
@@ -79,38 +79,38 @@ class Overviews:
     def __init__(self, database: Database, results: Results) -> None:
         self._database = database
         self._results = results
-        self._turn = threading.Lock()
+        self._mutex = threading.Lock()
         self._tables: dict[str, _Table] = {}
         self._version: int | None = None
         for statement in WATCHING:
             database.rows(statement)
 
     def get(self, scheme: str, basis: Basis | None) -> Overview:
-        """All frames by a scheme; the very same object while nothing has changed.
+        """Overview by a scheme; the same object while nothing has changed.
 
         Parameters
         ----------
         scheme
-            Name that results are kept under.
+            Name of the scheme.
         basis
-            What frames would be measured from now; None where the setup is not complete.
+            Present inputs; None where the setup is incomplete.
 
         Raises
         ------
         InputError
             If the session is damaged.
         """
-        with self._turn:
+        with self._mutex:
             try:
                 self._note_changes()
                 table = self._tables.get(scheme)
                 if table is None or len(table.due) > MANY:
                     table = self._tables[scheme] = self._read(scheme)
                 elif table.due:
-                    self._read_again(table, scheme)
+                    self._update(table, scheme)
                 outdated = self._results.outdated(basis)
             except BaseException:
-                self._tables.clear()  # what was to be read anew is known no more
+                self._tables.clear()  # the changed frames are no longer known
                 raise
             if table.seen is None or table.seen[0] != outdated:
                 table.seen = outdated, _overview(table, outdated)
@@ -140,8 +140,8 @@ class Overviews:
             sizes=array(sizes, np.float64).reshape(len(MEASURES), -1).T,
         )
 
-    def _read_again(self, table: _Table, scheme: str) -> None:
-        """Read the rows that are due."""
+    def _update(self, table: _Table, scheme: str) -> None:
+        """Update the rows of the changed frames."""
         array = self._database.array
         for frame in table.due:
             for row in self._database.rows(f"{QUERY} WHERE number = ?", scheme, frame):

@@ -26,7 +26,7 @@ from labapp.run.limits import Limits
 from labapp.run.measurers import ColdMeasurer, WarmMeasurer
 from labapp.run.runner import Measurer, Sink, run
 from labapp.session.contents import SessionContents
-from labapp.session.documents import WHOLE, Change, Key
+from labapp.session.documents import NO_FRAME, Change, Key
 from labapp.session.file.blobs import fingerprint
 from labapp.session.file.database import Database
 from labapp.session.frames import Progress
@@ -73,7 +73,7 @@ class Session(SessionContents):
 
     def set_record(self, record: Record) -> None:
         """Replace the experiment record."""
-        self._change("experiment record", {("record", WHOLE): record})
+        self._documents.change("experiment record", {("record", NO_FRAME): record})
 
     def set_setup(self, text: str, label: str = "setup") -> None:
         """Replace the setup by that of a setup file.
@@ -84,19 +84,21 @@ class Session(SessionContents):
             If anything in it is unknown, missing or impossible.
         """
         parse_setup(text, self.path)
-        self._change(label, {("setup", WHOLE): text})
+        self._documents.change(label, {("setup", NO_FRAME): text})
 
     def update_setup(
         self, values: Mapping[str, Mapping[str, object]], label: str = "setup"
     ) -> None:
-        """Put values (section → key → value; None takes it out) into the setup; it may stay open.
+        """Set or delete (None) keys of the setup: section → key → value; it may stay incomplete.
 
         Raises
         ------
         InputError
             If a section is not one; whether values are possible is told by `setup`.
         """
-        self._change(label, {("setup", WHOLE): updated_setup(self.setup_text, self.path, values)})
+        self._documents.change(
+            label, {("setup", NO_FRAME): updated_setup(self.setup_text, self.path, values)}
+        )
 
     def calibrate_laser(
         self,
@@ -106,7 +108,7 @@ class Session(SessionContents):
         fan_angle_deg: float = 10.0,
         picture: GreyImage | None = None,
     ) -> LaserCalibration:
-        """Find the laser from its cross-hair (Appendix I), put it into the rig, keep its picture.
+        """Calibrate the laser from its cross-hair (Appendix I), update the rig, store the picture.
 
         Raises
         ------
@@ -114,17 +116,20 @@ class Session(SessionContents):
             If no laser can have drawn such a cross.
         """
         found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg)
-        kept = None if picture is None else self._pictures.keep("cross-hair", picture)
+        kept = None if picture is None else self._pictures.add("cross-hair", picture)
         lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
         readings = LaserReadings(*lengths, fan_angle_deg, found, kept)
         laser = {"projection_angle_deg": found.angle_deg, "distance_mm": found.distance_mm}
         setup = updated_setup(self.setup_text, self.path, {"laser": laser})
-        values: dict[Key, Any] = {("laser-calibration", WHOLE): readings, ("setup", WHOLE): setup}
-        self._change("laser calibration", values)
+        values: dict[Key, Any] = {
+            ("laser-calibration", NO_FRAME): readings,
+            ("setup", NO_FRAME): setup,
+        }
+        self._documents.change("laser calibration", values)
         return found
 
     def calibrate_plane(self, picture: str | os.PathLike[str], unit_mm: float) -> PlaneCalibration:
-        """Find the imaging plane in a picture of the target (§5.1), keep both and use it.
+        """Calibrate the imaging plane from a picture of the target (§5.1); store and apply both.
 
         Parameters
         ----------
@@ -149,7 +154,7 @@ class Session(SessionContents):
     def use_plane(
         self, found: PlaneCalibration, unit_mm: float, image: GreyImage, name: str = "picture"
     ) -> None:
-        """Use an imaging plane found in a picture, or placed there by hand; keep both.
+        """Apply an imaging plane found in a picture or placed by hand; store both.
 
         Raises
         ------
@@ -157,19 +162,22 @@ class Session(SessionContents):
             If its three points lie on one line, or its marks do not give its model.
         """
         _ = found.image_calibration  # which refuses such points
-        readings = PlanePicture(unit_mm, found, self._pictures.keep(name, image))
+        readings = PlanePicture(unit_mm, found, self._pictures.add(name, image))
         setup = updated_setup(self.setup_text, self.path, {"image_calibration": found.setup_keys})
-        values: dict[Key, Any] = {("plane-calibration", WHOLE): readings, ("setup", WHOLE): setup}
-        self._change("imaging-plane calibration", values)
+        values: dict[Key, Any] = {
+            ("plane-calibration", NO_FRAME): readings,
+            ("setup", NO_FRAME): setup,
+        }
+        self._documents.change("imaging-plane calibration", values)
 
     def set_settings(self, settings: Settings, label: str = "settings") -> None:
-        """Choose how frames are measured: the scheme, and the settings of every step."""
-        self._change(label, {("settings", WHOLE): settings})
+        """Set how frames are measured: the scheme, and the settings of every step."""
+        self._documents.change(label, {("settings", NO_FRAME): settings})
 
     def correct(
         self, corrections: Mapping[int, Correction | None], label: str = "correction"
     ) -> None:
-        """Correct the dots and rows of frames, in one step; None goes back to automatic.
+        """Set the corrections of frames in one step; None returns a frame to automatic.
 
         Raises
         ------
@@ -178,22 +186,24 @@ class Session(SessionContents):
         """
         for frame in corrections:
             self._frames.time_s(frame)
-        self._change(label, {("correction", frame): value for frame, value in corrections.items()})
+        self._documents.change(
+            label, {("correction", frame): value for frame, value in corrections.items()}
+        )
 
     def set_signals(self, signals: Signals | None) -> None:
-        """Keep current and voltage (`read_signals`); None lets go of them."""
-        self._change("current and voltage", {("signals", WHOLE): signals})
+        """Store current and voltage of the weld (`read_signals`); None deletes them."""
+        self._documents.change("current and voltage", {("signals", NO_FRAME): signals})
 
     def set_limits(self, limits: Limits) -> None:
-        """Choose the limits of the pool's sizes; beyond one is an alarm (`alarms`)."""
-        self._change("limits", {("limits", WHOLE): limits})
+        """Set the limits of the pool's sizes; a size beyond one raises an alarm (`alarms`)."""
+        self._documents.change("limits", {("limits", NO_FRAME): limits})
 
     def undo(self) -> Change | None:
-        """Take back the last change that stands; None if there is none."""
+        """Undo the last change and return it; None if there is none."""
         return self._documents.undo()
 
     def redo(self) -> Change | None:
-        """Make the last change again that was taken back; None if there is none."""
+        """Redo the change that was undone last and return it; None if there is none."""
         return self._documents.redo()
 
     # --- what was filmed --------------------------------------------------------------------
@@ -207,8 +217,8 @@ class Session(SessionContents):
         embed: bool = False,
         progress: Progress | None = None,
     ) -> Recording:
-        """Import a recording; see `Frames.take_in`."""
-        return self._frames.take_in(
+        """Import a recording; see `Frames.import_recording`."""
+        return self._frames.import_recording(
             path, frames, frame_rate_hz=frame_rate_hz, embed=embed, progress=progress
         )
 
@@ -217,7 +227,7 @@ class Session(SessionContents):
         self._frames.refuse_another()
 
     def relink(self, path: str | os.PathLike[str]) -> None:
-        """Say where the recording is now; see `Frames.relink`."""
+        """Set where the recording is now; see `Frames.relink`."""
         self._frames.relink(path)
 
     # --- what was measured ------------------------------------------------------------------
@@ -230,10 +240,10 @@ class Session(SessionContents):
         warm: bool = False,
         sinks: Sequence[Sink] = (),
     ) -> Iterator[tuple[int, Measurement]]:
-        """Measure frames and keep what they give; yields (frame, measurement) once it is kept.
+        """Measure frames and store the results; yields (frame, measurement) once it is stored.
 
-        A frame that could not be read at import is kept with the status ``unreadable``. One that
-        could, and no longer can, is yielded with it, and what was kept of it before stays.
+        A frame that could not be read at import is stored with the status ``unreadable``. One that
+        could, and no longer can, is yielded with it, and its earlier result stays.
 
         Parameters
         ----------
@@ -249,8 +259,8 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If the setup is not complete, or a result cannot be saved; at the end, if frames are no
-            longer what was imported.
+            If the setup is incomplete, or a result cannot be saved; at the end, if frames are no
+            longer those that were imported.
         """
         chosen = self.stale_frames() if frames is None else frames
         basis = Basis(self.setup, self.settings)
@@ -311,8 +321,3 @@ class Session(SessionContents):
 
         what = choice or ExportChoice()
         return export_session(self, folder, what, frames, scheme, report, progress)
-
-    # --- within -----------------------------------------------------------------------------
-
-    def _change(self, label: str, values: Mapping[Key, Any]) -> None:
-        self._documents.change(label, values)

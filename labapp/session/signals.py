@@ -20,8 +20,8 @@ from labapp.errors import InputError
 from labapp.session.csv_tables import (
     PROBLEMS_SHOWN,
     bounded_lines,
-    number_in,
-    opened_table,
+    open_table,
+    parse_number,
 )
 
 A_TABLE = "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), a current, a voltage"
@@ -95,7 +95,7 @@ def read_signals(path: str | os.PathLike[str]) -> Signals:
         problems are reported together, each with its line and column.
     """
     path = Path(path)
-    with opened_table(path, A_TABLE, LARGEST_FILE) as file:
+    with open_table(path, A_TABLE, LARGEST_FILE) as file:
         return _read(path, file)
 
 
@@ -183,7 +183,7 @@ def _take(
     time_s = None
     for column in columns:
         cell = cells[column.place].strip()
-        value = number_in(cell, separator)
+        value = parse_number(cell, separator)
         if column.quantity == "time":
             time_s = None if value is None else value * column.factor
         elif not cell:

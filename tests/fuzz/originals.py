@@ -150,7 +150,9 @@ def _session(folder: Path, *, embed: bool) -> Path:
         plane = PlaneCalibration(
             (44.0, 590.0), (242.0, 588.0), 34.9, (43.0, 500.0), 15.9, (0.1, 0.1, 0.1), 90.0
         )
-        session._change("plane", {("plane-calibration", -1): PlanePicture(6.35, plane, sha256)})
+        session._documents.change(
+            "plane", {("plane-calibration", -1): PlanePicture(6.35, plane, sha256)}
+        )
         session.import_recording(recording, ":5", frame_rate_hz=100.0, embed=embed)
         correction = Correction(dots_of(1), lattice_of(), np.arange(12) < 3)
         session.correct({1: correction, 2: correction})

@@ -97,7 +97,7 @@ class Witness:
             self._after(Documents, "change", lambda kept, _, __, values: kept.change(values)),
             self._after(Documents, "undo", lambda kept, *_: kept.step(back=True)),
             self._after(Documents, "redo", lambda kept, *_: kept.step(back=False)),
-            self._after(Frames, "take_in", self._taken),
+            self._after(Frames, "import_recording", self._taken),
             self._after(Results, "put", self._measured),
         ):
             yield

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from labapp.errors import InputError
 from labapp.session import documents as module
-from labapp.session.documents import WHOLE, Documents
+from labapp.session.documents import NO_FRAME, Documents
 from labapp.session.file.database import Database
 
 
@@ -34,7 +34,7 @@ def documents(database: Database) -> Documents:
 
 
 def note(documents: Documents, text: str | None) -> bool:
-    return documents.change(f"note {text}", {("record", WHOLE): text})
+    return documents.change(f"note {text}", {("record", NO_FRAME): text})
 
 
 def test_a_document_is_what_was_set_last(documents: Documents):
@@ -58,7 +58,7 @@ def test_undo_and_redo_go_back_and_forth(documents: Documents):
         note(documents, text)
     undone = documents.undo()
     assert undone is not None
-    assert (undone.label, undone.undone, undone.keys) == ("note c", True, (("record", WHOLE),))
+    assert (undone.label, undone.undone, undone.keys) == ("note c", True, (("record", NO_FRAME),))
     documents.undo()
     assert documents.get("record") == "a"
     redone = documents.redo()
@@ -73,7 +73,7 @@ def test_undo_and_redo_go_back_and_forth(documents: Documents):
 def test_one_change_of_several_documents_is_one_step(documents: Documents):
     note(documents, "a")
     documents.change(
-        "both", {("record", WHOLE): "b", ("correction", 3): [1], ("setup", WHOLE): "x"}
+        "both", {("record", NO_FRAME): "b", ("correction", 3): [1], ("setup", NO_FRAME): "x"}
     )
     documents.undo()
     assert documents.get("record") == "a"
@@ -95,7 +95,7 @@ def test_the_history_is_saved(database: Database, documents: Documents):
 
 
 def test_the_history_is_bounded_in_steps(documents: Documents, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module, "KEPT_CHANGES", 5)
+    monkeypatch.setattr(module, "MAX_CHANGES", 5)
     for number in range(12):
         note(documents, str(number))
     assert [change.label for change in documents.history()] == [f"note {n}" for n in range(7, 12)]
@@ -106,7 +106,7 @@ def test_the_history_is_bounded_in_steps(documents: Documents, monkeypatch: pyte
 
 
 def test_the_history_is_bounded_in_bytes(documents: Documents, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(module, "KEPT_BYTES", 2_000)
+    monkeypatch.setattr(module, "MAX_HISTORY_BYTES", 2_000)
     for number in range(50):
         note(documents, f"{number} " + "".join(chr(200 + 7 * k * number % 900) for k in range(300)))
     kept = documents.history()
@@ -118,7 +118,7 @@ def test_the_history_is_bounded_in_bytes(documents: Documents, monkeypatch: pyte
 def test_a_change_that_cannot_be_written_is_none(documents: Documents):
     note(documents, "a")
     with pytest.raises(TypeError):
-        documents.change("two", {("setup", WHOLE): "x", ("record", WHOLE): object()})
+        documents.change("two", {("setup", NO_FRAME): "x", ("record", NO_FRAME): object()})
     assert documents.get("setup") is None
     assert [change.label for change in documents.history()] == ["note a"]
 
@@ -147,7 +147,7 @@ def test_a_document_that_the_history_does_not_know_is_told(
 @given(
     st.lists(
         st.sampled_from(["undo", "redo"])
-        | st.tuples(st.sampled_from([WHOLE, 1, 2]), st.none() | st.integers(0, 3)),
+        | st.tuples(st.sampled_from([NO_FRAME, 1, 2]), st.none() | st.integers(0, 3)),
         max_size=25,
     )
 )
@@ -178,7 +178,7 @@ def test_any_sequence_is_what_two_stacks_would_give(tmp_path_factory, steps):
                 done.append(state)
                 undone.clear()
                 state = after
-        found = {frame: documents.get("correction", frame) for frame in (WHOLE, 1, 2)}
+        found = {frame: documents.get("correction", frame) for frame in (NO_FRAME, 1, 2)}
         assert {frame: value for frame, value in found.items() if value is not None} == state
     assert documents.problems() == []
     database.close()

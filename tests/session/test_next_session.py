@@ -93,7 +93,9 @@ def test_nothing_is_written_over_and_nothing_half_made_is_left(
         def fail(*_: object) -> None:
             raise InputError(first, "picture", "damaged", "what was kept there")
 
-        monkeypatch.setattr("labapp.session.kept_pictures.KeptPictures.take_over", fail)
+        monkeypatch.setattr(
+            "labapp.session.calibration_pictures.CalibrationPictures.copy_from", fail
+        )
         with pytest.raises(InputError, match="damaged"):
             next_session(session, tmp_path / "half.labsession")
     assert not (tmp_path / "half.labsession").exists()

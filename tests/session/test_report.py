@@ -26,9 +26,9 @@ from labapp.export.summary import format_ranges
 from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
 from labapp.session.report import data, figures, layout, report_pdf
-from labapp.session.report.data import FrameLine, Told
+from labapp.session.report.data import FrameLine, ReportData
 from labapp.session.report.layout import Story, plain
-from labapp.session.report.results import tell_corrections, tell_example, tell_results
+from labapp.session.report.results import add_corrections, add_example, add_results
 from labapp.session.session import Session
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap
@@ -164,7 +164,7 @@ def test_a_correction_makes_stale_and_is_listed(
     line = lines_of(session)[2]
     assert (line.stale, line.state, line.counts) == ((CORRECTION_CHANGED,), "stale", False)
     story = Story()
-    tell_corrections(story, Told.of(session, None, None))
+    add_corrections(story, ReportData.of(session, None, None))
     count = str(len(moved.dots))
     assert story.tables[0][1:] == [["2", count, "2", "blocked rows 3"]]
     assert [row[2] for row in story.tables[1]][1:] == ["setup", "settings", "correction"]
@@ -320,9 +320,9 @@ def test_figures_and_tables_are_counted(session: Session, keep: Callable[..., No
     keep(0)
     keep(1)
     story = Story()
-    told = Told.of(session, None, None)
-    tell_results(story, told)
-    tell_example(story, told)
+    told = ReportData.of(session, None, None)
+    add_results(story, told)
+    add_example(story, told)
     numbered = [caption.split(".")[0] for caption in story.captions]
     assert numbered == [
         *("Table 1", "Table 2", "Figure 1", "Figure 2", "Table 3"),
@@ -344,9 +344,9 @@ def test_frames_without_a_surface_and_a_recording_that_is_gone_are_told(
         keep(frame, status="no-match", reason="<b> & 3 dots", **NOTHING)
     (tmp_path / "frames").rename(tmp_path / "elsewhere")
     story = Story()
-    told = Told.of(session, None, None)
-    tell_results(story, told)
-    tell_example(story, told)
+    told = ReportData.of(session, None, None)
+    add_results(story, told)
+    add_example(story, told)
     assert story.tables[0][1] == ["no-match", "<b> & 3 dots", "3", "0–2"]
     assert story.captions[-1].endswith("The frame itself cannot be read.")
     assert pages(report_pdf(session, now=NOW)) >= 2

@@ -1,8 +1,8 @@
-"""Values of the measurement as bytes, exactly, and back: what the session file holds.
+"""Serialisation of values, exact to the bit: the blobs of the session file.
 
 A blob is ``LAB1``, the crc32 of what follows, and the compressed value: a JSON tree of plain
-values in which arrays are named by their place behind it. Nothing in a blob is ever run, and bytes
-that were changed are noticed.
+values that refers to the arrays behind it by their offsets. Nothing in a blob is ever executed,
+and changed bytes are detected.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
     "ThinPlateSurface": (ThinPlateSurface, "points_mm", FloatArray, (3,)),
     "FlatSurface": (FlatSurface, "level_mm", float, ()),
 }
-"""Surfaces that are not dataclasses; the one thing each is made from, what it is, its shape."""
+"""Surfaces that are not dataclasses: the class, its one argument, that one's type and shape."""
 
 SURFACE_NAMES = {made: name for name, (made, *_) in SURFACES.items()}
 
 LARGEST = 100_000_000
-"""No value takes more bytes, unpacked, nor do all its arrays: few bytes cannot fill the memory.
+"""Bound of an unpacked value, and of all its arrays, bytes: few bytes cannot fill the memory.
 
-An array that is kept once may be named a thousand times; each is an array of its own when read.
+An array that is stored once may be referred to a thousand times; each becomes an array of its own.
 """
 
 LARGEST_TREE = 8_000_000
@@ -59,18 +59,18 @@ CONTAINERS: dict[str, Any] = {kind.__name__: kind for kind in (list, tuple, froz
 
 
 class Damaged(ValueError):
-    """These bytes are not what was once written."""
+    """Bytes that differ from what was once written."""
 
 
 def pack(value: object) -> bytes:
-    """Bytes of a value: plain values, arrays, containers of them, and the classes above.
+    """Serialise a value: plain values, arrays, containers of them, and the classes of `STORED`.
 
     Raises
     ------
     TypeError
         If a value of another class is in it.
     InputError
-        If it is larger than `LARGEST`, or what is no array of it than `LARGEST_TREE`.
+        If it is larger than `LARGEST`, or its part without arrays than `LARGEST_TREE`.
     """
     content = _canonical(value)
     tree = int.from_bytes(content[:4], "little")
@@ -82,20 +82,20 @@ def pack(value: object) -> bytes:
 
 
 def unpack(blob: object, kind: Any = Any) -> Any:
-    """The value that was packed; numbers and arrays bit for bit, arrays read-only.
+    """Deserialise a value; numbers and arrays bit for bit, arrays read-only.
 
     Parameters
     ----------
     blob
-        What `pack` gave.
+        Output of `pack`.
     kind
-        What it must be: a class or a type hint.
+        Its expected class or type hint.
 
     Raises
     ------
     Damaged
-        If the bytes were changed, cut off, hold something else, a class that this version does
-        not know, or one whose fields are not what it says.
+        If the bytes were changed or cut off, or hold another type, a class unknown to this version,
+        or one whose fields do not fit it.
     """
     if not isinstance(blob, bytes):
         raise Damaged("it is no blob")
@@ -138,12 +138,12 @@ def _decompressed(content: bytes) -> bytes:
 
 
 def fingerprint(value: object) -> str:
-    """SHA-256 of a value: equal for equal values, whatever bytes they were read from."""
+    """SHA-256 of a value; equal values have equal fingerprints."""
     return hashlib.sha256(_canonical(value)).hexdigest()
 
 
 def fingerprint_of(blob: bytes) -> str:
-    """`fingerprint` of the value that was packed, as it was then: no field added since changes it.
+    """`fingerprint` of a packed value at the time of packing; fields added since do not change it.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def _canonical(value: object) -> bytes:
 
 
 def _tree(value: object, arrays: dict[bytes, int]) -> object:
-    """JSON of a value; its arrays go into ``arrays``, bytes → place, equal ones once."""
+    """JSON tree of a value; its arrays go into ``arrays``, bytes → offset, equal ones once."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic):
@@ -197,7 +197,7 @@ def _place(array: npt.NDArray[Any], arrays: dict[bytes, int]) -> int:
 
 
 class _Reader:
-    """Makes a value from its JSON tree and the bytes of its arrays, of which it builds no end."""
+    """Builds a value from its JSON tree and the bytes of its arrays, within bounds."""
 
     def __init__(self, content: memoryview) -> None:
         self._content = content

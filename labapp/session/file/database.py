@@ -1,4 +1,4 @@
-"""The session file as a database: one writer, whole transactions, errors a user can act on.
+"""The session file as a database: one writer, atomic transactions, errors a user can act on.
 
 The journal is SQLite's rollback journal (docs/adr/0011): between two changes the file is complete
 by itself, so that it can be copied, moved and kept on a network drive.
@@ -29,10 +29,10 @@ from labapp.session.file.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSI
 SUFFIX = ".labsession"
 A_SESSION = f"a labapp session ({SUFFIX})"
 
-WHOLE_SESSION = "a whole session: a copy from before"
+INTACT_SESSION = "a whole session: a copy from before"
 
 BUSY_S = 5.0
-"""A reader waits this long for the writer's change to end, and the writer for a reader."""
+"""Time that a reader waits for the writer's change to end, and the writer for a reader."""
 
 LARGEST_BLOB = 1 << 30
 
@@ -57,8 +57,8 @@ class SessionInUse(InputError):
 class Database:
     """An open session file.
 
-    Make it with `Database.create` or `Database.open`. It may be used from several threads, one at
-    a time: a transaction keeps the others out.
+    Make it with `Database.create` or `Database.open`. It is thread-safe: a transaction excludes
+    other threads.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Database:
         self.path = path
         self.read_only = read_only
         self._lock = lock
-        self._turn = threading.RLock()
+        self._mutex = threading.RLock()
         self._temporary: Path | None = None
         self._connection = _connect(path, read_only)
 
@@ -91,7 +91,7 @@ class Database:
             # Made beside its place: a crash on the way leaves no session that is none.
             with (
                 atomic_file(path) as part,
-                _told(path),
+                _translated_errors(path),
                 _closing(_connect(part, read_only=False)) as connection,
             ):
                 connection.execute("BEGIN IMMEDIATE")
@@ -100,7 +100,7 @@ class Database:
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {VERSION}")
                 connection.execute("COMMIT")
-            with _told(path):
+            with _translated_errors(path):
                 return cls(path, read_only=False, lock=lock)
         except BaseException as error:
             _release(lock)
@@ -126,11 +126,11 @@ class Database:
         _check_journal(path)
         lock = None if read_only else _lock(path)
         try:
-            with _told(path):
+            with _translated_errors(path):
                 if read_only:
                     return cls._open_to_read(path)
                 with _closing(_connect(path, read_only=False)) as connection:
-                    _take_back(connection)
+                    _roll_back(connection)
                 if (version := _check_header(path)) < VERSION:
                     _migrate(path, version)
                 return cls(path, read_only=False, lock=lock)._checked()
@@ -140,14 +140,14 @@ class Database:
 
     @classmethod
     def _open_to_read(cls, path: Path) -> Database:
-        """Open without a change to the file: what must be changed first, in a copy."""
+        """Open without changing the file; a migration or a rollback is done in a copy."""
         if _check_header(path) == VERSION:
             database = cls(path, read_only=True, lock=None)
             try:
-                _take_back(database._connection)
+                _roll_back(database._connection)
                 return database._checked()
             except sqlite3.OperationalError:
-                database.close()  # a change that was cut off is to be taken back
+                database.close()  # an unfinished change is to be rolled back
             except BaseException:
                 database.close()
                 raise
@@ -158,7 +158,7 @@ class Database:
             if (journal := _journal_of(path)).exists():
                 shutil.copyfile(journal, _journal_of(copy))
             with _closing(_connect(copy, read_only=False)) as connection:
-                _take_back(connection)
+                _roll_back(connection)
             _apply_migrations(copy, _check_header(copy))
             database = cls(copy, read_only=True, lock=None)
             database.path, database._temporary = path, folder
@@ -168,26 +168,26 @@ class Database:
             raise
 
     def close(self) -> None:
-        """Let go of the file. Closing twice does no harm."""
-        with self._turn:
+        """Close the file. Closing twice does no harm."""
+        with self._mutex:
             self._connection.close()
         if self._temporary is not None:
             shutil.rmtree(self._temporary, ignore_errors=True)
         _release(self._lock)
 
     def rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
-        """Every row that a query gives, read at once so that no reader keeps the writer out.
+        """All rows of a query, read at once so that no reader blocks the writer.
 
         Raises
         ------
         InputError
             If the file cannot be read or is damaged.
         """
-        with self._turn, _told(self.path):
+        with self._mutex, _translated_errors(self.path):
             return self._connection.execute(sql, values).fetchall()
 
     def value(self, sql: str, *values: object) -> Any:
-        """The first value of the first row that a query gives; None if there is none."""
+        """First value of the first row of a query; None if there is none."""
         found = self.rows(sql, *values)
         return found[0][0] if found else None
 
@@ -197,16 +197,16 @@ class Database:
         Raises
         ------
         InputError
-            If they are no numbers, which is damage.
+            If they are not numbers, which is damage.
         """
         try:
             return np.array(values, kind)
         except (ValueError, TypeError, OverflowError) as error:
-            raise InputError(self.path, "content", f"damaged ({error})", WHOLE_SESSION) from error
+            raise InputError(self.path, "content", f"damaged ({error})", INTACT_SESSION) from error
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """One change: all of it is in the file at the end, or nothing of it.
+        """Atomic change of the file; a nested one joins the outer.
 
         Raises
         ------
@@ -217,7 +217,7 @@ class Database:
             raise InputError(
                 self.path, "session", "is open read-only", "a session that is open for writing"
             )
-        with self._turn, _told(self.path):
+        with self._mutex, _translated_errors(self.path):
             nested = self._connection.in_transaction
             if not nested:
                 self._connection.execute("BEGIN IMMEDIATE")
@@ -232,7 +232,7 @@ class Database:
                 raise
 
     def problems(self) -> list[str]:
-        """What SQLite finds wrong with the file itself; empty if it is whole."""
+        """SQLite's own findings on the file's integrity; empty if there are none."""
         found = [str(text) for (text,) in self.rows("PRAGMA integrity_check")]
         loose = self.rows("PRAGMA foreign_key_check")
         return [text for text in found if text != "ok"] + [
@@ -254,7 +254,7 @@ class Database:
 
 
 def new_session_path(path: str | os.PathLike[str]) -> Path:
-    """Where a session is to be made, absolute.
+    """Absolute path of a session to be created.
 
     Raises
     ------
@@ -270,7 +270,7 @@ def new_session_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _check_header(path: Path) -> int:
-    """Version of a session file, told without SQLite, which would not say what is wrong."""
+    """Version of a session file, read without SQLite, whose errors would not say what is wrong."""
     from labapp.media.formats.stored import (
         regular_size,  # late: it loads what reads every recording
     )
@@ -287,7 +287,7 @@ def _check_header(path: Path) -> int:
         raise InputError(path, "content", "a database of another program", A_SESSION)
     if header[18:20] != ROLLBACK_JOURNAL:
         # SQLite would leave files of its own beside it, even to read.
-        raise InputError(path, "content", "another kind of journal, or damaged", WHOLE_SESSION)
+        raise InputError(path, "content", "another kind of journal, or damaged", INTACT_SESSION)
     version = int.from_bytes(header[60:64], "big")
     if version > VERSION:
         raise InputError(
@@ -364,13 +364,13 @@ def _closing(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
         connection.close()
 
 
-def _take_back(connection: sqlite3.Connection) -> None:
-    """Have SQLite take back a change that was cut off, as it does at the first reading."""
+def _roll_back(connection: sqlite3.Connection) -> None:
+    """Have SQLite roll back an unfinished change, as it does at the first reading."""
     connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def _migrate(path: Path, version: int) -> None:
-    """Bring a file up to date, its former self kept beside it."""
+    """Migrate a file to the present version; a copy of the former one stays beside it."""
     kept = path.with_name(f"{path.stem}.version-{version}{SUFFIX}")
     if not kept.exists():
         with atomic_file(kept) as part:
@@ -389,7 +389,7 @@ def _apply_migrations(path: Path, version: int) -> None:
 
 
 def _lock(path: Path) -> FileLock:
-    """Become the one writer. The lock goes with the process, however it ends."""
+    """Lock the session for writing. The lock ends with the process, however that ends."""
     lock = FileLock(path.with_name(f".{path.name}.lock"))
     try:
         if not path.parent.is_dir():
@@ -418,7 +418,7 @@ def _release(lock: FileLock | None) -> None:
         lock.release()
 
 
-TOLD: Sequence[tuple[tuple[int, ...], str, str, str]] = (
+SQLITE_ERRORS: Sequence[tuple[tuple[int, ...], str, str, str]] = (
     (
         (sqlite3.SQLITE_FULL,),
         "disk",
@@ -447,22 +447,22 @@ TOLD: Sequence[tuple[tuple[int, ...], str, str, str]] = (
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Turn SQLite's errors into what a user can act on."""
+def _translated_errors(path: Path) -> Iterator[None]:
+    """Translate SQLite's errors into `InputError`."""
     try:
         yield
     except sqlite3.ProgrammingError:
         raise
     except sqlite3.DatabaseError as error:
         primary = getattr(error, "sqlite_errorcode", 0) & 0xFF
-        for codes, field, value, expected in TOLD:
+        for codes, field, value, expected in SQLITE_ERRORS:
             if primary in codes:
                 raise InputError(path, field, f"{value} ({error})", expected) from error
         raise InputError(
             path,
             "content",
             f"damaged ({error})",
-            WHOLE_SESSION,
+            INTACT_SESSION,
         ) from error
     except (OverflowError, UnicodeDecodeError, sqlite3.InterfaceError) as error:
-        raise InputError(path, "content", f"damaged ({error})", WHOLE_SESSION) from error
+        raise InputError(path, "content", f"damaged ({error})", INTACT_SESSION) from error

@@ -1,4 +1,4 @@
-"""Whether a value that was read is what its class says: types, lengths and shapes."""
+"""Run-time checks of values against the type hints and array shapes of their class."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ ARRAYS = {np.float64: "fiu", np.int64: "iu", np.bool_: "b"}
 
 
 def check_fields(value: Any, shapes: Mapping[str, str]) -> None:
-    """Hold the fields of a dataclass instance to what the class says of them.
+    """Check types and shapes of the fields of a dataclass instance.
 
     Parameters
     ----------
     value
         The instance.
     shapes
-        Shape of every array; equal letters are equal lengths.
+        Shape of every array, as in ``"n 3"``; equal letters are equal lengths.
 
     Raises
     ------
     TypeError
-        If one is of another type or shape.
+        If one has another type or shape.
     """
     kind: Any = type(value)
     for name, hint in _hints(kind).items():
@@ -50,7 +50,7 @@ def check_fields(value: Any, shapes: Mapping[str, str]) -> None:
 
 
 def is_a(value: object, hint: Any) -> bool:
-    """Whether a value is what a type hint says; whole numbers count as ``float``."""
+    """Whether a value conforms to a type hint; integers count as ``float``."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return any(is_a(value, part) for part in parts)

@@ -14,13 +14,13 @@ from labapp.errors import InputError
 from labapp.media.base import format_frame_rate
 from labapp.session.contents import SessionContents
 from labapp.session.report import data, figures
-from labapp.session.report.data import Told, number, with_unit
+from labapp.session.report.data import ReportData, number, with_unit
 from labapp.session.report.layout import Story
 from labapp.session.report.results import (
-    tell_budget,
-    tell_corrections,
-    tell_example,
-    tell_results,
+    add_budget,
+    add_corrections,
+    add_example,
+    add_results,
 )
 from labapp.studies.error_budget import laser_in_use, plane_in_use
 from labapp.version import VERSION
@@ -36,7 +36,7 @@ def report_pdf(
     now: datetime.datetime | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> bytes:
-    """Report on a session: A4 pages, PDF. It tells of what there is, however little.
+    """Report on a session as PDF, A4; sections without content say so.
 
     Parameters
     ----------
@@ -58,25 +58,25 @@ def report_pdf(
         If a frame is asked for that the session does not have, or what it notes is damaged.
     """
     now = now or datetime.datetime.now().astimezone()
-    told = Told.of(session, scheme, frames, progress)
+    report = ReportData.of(session, scheme, frames, progress)
     title = session.record.title or session.path.stem
     story = Story()
-    _experiment(story, told, title)
-    _set_up(story, told)
-    _laser(story, told)
-    _plane(story, told)
-    tell_results(story, told)
-    tell_example(story, told)
-    tell_budget(story, told)
-    tell_corrections(story, told)
+    _experiment(story, report, title)
+    _set_up(story, report)
+    _laser(story, report)
+    _plane(story, report)
+    add_results(story, report)
+    add_example(story, report)
+    add_budget(story, report)
+    add_corrections(story, report)
     name = session.path.name
     header = name if title == session.path.stem else f"{title}  ·  {name}"
     made = f"labapp {VERSION}, {now:%Y-%m-%d %H:%M}"
     return story.pdf(header, made, title)
 
 
-def _experiment(story: Story, told: Told, title: str) -> None:
-    session, record = told.session, told.session.record
+def _experiment(story: Story, report: ReportData, title: str) -> None:
+    session, record = report.session, report.session.record
     story.title(title)
     story.text(
         "Three-dimensional surface of a weld pool, measured from a reflected laser dot matrix."
@@ -112,11 +112,11 @@ def _experiment(story: Story, told: Told, title: str) -> None:
     story.part("Recording")
     _recording(story, session)
     story.part("Measured by")
-    versions = sorted({line.version for line in told.lines if line.version})
+    versions = sorted({line.version for line in report.lines if line.version})
     story.listing(
         [
             ("session file", session.path.name),
-            ("scheme", told.scheme),
+            ("scheme", report.scheme),
             ("measured with", ", ".join(f"labapp {v}" for v in versions) or "nothing measured yet"),
             (
                 "reported with",
@@ -163,11 +163,13 @@ def _recording(story: Story, session: SessionContents) -> None:
         )
 
 
-def _set_up(story: Story, told: Told) -> None:
+def _set_up(story: Story, report: ReportData) -> None:
     story.heading("2  Set-up")
-    if told.setup is None:
+    if report.setup is None:
         story.text("The set-up is not complete:")
-        rows = [[problem.field, str(problem.value), problem.expected] for problem in told.problems]
+        rows = [
+            [problem.field, str(problem.value), problem.expected] for problem in report.problems
+        ]
         story.table(
             "What is missing or wrong in the set-up.",
             [["key", "found", "expected"], *rows],
@@ -178,32 +180,32 @@ def _set_up(story: Story, told: Told) -> None:
     story.table(
         "The rig. UCS: origin on the work piece under the electrode's tip, Y along the welding "
         "direction, Z up.",
-        data.rig_cells(told.setup),
+        data.rig_cells(report.setup),
         "llr",
         (0.22, 0.48, 0.3),
     )
     story.figure(
         "The rig from the side, to scale: the central ray and the outer ones of its column, "
         "reflected as from a flat work piece. The width of the torch is not to scale.",
-        figures.side_view(told.setup.rig, _pool_size(told)),
+        figures.side_view(report.setup.rig, _pool_size(report)),
     )
 
 
-def _pool_size(told: Told) -> tuple[float, float]:
-    """Length and height for the side view: as measured, else as expected."""
-    record = told.session.record
-    length, height = data.values(told.lines, "length_mm"), data.values(told.lines, "height_mm")
-    depth = data.values(told.lines, "depth_mm")
+def _pool_size(report: ReportData) -> tuple[float, float]:
+    """Length and height of the pool for the side view, mm: measured, else expected."""
+    record = report.session.record
+    length, height = data.values(report.lines, "length_mm"), data.values(report.lines, "height_mm")
+    depth = data.values(report.lines, "depth_mm")
     if len(length):
         peak = height.mean() if abs(height.mean()) >= abs(depth.mean()) else depth.mean()
         return float(length.mean()), float(peak)
     return record.expected_length_mm or POOL_MM[0], record.expected_height_mm or POOL_MM[1]
 
 
-def _laser(story: Story, told: Told) -> None:
+def _laser(story: Story, report: ReportData) -> None:
     story.heading("3  Calibrations")
     story.part("Laser (Appendix I)")
-    readings = told.session.laser_calibration
+    readings = report.session.laser_calibration
     if readings is None:
         story.text("Not calibrated in this session: values were given.")
         return
@@ -234,13 +236,13 @@ def _laser(story: Story, told: Told) -> None:
             *(("warning", warning) for warning in found.warnings),
         ]
     )
-    if told.setup is not None and not laser_in_use(found, told.setup.rig):
+    if report.setup is not None and not laser_in_use(found, report.setup.rig):
         story.text("The rig's laser was changed after this calibration: other values are in use.")
 
 
-def _plane(story: Story, told: Told) -> None:
+def _plane(story: Story, report: ReportData) -> None:
     story.part("Imaging plane (§5.1)")
-    plane = told.session.plane_calibration
+    plane = report.session.plane_calibration
     if plane is None:
         story.text("Not calibrated in this session: values were given.")
         return
@@ -270,10 +272,10 @@ def _plane(story: Story, told: Told) -> None:
     )
     if found.fits is not None:
         story.text("; ".join(" ".join(line.split()) for line in found.fit_lines()) + ".")
-    if told.setup is not None and not plane_in_use(found, told.setup.calibration):
+    if report.setup is not None and not plane_in_use(found, report.setup.calibration):
         story.text("The image calibration was changed after this one: other values are in use.")
     try:
-        picture = told.session.picture(plane.picture_sha256)
+        picture = report.session.picture(plane.picture_sha256)
     except InputError as error:
         story.text(f"The calibration picture cannot be shown: it is {error.value}.")
         return

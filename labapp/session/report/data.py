@@ -1,4 +1,4 @@
-"""What a report tells, as plain values and tables of text, before it is laid out."""
+"""Contents of a report as plain values and tables of text, before the layout."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ STATISTICS = {
 
 @dataclass(frozen=True)
 class FrameLine:
-    """One frame, as a report tells of it.
+    """One frame of a report.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class FrameLine:
 
     @property
     def state(self) -> str:
-        """How it is marked in the trends, in words."""
+        """Mark in the trends: ``measured``, ``doubtful``, ``stale``, else the status."""
         if self.stale:
             return "stale"
         if self.measures is None:
@@ -105,19 +105,19 @@ class FrameLine:
 
 
 @dataclass(frozen=True)
-class Told:
-    """A session, and what of it is reported.
+class ReportData:
+    """Session, scheme and frames of a report.
 
     Parameters
     ----------
     session
         The session.
     scheme
-        Whose results.
+        Name of the scheme whose results are reported.
     lines
         The frames.
     setup
-        The setup as it is now; None if it is not complete.
+        The present setup; None if it is incomplete.
     problems
         What is missing or wrong in it.
     """
@@ -135,8 +135,8 @@ class Told:
         scheme: str | None,
         frames: Sequence[int] | None,
         progress: Callable[[int], None] | None = None,
-    ) -> Told:
-        """Gather it."""
+    ) -> ReportData:
+        """Collect the frames of a session, or all; parameters as of `report_pdf`."""
         scheme = scheme or scheme_name(session.settings)
         setup: Setup | None = None
         problems: tuple[InputError, ...] = ()
@@ -154,7 +154,7 @@ def frame_lines(
     frames: Sequence[int] | None,
     progress: Callable[[int], None] | None = None,
 ) -> list[FrameLine]:
-    """Tell of each frame what its result says; a damaged result is a status of its own.
+    """One line per frame from its result; a damaged result has the status ``damaged``.
 
     ``progress`` is called with the number of frames done; it may raise to stop.
 
@@ -210,9 +210,9 @@ def is_doubtful(measurement: Measurement) -> bool:
 
 
 def representative(lines: Iterable[FrameLine]) -> FrameLine | None:
-    """The frame that stands for all: its height is nearest to their median; None if none counts.
+    """Frame whose height is nearest to the median; None if no frame counts.
 
-    Of a concave pool it is the depth: whichever is farther from the work piece.
+    For concave pools the depth is compared: whichever is farther from the work piece.
     """
     counted = [line for line in lines if line.counts]
     if not counted:
@@ -223,23 +223,23 @@ def representative(lines: Iterable[FrameLine]) -> FrameLine | None:
 
 
 def values(lines: Iterable[FrameLine], name: str) -> FloatArray:
-    """One of the measures of the frames that count, NaN left out, shape (n,)."""
+    """Finite values of a measure over the frames that count, shape (n,)."""
     found = np.array([line.size(name) for line in lines if line.counts])
     return np.asarray(found[np.isfinite(found)], np.float64)
 
 
 def number(value: float | None, digits: int) -> str:
-    """A number with so many decimals, no sign on what rounds to nothing; a dash if unknown."""
+    """A number with fixed decimals, without the sign of −0; a dash if unknown."""
     return UNKNOWN if value is None or not math.isfinite(value) else f"{value:z.{digits}f}"
 
 
 def with_unit(value: float | None, unit: str) -> str:
-    """A number that was typed, with its unit; empty if none was."""
+    """A number with its unit; empty if None."""
     return "" if value is None else f"{value:.6g} {unit}"
 
 
 def status_cells(lines: Sequence[FrameLine]) -> Cells:
-    """How many frames came to what, and which: those that count first."""
+    """Outcomes with reason, number of frames and frame numbers; those that count first."""
     groups: dict[tuple[str, str], list[FrameLine]] = {}
     for line in lines:
         status, why = _outcome(line)
@@ -285,11 +285,11 @@ def sigma_name(name: str) -> str:
 
 
 def frame_cells(lines: Sequence[FrameLine]) -> Cells:
-    """All frames, one a row; of many the first and the last."""
+    """Sizes and state of every frame; of more than `ALL_FRAMES` the first and the last."""
     head = ["frame", "time (s)", "dots", *("width", "length", "height", "volume", "ARE"), "state"]
-    told = list(lines)
-    if len(told) > ALL_FRAMES:
-        told = [*told[:SOME_FRAMES], *told[-SOME_FRAMES:]]
+    shown = list(lines)
+    if len(shown) > ALL_FRAMES:
+        shown = [*shown[:SOME_FRAMES], *shown[-SOME_FRAMES:]]
     rows = [
         [
             str(line.frame),
@@ -300,16 +300,16 @@ def frame_cells(lines: Sequence[FrameLine]) -> Cells:
             number(line.size("are_mm"), 4),
             line.state,
         ]
-        for line in told
+        for line in shown
     ]
-    if len(told) < len(lines):
-        left_out = [["…", *[""] * (len(head) - 2), f"{len(lines) - len(told)} frames"]]
+    if len(shown) < len(lines):
+        left_out = [["…", *[""] * (len(head) - 2), f"{len(lines) - len(shown)} frames"]]
         rows = rows[:SOME_FRAMES] + left_out + rows[SOME_FRAMES:]
     return [head, *rows]
 
 
 def budget_cells(lines: Sequence[FrameLine], contributions: Sequence[Contribution]) -> Cells:
-    """The measurement's own ±, what each calibration's ± adds, and their root sum of squares."""
+    """± of dots and fit, of each calibrated quantity, and their root sum of squares."""
     digits = [STATISTICS[name][1] for name in SIZES]
     own = [values(lines, sigma_name(name)) for name in SIZES]
     noise = np.array([np.median(sigma) if len(sigma) else math.nan for sigma in own])

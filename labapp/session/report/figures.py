@@ -27,7 +27,7 @@ STATES = {
     "doubtful": {"marker": "o", "color": "#c05a00", "markerfacecolor": "white"},
     "stale": {"marker": "x", "color": "0.6", "markerfacecolor": "0.6"},
 }
-"""How frames are drawn over time: told apart by shape as well as colour."""
+"""How frames are drawn over time: report apart by shape as well as colour."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.session.report import data, figures
-from labapp.session.report.data import FrameLine, Told
+from labapp.session.report.data import FrameLine, ReportData
 from labapp.session.report.layout import Story
 from labapp.studies.error_budget import calibration_budget
 from labapp.studies.parameter_deviation import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX
@@ -29,16 +29,16 @@ NOT_COVERED = (
 )
 
 
-def tell_results(story: Story, told: Told) -> None:
-    """What the frames came to: counts, means, trends, every frame."""
+def add_results(story: Story, report: ReportData) -> None:
+    """Add the results: outcomes, means, trends, every frame."""
     story.heading("4  Results")
-    lines = told.lines
+    lines = report.lines
     if not lines:
         story.text("There are no frames: nothing was measured.")
         return
     counted = [line for line in lines if line.counts]
     story.text(
-        f"{len(lines)} frames, scheme {told.scheme}: {len(counted)} with a surface that stands. "
+        f"{len(lines)} frames, scheme {report.scheme}: {len(counted)} with a surface that stands. "
         "Stale results, made from calibrations, settings or corrections that were changed since, "
         "are in no mean."
     )
@@ -114,12 +114,12 @@ def _each(lines: Sequence[FrameLine], name: str) -> FloatArray:
     return np.array([line.size(name) for line in lines])
 
 
-def tell_example(story: Story, told: Told) -> None:
-    """One frame in pictures: that of the middling height; else the first with dots."""
-    line = data.representative(told.lines) or next((x for x in told.lines if x.dots), None)
+def add_example(story: Story, report: ReportData) -> None:
+    """Add one frame in pictures: that of median height, else the first with dots."""
+    line = data.representative(report.lines) or next((x for x in report.lines if x.dots), None)
     if line is None:
         return
-    result = told.session.result(line.frame, told.scheme)
+    result = report.session.result(line.frame, report.scheme)
     assert result is not None
     found = result.measurement
     if line.counts:
@@ -127,7 +127,7 @@ def tell_example(story: Story, told: Told) -> None:
     else:
         why = "; ".join(line.stale) or line.status
         story.part(f"Frame {line.frame}: the first with dots, not in the mean ({why})")
-    _dots(story, told, line.frame, found)
+    _dots(story, report, line.frame, found)
     if found.reconstruction is not None and found.measures is not None:
         story.figure(
             f"Frame {line.frame}: height over the work piece. Black: boundary; white: reflection "
@@ -145,10 +145,10 @@ def tell_example(story: Story, told: Told) -> None:
         )
 
 
-def _dots(story: Story, told: Told, frame: int, found: Measurement) -> None:
+def _dots(story: Story, report: ReportData, frame: int, found: Measurement) -> None:
     missing = ""
     try:
-        image = told.session.frame(frame).image
+        image = report.session.frame(frame).image
     except InputError:
         image, missing = None, " The frame itself cannot be read."
     story.figure(
@@ -158,15 +158,15 @@ def _dots(story: Story, told: Told, frame: int, found: Measurement) -> None:
     )
 
 
-def tell_budget(story: Story, told: Told) -> None:
-    """What each uncertainty does to the sizes of the frame that stands for all."""
+def add_budget(story: Story, report: ReportData) -> None:
+    """Add the error budget of the frame of median height."""
     story.heading("5  Error budget")
-    line = data.representative(told.lines)
+    line = data.representative(report.lines)
     if line is None:
         story.text("No frame has a surface that stands, so there is none.")
         return
-    session = told.session
-    result = session.result(line.frame, told.scheme)
+    session = report.session
+    result = session.result(line.frame, report.scheme)
     assert result is not None
     laser, plane = session.laser_calibration, session.plane_calibration
     contributions = calibration_budget(
@@ -180,12 +180,12 @@ def tell_budget(story: Story, told: Told) -> None:
         f"What each ± (one σ) changes in the sizes. Calibration: frame {line.frame}, measured "
         "anew with the quantity moved by its ±, the correspondence kept. *: no ± is known; a "
         f"nominal {NOMINAL_MM:g} mm, {NOMINAL_DEG:g}° or {NOMINAL_PX:g} px is taken.",
-        data.budget_cells(told.lines, contributions),
+        data.budget_cells(report.lines, contributions),
         "lrrrrrrr",
         (0.31, 0.1, *[0.0983] * 6),
     )
-    if not len(data.values(told.lines, "height_sigma_mm")):
-        story.text(f"The scheme {told.scheme} gives no ± of its own: the total is without it.")
+    if not len(data.values(report.lines, "height_sigma_mm")):
+        story.text(f"The scheme {report.scheme} gives no ± of its own: the total is without it.")
     if any(np.isnan(one.change).any() for one in contributions):
         story.text("–: the surface could not be made with the quantity moved; not in the total.")
     story.text(
@@ -195,10 +195,10 @@ def tell_budget(story: Story, told: Told) -> None:
     )
 
 
-def tell_corrections(story: Story, told: Told) -> None:
-    """What was corrected by hand, and what was changed in the session."""
+def add_corrections(story: Story, report: ReportData) -> None:
+    """Add the corrections by hand and the session's history."""
     story.heading("6  Corrections by hand, and history")
-    cells = data.corrections_cells(told.session, [line.frame for line in told.lines])
+    cells = data.corrections_cells(report.session, [line.frame for line in report.lines])
     if len(cells) > 1:
         story.table(
             "Frames whose dots and rows were corrected by hand.",
@@ -208,7 +208,7 @@ def tell_corrections(story: Story, told: Told) -> None:
         )
     else:
         story.text("No dots or rows were corrected by hand.")
-    history = told.session.history
+    history = report.session.history
     if not history:
         story.text("No change is in the history.")
         return

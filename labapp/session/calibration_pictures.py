@@ -1,4 +1,4 @@
-"""The calibration pictures that a session keeps."""
+"""The calibration pictures stored in a session."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from labapp.media.formats.images import decoded
 from labapp.session.file.database import Database
 
 
-class KeptPictures:
-    """Pictures by the SHA-256 of their PNG; what was kept is never changed."""
+class CalibrationPictures:
+    """Calibration pictures by the SHA-256 of their PNG; one that was stored never changes."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def keep(self, name: str, image: GreyImage) -> str:
-        """Keep a picture, grey levels, shape (rows, columns); returns its SHA-256."""
+    def add(self, name: str, image: GreyImage) -> str:
+        """Store a picture, grey levels, shape (rows, columns), and return its SHA-256."""
         _, encoded = cv2.imencode(".png", image)
         content = encoded.tobytes()
         sha256 = hashlib.sha256(content).hexdigest()
@@ -30,16 +30,16 @@ class KeptPictures:
             )
         return sha256
 
-    def take_over(self, other: KeptPictures) -> None:
-        """Keep what another session keeps, too."""
+    def copy_from(self, other: CalibrationPictures) -> None:
+        """Store every picture of another session, too."""
         rows = other._database.rows("SELECT * FROM picture")
         with self._database.transaction() as connection:
             connection.executemany("INSERT OR IGNORE INTO picture VALUES (?, ?, ?)", rows)
 
     def get(self, sha256: str) -> GreyImage:
-        """A kept picture; see `Session.picture`."""
+        """Stored picture, grey levels, shape (rows, columns); see `Session.picture`."""
         content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)
-        image = decoded(content) if _is_whole(content, sha256) else None
+        image = decoded(content) if _is_intact(content, sha256) else None
         if image is None or image.ndim != 2:
             value = "missing" if content is None else "damaged"
             path = self._database.path
@@ -47,13 +47,13 @@ class KeptPictures:
         return np.asarray(image)
 
     def problems(self) -> list[str]:
-        """What is damaged, a sentence each."""
+        """Sentences on damaged pictures; empty if there are none."""
         return [
             f"calibration picture {name} is damaged"
             for sha256, name, content in self._database.rows("SELECT * FROM picture")
-            if not _is_whole(content, sha256)
+            if not _is_intact(content, sha256)
         ]
 
 
-def _is_whole(content: object, sha256: str) -> bool:
+def _is_intact(content: object, sha256: str) -> bool:
     return isinstance(content, bytes) and hashlib.sha256(content).hexdigest() == sha256

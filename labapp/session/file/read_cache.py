@@ -1,4 +1,4 @@
-"""What was read from a session and is read again only when it may have changed."""
+"""Cache of values read from a session file."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 from labapp.session.file.database import Database
 
 
-class Kept:
-    """Values by name: a window reads them all the time, and must not wait while results are saved.
+class ReadCache:
+    """Values by name: a window reads them often, and must not wait while results are saved.
 
     Parameters
     ----------
@@ -23,18 +23,18 @@ class Kept:
         self._version: object = None
 
     def get(self, name: Hashable, read: Callable[[], Any]) -> Any:
-        """The value of a name, read if it is not known."""
+        """Cached value of a name; on a miss, ``read()``."""
         if self._database.read_only:
             version = self._database.value("PRAGMA data_version")  # another program's changes
             if version != self._version:
                 self._version = version
-                self.forget()
+                self.clear()
         values = self._values
         if name not in values:
-            # Forgotten meanwhile, it goes into values that nobody looks at any more.
+            # Cleared meanwhile, it goes into a dict that nobody reads any more.
             values[name] = read()
         return values[name]
 
-    def forget(self) -> None:
-        """Read everything anew: something was changed."""
+    def clear(self) -> None:
+        """Discard every value, as after a change."""
         self._values = {}
