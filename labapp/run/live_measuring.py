@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 import multiprocessing
 import time
-from collections.abc import Callable
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from labapp.config.setup import Setup
-from labapp.core.pipeline import Settings
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import Quality, judge_quality
-from labapp.core.surface.measures import Measures
+from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.scene import Scene, scene_of
-from labapp.media import GreyImage
+from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import begin_worker, end_processes
 
 JUDGED_S = 0.2
@@ -32,29 +30,25 @@ class LiveMeasuringEnded(Exception):
     """The process has ended: it was closed, or something ended it."""
 
 
-@dataclass(frozen=True)
-class LiveMeasurement:
-    """What a live frame gave.
+@dataclass(frozen=True, kw_only=True)
+class LiveResult(FrameResult):
+    """What a live frame gave: status, reason and sizes; dots, rays and surface stay behind.
 
     Parameters
     ----------
-    status, reason
-        As in `pipeline.Measurement`.
+    time_s
+        By the camera's clock, s.
+    arrived_s
+        `time.monotonic` when it came, s: the sizes are as old.
     quality
         How fit frames are to be measured; while each is followed, of one some times a second.
-    measures
-        Sizes; None where it could not be measured.
-    followed
-        Whether it was measured from the one before, in milliseconds; else by itself, in seconds.
     scene
         Its surface to be drawn, where that was asked for; None where it could not be measured.
     """
 
-    status: str
-    reason: str
+    time_s: float
+    arrived_s: float
     quality: Quality
-    measures: Measures | None
-    followed: bool
     scene: Scene | None = None
 
 
@@ -73,18 +67,18 @@ class LiveMeasuring:
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
         spawn = multiprocessing.get_context("spawn")
-        given, nice = _Chain(setup, settings, bit_depth), 0  # its figures are looked at now
+        nice, given = 0, (setup, settings, bit_depth)  # its figures are looked at now
         self._pool = ProcessPoolExecutor(
-            1, spawn, initializer=begin_worker, initargs=(nice, _begin, given)
+            1, spawn, initializer=begin_worker, initargs=(nice, _begin, *given)
         )
 
-    def measure(self, image: GreyImage, drawn: bool = False) -> LiveMeasurement | None:
+    def measure(self, frame: CameraFrame, drawn: bool = False) -> LiveResult | None:
         """Measure the next frame; None where it is left out, for one after it may be followed.
 
         Parameters
         ----------
-        image
-            Grey levels, shape (rows, columns).
+        frame
+            As the camera gave it.
         drawn
             Whether its surface is to be drawn: that takes a millisecond more.
 
@@ -94,7 +88,7 @@ class LiveMeasuring:
             If the process has ended.
         """
         try:
-            return self._pool.submit(_measured, image, drawn).result()
+            return self._pool.submit(_measured, frame, drawn).result()
         except (BrokenProcessPool, CancelledError, RuntimeError) as error:
             raise LiveMeasuringEnded(str(error)) from error
 
@@ -103,51 +97,60 @@ class LiveMeasuring:
         end_processes(self._pool)
 
 
-class _Chain(NamedTuple):
-    """What the process measures by."""
+class LiveChain:
+    """Measures frames in this process; parameters as of `LiveMeasuring`."""
 
-    setup: Setup
-    settings: Settings
-    bit_depth: int
+    def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
+        from labapp.core.sequence.warm import WarmChain
 
+        self._chain = WarmChain(setup.rig, setup.calibration, settings)
+        self._rays = setup.rig.pattern.rows * setup.rig.pattern.columns
+        self._bit_depth = bit_depth
+        self._measured_s = -math.inf
+        self._judged: tuple[float, Quality] | None = None
 
-_measure: list[Callable[[GreyImage, bool], LiveMeasurement | None]] = []
-"""In the process: what measures."""
-
-
-def _begin(given: _Chain) -> None:
-    setup, settings, depth = given
-    from labapp.core.sequence.warm import WarmChain
-
-    chain = WarmChain(setup.rig, setup.calibration, settings)
-    rays = setup.rig.pattern.rows * setup.rig.pattern.columns
-    verdict: list[tuple[float, Quality]] = []
-    measured_s = -math.inf
-
-    def measure(image: GreyImage, drawn: bool) -> LiveMeasurement | None:
-        nonlocal measured_s
-        found = chain.follow(image)
-        if found is None and time.monotonic() < measured_s + SOUGHT_S:
-            return None
-        found = found or chain.measure(image)
-        followed, ok, now_s = chain.broke is None, found.status == "ok", time.monotonic()
-        if ok:
-            measured_s = now_s
-        if not (verdict and followed and ok and now_s < verdict[0][0] + JUDGED_S):
-            # It takes nearly half as long as measuring.
-            verdict[:] = [(now_s, judge_quality(image, found, depth, rays))]
-        surface = found.reconstruction if drawn and ok else None
-        return LiveMeasurement(
-            found.status,
-            found.reason,
-            verdict[0][1],
-            found.measures if ok else None,
-            followed,
-            None if surface is None else scene_of(surface),
+    def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult | None:
+        """Measure the next frame, or leave it out: see `LiveMeasuring.measure`."""
+        found = self._chain.follow(frame.image)
+        if found is None:
+            if time.monotonic() < self._measured_s + SOUGHT_S:
+                return None
+            found = self._chain.measure(frame.image)
+        surface = None
+        if found.status == "ok":
+            self._measured_s, surface = time.monotonic(), found.reconstruction
+        return LiveResult(
+            frame=frame.number,
+            time_s=frame.time_s,
+            arrived_s=frame.arrived_s,
+            measurement=without_surface(found),
+            track_lost=self._chain.broke,
+            quality=self._quality(frame, found),
+            scene=scene_of(surface) if drawn and surface is not None else None,
         )
 
-    _measure[:] = [measure]
+    def _quality(self, frame: CameraFrame, found: Measurement) -> Quality:
+        """How fit the frame is, or one just before that it was followed from.
+
+        To judge takes nearly half as long as to measure.
+        """
+        now_s, is_followed = time.monotonic(), self._chain.broke is None
+        if self._judged is not None and is_followed and now_s < self._judged[0] + JUDGED_S:
+            return self._judged[1]
+        quality = judge_quality(frame.image, found, self._bit_depth, self._rays)
+        self._judged = now_s, quality
+        return quality
 
 
-def _measured(image: GreyImage, drawn: bool) -> LiveMeasurement | None:
-    return _measure[0](image, drawn)
+_chain: LiveChain | None = None
+"""What measures in this process."""
+
+
+def _begin(setup: Setup, settings: Settings, bit_depth: int) -> None:
+    global _chain  # noqa: PLW0603 - the process measures by one chain all its life
+    _chain = LiveChain(setup, settings, bit_depth)
+
+
+def _measured(frame: CameraFrame, drawn: bool) -> LiveResult | None:
+    assert _chain is not None
+    return _chain.measure(frame, drawn)

@@ -51,7 +51,7 @@ from labapp.gui.live import live as live_module
 from labapp.gui.live import view as live_view
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
-from labapp.media.cameras import Faults
+from labapp.media.cameras import CameraFrame, Faults
 from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Recorder
 from labapp.media.recording.take_files import Take
@@ -127,17 +127,18 @@ class Measured:
     ) -> Callable[..., Any]:
         """The same, counted."""
 
-        def counting(measuring: LiveMeasuring, image: Any, *given: Any) -> Any:
-            found = measure(measuring, image, *given)
-            if found is None:  # it was left out
-                return found
+        def counting(measuring: LiveMeasuring, frame: CameraFrame, *given: Any) -> Any:
+            result = measure(measuring, frame, *given)
+            if result is None:  # it was left out
+                return result
+            status = result.measurement.status
             cls.frames += 1
-            cls.good += found.status == "ok"
-            cls.cold += not found.followed
-            cls.newest = number_in(image)
+            cls.good += status == "ok"
+            cls.cold += result.track_lost is not None
+            cls.newest = number_in(frame.image)
             if is_noise(cls.newest):
-                cls.noise.append((cls.newest, found.status))
-            return found
+                cls.noise.append((cls.newest, status))
+            return result
 
         return counting
 

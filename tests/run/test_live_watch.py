@@ -24,9 +24,9 @@ from labapp.export.scene import Scene, empty_scene
 from labapp.media import open_source
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
-from labapp.run import live_measuring, live_watch
+from labapp.run import live_measuring, live_trend, live_watch
 from labapp.run.limits import Limits, Size, standing
-from labapp.run.live_measuring import SOUGHT_S, LiveMeasurement, LiveMeasuring
+from labapp.run.live_measuring import SOUGHT_S, LiveChain, LiveMeasuring, LiveResult
 from labapp.run.live_watch import LiveWatch
 from labapp.run.streams import LineStream
 from tests.waiting import PATIENCE_S, connect
@@ -45,14 +45,21 @@ class Prepared:
         self.widths: dict[int, float | None] = {}
         self.asked: list[bool] = []
 
-    def measure(self, image: np.ndarray, drawn: bool) -> LiveMeasurement:
+    def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult:
         self.asked.append(drawn)
-        width = self.widths.get(int(image[0, 0]), 6.7)
-        found = LiveMeasurement("ok", "", None, None, True)  # type: ignore[arg-type]  # no verdict
+        width = self.widths.get(int(frame.image[0, 0]), 6.7)
+        result = LiveResult(
+            frame=frame.number,
+            time_s=frame.time_s,
+            arrived_s=frame.arrived_s,
+            measurement=Measurement("no-dots", "it is dark", "fit"),
+            quality=None,  # type: ignore[arg-type]  # no verdict
+        )
         if width is None:
-            return replace(found, status="no-dots", reason="it is dark")
+            return result
         scene: Scene | None = empty_scene(np.zeros((1, 3)), (0, 1), "", "") if drawn else None
-        return replace(found, measures=replace(MEASURES, width_mm=width), scene=scene)
+        found = Measurement("ok", "", "fit", measures=replace(MEASURES, width_mm=width))
+        return replace(result, measurement=found, scene=scene)
 
     def close(self) -> None:
         pass
@@ -91,28 +98,29 @@ def prepare(watch: LiveWatch, widths: dict[int, float | None]) -> Prepared:
 
 def test_the_trend_has_every_frame_that_was_tried(watch: LiveWatch):
     prepare(watch, {1: 7.2, 2: None})
-    assert watch.trend(60).names == ("width", "length", "height")
-    assert watch.trend(60).value_mm.shape == (3, 0)
+    limits = watch.alarms.limits
+    assert watch.trend.over(60, limits).names == ("width", "length", "height")
+    assert watch.trend.over(60, limits).value_mm.shape == (3, 0)
     for number in range(4):
         watch.measure(frame(number))
-    trend = watch.trend(60)
+    trend = watch.trend.over(60, limits)
     assert trend.number.tolist() == [0, 1, 2, 3]
     assert np.array_equal(trend.value_mm[0], [6.7, 7.2, np.nan, 6.7], equal_nan=True)
     assert np.array_equal(trend.sigma_mm[1], [0.04, 0.04, np.nan, 0.04], equal_nan=True)
     assert trend.beyond.tolist() == [[False, True, False, False], *[[False] * 4] * 2]
     assert (trend.since_s <= 0).all()
     assert (np.diff(trend.since_s) >= 0).all()
-    assert len(watch.trend(0.0).number) == 0
-    pace = watch.pace()
+    assert len(watch.trend.over(0.0, limits).number) == 0
+    pace = watch.trend.pace()
     assert (pace.tried, pace.failed) == (4, 1)
-    assert pace.measured_hz == 3 / live_watch.RATE_S
+    assert pace.measured_hz == 3 / live_trend.RATE_S
 
 
 def test_the_trend_forgets_what_is_old(watch: LiveWatch, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(live_watch, "TREND_S", 0.0)
+    monkeypatch.setattr(live_trend, "TREND_S", 0.0)
     for number in range(50):
         watch.measure(frame(number))
-    assert watch.trend(60).number.tolist() == [49]
+    assert watch.trend.over(60, Limits()).number.tolist() == [49]
 
 
 def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: Told):
@@ -165,7 +173,7 @@ def test_measuring_that_ends_by_itself_is_an_alarm_and_is_told(watch: LiveWatch,
         lines = heard.makefile(encoding="utf-8")
         lines.readline()
 
-        def broken(*_: object) -> LiveMeasurement:
+        def broken(*_: object) -> LiveResult:
             raise OSError("the process was killed")
 
         prepare(watch, {}).measure = broken  # type: ignore[method-assign]  # it breaks
@@ -192,7 +200,8 @@ def test_the_trend_judges_as_figures_are_judged(watch: LiveWatch):
     prepare(watch, {**widths, 7: None})
     for number in widths:
         watch.measure(frame(number))
-    trend, limits = watch.trend(60), watch.alarms.limits
+    limits = watch.alarms.limits
+    trend = watch.trend.over(60, limits)
     sizes = zip(trend.value_mm[0].tolist(), trend.sigma_mm[0].tolist(), strict=True)
     stands = [standing(Size("width", *each), limits.width_mm) for each in sizes]
     assert trend.beyond[0].tolist() == [each in ("low", "high") for each in stands]
@@ -206,9 +215,9 @@ def test_a_surface_is_drawn_when_it_is_asked_for_and_only_once(watch: LiveWatch)
     for number in (1, 2, 3):  # the first of them has none
         watch.measure(frame(number))
     assert prepared.asked == [False, True, True, False]
-    followed = watch.newest()
-    assert followed is not None
-    assert followed.number == 3
+    result = watch.newest()
+    assert result is not None
+    assert result.frame == 3
     assert watch.newest() is None
     # The surface that was asked for is there, though another frame was measured since.
     assert watch.scene() is not None
@@ -297,8 +306,8 @@ def test_a_frame_that_is_left_out_is_none_that_failed(watch: LiveWatch, told: To
         watch.measure(frame(number))
     prepared.measure = measure  # type: ignore[method-assign]
     watch.measure(frame(9))
-    assert watch.trend(60).number.tolist() == [1, 9]
-    assert watch.pace().failed == 0
+    assert watch.trend.over(60, Limits()).number.tolist() == [1, 9]
+    assert watch.trend.pace().failed == 0
     assert told == []
 
 
@@ -325,23 +334,20 @@ def test_a_frame_is_searched_for_only_when_none_was_followed_for_long(
     monkeypatch.setattr(warm, "WarmChain", Chain)
     monkeypatch.setattr(live_measuring, "judge_quality", lambda *_: None)
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
-    monkeypatch.setattr(live_measuring, "_measure", [])
-    live_measuring._begin(live_measuring._Chain(setup, Settings(), 8))
-    (measure,) = live_measuring._measure
-    image = np.zeros((2, 2), np.uint8)
-    assert measure(image, False) is not None  # the first
+    measure, one = LiveChain(setup, Settings(), 8).measure, frame(1)
+    assert measure(one, False) is not None  # the first
     assert searched == [100.0]
     now_s[0] += 0.9 * SOUGHT_S
-    assert measure(image, False) is None
+    assert measure(one, False) is None
     is_lost[0] = False
-    followed = measure(image, False)
+    followed = measure(one, False)
     assert followed is not None
-    assert followed.followed
+    assert followed.track_lost is None
     is_lost[0] = True
     now_s[0] += 0.9 * SOUGHT_S
-    assert measure(image, False) is None
+    assert measure(one, False) is None
     now_s[0] += 0.2 * SOUGHT_S
-    again = measure(image, False)
+    again = measure(one, False)
     assert again is not None
-    assert not again.followed
+    assert again.track_lost == "it jumped"
     assert searched == [100.0, now_s[0]]

@@ -13,7 +13,8 @@ from labapp.gui.live.surface import LiveSurface
 from labapp.gui.live.trends import LiveTrends
 from labapp.gui.views.picture import PictureView
 from labapp.gui.workspace import Workspace
-from labapp.run.live_watch import Followed, LiveWatch
+from labapp.run.live_measuring import LiveResult
+from labapp.run.live_watch import LiveWatch
 
 PARTS = {
     "picture": ("Picture", "What the camera sees"),
@@ -86,9 +87,9 @@ class LiveCanvas(QWidget):
             self.alarms.keep_unseen()
             self.streams.show_state()
 
-    def follow(self, followed: Followed | None, watch: LiveWatch) -> bool:
+    def follow(self, result: LiveResult | None, watch: LiveWatch) -> bool:
         """Show what was measured, at the camera's pace; whether anything was."""
-        return self.surface.isVisible() and self.surface.follow(followed, watch)
+        return self.surface.isVisible() and self.surface.follow(result, watch)
 
     def tell(self, watch: LiveWatch) -> None:
         """Show what is renewed a few times a second."""

@@ -17,7 +17,8 @@ from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label, selectable_label
 from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
-from labapp.run.live_watch import Followed, Pace
+from labapp.run.live_measuring import LiveResult
+from labapp.run.live_trend import Pace
 
 DECIMALS = 3
 """Of live figures, mm."""
@@ -60,7 +61,7 @@ class Figure:
 
 
 def figures(
-    followed: Followed | None, limits: Limits | None = None, age_s: float = 0.0
+    result: LiveResult | None, limits: Limits | None = None, age_s: float = 0.0
 ) -> tuple[Figure, ...]:
     """Width, length and height, of a hollow pool the depth.
 
@@ -68,14 +69,14 @@ def figures(
 
     Parameters
     ----------
-    followed
-        The frame measured last; None before one was.
+    result
+        Of the frame measured last; None before one was.
     limits
         Of the sizes; None: there are none.
     age_s
         How old the frame is, s.
     """
-    sizes = sizes_of(None) if followed is None else followed.sizes
+    sizes = sizes_of(None if result is None else result.measurement.measures)
     return tuple(_figure(size, limits or Limits(), age_s > OLD_S) for size in sizes)
 
 
@@ -110,14 +111,15 @@ def standing_in_words(stands: Standing, limits: Limits, name: str) -> str:
 
 
 def pace_in_words(
-    followed: Followed | None, pace: Pace, came_hz: float | None, age_s: float
+    result: LiveResult | None, pace: Pace, came_hz: float | None, age_s: float
 ) -> str:
     """How measuring keeps up, and why there is no figure where there is none."""
-    if followed is None:
+    if result is None:
         return FIRST
     told = []
-    if followed.found.measures is None:
-        told.append(f"▲ Not measured ({followed.found.status}): {followed.found.reason}.")
+    found = result.measurement
+    if found.measures is None:
+        told.append(f"▲ Not measured ({found.status}): {found.reason}.")
     elif pace.failed:
         told.append(f"◆ {pace.failed} of the last {pace.tried} frames could not be measured.")
     if age_s > OLD_S:

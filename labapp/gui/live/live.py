@@ -33,7 +33,8 @@ from labapp.media.recording.take_files import Take
 from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveMeasuringEnded
 from labapp.run.live_queue import newest_of
-from labapp.run.live_watch import RATE_S, LiveWatch
+from labapp.run.live_trend import RATE_S
+from labapp.run.live_watch import LiveWatch
 from labapp.session.session import Session
 from labapp.text import format_bytes, pluralize
 

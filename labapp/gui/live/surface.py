@@ -12,7 +12,8 @@ from labapp.export.scene import Scene
 from labapp.gui.live.figures import OLD_S
 from labapp.gui.views.view3d import LOOKS, make_view3d
 from labapp.gui.widgets.buttons import button
-from labapp.run.live_watch import Followed, LiveWatch
+from labapp.run.live_measuring import LiveResult
+from labapp.run.live_watch import LiveWatch
 
 LASTS_S = 1.0
 """A surface is shown so long where the frames after it cannot be measured; `OLD_S`, where no more
@@ -43,12 +44,12 @@ class LiveSurface(QWidget):
         layout.addLayout(row)
         layout.addWidget(self.view, 1)
 
-    def follow(self, followed: Followed | None, watch: LiveWatch) -> bool:
+    def follow(self, result: LiveResult | None, watch: LiveWatch) -> bool:
         """Show the newest surface that was drawn, and ask for the next; whether there was one.
 
         Parameters
         ----------
-        followed
+        result
             What was measured since the last call; None: nothing.
         watch
             Which measures.
@@ -61,7 +62,7 @@ class LiveSurface(QWidget):
             self._shown_s = time.monotonic()
             return True
         age_s = time.monotonic() - self._shown_s
-        found = None if followed is None else followed.found
+        found = None if result is None else result.measurement
         if found is not None and found.measures is None and age_s > LASTS_S:
             self.view.set_words(f"No surface ({found.status}): {found.reason}")
             self._show(None)

@@ -17,7 +17,8 @@ from labapp.gui.widgets.fields import FieldForm, NumberField
 from labapp.gui.widgets.labels import plain_label
 from labapp.gui.workspace import Workspace
 from labapp.run.limits import LARGEST_MM, NAMES, Ends, Limits
-from labapp.run.live_watch import TREND_S, LiveWatch, Trend
+from labapp.run.live_trend import TREND_S, Trend
+from labapp.run.live_watch import LiveWatch
 from labapp.text import SIGMA_OF
 
 LAST_S = 30.0
@@ -179,7 +180,8 @@ class LiveTrends(QWidget):
     def show_trend(self, watch: LiveWatch) -> None:
         """Show what was measured of late."""
         last_s = self.last.value() or LAST_S
-        trend, limits = watch.trend(last_s), watch.alarms.limits
+        limits = watch.alarms.limits
+        trend = watch.trend.over(last_s, limits)
         axis = Axis("From now", "s", decimals=1, span=(-last_s, 0.0))
         self.plots.show_curves(trend_curves(trend, limits, trend.names), axis)
 

@@ -43,7 +43,8 @@ from labapp.media.cameras import (
 from labapp.media.events import Event
 from labapp.media.recording.recorder import recording_path
 from labapp.media.recording.take_files import Take
-from labapp.run.live_watch import Followed, LiveWatch
+from labapp.run.live_measuring import LiveResult
+from labapp.run.live_watch import LiveWatch
 from labapp.session.session import Session
 from labapp.simulated.simulated_pool import pool_camera, simulated_pool
 from labapp.text import pluralize
@@ -109,7 +110,7 @@ class LiveView(QObject):
         self._opening: Task | None = None
         self._finding: Task | None = None
         self._told_s = self.measured_s = 0.0
-        self._followed: Followed | None = None
+        self._result: LiveResult | None = None
         self._room_byte: int | None = None
         self._timer = QTimer(self)
         self._timer.setInterval(TICK_MS)
@@ -203,7 +204,7 @@ class LiveView(QObject):
         )
         self._room_byte = None
         self._rings.setData([])
-        self.measured_s, self._followed = 0.0, None
+        self.measured_s, self._result = 0.0, None
         self.figures.show_figures(figures(None) if live.watch is not None else ())
         self.figures.words.setText(NO_SETUP if live.watch is None else "")
         self.canvas.set_live(live.watch is not None)
@@ -327,7 +328,7 @@ class LiveView(QObject):
         if looked is not None:
             self._room_byte = looked.room_byte
             self._ring_dots(looked.dots_px)
-            if self._followed is None or self._age_s > OLD_S:
+            if self._result is None or self._age_s > OLD_S:
                 self._show_quality(looked.quality)
         if live.watch is not None:
             self._follow(live.watch)
@@ -342,25 +343,25 @@ class LiveView(QObject):
 
     def _follow(self, watch: LiveWatch) -> None:
         """Show what was measured since it was asked last."""
-        followed = watch.newest()
-        if followed is not None:
-            former, was_old = self._followed, self._age_s > OLD_S
-            self._followed, self.measured_s = followed, time.monotonic()
+        result = watch.newest()
+        if result is not None:
+            former, was_old = self._result, self._age_s > OLD_S
+            self._result, self.measured_s = result, time.monotonic()
             self._show_figures(watch)
-            if was_old or former is None or former.found.status != followed.found.status:
+            if was_old or former is None or former.measurement.status != result.measurement.status:
                 self._told_s = 0.0  # what is said of the figures goes with them
             if self._age_s <= OLD_S:  # else it is not of what is in view
-                self._show_quality(followed.found.quality)
-        self.updates += self.canvas.follow(followed, watch)
+                self._show_quality(result.quality)
+        self.updates += self.canvas.follow(result, watch)
 
     def _show_figures(self, watch: LiveWatch) -> None:
-        self.figures.show_figures(figures(self._followed, watch.alarms.limits, self._age_s))
+        self.figures.show_figures(figures(self._result, watch.alarms.limits, self._age_s))
 
     @property
     def _age_s(self) -> float:
         """How old the figures are, s."""
-        followed = self._followed
-        return 0.0 if followed is None else time.monotonic() - followed.arrived_s
+        result = self._result
+        return 0.0 if result is None else time.monotonic() - result.arrived_s
 
     def _show_quality(self, quality: Quality) -> None:
         self._exposure.show_exposure(quality.exposure, quality.words, quality.grade == "good")
@@ -388,9 +389,9 @@ class LiveView(QObject):
         self.bar.tell(live, self._room_byte)
         self.counts.setText(live.counts_in_words())
         if live.watch is not None:
-            pace, came_hz = live.watch.pace(), live.rate_hz()
+            pace, came_hz = live.watch.trend.pace(), live.rate_hz()
             self._show_figures(live.watch)
-            self.figures.words.setText(pace_in_words(self._followed, pace, came_hz, self._age_s))
+            self.figures.words.setText(pace_in_words(self._result, pace, came_hz, self._age_s))
             self.canvas.tell(live.watch)
         picture = self._picture.picture
         if live.feed is not None and picture is not None:

@@ -33,7 +33,7 @@ from labapp.media.cameras import (
     SimulatedDevice,
 )
 from labapp.media.recording.recorder import Plan
-from labapp.run.live_watch import Followed
+from labapp.run.live_measuring import LiveResult
 from labapp.session.session import Session
 from labapp.simulated.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
 from tests.gui.conftest import SAMPLES, let_draw
@@ -226,16 +226,16 @@ def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
         with_setup.open(device.open)
         watch = with_setup.watch
         assert watch is not None
-        found: list[Followed | None] = []
+        found: list[LiveResult | None] = []
         wait_until(lambda: bool(found.append(watch.newest()) or found[-1]))
         # The first is measured by itself, those right after it from the one before.
         wait_until(lambda: bool(found.append(watch.newest()) or found[-1]))
     finally:
         with_setup.close()
     first, measured = [each for each in found if each is not None]
-    assert (first.found.status, measured.found.status) == ("ok", "ok")
-    assert (first.found.followed, measured.found.followed) == (False, True)
-    assert measured.found.quality.reference
+    assert (first.measurement.status, measured.measurement.status) == ("ok", "ok")
+    assert (first.track_lost is None, measured.track_lost is None) == (False, True)
+    assert measured.quality.reference
     width, length, height = figures(measured)
     with (folder / "truth.csv").open() as file:
         truth = next(csv.DictReader(file))

@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +19,7 @@ from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
 from labapp.core.images.exposure import Exposure
+from labapp.core.pipeline import Measurement
 from labapp.core.quality import Quality, Remark
 from labapp.core.surface.measures import Measures
 from labapp.export.scene import HEIGHT, Scene
@@ -37,12 +37,12 @@ from labapp.gui.live.trends import trend_curves
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.theme import RED, is_dark
-from labapp.media.cameras import SimulatedDevice
+from labapp.media.cameras import CameraFrame, SimulatedDevice
 from labapp.run import live_watch
 from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits
-from labapp.run.live_measuring import LiveMeasurement
-from labapp.run.live_watch import Followed, Pace, Trend
+from labapp.run.live_measuring import LiveResult
+from labapp.run.live_trend import Pace, Trend
 from tests.gui.conftest import SAMPLES
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
@@ -57,12 +57,14 @@ QUALITY = Quality(
     0.003,
     (Remark("exposure", "good", "The dots stand out well."),),
 )
-OK = LiveMeasurement("ok", "", QUALITY, MEASURES, True)
-DARK = LiveMeasurement("no-dots", "it is dark", QUALITY, None, False)
+OK = Measurement("ok", "", "fit", measures=MEASURES)
+DARK = Measurement("no-dots", "it is dark", "fit")
 
 
-def followed(found: LiveMeasurement = OK) -> Followed:
-    return Followed(7, 0.7, time.monotonic(), found)
+def live_result(found: Measurement = OK) -> LiveResult:
+    return LiveResult(
+        frame=7, time_s=0.7, arrived_s=time.monotonic(), measurement=found, quality=QUALITY
+    )
 
 
 # --- in words -------------------------------------------------------------------------------------
@@ -70,7 +72,7 @@ def followed(found: LiveMeasurement = OK) -> Followed:
 
 def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known():
     limits = Limits(width_mm=(6.0, 6.6), length_mm=(7.0, 8.0), height_mm=(0.301, None))
-    shown = figures(followed(), limits)
+    shown = figures(live_result(), limits)
     assert [(f.value, f.sigma, f.told, f.look) for f in shown] == [
         ("6.700", "± 0.030", "▲ above 6.6", "alarm"),
         ("7.500", "± 0.040", "✓ in order", "plain"),
@@ -78,25 +80,25 @@ def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known(
     ]
     for unknown in (
         figures(None, limits),
-        figures(followed(DARK), limits),
-        figures(followed(), limits, age_s=OLD_S + 0.1),
+        figures(live_result(DARK), limits),
+        figures(live_result(), limits, age_s=OLD_S + 0.1),
     ):
         assert [figure.told for figure in unknown] == ["? not known"] * 3
         assert "alarm" not in [figure.look for figure in unknown]
-    assert [figure.value for figure in figures(followed(DARK), limits)] == ["–"] * 3
-    assert [figure.told for figure in figures(followed())] == [""] * 3
+    assert [figure.value for figure in figures(live_result(DARK), limits)] == ["–"] * 3
+    assert [figure.told for figure in figures(live_result())] == [""] * 3
 
 
 def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():
     assert pace_in_words(None, Pace(0.0, 0, 0), 60.0, 0.0) == FIRST
     assert (
-        pace_in_words(followed(), Pace(38.0, 76, 0), 60.0, 0.04)
+        pace_in_words(live_result(), Pace(38.0, 76, 0), 60.0, 0.04)
         == "38.0 of 60.0 frames/s measured; 0.04 s old"
     )
-    assert pace_in_words(followed(), Pace(38.0, 76, 2), None, 0.0).startswith(
+    assert pace_in_words(live_result(), Pace(38.0, 76, 2), None, 0.0).startswith(
         "◆ 2 of the last 76 frames could not be measured. 38.0 frames/s measured"
     )
-    dark = pace_in_words(followed(DARK), Pace(0.0, 3, 3), 60.0, 5.2)
+    dark = pace_in_words(live_result(DARK), Pace(0.0, 3, 3), 60.0, 5.2)
     assert dark.startswith("▲ Not measured (no-dots): it is dark. ▲ The figures are 5 s old.")
 
 
@@ -149,16 +151,24 @@ def surface() -> Scene:
 class Prepared:
     """Measures what the test wants, in milliseconds."""
 
-    found = OK
+    found, quality = OK, QUALITY
     gate = threading.Event()
 
     def __init__(self, *_: object) -> None:
         pass
 
-    def measure(self, _image: Any, drawn: bool) -> LiveMeasurement:
+    def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult:
         Prepared.gate.wait(PATIENCE_S)
-        drawn = drawn and Prepared.found.measures is not None
-        return replace(Prepared.found, scene=surface() if drawn else None)
+        found = Prepared.found
+        return LiveResult(
+            frame=frame.number,
+            time_s=frame.time_s,
+            arrived_s=frame.arrived_s,
+            measurement=found,
+            track_lost=None if found.status == "ok" else found.reason,
+            quality=Prepared.quality,
+            scene=surface() if drawn and found.measures is not None else None,
+        )
 
     def close(self) -> None:
         pass
@@ -173,6 +183,7 @@ def page(
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
     monkeypatch.setattr(live_watch, "LiveMeasuring", Prepared)
     monkeypatch.setattr(Prepared, "found", OK)
+    monkeypatch.setattr(Prepared, "quality", QUALITY)
     Prepared.gate.set()
     assert window.workspace.create(tmp_path / "new.labsession")
     setup = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
@@ -225,7 +236,7 @@ def test_the_verdict_is_that_of_a_measured_frame_unless_it_is_old(
 ):
     monkeypatch.setattr(live_view, "OLD_S", old_s)
     hidden = Remark("rows", "doubtful", "The torch hides dots in a row.")
-    monkeypatch.setattr(Prepared, "found", replace(OK, quality=replace(QUALITY, remarks=(hidden,))))
+    monkeypatch.setattr(Prepared, "quality", replace(QUALITY, remarks=(hidden,)))
     start(page, qtbot)
     said: set[str] = set()
 

@@ -1,0 +1,130 @@
+"""Sizes of a live pool over the last seconds, and how measuring keeps up."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import NamedTuple
+
+import numpy as np
+
+from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.run.limits import NAMES, Limits, beyond, sizes_of
+from labapp.run.live_measuring import LiveResult
+
+RATE_S = 2.0
+"""Rates are those of so long."""
+
+TREND_S = 120.0
+"""The trend goes back so far."""
+
+MOST_KEPT = 12_000
+"""Frames of the trend at most: a hundred a second."""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """Sizes of the last frames that were tried; n frames, the oldest first.
+
+    Parameters
+    ----------
+    names
+        What the three sizes are: the last is ``height``, or of a hollow pool ``depth``.
+    number
+        The camera's numbers of them, shape (n,).
+    since_s
+        When they came, from now on and so negative, shape (n,), s.
+    value_mm, sigma_mm
+        Of width, length and height, shape (3, n); NaN where they are not known.
+    beyond
+        Which of them are beyond a limit, shape (3, n).
+    """
+
+    names: tuple[str, ...]
+    number: IntArray
+    since_s: FloatArray
+    value_mm: FloatArray
+    sigma_mm: FloatArray
+    beyond: BoolArray
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How measuring keeps up, of late.
+
+    Parameters
+    ----------
+    measured_hz
+        Frames measured a second.
+    tried, failed
+        How many frames were tried, and of them could not be measured.
+    """
+
+    measured_hz: float
+    tried: int
+    failed: int
+
+
+class _Frame(NamedTuple):
+    """What is kept of a frame: numbers alone, for there are thousands.
+
+    Sizes are their values and then their σ, shape (6,), mm.
+    """
+
+    done_s: float
+    arrived_s: float
+    number: int
+    is_measured: bool
+    sizes_mm: tuple[float, ...]
+
+
+class LiveTrend:
+    """Keeps the sizes of the last frames. `add` belongs into one thread."""
+
+    def __init__(self) -> None:
+        self._frames: deque[_Frame] = deque(maxlen=MOST_KEPT)
+        self._names: tuple[str, ...] = NAMES
+        self._turn = threading.Lock()
+
+    def add(self, result: LiveResult) -> None:
+        """Take what the next frame gave."""
+        done_s, measures = time.monotonic(), result.measurement.measures
+        sizes = sizes_of(measures)
+        numbers = (*(s.value_mm for s in sizes), *(s.sigma_mm for s in sizes))
+        frame = _Frame(done_s, result.arrived_s, result.frame, measures is not None, numbers)
+        with self._turn:
+            if frame.is_measured:
+                self._names = tuple(size.name for size in sizes)
+            self._frames.append(frame)
+            while self._frames[0].done_s < done_s - TREND_S:
+                self._frames.popleft()
+
+    def pace(self) -> Pace:
+        """How measuring keeps up."""
+        since_s = time.monotonic() - RATE_S
+        with self._turn:
+            late = list(takewhile(lambda each: each.done_s > since_s, reversed(self._frames)))
+        failed = sum(not each.is_measured for each in late)
+        return Pace((len(late) - failed) / RATE_S, len(late), failed)
+
+    def over(self, last_s: float, limits: Limits) -> Trend:
+        """Sizes of the frames that came in the last so many seconds, held against limits."""
+        now_s = time.monotonic()
+        with self._turn:
+            late = [each for each in self._frames if each.arrived_s > now_s - last_s]
+        sizes = np.array([each.sizes_mm for each in late], float).reshape(len(late), 6).T
+        value, sigma = sizes[:3], sizes[3:]
+        return Trend(
+            self._names,
+            np.array([each.number for each in late], np.int64),
+            np.array([each.arrived_s for each in late], float) - now_s,
+            value,
+            sigma,
+            np.array([beyond(value[k], sigma[k], limits.of(n)) for k, n in enumerate(NAMES)]),
+        )
