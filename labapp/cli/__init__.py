@@ -282,7 +282,7 @@ def _run(
     from labapp.export.results import ResultsWriter
     from labapp.export.summary import Summary
     from labapp.media import open_source
-    from labapp.run.measurers import ColdMeasurer, Recorded, WarmProcesses, stretch_pools
+    from labapp.run.measurers import ColdMeasurer, RecordingMeasurer, stretch_pools
     from labapp.run.runner import provenance, run, select_frames
 
     setup = read_setup(setup_path)
@@ -298,9 +298,9 @@ def _run(
             with results, ExitStack() as at_end:
                 measurer: Measurer = ColdMeasurer(source.frame, setup, settings)
                 if warm:
-                    recorded = Recorded(source_path, source.index, setup, settings, whole=surfaces)
+                    given = (source_path, source.index, setup, settings, surfaces)
                     pools = at_end.enter_context(stretch_pools(len(selected)))
-                    measurer = WarmProcesses(recorded, pools)
+                    measurer = RecordingMeasurer(*given, pools)
                 for _ in run(selected, measurer, [results.write, summary.add, *streams, show]):
                     pass
         except KeyboardInterrupt:

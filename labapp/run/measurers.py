@@ -1,8 +1,8 @@
 """What measures the frames of a run (`runner.Measurer`).
 
 `ColdMeasurer` measures each frame as if it were the first, here or in a pool of processes.
-`WarmMeasurer` measures each from the one before, here; `WarmProcesses` does so with stretches of a
-recording, each in a process that opens the recording itself and makes the rows of the tables, too.
+`WarmMeasurer` measures each from the one before, here; `RecordingMeasurer` does so with stretches
+of a recording in processes, which make the rows of the tables, too.
 
 Stretches are of one length, however many processes there are, and begin with a cold frame each:
 results do not depend on the machine.
@@ -186,8 +186,10 @@ class WarmMeasurer:
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """A recording, and what it is measured with.
+class RecordingMeasurer:
+    """Measures each frame of a recording from the one before, many stretches at once.
+
+    Each process opens the recording itself. Results have the rows of the tables (`FrameResult`).
 
     Parameters
     ----------
@@ -196,27 +198,8 @@ class Recorded:
     setup, settings
         What it is measured with.
     whole
-        Whether dots, rays and surface are handed over besides the rows: that takes a twentieth of
-        the time that it took to measure them.
-    """
-
-    path: Path
-    index: bytes | None
-    setup: Setup
-    settings: Settings
-    whole: bool = False
-
-
-@dataclass(frozen=True)
-class WarmProcesses:
-    """Measures each frame of a recording from the one before, many stretches at once.
-
-    Results have their rows, and dots, rays and surface only if they are asked for (`Recorded`).
-
-    Parameters
-    ----------
-    recorded
-        What to measure.
+        Whether results have dots, rays and surface, too: to hand them over takes a twentieth of the
+        time that it took to measure them.
     pools
         Where to measure (`stretch_pools`); none: here.
 
@@ -226,59 +209,56 @@ class WarmProcesses:
         While frames are measured, if the recording cannot be opened.
     """
 
-    recorded: Recorded
+    path: Path
+    index: bytes | None
+    setup: Setup
+    settings: Settings
+    whole: bool = False
     pools: Sequence[Executor] = ()
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
-        if not self.pools:
-            return _with_rows(self.recorded, frames)
-        return self._measured(list(frames))
+        return self._in_processes(list(frames)) if self.pools else self._here(frames)
 
-    def _measured(self, frames: Sequence[int]) -> Generator[FrameResult]:
-        recorded = self.recorded
-        if recorded.index is None:  # found out once, for all of them
-            with open_source(recorded.path) as source:
-                recorded = replace(recorded, index=source.index)
-        ahead = len(self.pools) * -(-STRETCH // BATCH)  # each has a stretch
-        for batch in _in_order(self._begun(recorded, frames), ahead):
+    def _here(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        with open_source(self.path, self.index) as source:
+            for result in WarmMeasurer(source.frame, self.setup, self.settings)(frames):
+                found = result.measurement
+                yield replace(
+                    result,
+                    measurement=found if self.whole else without_surface(found),
+                    rows=table_rows(result, self.setup.calibration),
+                )
+
+    def _in_processes(self, frames: Sequence[int]) -> Generator[FrameResult]:
+        there = replace(self, pools=())
+        if there.index is None:  # found out once, for all of them
+            with open_source(self.path) as source:
+                there = replace(there, index=source.index)
+
+        def begun() -> Iterator[Future[list[FrameResult]]]:
+            for k, at in enumerate(range(0, len(frames), STRETCH)):
+                pool, stretch = self.pools[k % len(self.pools)], frames[at : at + STRETCH]
+                yield pool.submit(_first_batch, there, stretch)
+                for _ in range(BATCH, len(stretch), BATCH):
+                    yield pool.submit(_next_batch)
+
+        batches = -(-STRETCH // BATCH)
+        for batch in _in_order(begun(), len(self.pools) * batches):
             yield from batch
-
-    def _begun(
-        self, recorded: Recorded, frames: Sequence[int]
-    ) -> Iterator[Future[list[FrameResult]]]:
-        """Give stretch after stretch to one process after the other, batch by batch."""
-        for k, at in enumerate(range(0, len(frames), STRETCH)):
-            pool, stretch = self.pools[k % len(self.pools)], frames[at : at + STRETCH]
-            yield pool.submit(_first_batch, recorded, stretch)
-            for _ in range(BATCH, len(stretch), BATCH):
-                yield pool.submit(_next_batch)
-
-
-def _with_rows(recorded: Recorded, frames: Iterable[int]) -> Generator[FrameResult]:
-    """What frames of a recording give, each from the one before, with the rows of the tables."""
-    setup, settings = recorded.setup, recorded.settings
-    with open_source(recorded.path, recorded.index) as source:
-        for result in WarmMeasurer(source.frame, setup, settings)(frames):
-            found = result.measurement
-            yield replace(
-                result,
-                measurement=found if recorded.whole else without_surface(found),
-                rows=table_rows(result, setup.calibration),
-            )
 
 
 _stretch: Generator[FrameResult] | None = None
 """The stretch that this process is at."""
 
 
-def _first_batch(recorded: Recorded, frames: Sequence[int]) -> list[FrameResult]:
+def _first_batch(measurer: RecordingMeasurer, frames: Sequence[int]) -> list[FrameResult]:
     """Begin a stretch in this process, in place of the one that it was at."""
     global _stretch  # noqa: PLW0603 - a stretch stays in the process that began it
     if _stretch is not None:
         _stretch.close()
     cv2.setNumThreads(1)
-    _stretch = _with_rows(recorded, frames)
+    _stretch = measurer(frames)
     return _next_batch()
 
 
@@ -289,7 +269,7 @@ def _next_batch() -> list[FrameResult]:
 
 @contextmanager
 def stretch_pools(frames: int, workers: int | None = None) -> Iterator[list[Executor]]:
-    """Begin processes for `WarmProcesses`; they load meanwhile what they need.
+    """Begin processes for a `RecordingMeasurer`; they load meanwhile what they need.
 
     Parameters
     ----------

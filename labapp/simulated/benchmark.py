@@ -23,7 +23,7 @@ from labapp.core.values import FloatArray, IntArray
 from labapp.export.results import ResultsWriter
 from labapp.files import atomic_file
 from labapp.media import open_source
-from labapp.run.measurers import Recorded, WarmProcesses, await_loaded, stretch_pools
+from labapp.run.measurers import RecordingMeasurer, await_loaded, stretch_pools
 from labapp.run.runner import run
 from labapp.simulated.simulate import simulate
 from labapp.simulated.simulated_pool import BENCH
@@ -259,12 +259,12 @@ def run_video(
     """
     frames, lost = len(video.height_mm), 0
     begun, used = time.perf_counter(), sum(os.times()[:4])
-    recorded = Recorded(video.path, None, video.setup, Settings())
     with stretch_pools(frames, workers) as pools:
         await_loaded(pools)
+        measurer = RecordingMeasurer(video.path, None, video.setup, Settings(), pools=pools)
         start_s = time.perf_counter() - begun
         with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
-            for result in run(range(frames), WarmProcesses(recorded, pools), [results.write]):
+            for result in run(range(frames), measurer, [results.write]):
                 lost += result.track_lost is not None
                 progress()
         seconds = time.perf_counter() - begun - start_s

@@ -24,7 +24,7 @@ from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
 from labapp.media import Frame, open_source
 from labapp.run import measurers
-from labapp.run.measurers import AHEAD, ColdMeasurer, Recorded, WarmProcesses, stretch_pools
+from labapp.run.measurers import AHEAD, ColdMeasurer, RecordingMeasurer, stretch_pools
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulated.benchmark import SCENARIO
@@ -35,27 +35,27 @@ FRAMES = 9
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> RecordingMeasurer:
     folder = tmp_path_factory.mktemp("sequence")
     (folder / "scenario.toml").write_text(SCENARIO.format(frames=FRAMES), "utf-8")
     simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
     setup = read_setup(folder / "made" / "setup.toml")
-    return Recorded(folder / "made" / "recording.avi", None, setup, Settings())
+    return RecordingMeasurer(folder / "made" / "recording.avi", None, setup, Settings())
 
 
 def test_two_sequences_in_turn_keep_apart(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(measurers, "BATCH", 1)
-    with open_source(recorded.path) as source:
+    with open_source(recording.path) as source:
         images = [source.frame(k).image for k in range(3)]
     for name, order in (("a", (0, 1, 2)), ("b", (2, 1, 0))):
         (tmp_path / name).mkdir()
         for k, number in enumerate(order):
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), images[number])
-    jobs = [Recorded(tmp_path / name, None, recorded.setup, recorded.settings) for name in "ab"]
-    alone = [[one.rows for one in WarmProcesses(each)(range(3))] for each in jobs]
-    in_turn = zip(*(WarmProcesses(each)(range(3)) for each in jobs), strict=True)
+    jobs = [replace(recording, path=tmp_path / name) for name in "ab"]
+    alone = [[one.rows for one in each(range(3))] for each in jobs]
+    in_turn = zip(*(each(range(3)) for each in jobs), strict=True)
     assert [[one.rows for one in pair] for pair in in_turn] == [
         list(pair) for pair in zip(*alone, strict=True)
     ]
@@ -67,7 +67,7 @@ def measures_of(told: FrameResult) -> dict[str, float]:
 
 
 def test_stretches_are_measured_alike_here_and_by_processes(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(measurers, "STRETCH", 5)
     monkeypatch.setattr(measurers, "BATCH", 2)
@@ -75,7 +75,7 @@ def test_stretches_are_measured_alike_here_and_by_processes(
     for workers in (0, 2):
         with stretch_pools(FRAMES, workers) as pools:
             assert len(pools) == workers
-            told[workers] = list(WarmProcesses(replace(recorded, whole=True), pools)(range(FRAMES)))
+            told[workers] = list(replace(recording, whole=True, pools=pools)(range(FRAMES)))
     assert [one.frame for one in told[2]] == list(range(FRAMES))
     for here, there in zip(told[0], told[2], strict=True):
         assert here.rows == there.rows
@@ -85,7 +85,7 @@ def test_stretches_are_measured_alike_here_and_by_processes(
     cold = [one.frame for one in told[0] if one.track_lost is not None]
     assert {0, 5} <= set(cold)
     assert len(cold) <= 4
-    with ResultsWriter(tmp_path / "out", recorded.setup.calibration, {}) as results:
+    with ResultsWriter(tmp_path / "out", recording.setup.calibration, {}) as results:
         for one in told[2]:
             results.write(one)
     made = sorted(path.name for path in (tmp_path / "out").glob("surface_*"))
@@ -111,33 +111,33 @@ class Slow(Executor):
 
 
 def test_a_sequence_given_up_takes_back_what_it_had_given_out(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+    recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(measurers, "BATCH", 2)
     pool = Slow(5)
-    told = WarmProcesses(recorded, [pool])(range(FRAMES))
+    told = replace(recording, pools=[pool])(range(FRAMES))
     assert next(told) == "the first"
     told.close()
     assert [one.cancelled() for one in pool.given] == [False, True, True, True, True]
 
 
 def test_a_frame_that_cannot_be_read_is_told_and_the_others_measured(
-    recorded: Recorded, tmp_path: Path
+    recording: RecordingMeasurer, tmp_path: Path
 ) -> None:
     folder = tmp_path / "frames"
     folder.mkdir()
-    with open_source(recorded.path) as source:
+    with open_source(recording.path) as source:
         for n in range(3):
             cv2.imwrite(str(folder / f"frame_{n}.png"), np.asarray(source.frame(n).image))
     (folder / "frame_1.png").write_bytes(b"not a picture")
-    told = list(WarmProcesses(Recorded(folder, None, recorded.setup, recorded.settings))(range(3)))
+    told = list(replace(recording, path=folder)(range(3)))
     assert [one.measurement.status for one in told] == ["ok", "unreadable", "ok"]
 
 
-def test_the_command_follows_frames(recorded: Recorded, tmp_path: Path) -> None:
-    (tmp_path / "setup.toml").write_text(recorded.setup.text, "utf-8")
+def test_the_command_follows_frames(recording: RecordingMeasurer, tmp_path: Path) -> None:
+    (tmp_path / "setup.toml").write_text(recording.setup.text, "utf-8")
     out = tmp_path / "results"
-    given = ["reconstruct", recorded.path, "--setup", tmp_path / "setup.toml", "--out", out]
+    given = ["reconstruct", recording.path, "--setup", tmp_path / "setup.toml", "--out", out]
     some = ["--frames", "2:6", "--surfaces", "none", "--warm"]
     result = CliRunner().invoke(app, [*map(str, given), *some])
     assert result.exit_code == 0, result.output
@@ -157,14 +157,14 @@ def test_the_benchmark_measures_every_frame_and_no_label_wrong(tmp_path: Path) -
 
 
 def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
-    recorded: Recorded, tmp_path: Path
+    recording: RecordingMeasurer, tmp_path: Path
 ) -> None:
     with Session.create(tmp_path / "one.labsession", Record(title="a pool that swings")) as session:
-        session.set_setup(recorded.setup.text)
-        session.import_recording(recorded.path)
+        session.set_setup(recording.setup.text)
+        session.import_recording(recording.path)
         first = dict(session.measure([0, 1, 2], warm=True))
         assert [one.status for one in first.values()] == ["ok"] * 3
-        bare = told_here(recorded)[1].measurement
+        bare = told_here(recording)[1].measurement
         assert_same(first[1].measures, bare.measures)
         assert (bare.dots, bare.lattice, bare.match, bare.reconstruction) == (None,) * 4
         session.correct({1: start_correction(first[1])}, "as it is")
@@ -173,8 +173,8 @@ def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
         assert again[2].status == "ok"
 
 
-def told_here(recorded: Recorded) -> list[FrameResult]:
-    return list(WarmProcesses(recorded)(range(3)))
+def told_here(recording: RecordingMeasurer) -> list[FrameResult]:
+    return list(recording(range(3)))
 
 
 # --- each frame by itself -------------------------------------------------------------------------
@@ -196,7 +196,7 @@ class Later(Executor):
 
 
 @pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch, recorded: Recorded) -> Any:
+def plain(monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer) -> Any:
     """A cold measurer whose measurements say no more than grey level and correction of a frame."""
 
     def measure(image: np.ndarray, *given: Any) -> Measurement:
@@ -211,7 +211,7 @@ def plain(monkeypatch: pytest.MonkeyPatch, recorded: Recorded) -> Any:
 
     def measurer(pool: Executor | None = None) -> ColdMeasurer:
         corrected: Any = {5: "by hand"}.get
-        return ColdMeasurer(read, recorded.setup, recorded.settings, corrected, pool)
+        return ColdMeasurer(read, recording.setup, recording.settings, corrected, pool)
 
     return measurer
 

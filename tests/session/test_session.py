@@ -13,7 +13,7 @@ import pytest
 
 import labapp
 from labapp.config.setup import read_setup
-from labapp.core.pipeline import Settings
+from labapp.core.pipeline import Settings, start_correction
 from labapp.core.rows.correction import Correction
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
@@ -513,6 +513,42 @@ def test_processes_measure_the_same(session: Session):
         there = dict(session.measure([4, 6], pool))
     assert list(there) == [4, 6]
     assert same(there[4], here[0])
+
+
+def test_a_corrected_frame_that_processes_measure_stands_until_it_is_corrected_anew(
+    session: Session,
+):
+    ((_, found),) = session.measure([4])
+    session.correct({4: start_correction(found)})
+    assert stale(session) == [4]
+    with measuring_pool(1) as pool:
+        ((_, again),) = session.measure([4], pool)
+    assert again.correction is not None
+    assert stale(session) == []
+    session.undo()
+    session.redo()
+    assert stale(session) == []
+    session.undo()
+    ((_, meanwhile),) = session.measure([4], sinks=[lambda _: session.redo()])
+    assert meanwhile.correction is None
+    assert stale(session) == []
+
+
+def stale(session: Session) -> list[int]:
+    seen = session.overview()
+    return seen.frame[seen.stale].tolist()
+
+
+def test_results_go_on_to_sinks_when_they_are_kept(session: Session):
+    told: list[tuple[int, float | None, bool]] = []
+
+    def tell(result: FrameResult) -> None:
+        kept = session.result(result.frame)
+        is_kept = kept is not None and same(kept.measurement, result.measurement)
+        told.append((result.frame, result.time_s, is_kept))
+
+    assert [frame for frame, _ in session.measure([4, 6], sinks=[tell])] == [4, 6]
+    assert told == [(4, session.frame(4).time_s, True), (6, session.frame(6).time_s, True)]
 
 
 def test_measuring_that_is_stopped_keeps_what_was_finished(session: Session):
