@@ -1,6 +1,6 @@
-"""What happened to a camera, a recording or a pedal, in words: one stream for the page and the log.
+"""Events of cameras, recordings and pedals: one stream for the page and the log.
 
-Whoever reports calls a `Say`; it may be called from any thread.
+They are passed to an `OnEvent`, which may be called from any thread.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from datetime import datetime
 from typing import Literal
 
 Kind = Literal["note", "warning", "loss"]
-"""Something to know; something that is not as it should be; frames that are lost for good."""
+"""Information; a fault that may pass; frames that are lost for good."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened.
+    """An event.
 
     Parameters
     ----------
     source
-        To what: a camera's id, a recording's file, a pedal's name.
+        A camera's id, a recording's file, a pedal's name.
     kind
-        How bad it is.
+        Severity.
     words
         One sentence for the operator.
     at
@@ -42,60 +42,60 @@ class Event:
         return f"{self.source}: {self.words}"
 
 
-Say = Callable[[Event], None]
+OnEvent = Callable[[Event], None]
 
 
-def logged(say: Say) -> Say:
-    """Tell the same, and keep it in the program's log."""
+def logged(on_event: OnEvent) -> OnEvent:
+    """Callback that writes events to the program's log and passes them on."""
     levels = {"note": logging.INFO, "warning": logging.WARNING, "loss": logging.ERROR}
 
-    def tell(event: Event) -> None:
+    def log(event: Event) -> None:
         logging.getLogger("labapp").log(levels[event.kind], "%s", event)
-        say(event)
+        on_event(event)
 
-    return tell
+    return log
 
 
-def silent(_: Event) -> None:
-    """Tell nobody."""
+def ignore_event(_: Event) -> None:
+    """Discard an event."""
 
 
 class Tally:
-    """What happens often, told at once the first time and then together, once a while.
+    """Counter of frequent events that reports at most once in an interval.
 
     Parameters
     ----------
-    tell
-        Called with how many there were since it was called last.
+    report
+        Called with the count since its last call.
     every_s
-        Not called more often.
+        Least time between calls, s.
     """
 
-    def __init__(self, tell: Callable[[int], None], every_s: float = 1.0) -> None:
+    def __init__(self, report: Callable[[int], None], every_s: float = 1.0) -> None:
         self.total = 0
-        self._tell = tell
+        self._report = report
         self._every_s = every_s
-        self._untold = 0
-        self._told_s = -every_s
-        self._turn = threading.Lock()
+        self._unreported = 0
+        self._reported_s = -every_s
+        self._mutex = threading.Lock()
 
     def count(self, more: int = 1) -> None:
-        """Count some more, to be told at the next `flush`."""
-        with self._turn:
+        """Count, without a report before the next `flush`."""
+        with self._mutex:
             self.total += more
-            self._untold += more
+            self._unreported += more
 
     def add(self, more: int = 1) -> None:
-        """Count some more, and tell if it is time."""
+        """Count, and report if the interval is over."""
         self.count(more)
         self.flush()
 
     def flush(self, *, now: bool = False) -> None:
-        """Tell of what was not told yet, if it is time; with ``now`` in any case."""
+        """Report what is not reported yet, if the interval is over; with ``now`` in any case."""
         at_s = time.monotonic()
-        with self._turn:
-            count = self._untold
-            if not count or not (now or at_s - self._told_s >= self._every_s):
+        with self._mutex:
+            count = self._unreported
+            if not count or not (now or at_s - self._reported_s >= self._every_s):
                 return
-            self._untold, self._told_s = 0, at_s
-        self._tell(count)
+            self._unreported, self._reported_s = 0, at_s
+        self._report(count)

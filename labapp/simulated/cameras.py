@@ -1,4 +1,4 @@
-"""Cameras by their ids, the simulated one among them, and a recording from one of them."""
+"""Opening cameras by id, simulated ones included, and recording from one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from labapp.media.cameras import (
     open_camera,
     there_and_back,
 )
-from labapp.media.events import Event, Say, logged, silent
+from labapp.media.events import Event, OnEvent, ignore_event, logged
 from labapp.media.recording.recorder import Plan, Recorder
 from labapp.media.recording.take_files import Take
 from labapp.simulated.simulate import simulate
@@ -31,7 +31,7 @@ from labapp.simulation.parallel import Progress
 SIMULATED = "simulated:"
 
 FRAMES = 48
-"""So many frames of a scenario are rendered, and played there and back."""
+"""Frames rendered of a scenario, played there and back."""
 
 MOST_BYTE = 400_000_000
 """Frames of a recording that a simulated camera holds; it plays the first of a longer one."""
@@ -44,7 +44,7 @@ def camera_opener(
     progress: Progress | None = None,
     faults: Faults | None = None,
 ) -> Callable[[], Camera]:
-    """What opens a camera, again and again: for `Feed`.
+    """Function that opens a camera, as often as it is called; for `Feed`.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def camera_opener(
         As `find_cameras` has it; or "simulated:FILE", a scenario or any recording that is played
         as if a camera filmed it, there and back without end.
     progress
-        Told of each frame of a scenario that is rendered.
+        Called for each frame of a scenario that is rendered.
     faults
         Of a simulated camera.
 
@@ -107,27 +107,27 @@ def _recorded(path: Path) -> tuple[list[GreyImage], int, float | None]:
 
 def record(
     id: str,
-    opened: Callable[[], Camera],
-    place: Callable[[], Path],
+    opener: Callable[[], Camera],
+    new_path: Callable[[], Path],
     plan: Plan,
     settings: CameraSettings,
     wait: Callable[[Feed, Take], None],
-    say: Say = silent,
+    on_event: OnEvent = ignore_event,
 ) -> Take:
     """Record from a camera, at once.
 
     Parameters
     ----------
-    id, opened
-        The camera, and what opens it: `camera_opener`.
-    place
-        Gives the recording's file.
+    id, opener
+        The camera's id, and its `camera_opener`.
+    new_path
+        Returns the path of the recording.
     plan, settings
-        What is recorded, and what the camera is set to.
+        What is recorded, and the camera's settings.
     wait
-        Returns when enough is recorded; what was recorded is kept if it raises.
-    say
-        Called with what happens; it is noted beside the recording, too.
+        Returns when enough is recorded; the recording is complete also if it raises.
+    on_event
+        Called with every event; the notes have it, too.
 
     Raises
     ------
@@ -136,20 +136,20 @@ def record(
     """
     recorders: list[Recorder] = []
 
-    def hand_on(frame: CameraFrame) -> None:
+    def deliver(frame: CameraFrame) -> None:
         for recorder in recorders:
             recorder.take(frame)
 
-    told = logged(say)
+    log = logged(on_event)
 
-    def tell(event: Event) -> None:
-        told(event)
+    def note(event: Event) -> None:
+        log(event)
         for recorder in recorders:
             recorder.note(event)
 
     with (
-        Feed(id, opened, hand_on, tell, settings) as feed,
-        Recorder(place, plan, feed.bit_depth, feed.settings.rate_hz, told) as recorder,
+        Feed(id, opener, deliver, note, settings) as feed,
+        Recorder(new_path, plan, feed.bit_depth, feed.settings.rate_hz, log) as recorder,
     ):
         take = recorder.trigger()
         recorders.append(recorder)

@@ -114,7 +114,7 @@ def test_it_turns_the_surface_page_while_that_is_in_view(
     bench = Bench({MOUSE_3D: Device(AXES)})
     monkeypatch.setattr(hid, "RETRY_S", 0.02)
     monkeypatch.setattr("labapp.media.devices.space_mouse.RETRY_S", 0.02)
-    made = partial(SpaceMouse, find=bench.find, opened=bench.open)
+    made = partial(SpaceMouse, find=bench.find, opener=bench.open)
     monkeypatch.setattr(steering, "SpaceMouse", made)
     window.files.open(copy_sample("thumb_tack"))
     window.show_step("surface")

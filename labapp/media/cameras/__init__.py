@@ -69,7 +69,7 @@ def open_camera(id: str) -> Camera:
     InputError
         If there is no such kind of camera.
     CameraError
-        If it is not there or cannot be opened: what to do about it.
+        If it is not there or cannot be opener: what to do about it.
     """
     for kind in KINDS:
         if id.startswith(kind.prefix):

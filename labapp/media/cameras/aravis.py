@@ -95,7 +95,7 @@ class GenicamCamera(Camera):
         try:
             self._camera = self._aravis.open(info.id.removeprefix(PREFIX))
         except CameraError as error:
-            raise CameraLost(f"{info.name} cannot be opened: {error}") from error
+            raise CameraLost(f"{info.name} cannot be opener: {error}") from error
         self._stream: _Stream | None = None
         self._is_lost = False
         self._line = b""
@@ -142,7 +142,7 @@ class GenicamCamera(Camera):
         try:
             self._set(wanted)
         except (CameraError, InputError):
-            self._put_back(before, set(wanted.asked()))
+            self._put_back(before, set(wanted.specified()))
             raise
         return self.settings
 

@@ -117,19 +117,19 @@ class CameraSettings:
     region: Region | None = None
     trigger: Trigger | None = None
 
-    def asked(self) -> dict[str, Any]:
-        """What is not left as it is, by name."""
+    def specified(self) -> dict[str, Any]:
+        """Settings that are not None, by name."""
         found = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in found.items() if value is not None}
 
-    def in_words(self) -> str:
-        """What is not left as it is, for people: "exposure 800 µs, rate 200 frames/s"."""
-        told = []
-        for name, value in self.asked().items():
+    def describe(self) -> str:
+        """Settings that are not None as text: "exposure 800 µs, rate 200 frames/s"."""
+        parts = []
+        for name, value in self.specified().items():
             unit = NUMBERS.get(name)
             shown = value if unit is None else f"{value:.6g} {unit}"
-            told.append(f"{name.partition('_')[0]} {shown}")
-        return ", ".join(told)
+            parts.append(f"{name.partition('_')[0]} {shown}")
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Keeps a camera going: frames to whoever takes them, and words for all that goes wrong."""
+"""Continuous acquisition from a camera, with reconnection after faults."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ from labapp.media.cameras.base import (
     CameraLost,
     CameraSettings,
 )
-from labapp.media.events import Event, Kind, Say, Tally, silent
+from labapp.media.events import Event, Kind, OnEvent, Tally, ignore_event
 from labapp.text import pluralize
 
 WAIT_S = 0.1
-"""So long a frame is waited for before it is seen whether the feed is to end."""
+"""Longest wait for a frame before `stop` is checked, s."""
 
 SOON_S = 0.01
-"""… and so long where the next frame is taken only when it is asked for."""
+"""… and with a software trigger, s."""
 
 SILENT_S = 2.0
-"""A camera that gives no frame by itself for so long, or for 20 frames, is said to stall."""
+"""A free-running camera without a frame for so long, or for 20 frames, is stalled."""
 
 HOPELESS_S = 6.0
-"""… and after so long it is opened anew."""
+"""… and after so much longer it is opened again."""
 
 RETRY_S = (0.1, 0.2, 0.5, 1.0)
-"""Pauses between attempts to open a camera that is gone; the last again and again."""
+"""Pauses between attempts to open a lost camera; the last is repeated."""
 
 State = Literal["opening", "running", "stalled", "lost", "ended"]
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What a feed has seen so far.
+    """Counts of a feed so far.
 
     Parameters
     ----------
     frames
-        Whole frames handed on.
+        Complete frames delivered.
     broken
-        Frames that were not whole, and were not handed on.
+        Incomplete frames, left out.
     dropped
-        Frames that never arrived, as gaps in the camera's numbers and its driver's count tell.
+        Frames that never arrived, by gaps in the camera's numbers and its driver's count.
     lost
-        How often the camera was gone.
+        How often the camera was lost.
     """
 
     frames: int
@@ -68,24 +68,24 @@ class Counts:
 
 
 class Feed:
-    """Frames of a camera in a thread of its own, whatever the camera does.
+    """Acquisition thread of a camera.
 
-    A camera that is unplugged or stalls is opened again, set as it was, until `stop`; a frame that
-    is not whole, of another size or type, is left out. Each is said.
+    A camera that is unplugged or stalls is opened again with the same settings, until `stop`; an
+    incomplete frame, or one of another size or type, is left out. Each raises an event.
 
     Parameters
     ----------
     name
-        Of the camera, for what is said.
-    opened
+        Of the camera, for events.
+    opener
         Opens the camera: raises `CameraError` while it cannot.
-    take
+    on_frame
         Called with every frame, in the feed's thread: it must not wait. Frames are numbered from
         0 on; numbers of frames that did not arrive are left out, and of those there was no time for
         while the camera was set, as far as its rate tells. `CameraFrame.time_s` is the time
         since the first, by the camera's clock, and goes on when the camera is opened again.
-    say
-        Called with what happens.
+    on_event
+        Called with every event.
     settings
         What the camera is set to whenever it was opened. Where no trigger is asked for it takes
         frames by itself, whatever mode it was left in.
@@ -99,31 +99,31 @@ class Feed:
     def __init__(
         self,
         name: str,
-        opened: Callable[[], Camera],
-        take: Callable[[CameraFrame], None],
-        say: Say = silent,
+        opener: Callable[[], Camera],
+        on_frame: Callable[[CameraFrame], None],
+        on_event: OnEvent = ignore_event,
         settings: CameraSettings | None = None,
     ) -> None:
         self.name = name
         self.state: State = "opening"
-        self._opened = opened
-        self._take = take
-        self._say = say
+        self._opener = opener
+        self._on_frame = on_frame
+        self._on_event = on_event
         wanted = settings or CameraSettings()
         self._wanted = replace(wanted, trigger=wanted.trigger or "free")
         self._ending = threading.Event()
-        self._asked: queue.SimpleQueue[tuple[CameraSettings, Future[CameraSettings]]]
-        self._asked = queue.SimpleQueue()
-        self._pulls = threading.Semaphore(0)
+        self._requests: queue.SimpleQueue[tuple[CameraSettings, Future[CameraSettings]]]
+        self._requests = queue.SimpleQueue()
+        self._triggers = threading.Semaphore(0)
         self._frames = self._lost = 0
         self._broken = Tally(
-            lambda n: self._tell("loss", f"{pluralize(n, 'frame')} not whole, left out")
+            lambda n: self._emit("loss", f"{pluralize(n, 'frame')} not whole, left out")
         )
         self._dropped = Tally(
-            lambda n: self._tell("loss", f"{pluralize(n, 'frame')} lost on the way")
+            lambda n: self._emit("loss", f"{pluralize(n, 'frame')} lost on the way")
         )
-        self._set_words = ""
-        """To be said when frames come again after a setting."""
+        self._setting_message = ""
+        """Event to be raised when frames come again after a setting."""
         self._arrived_s: float | None = None
         self._next = 0
         self._first_s: float | None = None
@@ -134,12 +134,12 @@ class Feed:
 
     @property
     def counts(self) -> Counts:
-        """What it has seen so far."""
+        """Counts so far."""
         return Counts(self._frames, self._broken.total, self._dropped.total, self._lost)
 
     @property
     def settings(self) -> CameraSettings:
-        """What the camera was set to when it was opened or set last."""
+        """Settings of the camera when it was opened or set last."""
         return self._connection.settings
 
     @property
@@ -148,29 +148,29 @@ class Feed:
         return self.camera.bit_depth
 
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings]:
-        """Set the camera between two frames, now and whenever it is opened again; this is said.
+        """Set the camera between two frames, now and whenever it is opened again.
 
         It gives no frames meanwhile, of some cameras for half a second.
 
         Returns
         -------
         Future
-            What it is set to then. `InputError` or `CameraError` where it refuses: it goes on as
+            The resulting settings. `InputError` or `CameraError` where it refuses: it goes on as
             it was set before. A camera that is away is set when it is back; of a feed that has
             ended it is refused.
         """
         answer: Future[CameraSettings] = Future()
-        self._asked.put((wanted, answer))
+        self._requests.put((wanted, answer))
         if self.state == "ended":
-            self._refuse_asked()
+            self._refuse_requests()
         return answer
 
     def trigger(self) -> None:
-        """Have a frame taken now; without effect while it is away, or takes frames otherwise."""
-        self._pulls.release()
+        """Trigger a frame; without effect while the camera is lost or not triggered by software."""
+        self._triggers.release()
 
     def stop(self) -> None:
-        """Take no more frames and let go of the camera. Twice does no harm."""
+        """Stop and close the camera. Twice does no harm."""
         self._ending.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
@@ -181,11 +181,11 @@ class Feed:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _tell(self, kind: Kind, words: str) -> None:
-        self._say(Event(self.name, kind, words))
+    def _emit(self, kind: Kind, words: str) -> None:
+        self._on_event(Event(self.name, kind, words))
 
     def _open(self) -> Camera:
-        camera = self._opened()
+        camera = self._opener()
         try:
             camera.apply(self._wanted)
             camera.start()
@@ -201,52 +201,52 @@ class Feed:
                 try:
                     self._read_on()
                 except CameraError as error:
-                    self._tell_set()
+                    self._emit_set()
                     self._lost += 1
                     self.state = "lost"
-                    self._tell("warning", f"{error}. Trying to get it back")
+                    self._emit("warning", f"{error}. Trying to get it back")
                     self._reopen()
         except Exception as error:
             logging.getLogger("labapp").exception("feed of %s", self.name)
-            self._tell("loss", f"a fault in the program ended its pictures: {error!r}")
+            self._emit("loss", f"a fault in the program ended its pictures: {error!r}")
         finally:
-            self._tell_set()
+            self._emit_set()
             for tally in (self._broken, self._dropped):
                 tally.flush(now=True)
             self.state = "ended"
             self.camera.close()
-            self._refuse_asked()
+            self._refuse_requests()
 
     def _read_on(self) -> None:
-        """Hand frames on until the camera is lost or the feed is to end."""
-        heard_s = time.monotonic()
+        """Deliver frames until the camera is lost or the feed is stopped."""
+        last_s = time.monotonic()
         self.state = "running"
         while not self._ending.is_set():
-            self._set_asked()
-            told = self._connection.settings.trigger == "software"
-            while self._pulls.acquire(blocking=False):
-                if told:
+            self._apply_requests()
+            by_software = self._connection.settings.trigger == "software"
+            while self._triggers.acquire(blocking=False):
+                if by_software:
                     self.camera.trigger()
             try:
-                frame = self.camera.read(SOON_S if told else WAIT_S)
+                frame = self.camera.read(SOON_S if by_software else WAIT_S)
             except BrokenFrame:
                 self._leave_out()
-                heard_s = time.monotonic()
+                last_s = time.monotonic()
                 continue
             for tally in (self._broken, self._dropped):
                 tally.flush()
             if frame is None:
-                self._is_silent(heard_s)
+                self._check_stall(last_s)
                 continue
-            self._is_heard(frame.arrived_s - heard_s)
-            heard_s = frame.arrived_s
-            self._hand_on(frame)
+            self._end_stall(frame.arrived_s - last_s)
+            last_s = frame.arrived_s
+            self._deliver(frame)
 
-    def _set_asked(self) -> None:
-        """Set what was asked for meanwhile; numbers and times go on."""
-        while not self._asked.empty():
-            wanted, answer = self._asked.get()
-            self._tell_set()
+    def _apply_requests(self) -> None:
+        """Apply the settings requested meanwhile; numbers and times continue."""
+        while not self._requests.empty():
+            wanted, answer = self._requests.get()
+            self._emit_set()
             camera, former = self.camera, self._connection
             camera.stop()
             try:
@@ -257,45 +257,45 @@ class Feed:
                     raise
                 words = "it could not be set, and goes on as it was"
             else:
-                self._wanted = replace(self._wanted, **wanted.asked())
+                self._wanted = replace(self._wanted, **wanted.specified())
                 answer.set_result(settings)
-                found = {name: getattr(settings, name) for name in wanted.asked()}
-                words = f"set to {CameraSettings(**found).in_words()}"
+                found = {name: getattr(settings, name) for name in wanted.specified()}
+                words = f"set to {CameraSettings(**found).describe()}"
             camera.start()
             self._connection = _Connection(camera)
-            self._set_words = words
+            self._setting_message = words
             if former.is_free and self._connection.is_free and self._arrived_s is not None:
                 self._connection.former_hz = former.last_hz
             else:
-                self._tell_set()
+                self._emit_set()
 
-    def _tell_set(self, more: str = "") -> None:
-        words, self._set_words = self._set_words, ""
+    def _emit_set(self, more: str = "") -> None:
+        words, self._setting_message = self._setting_message, ""
         if words:
-            self._tell("note", words + more)
+            self._emit("note", words + more)
 
-    def _refuse_asked(self) -> None:
+    def _refuse_requests(self) -> None:
         with contextlib.suppress(queue.Empty):
             while True:
-                self._asked.get_nowait()[1].set_exception(CameraError(f"{self.name} is closed"))
+                self._requests.get_nowait()[1].set_exception(CameraError(f"{self.name} is closed"))
 
-    def _is_heard(self, silent_s: float) -> None:
+    def _end_stall(self, silent_s: float) -> None:
         if self.state == "stalled":
             self.state = "running"
-            self._tell("note", f"frames come again, after {silent_s:.1f} s without")
+            self._emit("note", f"frames come again, after {silent_s:.1f} s without")
 
-    def _is_silent(self, heard_s: float) -> None:
+    def _check_stall(self, last_s: float) -> None:
         if not self._connection.is_free:
             return
-        silent_s = time.monotonic() - heard_s
+        silent_s = time.monotonic() - last_s
         longest_s = max(SILENT_S, 20 / (self._connection.settings.rate_hz or 20))
         if silent_s > longest_s + HOPELESS_S:
             raise CameraLost(f"no frame came for {silent_s:.0f} s")
         if silent_s > longest_s and self.state == "running":
             self.state = "stalled"
-            self._tell("warning", f"no frame came for {silent_s:.1f} s; it is still connected")
+            self._emit("warning", f"no frame came for {silent_s:.1f} s; it is still connected")
 
-    def _hand_on(self, frame: CameraFrame) -> None:
+    def _deliver(self, frame: CameraFrame) -> None:
         known = self._connection
         if frame.image.shape != known.shape or frame.image.dtype != known.dtype:
             self._leave_out()
@@ -304,7 +304,7 @@ class Feed:
         if missing > known.spoiled:
             self._dropped.add(missing - known.spoiled)
         known.spoiled = 0
-        if self._set_words:
+        if self._setting_message:
             missing += self._end_setting(frame.arrived_s)
         self._arrived_s = frame.arrived_s
         if self._first_s is None:
@@ -319,12 +319,12 @@ class Feed:
         number = self._next + missing
         self._next, self._last_s = number + 1, time_s
         self._frames += 1
-        self._take(replace(frame, number=number, time_s=time_s))
+        self._on_frame(replace(frame, number=number, time_s=time_s))
 
     def _end_setting(self, arrived_s: float) -> int:
-        """Say how long no frames came for a setting; how many there would have been."""
+        """Raise the event of a setting; returns how many frames there would have been."""
         gap_s = arrived_s - (self._arrived_s or arrived_s)
-        self._tell_set(f"; {gap_s:.2f} s without frames")
+        self._emit_set(f"; {gap_s:.2f} s without frames")
         return max(0, round(gap_s * (self._connection.former_hz or 0.0)) - 1)
 
     def _leave_out(self) -> None:
@@ -332,9 +332,9 @@ class Feed:
         self._broken.add()
 
     def _reopen(self) -> None:
-        """Open the camera again, however long that takes; or until the feed is to end."""
+        """Open the camera again, with retries until it succeeds or the feed is stopped."""
         gone_s = time.monotonic()
-        told: set[str] = set()
+        reported: set[str] = set()
         self.camera.close()
         for pause_s in itertools.chain(RETRY_S, itertools.repeat(RETRY_S[-1])):
             if self._ending.wait(pause_s):
@@ -344,19 +344,19 @@ class Feed:
             except CameraLost:
                 continue
             except (CameraError, InputError) as error:
-                if str(error) not in told:
-                    told.add(str(error))
-                    self._tell("warning", str(error))
+                if str(error) not in reported:
+                    reported.add(str(error))
+                    self._emit("warning", str(error))
                 continue
-            while self._pulls.acquire(blocking=False):
+            while self._triggers.acquire(blocking=False):
                 pass  # of a moment that has gone
             away_s = time.monotonic() - gone_s
-            self._tell("note", f"it is back after {away_s:.1f} s, set as before")
+            self._emit("note", f"it is back after {away_s:.1f} s, set as before")
             return
 
 
 class _Connection:
-    """What is known of a camera from when it was opened to when it is lost."""
+    """State of a camera from its opening to its loss."""
 
     def __init__(self, camera: Camera) -> None:
         self.settings = camera.settings
@@ -373,16 +373,16 @@ class _Connection:
 
     @property
     def is_free(self) -> bool:
-        """Whether frames come by themselves."""
+        """Whether the camera is free-running."""
         return self.settings.trigger in (None, "free")
 
     @property
     def last_hz(self) -> float | None:
-        """The rate at which frames came last."""
+        """Last frame rate, Hz."""
         return self.former_hz if self._number is None else self.settings.rate_hz
 
     def missing(self, frame: CameraFrame, overrun: int) -> int:
-        """How many frames should have come before this one and did not."""
+        """Number of frames missing before this one."""
         gap = 0 if self._number is None else max(0, frame.number - self._number - 1)
         more, self._overrun = max(0, overrun - self._overrun), overrun
         self._number = frame.number

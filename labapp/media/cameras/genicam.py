@@ -168,9 +168,9 @@ class Aravis:
         except CameraError:
             return []
         texts = ctypes.cast(found, POINTER(c_char_p))
-        told = [texts[k] or b"" for k in range(count.value)]
+        names = [texts[k] or b"" for k in range(count.value)]
         self._glib.g_free(found)
-        return told
+        return names
 
     def release(self, thing: int) -> None:
         """Let go of a camera, a stream or a buffer."""

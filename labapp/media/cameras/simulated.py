@@ -196,7 +196,7 @@ class SimulatedCamera(Camera):
         check_settings(self.info, self.limits, wanted)
         for name in ("exposure_us", "gain_db"):
             assert getattr(wanted, name) is None  # no limits: refused above
-        self._device.settings = replace(self._device.settings, **wanted.asked())
+        self._device.settings = replace(self._device.settings, **wanted.specified())
         return self.settings
 
     def start(self) -> None:

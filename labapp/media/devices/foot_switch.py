@@ -23,7 +23,7 @@ from labapp.media.devices.hid import (
     has_numbers,
     open_hid,
 )
-from labapp.media.events import Say, silent
+from labapp.media.events import OnEvent, ignore_event
 
 Action = Literal["trigger", "mark", "next"]
 """Begin a recording; mark the frame; go to the next step."""
@@ -62,25 +62,25 @@ class PedalMap:
     actions: Mapping[int, Action] = field(default_factory=dict)
 
     def with_action(self, pedal: int, action: Action | None) -> PedalMap:
-        """The same with a pedal that does something else; None: nothing."""
+        """Copy with another action of a pedal; None: no action."""
         actions = {key: value for key, value in self.actions.items() if key != pedal}
         if action is not None:
             actions[pedal] = action
         return replace(self, actions=actions)
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain values, to be kept."""
+        """Plain values, for the preferences."""
         actions = {str(pedal): action for pedal, action in self.actions.items()}
         return {**vars(self), "actions": actions}
 
     @classmethod
     def from_dict(cls, values: Any) -> PedalMap:
-        """Take what `as_dict` gave.
+        """Inverse of `as_dict`.
 
         Raises
         ------
         InputError
-            If it is anything else.
+            If the values are invalid.
         """
         try:
             actions = {int(pedal): action for pedal, action in values["actions"].items()}
@@ -97,19 +97,19 @@ class PedalMap:
 
 @dataclass(frozen=True)
 class Learned:
-    """A pedal that was pressed: on which device, and its number there."""
+    """A pedal that was pressed: its device, and its number there."""
 
     info: HidInfo
     pedal: int
 
     def mapped(self, action: Action) -> PedalMap:
-        """A foot switch of which this pedal does something."""
+        """Foot switch with an action of this pedal."""
         info = self.info
         return PedalMap(info.key, info.name, info.is_keyboard, {self.pedal: action})
 
 
 class Pedals:
-    """Which pedals of a device are down, told by its reports.
+    """State of a device's pedals, from its reports.
 
     A keyboard's report lists its keys; of any other device every bit may be a pedal, and those
     that are set without one, as by a joystick's axes, count for nothing.
@@ -126,18 +126,18 @@ class Pedals:
 
     @property
     def down(self) -> frozenset[int]:
-        """Pedals that are down, as told last."""
+        """Pedals that are down by the last reports."""
         return frozenset().union(*self._down.values())
 
     def pressed(self, number: int, report: bytes) -> frozenset[int]:
-        """Pedals that a report tells to be down, and that were not before.
+        """Pedals that are down by a report and were not before.
 
         Parameters
         ----------
         number
-            Number of the kind of report; 0 where there is one kind; −1: the device is gone.
+            Report ID; 0 where there is none; −1: the device is gone.
         report
-            What follows it.
+            Its bytes, without the ID.
         """
         if number < 0:
             self._down.clear()
@@ -161,34 +161,39 @@ def _bits(number: int, report: bytes) -> frozenset[int]:
 
 
 class FootSwitch:
-    """A foot switch in use: what is pressed is done, whenever it is plugged in.
+    """A foot switch in use, whenever it is plugged in.
 
     Parameters
     ----------
     pedals
-        Which it is, and what its pedals do; what they do may be set otherwise at any time.
-    do
-        Called with what is to be done, in a thread of the foot switch.
-    say
-        Called with what happens.
-    find, opened
-        In tests others.
+        The device and its pedals' actions, which may be replaced at any time.
+    on_action
+        Called with an action when its pedal is pressed, in a thread of the foot switch.
+    on_event
+        Called with every event.
+    find, opener
+        Find and open devices; tests replace them.
     """
 
     def __init__(
         self,
         pedals: PedalMap,
-        do: Callable[[Action], None],
-        say: Say = silent,
+        on_action: Callable[[Action], None],
+        on_event: OnEvent = ignore_event,
         find: Find = find_hid,
-        opened: Open = open_hid,
+        opener: Open = open_hid,
     ) -> None:
         self.pedals = pedals
-        self._do = do
+        self._on_action = on_action
         self._known = Pedals(pedals.keyboard)
         self._down_s: dict[int, float] = {}
         self._reader = HidReader(
-            lambda info: info.key == pedals.device, pedals.name, self._hear, say, find, opened
+            lambda info: info.key == pedals.device,
+            pedals.name,
+            self._on_report,
+            on_event,
+            find,
+            opener,
         )
 
     @property
@@ -197,7 +202,7 @@ class FootSwitch:
         return self._reader.connected
 
     def stop(self) -> None:
-        """Do nothing any more. Twice does no harm."""
+        """Stop. Twice does no harm."""
         self._reader.stop()
 
     def __enter__(self) -> FootSwitch:
@@ -206,7 +211,7 @@ class FootSwitch:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _hear(self, number: int, report: bytes) -> None:
+    def _on_report(self, number: int, report: bytes) -> None:
         now_s, before = time.monotonic(), self._known.down
         new = self._known.pressed(number, report)
         first = [p for p in sorted(new) if now_s - self._down_s.get(p, -math.inf) >= BOUNCE_S]
@@ -217,30 +222,30 @@ class FootSwitch:
         for pedal in first:
             action = self.pedals.actions.get(pedal)
             if action is not None:
-                self._do(action)
+                self._on_action(action)
 
 
 def learn(
     ending: threading.Event,
     find: Find = find_hid,
-    opened: Open = open_hid,
-    told: Callable[[list[str]], None] = lambda _: None,
+    opener: Open = open_hid,
+    on_problems: Callable[[list[str]], None] = lambda _: None,
 ) -> Learned | None:
-    """Wait until a pedal is pressed, on whatever device but 3-D controllers and mice.
+    """Wait for a pedal on any device but 3-D controllers and mice.
 
     Parameters
     ----------
     ending
-        Set to wait no longer.
-    find, opened
-        In tests others.
-    told
-        Called once with why some devices cannot be listened to.
+        Set to stop waiting.
+    find, opener
+        Find and open devices; tests replace them.
+    on_problems
+        Called once with why some devices cannot be read.
 
     Returns
     -------
     Learned
-        What was pressed; None if ``ending`` was set first.
+        The pedal; None if ``ending`` was set first.
 
     Raises
     ------
@@ -249,10 +254,10 @@ def learn(
     """
     problems: list[str] = []
     with ExitStack() as devices:
-        listening = list(_listen(find(), opened, devices, problems))
+        listening = list(_listen(find(), opener, devices, problems))
         if not listening:
             raise HidError("; ".join(problems) or "no foot switch is connected: plug it in")
-        told(problems)
+        on_problems(problems)
         while not ending.is_set():
             for info, device, numbered, pedals in tuple(listening):
                 try:
@@ -271,13 +276,13 @@ def learn(
 
 
 def _listen(
-    infos: Iterable[HidInfo], opened: Open, devices: ExitStack, problems: list[str]
+    infos: Iterable[HidInfo], opener: Open, devices: ExitStack, problems: list[str]
 ) -> Iterable[tuple[HidInfo, HidDevice, bool, Pedals]]:
     for info in infos:
         if info.is_3d or (info.is_mouse and not info.is_pedal):
             continue
         try:
-            device = opened(info)
+            device = opener(info)
         except HidError as error:
             problems.append(str(error))
             continue

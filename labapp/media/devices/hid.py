@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from labapp.bundled import bundled
 from labapp.errors import InputError
-from labapp.media.events import Event, Kind, Say, silent
+from labapp.media.events import Event, Kind, OnEvent, ignore_event
 from labapp.system import IS_LINUX
 
 LONGEST = 64
@@ -105,23 +105,23 @@ class HidDevice(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the device."""
         ...
 
     def get_report_descriptor(self) -> list[int]:
-        """Say how reports are made up."""
+        """Report descriptor (HID 1.11, §6.2.2)."""
         ...
 
 
 Find = Callable[[], Iterable[HidInfo]]
 Open = Callable[[HidInfo], HidDevice]
 
-_turn = threading.Lock()
-"""hidapi keeps one last error for all: it is not to be asked by several threads at once."""
+_mutex = threading.Lock()
+"""hidapi keeps one global last error: calls from several threads are serialised."""
 
 
 def find_hid() -> list[HidInfo]:
-    """Devices that are connected, foot switches that are known first.
+    """Connected devices, known foot switches first.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def find_hid() -> list[HidInfo]:
         If hidapi is not installed.
     """
     hidraw = _hidraw()
-    with _turn:
+    with _mutex:
         entries = hidraw.enumerate()
     found = [
         HidInfo(
@@ -147,8 +147,8 @@ def find_hid() -> list[HidInfo]:
 
 def _name(entry: Mapping[str, Any]) -> str:
     known = KNOWN.get((entry["vendor_id"], entry["product_id"]))
-    told = f"{entry['manufacturer_string'] or ''} {entry['product_string'] or ''}".strip()
-    return known or told or f"{entry['vendor_id']:04x}:{entry['product_id']:04x}"
+    own = f"{entry['manufacturer_string'] or ''} {entry['product_string'] or ''}".strip()
+    return known or own or f"{entry['vendor_id']:04x}:{entry['product_id']:04x}"
 
 
 def open_hid(info: HidInfo) -> HidDevice:
@@ -161,7 +161,7 @@ def open_hid(info: HidInfo) -> HidDevice:
     """
     device: HidDevice = _hidraw().device()
     try:
-        with _turn:
+        with _mutex:
             device.open_path(os.fsencode(info.path))  # type: ignore[attr-defined]
     except OSError as error:
         raise HidError(why_closed(info)) from error
@@ -181,12 +181,12 @@ def why_closed(info: HidInfo) -> str:
 
 
 def may_be_read(info: HidInfo) -> bool:
-    """Whether the user has the right to; elsewhere than on Linux only opening it tells."""
+    """Whether the user may read a device; True except on Linux, where it can be told beforehand."""
     return not IS_LINUX or os.access(info.path, os.R_OK | os.W_OK)
 
 
 def commands(info: HidInfo) -> str:
-    """What to type for the right to read a device: it installs `RULES`, or a rule of its own."""
+    """Shell commands that allow reading a device: they install `RULES`, or a rule for it alone."""
     rules = bundled(RULES)
     if (info.is_pedal or info.is_3d) and rules.is_file():
         install = f"sudo cp {shlex.quote(str(rules))} {RULES_FOLDER}"
@@ -200,12 +200,12 @@ def commands(info: HidInfo) -> str:
 
 
 def has_numbers(descriptor: Iterable[int]) -> bool:
-    """Whether a device's reports begin with a number, as it has several kinds of them.
+    """Whether a device's reports begin with a report ID.
 
     Parameters
     ----------
     descriptor
-        Its report descriptor (HID 1.11, §6.2.2): items of a byte that tells tag and size, and data.
+        Its report descriptor (HID 1.11, §6.2.2): items of a byte with tag and size, and data.
     """
     items = iter(descriptor)
     for item in items:
@@ -221,48 +221,48 @@ def has_numbers(descriptor: Iterable[int]) -> bool:
 
 
 class HidReader:
-    """Reads a device in a thread, and opens it again when it was unplugged.
+    """Reader thread of a device, which reconnects after unplugging.
 
     Parameters
     ----------
-    is_it
-        Tells the device from others.
+    matches
+        Selects the device.
     name
-        What to call it in what is said.
-    hear
-        Called with every report, (its number or 0, its bytes), in the reader's thread; with
-        (−1, nothing) when the device is gone: what was pressed is released.
-    say
-        Called with what happens.
-    find, opened
-        In tests others.
+        Its name in events.
+    on_report
+        Called with every report, (report ID or 0, bytes), in the reader's thread; with (−1, b"")
+        when the device is gone: what was pressed is released.
+    on_event
+        Called with every event.
+    find, opener
+        Find and open devices; tests replace them.
     retry_s
-        Pause between looks for a device that is not there; None: `RETRY_S`.
+        Pause between searches for a missing device, s; None: `RETRY_S`.
     """
 
     def __init__(
         self,
-        is_it: Callable[[HidInfo], bool],
+        matches: Callable[[HidInfo], bool],
         name: str,
-        hear: Callable[[int, bytes], None],
-        say: Say = silent,
+        on_report: Callable[[int, bytes], None],
+        on_event: OnEvent = ignore_event,
         find: Find = find_hid,
-        opened: Open = open_hid,
+        opener: Open = open_hid,
         retry_s: float | None = None,
     ) -> None:
         self.connected = False
-        self._is_it, self._name = is_it, name
+        self._matches, self._name = matches, name
         self._retry_s = retry_s
-        self._hear, self._say = hear, say
-        self._find, self._opened = find, opened
-        self._told = ""
+        self._on_report, self._on_event = on_report, on_event
+        self._find, self._opener = find, opener
+        self._reported = ""
         self._gone_s = time.monotonic()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"reader of {name}", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Read no more. Twice does no harm."""
+        """Stop reading. Twice does no harm."""
         self._ending.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
@@ -279,55 +279,55 @@ class HidReader:
                 try:
                     self._read_on()
                 except (HidError, OSError, ValueError) as error:
-                    self._is_gone(str(error) if isinstance(error, HidError) else UNPLUGGED)
+                    self._on_disconnect(str(error) if isinstance(error, HidError) else UNPLUGGED)
                     self._ending.wait(self._retry_s or RETRY_S)
         except Exception as error:
             logging.getLogger("labapp").exception("reader of %s", self._name)
-            self._tell("warning", f"a fault in the program: {error!r}")
+            self._emit("warning", f"a fault in the program: {error!r}")
         self.connected = False
 
-    def _is_gone(self, words: str) -> None:
-        """Say why nothing is read, once; that what was unplugged is not connected says nothing."""
+    def _on_disconnect(self, words: str) -> None:
+        """Raise an event on why nothing is read, once for each reason."""
         if self.connected:
             self.connected = False
             self._gone_s = time.monotonic()
-            self._hand_on(-1, b"")
-        if words != self._told and not (self._told and words == AWAY):
-            self._tell("warning", words)
-            self._told = words
+            self._deliver(-1, b"")
+        if words != self._reported and not (self._reported and words == AWAY):
+            self._emit("warning", words)
+            self._reported = words
 
     def _read_on(self) -> None:
-        info = next(filter(self._is_it, self._find()), None)
+        info = next(filter(self._matches, self._find()), None)
         if info is None:
             raise HidError(AWAY)
-        device = self._opened(info)
+        device = self._opener(info)
         try:
             numbered = has_numbers(device.get_report_descriptor())
             away_s = time.monotonic() - self._gone_s
-            self._tell("note", f"connected after {away_s:.1f} s" if self._told else "connected")
-            self._told, self.connected = "", True
+            self._emit("note", f"connected after {away_s:.1f} s" if self._reported else "connected")
+            self._reported, self.connected = "", True
             while not self._ending.is_set():
                 report = bytes(device.read(LONGEST, WAIT_MS))
                 if report:
-                    self._hand_on(report[0] if numbered else 0, report[numbered:])
+                    self._deliver(report[0] if numbered else 0, report[numbered:])
         finally:
             device.close()
 
-    def _hand_on(self, number: int, report: bytes) -> None:
-        """Let a report be heard; what goes wrong with what it does ends no reading."""
+    def _deliver(self, number: int, report: bytes) -> None:
+        """Call `on_report`; an error in it is an event and ends no reading."""
         try:
-            self._hear(number, report)
+            self._on_report(number, report)
         except Exception as error:
             if not isinstance(error, InputError):
                 logging.getLogger("labapp").exception("%s, report %s", self._name, report.hex())
-            self._tell("warning", f"what it was pressed for failed: {error}")
+            self._emit("warning", f"what it was pressed for failed: {error}")
 
-    def _tell(self, kind: Kind, words: str) -> None:
-        self._say(Event(self._name, kind, words))
+    def _emit(self, kind: Kind, words: str) -> None:
+        self._on_event(Event(self._name, kind, words))
 
 
 def _hidraw() -> Any:
-    """The part of hidapi that reads through the system, which leaves its drivers alone."""
+    """Module of hidapi that reads through the operating system's drivers."""
     try:
         if IS_LINUX:
             import hidraw

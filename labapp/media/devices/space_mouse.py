@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from labapp.media.devices.hid import AWAY, MISSING, Find, HidReader, Open, find_hid, open_hid
-from labapp.media.events import Event, Say, silent
+from labapp.media.events import Event, OnEvent, ignore_event
 
 RETRY_S = 2.0
 """Pause between looks for one: most benches have none."""
@@ -63,29 +63,35 @@ class SixAxes:
 
 
 class SpaceMouse:
-    """The controller that is plugged in, if one is, read in a thread.
+    """Reader thread of the connected controller, if there is one.
 
     Parameters
     ----------
-    hold
-        Called with how it is held whenever that changes, in the reader's thread.
-    say
-        Called with what happens; that there is none is not told.
-    find, opened
-        In tests others.
+    on_move
+        Called with its state whenever that changes, in the reader's thread.
+    on_event
+        Called with every event but that none is connected.
+    find, opener
+        Find and open devices; tests replace them.
     """
 
     def __init__(
         self,
-        hold: Callable[[SixAxes], None],
-        say: Say = silent,
+        on_move: Callable[[SixAxes], None],
+        on_event: OnEvent = ignore_event,
         find: Find = find_hid,
-        opened: Open = open_hid,
+        opener: Open = open_hid,
     ) -> None:
-        self._hold, self._say = hold, say
+        self._on_move, self._on_event = on_move, on_event
         self._held = SixAxes()
         self._reader = HidReader(
-            lambda info: info.is_3d, "3-D controller", self._hear, self._tell, find, opened, RETRY_S
+            lambda info: info.is_3d,
+            "3-D controller",
+            self._on_report,
+            self._emit,
+            find,
+            opener,
+            RETRY_S,
         )
 
     @property
@@ -94,18 +100,18 @@ class SpaceMouse:
         return self._reader.connected
 
     def stop(self) -> None:
-        """Read no more. Twice does no harm."""
+        """Stop reading. Twice does no harm."""
         self._reader.stop()
 
-    def _tell(self, event: Event) -> None:
+    def _emit(self, event: Event) -> None:
         if event.words not in (AWAY, MISSING):
-            self._say(event)
+            self._on_event(event)
 
-    def _hear(self, number: int, report: bytes) -> None:
+    def _on_report(self, number: int, report: bytes) -> None:
         held = self._held.after(number, report)
         if held != self._held:
             self._held = held
-            self._hold(held)
+            self._on_move(held)
 
 
 def _axes(report: bytes) -> tuple[float, float, float]:

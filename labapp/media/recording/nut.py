@@ -1,4 +1,4 @@
-"""Writes frames as a video that loses nothing and is whole up to wherever it is cut off.
+"""Writing of lossless video that can be read up to wherever it is cut off.
 
 NUT (docs/adr/0015): every frame is written at once, with its own time to the microsecond.
 """
@@ -30,23 +30,23 @@ FFV1 = {"level": "3", "slices": "4", "slicecrc": "1", "g": "1", "context": "0"}
 
 
 class ByteFile(Protocol):
-    """What is written to: a file without a buffer of its own."""
+    """Unbuffered binary file."""
 
     def write(self, content: memoryview) -> int:
-        """Write it or the beginning of it, and tell how many bytes; or raise OSError."""
+        """Write all or the beginning, and return the number of bytes; or raise OSError."""
         ...
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the file."""
         ...
 
 
 class WrongFrame(ValueError):
-    """A frame is not as the video's are, and was left out; the next may be."""
+    """A frame does not fit the video and was left out; the next one may fit."""
 
 
-class _Whole:
-    """A file that everything is written to: a disk that is nearly full takes a part at first."""
+class _CompleteWriter:
+    """Repeats partial writes: a disk that is nearly full takes a part at first."""
 
     def __init__(self, file: ByteFile) -> None:
         self._file = file
@@ -61,24 +61,24 @@ class _Whole:
 
 
 class NutWriter:
-    """A video in NUT that is being written.
+    """Writer of a video in NUT.
 
     Parameters
     ----------
     path
-        Where to; must not be there yet.
+        A new file.
     shape
         (rows, columns) of every frame.
     bit_depth
-        Significant bits of a grey level: to 8 uint8 is written, beyond uint16.
+        Significant bits of a grey level: up to 8 for uint8, else for uint16.
     rate_hz
-        Frames a second, as the video's header has it; frames have times of their own.
+        Frame rate in the header, Hz; frames have time stamps of their own.
     codec
         ``ffv1``: about half the size; ``raw``: the levels as they are.
     threads
         That encode.
     file
-        What to write to, in place of a file at ``path``.
+        Written instead of a file at ``path``.
 
     Raises
     ------
@@ -97,7 +97,7 @@ class NutWriter:
         file: ByteFile | None = None,
     ) -> None:
         self.frames = 0
-        self._file = _Whole(_made(path) if file is None else file)
+        self._file = _CompleteWriter(_create(path) if file is None else file)
         self._shape, self._top = shape, 2**bit_depth - 1
         self._dtype = np.uint8 if bit_depth <= 8 else np.uint16
         # An index at the end would have to be kept in memory: 240 bytes a frame, for hours.
@@ -165,11 +165,11 @@ class NutWriter:
 
 
 def _levels(bit_depth: int, codec: Codec) -> int:
-    """Bits that FFmpeg stores for so many: it has none for each, and of raw ones reads 16 only."""
+    """Bits of the pixel format: FFmpeg has some depths only, and reads raw video with 16 only."""
     return 16 if codec == "raw" else next(n for n in (10, 12, 14, 16) if n >= bit_depth)
 
 
-def _made(path: Path) -> ByteFile:
+def _create(path: Path) -> ByteFile:
     try:
         return path.open("xb", buffering=0)
     except OSError as error:

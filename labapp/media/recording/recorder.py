@@ -19,7 +19,7 @@ from pathlib import Path
 
 from labapp.errors import InputError
 from labapp.media.cameras.base import CameraFrame
-from labapp.media.events import Event, Kind, Say, Tally, silent
+from labapp.media.events import Event, Kind, OnEvent, Tally, ignore_event
 from labapp.media.recording.nut import TICKS_HZ, Codec, NutWriter, WrongFrame
 from labapp.media.recording.take_files import Note, Take, TakeFiles, notes_of
 from labapp.text import pluralize
@@ -35,7 +35,7 @@ STALL_S = 1.0
 """A disk that takes longer for a frame is said to stall."""
 
 RATE_HZ = 25.0
-"""Stands in the video's header where the camera does not say its rate."""
+"""Frame rate in the video's header where the camera's is unknown."""
 
 
 @dataclass(frozen=True)
@@ -85,47 +85,47 @@ class Plan:
 
 
 _Item = tuple[Take, CameraFrame | Note | None]
-"""What is to be done for a recording: write a frame or a note, or end it."""
+"""Task of the writer: a frame or a note of a recording, or None to end it."""
 
 
 class Recorder:
-    """Takes every frame of a camera and records those that are wanted.
+    """Records frames of a camera, with a buffer of those before the trigger.
 
-    `take` never waits; what the disk has no time for yet waits in memory, and only when that is
-    full frames are left out, which is said. The methods may be called from any thread.
+    `take` never waits: frames that are not written yet are queued in memory, and left out, with an
+    event, only when that is full. The methods may be called from any thread.
 
     Parameters
     ----------
-    place
-        Gives the file of a recording that begins; it and its notes must not be there yet.
+    new_path
+        Returns the path of a new recording; it and its notes must not exist.
     plan
         What is recorded.
     bit_depth, rate_hz
         Of the camera.
-    say
-        Called with what happens.
+    on_event
+        Called with every event.
     writer
         Opens the file of a recording: (path, shape, bit_depth, rate_hz, codec).
     """
 
     def __init__(
         self,
-        place: Callable[[], Path],
+        new_path: Callable[[], Path],
         plan: Plan,
         bit_depth: int,
         rate_hz: float | None,
-        say: Say = silent,
+        on_event: OnEvent = ignore_event,
         writer: Callable[..., NutWriter] = NutWriter,
     ) -> None:
         self.plan = plan
         self.takes: list[Take] = []
-        self._place = place
+        self._new_path = new_path
         self._bit_depth = bit_depth
         self._rate_hz = (rate_hz or RATE_HZ) / plan.every
-        self._say = say
+        self._on_event = on_event
         self._open = writer
         self._memory_byte = round(plan.memory_mb * 1e6)
-        self._turn = threading.Condition()
+        self._condition = threading.Condition()
         self._ring: deque[CameraFrame] = deque()
         self._queue: deque[_Item] = deque()
         self._held_byte = 0
@@ -133,7 +133,7 @@ class Recorder:
         self._running: Take | None = None
         self._closing = self._is_short = self._is_behind = False
         self._writing_since_s = float("inf")
-        self._lost = Tally(self._tell_lost)
+        self._lost = Tally(self._emit_lost)
         sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_S))
         self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
         self._thread.start()
@@ -142,24 +142,24 @@ class Recorder:
 
     @property
     def running(self) -> Take | None:
-        """The recording that frames go into now."""
+        """The present recording."""
         return self._running
 
     @property
     def waiting_mb(self) -> float:
-        """Memory that frames take now, MB."""
+        """Memory that frames occupy, MB."""
         return self._held_byte / 1e6
 
     @property
     def ring_s(self) -> float:
-        """How many seconds are kept for before a trigger."""
-        with self._turn:
+        """Length of the pre-trigger buffer, s."""
+        with self._condition:
             return self._ring[-1].time_s - self._ring[0].time_s if self._ring else 0.0
 
     def take(self, frame: CameraFrame) -> None:
-        """Take a frame of the camera; never waits."""
-        told: list[tuple[Kind, str]] = []
-        with self._turn:
+        """Accept a frame of the camera; never waits."""
+        events: list[tuple[Kind, str]] = []
+        with self._condition:
             self._newest_s = frame.time_s
             if frame.number % self.plan.every or self._closing:
                 return
@@ -169,7 +169,7 @@ class Recorder:
                 or self._held_byte + size > self._memory_byte
             ):
                 if self._ring[0].time_s >= frame.time_s - self.plan.before_s:
-                    told += self._ring_is_short(frame)
+                    events += self._ring_is_short(frame)
                 self._held_byte -= _size(self._ring.popleft())
             running = self._running
             has_room = self._held_byte + size <= self._memory_byte
@@ -177,25 +177,25 @@ class Recorder:
                 self._ring.append(frame)
                 self._held_byte += size
             elif running is not None:
-                told += self._record(running, frame, size if has_room else None)
-        for kind, words in told:
-            self._tell(kind, words)
+                events += self._record(running, frame, size if has_room else None)
+        for kind, words in events:
+            self._emit(kind, words)
         self._lost.flush()
 
     def trigger(self) -> Take:
-        """Begin a recording, with the frames of the seconds before; the one that runs if one does.
+        """Begin a recording, with the frames before the trigger; or return the present one.
 
         Raises
         ------
         InputError
             If there is such a file, or its notes, already; or the recorder was closed.
         """
-        with self._turn:
+        with self._condition:
             if self._closing:
                 raise InputError("recording", "trigger", "closed", "one before it is closed")
             if self._running is not None:
                 return self._running
-            path = self._apart(self._place())
+            path = self._apart(self._new_path())
             take = self._running = Take(path, triggered_s=self._newest_s)
             self.takes.append(take)
             self._queue.extend((take, frame) for frame in self._ring)
@@ -204,34 +204,34 @@ class Recorder:
             self._add_note(
                 take, Event("recording", "note", f"trigger, {pluralize(count, 'frame')} before it")
             )
-            self._turn.notify()
-        self._say(Event(path.name, "note", "recording"))
+            self._condition.notify()
+        self._on_event(Event(path.name, "note", "recording"))
         return take
 
     def stop(self) -> None:
-        """End the recording that runs; what waits is still written."""
+        """End the present recording; queued frames are still written."""
         self._lost.flush(now=True)
-        with self._turn:
+        with self._condition:
             if self._running is not None:
                 self._end(self._running)
 
     def note(self, event: Event, time_s: float | None = None) -> None:
-        """Keep what happened beside the recording that runs, by the camera's clock; None: now."""
-        with self._turn:
+        """Add an event to the present notes; ``time_s`` by the camera's clock, None: now."""
+        with self._condition:
             if self._running is not None:
                 self._add_note(self._running, event, time_s)
-                self._turn.notify()
+                self._condition.notify()
 
     def close(self) -> None:
         """End the recording, and wait until all of it is written. Twice does no harm."""
         self.stop()
-        with self._turn:
+        with self._condition:
             self._closing = True
             if self._running is not None:  # triggered meanwhile
                 self._end(self._running)
             self._held_byte -= sum(_size(frame) for frame in self._ring)
             self._ring.clear()
-            self._turn.notify()
+            self._condition.notify()
         self._thread.join()
         self._lost.flush(now=True)
 
@@ -244,27 +244,27 @@ class Recorder:
     # --- in the camera's thread ---------------------------------------------------------------
 
     def _record(self, take: Take, frame: CameraFrame, size: int | None) -> list[tuple[Kind, str]]:
-        """Queue a frame of the recording that runs; ``size`` None: there is no room for it."""
-        told: list[tuple[Kind, str]] = []
+        """Queue a frame; ``size`` None: there is no memory for it."""
+        events: list[tuple[Kind, str]] = []
         if take.ends_s is None and self.plan.after_s is not None:
             # Not from the newest frame at the trigger on: the camera may have been away since.
             take.ends_s = frame.time_s + self.plan.after_s
         if take.ends_s is not None and frame.time_s > take.ends_s - 1 / TICKS_HZ:
             self._end(take)
-            return told
+            return events
         if take.trouble or size is None:
             take.lost += 1
             if not take.trouble:
                 self._lost.count()
-            return told
+            return events
         self._queue.append((take, frame))
         self._held_byte += size
-        told += self._falls_behind()
-        self._turn.notify()
-        return told
+        events += self._falls_behind()
+        self._condition.notify()
+        return events
 
     def _falls_behind(self) -> list[tuple[Kind, str]]:
-        """Say that frames wait, the first time that they do."""
+        """Event that writing falls behind, the first time that it does."""
         writing_s = time.monotonic() - self._writing_since_s
         if self._is_behind or (self._held_byte <= self._memory_byte / 2 and writing_s < STALL_S):
             return []
@@ -285,7 +285,7 @@ class Recorder:
         return [("warning", words)]
 
     def _apart(self, path: Path) -> Path:
-        """Give a path, or one beside it where a recording of ours is about to be."""
+        """Path, numbered where another recording of ours has it."""
         own, wanted = {take.path for take in self.takes}, path
         for number in itertools.count(2):
             if path not in own:
@@ -299,39 +299,39 @@ class Recorder:
     def _end(self, take: Take) -> None:
         self._queue.append((take, None))
         self._running = None
-        self._turn.notify()
+        self._condition.notify()
 
     def _add_note(self, take: Take, event: Event, time_s: float | None = None) -> None:
         self._queue.append((take, Note(self._newest_s if time_s is None else time_s, event)))
 
-    def _tell(self, kind: Kind, words: str) -> None:
+    def _emit(self, kind: Kind, words: str) -> None:
         event = Event("recording", kind, words)
-        self._say(event)
+        self._on_event(event)
         self.note(event)
 
-    def _tell_lost(self, count: int) -> None:
+    def _emit_lost(self, count: int) -> None:
         faster = "; raw is written faster" * (self.plan.codec == "ffv1")
         lost = pluralize(count, "frame")
-        self._tell("loss", f"{lost} lost: writing does not keep up, and memory is full{faster}")
+        self._emit("loss", f"{lost} lost: writing does not keep up, and memory is full{faster}")
 
     # --- in the writer's thread ---------------------------------------------------------------
 
     def _write_on(self) -> None:
         video: TakeFiles | None = None
         while True:
-            with self._turn:
-                self._turn.wait_for(lambda: self._queue or self._closing)
+            with self._condition:
+                self._condition.wait_for(lambda: self._queue or self._closing)
                 if not self._queue:
                     break
                 take, item = self._queue.popleft()
                 self._writing_since_s = time.monotonic()
             if video is None or video.take is not take:
-                video = TakeFiles(take, self._new_video, self._say)
+                video = TakeFiles(take, self._new_video, self._on_event)
             try:
-                video.do(item)
+                video.process(item)
             except Exception as error:
                 if isinstance(item, CameraFrame):
-                    with self._turn:
+                    with self._condition:
                         take.lost += 1
                 if isinstance(error, WrongFrame):
                     video.wrong.add()
@@ -339,43 +339,43 @@ class Recorder:
                     self._give_up(take, error)
             if item is None:
                 take.finished.set()
-            self._forget(item, take)
+            self._release(item, take)
 
     def _new_video(self, take: Take, shape: tuple[int, int]) -> NutWriter:
         return self._open(take.path, shape, self._bit_depth, self._rate_hz, self.plan.codec)
 
-    def _forget(self, item: CameraFrame | Note | None, take: Take) -> None:
-        """Give the memory of what was written free; say when all was caught up with."""
+    def _release(self, item: CameraFrame | Note | None, take: Take) -> None:
+        """Free the memory of a written frame; raise an event once the queue is empty again."""
         caught_up = False
-        with self._turn:
+        with self._condition:
             self._writing_since_s = float("inf")
             if isinstance(item, CameraFrame):
                 self._held_byte -= _size(item)
             if self._is_behind and not self._queue:
                 self._is_behind, caught_up = False, True
         if caught_up:
-            self._tell("note", "writing has caught up")
+            self._emit("note", "writing has caught up")
         if item is None:
             self._lost.flush(now=True)
-            self._say(take.summary)
+            self._on_event(take.summary)
 
     def _give_up(self, take: Take, error: Exception) -> None:
-        """Say why no more of a recording can be written; what is there stays."""
+        """Mark a recording as failed and raise an event; what is written stays."""
         if not isinstance(error, OSError | InputError):
             logging.getLogger("labapp").exception("recording %s", take.path)
         reason = (isinstance(error, OSError) and error.strerror) or error
         take.trouble = f"cannot be written: {reason}"
         words = f"{take.trouble}; what was written is whole: {pluralize(take.frames, 'frame')}"
-        self._say(Event(take.path.name, "loss", words))
+        self._on_event(Event(take.path.name, "loss", words))
 
 
 def _size(frame: CameraFrame) -> int:
-    """What a frame takes in memory, bytes."""
+    """Memory of a frame, bytes."""
     return frame.image.nbytes + FRAME_BYTE
 
 
 def recording_path(folder: Path, stem: str) -> Path:
-    """A file, not there yet, for a recording that begins now: its name ends in date and time."""
+    """Unused path for a recording that begins now, named by date and time."""
     begun = time.strftime("%Y-%m-%d-%H%M%S")
     path, count = folder / f"{stem}-{begun}.nut", 1
     while os.path.lexists(path) or os.path.lexists(notes_of(path)):

@@ -1,4 +1,4 @@
-"""What is beside each other on the disk of one recording: its video, and notes of what happened."""
+"""Files of one recording: its video, and a table of notes beside it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from labapp.media.cameras.base import CameraFrame
-from labapp.media.events import Event, Say, Tally
+from labapp.media.events import Event, OnEvent, Tally
 from labapp.media.recording.nut import NutWriter
 from labapp.text import as_cell, pluralize
 
@@ -20,7 +20,7 @@ NOTES = ("time_s", "frame", "source", "kind", "what")
 """Columns of the notes beside a recording; the frame is the one that was next at that time."""
 
 NOTED_LATE = 10_000
-"""A note may be of so many frames ago: what is measured by itself is told seconds later."""
+"""A note may refer to a time so many frames ago: measuring a frame can take seconds."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Note:
 
 
 def notes_of(path: Path) -> Path:
-    """The notes beside a recording."""
+    """Path of the notes of a recording."""
     return path.with_name(f"{path.stem}-notes.csv")
 
 
@@ -70,7 +70,7 @@ class Take:
 
     @property
     def summary(self) -> Event:
-        """What became of it."""
+        """Event that sums up the recording."""
         words = f"{pluralize(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
             self.lost > 0
         )
@@ -78,44 +78,44 @@ class Take:
 
     @property
     def notes(self) -> Path:
-        """Table of what happened meanwhile: trigger, marks, frames lost (CSV)."""
+        """Path of the notes (CSV): trigger, marks, frames lost."""
         return notes_of(self.path)
 
 
 class TakeFiles:
-    """Video and notes of a recording, while they are written; used by one thread.
+    """Writes video and notes of a recording; used by one thread.
 
     Parameters
     ----------
     take
-        The recording; what is written is counted there.
-    opened
+        The recording; frames are counted there.
+    opener
         Opens its video, for frames of a shape.
-    say
-        Called with what goes wrong.
+    on_event
+        Called with faults.
 
     Attributes
     ----------
     wrong
-        Frames that are not as the others are.
+        Frames of another size or with more bits.
     """
 
     def __init__(
-        self, take: Take, opened: Callable[[Take, tuple[int, int]], NutWriter], say: Say
+        self, take: Take, opener: Callable[[Take, tuple[int, int]], NutWriter], on_event: OnEvent
     ) -> None:
         self.take = take
-        self.wrong = Tally(self._tell_wrong)
-        self._opened = opened
-        self._say = say
+        self.wrong = Tally(self._emit_wrong)
+        self._opener = opener
+        self._on_event = on_event
         self._has_notes = True
         self._video: NutWriter | None = None
         self._early: list[Note] = []
-        """Notes from before the first frame, whose time they are told by."""
+        """Notes from before the first frame; their times are relative to it."""
         self._first_s = self._last_s = take.triggered_s
         self._times_s: deque[float] = deque(maxlen=NOTED_LATE)
 
-    def do(self, item: CameraFrame | Note | None) -> None:
-        """Write a frame or a note; None: end it."""
+    def process(self, item: CameraFrame | Note | None) -> None:
+        """Write a frame or a note; None: end the recording."""
         if isinstance(item, CameraFrame):
             self._write(item)
         elif item is None:
@@ -137,7 +137,7 @@ class TakeFiles:
             raise OSError(0, self.take.trouble)
         if self._video is None:
             rows, columns = frame.image.shape
-            self._video = self._opened(self.take, (rows, columns))
+            self._video = self._opener(self.take, (rows, columns))
         if not self.take.frames:
             self._first_s = frame.time_s
         self._video.write(frame.image, frame.time_s - self._first_s)
@@ -147,12 +147,12 @@ class TakeFiles:
         self._last_s = frame.time_s
         self._times_s.append(frame.time_s)
 
-    def _tell_wrong(self, count: int) -> None:
+    def _emit_wrong(self, count: int) -> None:
         frames = pluralize(count, "frame")
         words = f"{frames} left out: of another size, or brighter than the camera's bits allow"
         event = Event(self.take.path.name, "loss", words)
-        self._say(event)
-        self.do(Note(self._last_s, event))
+        self._on_event(event)
+        self.process(Note(self._last_s, event))
 
     def _note_early(self) -> None:
         early, self._early = self._early, []
@@ -160,7 +160,7 @@ class TakeFiles:
             self._note(note)
 
     def _note(self, note: Note) -> None:
-        """Add a row to the notes; the video goes on where that cannot be, which is said once."""
+        """Append a note; if that fails the video goes on, with one event."""
         time_s = note.time_s - self._first_s
         event = note.event
         later = len(self._times_s) - bisect_right(self._times_s, note.time_s)
@@ -176,4 +176,4 @@ class TakeFiles:
             if self._has_notes:
                 self._has_notes = False
                 words = f"not all notes can be written beside it: {error.strerror}"
-                self._say(Event(self.take.path.name, "warning", words))
+                self._on_event(Event(self.take.path.name, "warning", words))
