@@ -40,10 +40,10 @@ def sync_folder(path: Path) -> None:
 
 
 @contextmanager
-def deaf() -> Iterator[None]:
-    """Hold Ctrl-C back: processes that are started now never hear it; this one does afterwards.
+def interrupts_blocked() -> Iterator[None]:
+    """Block Ctrl-C: processes started meanwhile ignore it; this one receives it afterwards.
 
-    Windows has nothing like it: a process that is started there calls `turn_deaf` itself.
+    Windows has no such mask: a process that is started there calls `ignore_interrupts` itself.
     """
     if IS_WINDOWS:
         yield
@@ -55,14 +55,14 @@ def deaf() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, former)
 
 
-def turn_deaf() -> None:
-    """Hear no Ctrl-C from now on, where `deaf` cannot have seen to it; in the main thread."""
+def ignore_interrupts() -> None:
+    """Ignore Ctrl-C from now on, where `interrupts_blocked` has no effect; in the main thread."""
     if IS_WINDOWS:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def give_way(nice: int) -> None:
-    """Let processes go first that others wait for, by so much; not on Windows."""
+def lower_priority(nice: int) -> None:
+    """Raise the niceness of this process; without effect on Windows."""
     if not IS_WINDOWS:
         os.nice(nice)
 

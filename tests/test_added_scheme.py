@@ -86,7 +86,7 @@ found = {
     "surface page": offered(side.scheme),
     "comparison": offered(box.choice),
     "error analysis, window": dict(analysing.SCHEME_CHOICES),
-    "error analysis": dict.fromkeys(analysis.Question().schemes),
+    "error analysis": dict.fromkeys(analysis.AnalysisOptions().schemes),
     "survey": dict.fromkeys(error_analysis.survey.__defaults__[0]),
     "pictures": pictures.STYLE_OF,
 }

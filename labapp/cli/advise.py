@@ -56,9 +56,9 @@ def advise(
     Options replace what FILE.toml says. The setup.toml that is written lacks the image
     calibration, which the bench must be measured for: labapp calibrate plane.
     """
-    from labapp.studies.adviser.keys import parse_question, read_question
+    from labapp.studies.adviser.keys import parse_request, read_request
 
-    values = read_question(question) if question else {}
+    values = read_request(question) if question else {}
     kind = None if convex is None else "convex" if convex else "concave"
     for table, key, value in (
         ("pools", "kind", kind),
@@ -71,7 +71,7 @@ def advise(
     ):
         if value is not None and isinstance(values.setdefault(table, {}), dict):
             values[table][key] = value
-    expected, limits = parse_question(values, question or "labapp advise")
+    expected, limits = parse_request(values, question or "labapp advise")
     if not _advised(expected, limits, out, quick, check, seed):
         raise typer.Exit(NOTHING)
 

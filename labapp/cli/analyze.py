@@ -18,8 +18,8 @@ from labapp.errors import InputError
 from labapp.studies import SCHEMES
 from labapp.studies.analysis import (
     PARTS,
-    Made,
-    Question,
+    AnalysisOptions,
+    AnalysisPart,
     analyze_budget,
     analyze_errors,
     expected_pool,
@@ -50,7 +50,7 @@ def positioning(out: Out = None, tables: Tables = False, picture: Format = "png"
     placements = found.coverage()
     made = (*found.blocking_tables(), found.clearance_table(), found.coverage_table(placements))
     folder = results_folder(out, tables)
-    _keep(folder, Made(made, {}, made if tables else ()))
+    _keep(folder, AnalysisPart(made, {}, made if tables else ()))
     if folder is not None:
         from labapp.studies import pictures
 
@@ -67,7 +67,7 @@ def correspondence(out: Out = None, tables: Tables = False, picture: Format = "p
 
     made = found.correspondence_tables()
     folder = results_folder(out, tables)
-    _keep(folder, Made(made, {}, made if tables else ()))
+    _keep(folder, AnalysisPart(made, {}, made if tables else ()))
     if folder is not None:
         from labapp.studies import pictures
 
@@ -108,7 +108,7 @@ def errors(
 
     What is done is written before the next part begins. All of it takes long: see --part.
     """
-    question = Question(
+    options = AnalysisOptions(
         _chosen("part", part, PARTS),
         _chosen("scheme", scheme, SCHEMES),
         step,
@@ -118,7 +118,7 @@ def errors(
     )
     folder = writable_folder(out)
     with progress_shown() as progress:
-        for made in analyze_errors(question, progress):
+        for made in analyze_errors(options, progress):
             _keep(folder, made)
 
 
@@ -156,10 +156,10 @@ def _chosen(name: str, asked: list[str] | None, known: tuple[T, ...]) -> tuple[T
     return tuple(one for one in known if one in (asked or known))
 
 
-def _keep(folder: Path | None, made: Made) -> None:
+def _keep(folder: Path | None, made: AnalysisPart) -> None:
     """Write what a part gave, and print what is to be told of it."""
     if folder is not None:
         for name, content in made.files.items():
             write_file(folder / name, content)
-    for table in made.told:
+    for table in made.printed:
         typer.echo(table.markdown())

@@ -61,16 +61,6 @@ class Studio:
         return np.ascontiguousarray(picture[..., ::-1])
 
 
-def draw_scene(
-    scene: Scene, size: tuple[int, int] = PICTURE_PX, direction: Direction = "free"
-) -> Picture:
-    """Draw one scene; see `Studio`."""
-    studio = Studio(size, direction)
-    picture = studio.draw(scene)
-    studio.plotter.close()
-    return picture
-
-
 def drawing_process(
     size: tuple[int, int] = PICTURE_PX, direction: Direction = "free"
 ) -> ProcessPoolExecutor:

@@ -15,7 +15,7 @@ from labapp.core.quality import Quality, judge_quality
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.scene import Scene, scene_of
 from labapp.media.cameras import CameraFrame
-from labapp.simulation.parallel import begin_worker, end_processes
+from labapp.simulation.parallel import end_processes, start_worker
 
 JUDGED_S = 0.2
 """So long the verdict on a frame stands for those that are followed from it."""
@@ -69,7 +69,7 @@ class LiveMeasuring:
         spawn = multiprocessing.get_context("spawn")
         nice, given = 0, (setup, settings, bit_depth)  # its figures are looked at now
         self._pool = ProcessPoolExecutor(
-            1, spawn, initializer=begin_worker, initargs=(nice, _begin, *given)
+            1, spawn, initializer=start_worker, initargs=(nice, _begin, *given)
         )
 
     def measure(self, frame: CameraFrame, drawn: bool = False) -> LiveResult | None:

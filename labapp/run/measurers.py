@@ -32,7 +32,7 @@ from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
 from labapp.media import Frame, open_source
-from labapp.simulation.parallel import NICE, begin_worker
+from labapp.simulation.parallel import NICE, start_worker
 
 T = TypeVar("T")
 
@@ -125,7 +125,7 @@ def _threads() -> ThreadpoolController:
 def measuring_pool(workers: int) -> ProcessPoolExecutor:
     """Processes that measure: a window stays quick while they do."""
     spawn = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, spawn, initializer=begin_worker, initargs=(NICE,))
+    return ProcessPoolExecutor(workers, spawn, initializer=start_worker, initargs=(NICE,))
 
 
 def _in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:

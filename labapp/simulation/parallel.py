@@ -1,4 +1,4 @@
-"""Many independent simulations on all cores; and how a process begins that works for another."""
+"""Parallel execution in worker processes."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from labapp.system import deaf, give_way, turn_deaf
+from labapp.system import ignore_interrupts, interrupts_blocked, lower_priority
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 POLL_S = 0.2
-"""So often is told how far it is, done or not: who is told may end it."""
+"""Interval of calls to ``progress`` while a task is waited for, s; a call may raise to stop."""
 
 NICE = 10
-"""So much a process that works behind a window gives way to it."""
+"""Niceness of processes that work for a window."""
 
-_behind = ContextVar("behind", default=False)
-"""Whether what begins processes now works behind a window."""
+_low = ContextVar("low", default=False)
+"""Whether processes started now get a low priority."""
 
 _shared: ContextVar[ProcessPoolExecutor | None] = ContextVar("shared", default=None)
 """The processes of `shared_processes`."""
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""The matrices are small: more threads than one get in each other's way."""
+"""Variables that limit BLAS to one thread: for small matrices more are slower."""
 
 Progress = Callable[[str, int, int], None]
-"""Told what is being done, how many steps of it are done and how many there are."""
+"""Called with a name of the work, steps done and steps in all; may raise to stop."""
 
 
 def in_parallel(
@@ -46,18 +46,18 @@ def in_parallel(
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> list[R]:
-    """Call a function for every task; results in the order of the tasks.
+    """Map a function over tasks in parallel; results in the order of the tasks.
 
     Parameters
     ----------
     function
-        Of a module, so that another process finds it.
+        A function of a module, so that another process can import it.
     tasks
-        What it is called with, each on its own.
+        Its arguments, one per call.
     what, progress
-        What is being done, and who is told of it.
+        Name of the work, and the callback for it.
     workers
-        How many processes; None: one a core. With 1 all is done here.
+        Number of processes; None: one per core. With 1 all is done in this one.
 
     Raises
     ------
@@ -65,29 +65,29 @@ def in_parallel(
         On Ctrl-C. This, and what ``progress`` raises, ends the tasks being done.
     """
     tasks = list(tasks)
-    tell = progress or (lambda *_: None)
-    tell(what, 0, len(tasks))
+    report = progress or (lambda *_: None)
+    report(what, 0, len(tasks))
     workers = workers or os.cpu_count() or 1
     results = []
     if workers <= 1 or not tasks:
         with threadpool_limits(1, "blas"):
             for task in tasks:
                 results.append(function(task))
-                tell(what, len(results), len(tasks))
+                report(what, len(results), len(tasks))
         return results
     shared = _shared.get()
     with nullcontext(shared) if shared else processes(min(workers, len(tasks))) as pool:
-        with deaf():
+        with interrupts_blocked():
             futures = [pool.submit(function, task) for task in tasks]
         for future in futures:
-            results.append(awaited(future, lambda: tell(what, len(results), len(tasks))))
-            tell(what, len(results), len(tasks))
+            results.append(wait_for(future, lambda: report(what, len(results), len(tasks))))
+            report(what, len(results), len(tasks))
     return results
 
 
 @contextmanager
 def shared_processes(workers: int | None = None) -> Iterator[None]:
-    """Let every `in_parallel` within this use the same processes: each takes seconds to begin.
+    """Reuse the same processes for every `in_parallel` within: each takes seconds to start.
 
     Parameters
     ----------
@@ -106,10 +106,10 @@ def shared_processes(workers: int | None = None) -> Iterator[None]:
             _shared.reset(former)
 
 
-def awaited(future: Future[R], tell: Callable[[], None]) -> R:
-    """Result of a task in another process; ``tell`` is called meanwhile, and may end the wait."""
+def wait_for(future: Future[R], poll: Callable[[], None]) -> R:
+    """Result of a task in another process; ``poll`` is called meanwhile and may raise to stop."""
     while not wait([future], POLL_S).done:
-        tell()
+        poll()
     return future.result()
 
 
@@ -117,17 +117,17 @@ def awaited(future: Future[R], tell: Callable[[], None]) -> R:
 def processes(
     workers: int, become: Callable[..., None] | None = None, *given: object
 ) -> Iterator[ProcessPoolExecutor]:
-    """Processes that work for this one; an exception ends what they are at.
+    """Pool of worker processes; an exception terminates them.
 
     Parameters
     ----------
     workers
-        How many.
+        Number of processes.
     become, given
-        What each calls first, and with what.
+        Function that each calls first, and its arguments.
     """
     spawn = multiprocessing.get_context("spawn")
-    begin = functools.partial(begin_worker, NICE if _behind.get() else 0, become, *given)
+    begin = functools.partial(start_worker, NICE if _low.get() else 0, become, *given)
     pool = ProcessPoolExecutor(workers, spawn, initializer=begin)
     try:
         yield pool
@@ -138,17 +138,17 @@ def processes(
 
 
 def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
-    """End processes whatever they are at, which can take a minute.
+    """Terminate the processes of a pool, whatever they are doing.
 
     Parameters
     ----------
     pool
-        Their pool, of no more use then.
+        The pool; it cannot be used afterwards.
     wait
-        Whether to return only when they are gone.
+        Whether to wait until they have ended.
     """
-    # One may be half through telling its result: who listens must see that nobody goes on. A pool
-    # that has ended listens no more.
+    # A process may be half through sending its result: the reading thread must see the end of the
+    # pipe. A pool that has ended reads no more.
     results = getattr(pool, "_result_queue", None)
     if results is not None:
         results._writer.close()
@@ -157,15 +157,15 @@ def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
     pool.shutdown(wait, cancel_futures=True)
 
 
-def begin_worker(nice: int = 0, become: Callable[..., None] | None = None, *given: object) -> None:
-    """Begin a process that works for another one; see `processes`.
+def start_worker(nice: int = 0, become: Callable[..., None] | None = None, *given: object) -> None:
+    """Initialise a worker process; see `processes`.
 
-    It gives way by ``nice``, where the system knows of it, computes in one thread, and ends when
-    the one that it works for is gone, killed even. At its own end nothing is taken down: what was
-    registered with `atexit` before is not called.
+    Its niceness is raised by ``nice``, it computes in one thread, and it ends when its parent has
+    ended, killed even. At its own end nothing is torn down: functions that were registered with
+    `atexit` before are not called.
     """
-    turn_deaf()
-    give_way(nice)
+    ignore_interrupts()
+    lower_priority(nice)
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     threadpool_limits(1)  # of what is loaded already
     parent = multiprocessing.parent_process()
@@ -182,10 +182,10 @@ def begin_worker(nice: int = 0, become: Callable[..., None] | None = None, *give
 
 
 @contextmanager
-def behind_a_window() -> Iterator[None]:
-    """Have processes that are begun now, by this thread, give way to the window."""
-    former = _behind.set(True)
+def low_priority() -> Iterator[None]:
+    """Start processes of this thread with a low priority, so that a window stays responsive."""
+    former = _low.set(True)
     try:
         yield
     finally:
-        _behind.reset(former)
+        _low.reset(former)

@@ -1,4 +1,4 @@
-"""A simulated recording, its truth, and the folder that holds both."""
+"""A simulated recording with its ground truth, written into a folder."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
-from labapp.simulation.parallel import Progress, awaited, processes
+from labapp.simulation.parallel import Progress, processes, wait_for
 from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
 from labapp.simulation.target import Target, TargetLook, render_target
 from labapp.simulation.torch import Torch
-from labapp.system import deaf
+from labapp.system import interrupts_blocked
 
 TARGET = Target()
 
 MOMENTS = 15
-"""At so many moments over its exposure a pool that moves is drawn; odd: one is the middle."""
+"""Samples over the exposure of a moving pool; odd, so that one is the middle."""
 
 AHEAD = 4
-"""So many frames are rendered ahead of the one being written."""
+"""Frames rendered ahead of the one being written."""
 
 TRUTH_COLUMNS = (
     "frame", "time_s", "width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3",
@@ -45,7 +45,7 @@ DOT_COLUMNS = (
 
 
 class TruePool(PoolSurface, Protocol):
-    """What the truth needs to know of a pool besides."""
+    """Pool surface with what the ground truth needs besides."""
 
     def inside(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
         """Whether (x, y) is within the boundary."""
@@ -62,12 +62,12 @@ class TruePool(PoolSurface, Protocol):
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """A frame with what it was rendered from.
+    """A rendered frame and its ground truth.
 
     Parameters
     ----------
     pool, reflections
-        The truth, in the middle of the exposure.
+        The ground truth, in the middle of the exposure.
     image
         Grey levels, shape (height, width), 8 bit; 16 bit where exposures were added up or the
         look has more bits.
@@ -89,7 +89,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A recording to be simulated; everything random in it follows from its seed.
+    """Description of a simulated recording; its random numbers follow from the seed.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class Recording:
     dot_columns: ClassVar[tuple[str, ...]] = DOT_COLUMNS
 
     def frame(self, index: int) -> RecordedFrame:
-        """Render frame ``index``, counted from 0, by itself."""
+        """Frame ``index``, from 0, rendered independently of the others."""
         torch = self.torches[index] if self.torches else None
         pools = _over_exposure(self.pools[index], self.exposure_s)
         moments = [trace(pool, self.rig, torch) for pool in pools]
@@ -148,7 +148,7 @@ class Recording:
         return RecordedFrame(self.pools[index], middle, image, exposed[0].dot_px, exposed[0].shown)
 
     def calibration_picture(self) -> GreyImage:
-        """Render the calibration picture."""
+        """Calibration picture, grey levels, shape (height, width)."""
         rng = np.random.default_rng([self.seed, 2])
         return render_target(TARGET, self.view, TargetLook(), rng)
 
@@ -168,9 +168,9 @@ class Recording:
         setup
             Text of the setup file.
         workers
-            How many processes render.
+            Number of processes.
         progress
-            Told of each frame, and while one is waited for; what it raises ends the rendering.
+            Called for each frame, and while one is waited for; may raise to stop.
 
         Raises
         ------
@@ -186,33 +186,33 @@ class Recording:
         ):
             done = 0
 
-            def tell() -> None:
+            def report() -> None:
                 if progress is not None:
                     progress("frames", done, len(self.pools))
 
             def images() -> Iterator[Picture]:
                 nonlocal done
-                for told in self._told(workers, tell):
-                    truth.write([told.truth])
-                    dots.write(told.dots)
-                    yield told.image
+                for one in self._frames(workers, report):
+                    truth.write([one.truth])
+                    dots.write(one.dots)
+                    yield one.image
                     done += 1
-                    tell()
+                    report()
 
             self._write_recording(folder / self.file, images())
 
-    def _told(self, workers: int, tell: Callable[[], None]) -> Iterator[_Told]:
-        """Every frame in its order; ``tell`` is called while one is waited for."""
+    def _frames(self, workers: int, poll: Callable[[], None]) -> Iterator[_Rendered]:
+        """Render every frame in order; ``poll`` is called while one is waited for."""
         numbers = iter(range(len(self.pools)))
         if workers == 1:
-            yield from (_tell(self, number) for number in numbers)
+            yield from (_render(self, number) for number in numbers)
             return
         with processes(workers, _become_worker, self) as pool:
-            waiting: deque[Future[_Told]] = deque()
-            with deaf():
+            waiting: deque[Future[_Rendered]] = deque()
+            with interrupts_blocked():
                 waiting += (pool.submit(_work, n) for n in islice(numbers, workers + AHEAD))
             while waiting:
-                yield awaited(waiting.popleft(), tell)
+                yield wait_for(waiting.popleft(), poll)
                 waiting += (pool.submit(_work, n) for n in islice(numbers, 1))
 
     def _write_recording(self, path: Path, images: Iterator[Picture]) -> None:
@@ -237,7 +237,7 @@ class Recording:
 
 
 def _over_exposure(pool: TruePool, exposure_s: float) -> list[TruePool]:
-    """The pool at moments evenly over an exposure that it is the middle of."""
+    """Pool at evenly spaced times over an exposure, centred on its own time."""
     if exposure_s == 0 or pool.after(exposure_s) is pool:
         return [pool]
     steps = (np.arange(MOMENTS) - (MOMENTS - 1) / 2) / MOMENTS
@@ -248,31 +248,31 @@ def _over_exposure(pool: TruePool, exposure_s: float) -> list[TruePool]:
 
 
 @dataclass(frozen=True)
-class _Told:
-    """A frame as it is written: its picture and its rows of the tables."""
+class _Rendered:
+    """A frame as it is written: picture and table rows."""
 
     image: Picture
     truth: Mapping[str, str]
     dots: list[Mapping[str, str]]
 
 
-def _tell(recording: Recording, number: int) -> _Told:
+def _render(recording: Recording, number: int) -> _Rendered:
     frame = recording.frame(number)
     truth = _truth_row(number, recording.frame_rate_hz, frame)
-    return _Told(frame.image, truth, list(_dot_rows(number, frame)))
+    return _Rendered(frame.image, truth, list(_dot_rows(number, frame)))
 
 
-_rendered: Recording
-"""In a process that renders: what it renders."""
+_recording: Recording
+"""The recording that this worker process renders."""
 
 
 def _become_worker(recording: Recording) -> None:
-    global _rendered  # noqa: PLW0603 - set once, where the process begins
-    _rendered = recording
+    global _recording  # noqa: PLW0603 - set once, where the process begins
+    _recording = recording
 
 
-def _work(number: int) -> _Told:
-    return _tell(_rendered, number)
+def _work(number: int) -> _Rendered:
+    return _render(_recording, number)
 
 
 # --- files --------------------------------------------------------------------------------------
@@ -284,7 +284,7 @@ def write_video(
     frame_rate_hz: float,
     size_px: tuple[int, int],
 ) -> None:
-    """Write 8-bit grey frames of (width, height) ``size_px`` as FFV1, which loses nothing.
+    """Write 8-bit grey frames of (width, height) ``size_px`` as lossless FFV1.
 
     Raises
     ------
@@ -305,7 +305,7 @@ def _number(value: float) -> str:
 
 
 def _area_and_volume(pool: TruePool) -> tuple[float, float]:
-    """Area inside the boundary and volume under the surface, by a grid of 0.02 mm."""
+    """Area within the boundary, mm², and volume under the surface, mm³, on a grid of 0.02 mm."""
     rim = pool.boundary_mm()
     step = 0.02
     x, y = np.meshgrid(*(np.arange(rim[:, n].min(), rim[:, n].max(), step) for n in range(2)))

@@ -1,7 +1,6 @@
-"""The error analysis of chapter 8 part by part, and the error budget of a set-up.
+"""The error analysis of chapter 8, part by part, and the error budget of a set-up.
 
-What a part gives are tables and pictures, by the names of their files: the command writes them, the
-window shows them first.
+A part consists of tables and pictures by file name: the command writes them, the window shows them.
 """
 
 from __future__ import annotations
@@ -24,28 +23,28 @@ if TYPE_CHECKING:
     from labapp.studies.tables import Table
 
 PARTS = ("CE", "LE", "ME", "measurement", "images", "parameters")
-"""What can be worked out."""
+"""Parts of the analysis."""
 
 FIGURES = {"CE": (6, 7), "LE": (8, 9), "ME": (10, 11)}
 """Numbers in chapter 8 of the figures that show errors and ARE."""
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is to be worked out of chapter 8.
+class AnalysisOptions:
+    """Options of the error analysis of chapter 8.
 
     Parameters
     ----------
     parts
         Some of `PARTS`.
     schemes
-        By which schemes.
+        Reconstruction schemes.
     step
-        Between the laser's places, degrees and mm (LE, ME).
+        Step between places of the laser, degrees and mm (LE, ME).
     frames
-        So many frames are rendered of each surface (measurement, images).
+        Frames rendered of each surface (measurement, images).
     draws
-        Of the calibration, by Monte Carlo (parameters).
+        Monte Carlo draws of the calibration (parameters).
     picture
         ``png`` or ``svg``.
     """
@@ -59,8 +58,8 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Made:
-    """What a part gave.
+class AnalysisPart:
+    """Result of a part of the analysis.
 
     Parameters
     ----------
@@ -68,17 +67,17 @@ class Made:
         Its tables.
     pictures
         File name → content.
-    told
-        Those of the tables that are printed: they are short, and grow no more.
+    printed
+        Tables to print: those that are short and complete.
     """
 
     tables: tuple[Table, ...]
     pictures: Mapping[str, bytes]
-    told: tuple[Table, ...]
+    printed: tuple[Table, ...]
 
     @property
     def files(self) -> dict[str, bytes]:
-        """Everything as it is written: name → content."""
+        """All files: name → content."""
         return {
             **{f"{table.name}.csv": table.csv().encode() for table in self.tables},
             **{f"{table.name}.md": table.markdown().encode() for table in self.tables},
@@ -86,29 +85,30 @@ class Made:
         }
 
 
-def analyze_errors(question: Question, progress: Progress | None = None) -> Iterator[Made]:
-    """Work out the parts asked for, one after the other.
+def analyze_errors(
+    options: AnalysisOptions, progress: Progress | None = None
+) -> Iterator[AnalysisPart]:
+    """Compute the chosen parts, one after the other.
 
-    The tables of CE, LE and ME are the same ones, which grow with each. What ``progress`` raises
-    ends it.
+    CE, LE and ME share their tables, which grow with each. ``progress`` may raise to stop.
     """
-    yield from _surveys(question, progress)
+    yield from _surveys(options, progress)
     for name, part in (
         ("measurement", _measurement),
         ("images", _images),
         ("parameters", _parameters),
     ):
-        if name in question.parts:
-            yield part(question, progress)
+        if name in options.parts:
+            yield part(options, progress)
 
 
-def _surveys(question: Question, progress: Progress | None) -> Iterator[Made]:
+def _surveys(options: AnalysisOptions, progress: Progress | None) -> Iterator[AnalysisPart]:
     from labapp.studies import error_analysis, pictures
 
     done: list[ErrorSurvey] = []
-    kinds = [kind for kind in FIGURES if kind in question.parts]
+    kinds = [kind for kind in FIGURES if kind in options.parts]
     for kind in kinds:
-        found = error_analysis.survey(kind, question.schemes, question.step, progress=progress)
+        found = error_analysis.survey(kind, options.schemes, options.step, progress=progress)
         done.append(found)
         short = (error_analysis.error_table(done), error_analysis.are_table(done))
         errors, ares = FIGURES[kind]
@@ -117,26 +117,28 @@ def _surveys(question: Question, progress: Progress | None) -> Iterator[Made]:
             f"figure_8_{ares}_{kind}_are": pictures.are_picture(found),
         }
         tables = (*short, error_analysis.cap_table(done))
-        yield Made(tables, _drawn(drawn, question.picture), short if kind == kinds[-1] else ())
+        yield AnalysisPart(
+            tables, _drawn(drawn, options.picture), short if kind == kinds[-1] else ()
+        )
 
 
-def _measurement(question: Question, progress: Progress | None) -> Made:
+def _measurement(options: AnalysisOptions, progress: Progress | None) -> AnalysisPart:
     from labapp.studies import image_error, pictures
 
     found = image_error.frame_errors(
         [image_error.TACK],
         image_error.TACK_RIG,
-        question.frames,
-        schemes=question.schemes,
+        options.frames,
+        schemes=options.schemes,
         progress=progress,
     )
     frame = image_error.rendered(image_error.TACK, image_error.TACK_RIG, 0)
     drawn = {"figure_8_2_thumb_tack": pictures.frame_picture(frame)}
-    table = image_error.thumb_tack_table(found[0], question.schemes)
-    return Made((table,), _drawn(drawn, question.picture), (table,))
+    table = image_error.thumb_tack_table(found[0], options.schemes)
+    return AnalysisPart((table,), _drawn(drawn, options.picture), (table,))
 
 
-def _images(question: Question, progress: Progress | None) -> Made:
+def _images(options: AnalysisOptions, progress: Progress | None) -> AnalysisPart:
     from labapp.simulation.pools import caps_8_3_1
     from labapp.studies import image_error
 
@@ -144,15 +146,15 @@ def _images(question: Question, progress: Progress | None) -> Made:
     found = image_error.frame_errors(
         caps,
         image_error.BENCH,
-        question.frames,
-        schemes=question.schemes,
+        options.frames,
+        schemes=options.schemes,
         progress=progress,
     )
-    table = image_error.image_error_table(caps, found, question.schemes)
-    return Made((table,), {}, (table,))
+    table = image_error.image_error_table(caps, found, options.schemes)
+    return AnalysisPart((table,), {}, (table,))
 
 
-def _parameters(question: Question, progress: Progress | None) -> Made:
+def _parameters(options: AnalysisOptions, progress: Progress | None) -> AnalysisPart:
     from labapp.simulation.pools import spherical_cap
     from labapp.studies import image_error, pictures
     from labapp.studies import parameter_deviation as deviation
@@ -160,18 +162,16 @@ def _parameters(question: Question, progress: Progress | None) -> Made:
     found, drawn = {}, {}
     for surface, height in (("convex", 0.3), ("concave", -0.3)):
         known = image_error.exactly_seen(spherical_cap(6.0, height), image_error.BENCH)
-        for scheme in question.schemes:
+        for scheme in options.schemes:
             found[surface, scheme] = deviation.parameter_deviation(
-                known, scheme, draws=question.draws, progress=progress
+                known, scheme, draws=options.draws, progress=progress
             )
         names = [quantity.name for quantity in deviation.QUANTITIES]
-        values = {
-            str(one): 100 * found[surface, one].contribution[:, 0] for one in question.schemes
-        }
+        values = {str(one): 100 * found[surface, one].contribution[:, 0] for one in options.schemes}
         label = f"standard uncertainty of the height, {surface} 6 mm × 0.3 mm (%)"
         drawn[f"parameter_deviation_{surface}"] = pictures.bars_picture(names, values, label)
     table = deviation.deviation_table(found)
-    return Made((table,), _drawn(drawn, question.picture), (table,))
+    return AnalysisPart((table,), _drawn(drawn, options.picture), (table,))
 
 
 def _drawn(figures: Mapping[str, Figure], kind: str) -> dict[str, bytes]:
@@ -183,8 +183,10 @@ def _drawn(figures: Mapping[str, Figure], kind: str) -> dict[str, bytes]:
 # --- the budget of a set-up -----------------------------------------------------------------------
 
 
-def analyze_budget(setup: Setup | None, pool: Pool, progress: Progress | None = None) -> Made:
-    """Work out the error budget of a set-up for a kind of pool: predicted and simulated.
+def analyze_budget(
+    setup: Setup | None, pool: Pool, progress: Progress | None = None
+) -> AnalysisPart:
+    """Compute the error budget of a set-up for a kind of pool, predicted and simulated.
 
     Parameters
     ----------
@@ -193,7 +195,7 @@ def analyze_budget(setup: Setup | None, pool: Pool, progress: Progress | None = 
     pool
         The kind: see `expected_pool`.
     progress
-        What it raises ends the analysis.
+        May raise to stop.
     """
     import numpy as np
 
@@ -206,7 +208,7 @@ def analyze_budget(setup: Setup | None, pool: Pool, progress: Progress | None = 
     values = {"predicted": predicted, "simulated": simulated}
     label = f"standard uncertainty of the height, fit (% of {abs(pool.peak_mm):g} mm)"
     drawn = {table.name: bars_picture(names, values, label)}
-    return Made((table,), _drawn(drawn, "png"), (table,))
+    return AnalysisPart((table,), _drawn(drawn, "png"), (table,))
 
 
 def _bench(setup: Setup | None) -> Bench:
@@ -221,7 +223,7 @@ def _bench(setup: Setup | None) -> Bench:
 
 
 def expected_pool(width: float, length: float, height: float) -> Pool:
-    """A pool of a width, length and height, mm; a hollow's height is below 0.
+    """Ellipsoidal pool of a width, length and height, mm; the height of a concave one is negative.
 
     Raises
     ------

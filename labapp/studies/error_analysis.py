@@ -60,7 +60,7 @@ TEXT = {
 
 
 def circle_settings(scheme: str) -> Settings:
-    """A scheme with the circle as boundary model (§8.2.1); fit has a boundary of its own."""
+    """Settings with the circle as boundary model (§8.2.1); fit has a boundary of its own."""
     return Settings(
         scheme=scheme,
         ers=ers.ErsSettings(boundary="circle"),
@@ -68,8 +68,8 @@ def circle_settings(scheme: str) -> Settings:
     )
 
 
-def followed(pool: PoolSurface, rig: Rig) -> Reflections:
-    """Follow the rays as the text does: a second meeting with the pool is not looked for."""
+def trace_once(pool: PoolSurface, rig: Rig) -> Reflections:
+    """Reflections as the text computes them: without second reflections on the pool."""
     seen = trace(pool, rig)
     return replace(seen, hits_again=np.zeros_like(seen.hits_again))
 
@@ -82,7 +82,7 @@ def relative_errors(measures: Measures, cap: Pool) -> tuple[float, float]:
 
 
 def computed_are(measures: Measures) -> float:
-    """The computed ARE as the text has it, mm: of IRS and ERS that of their own points."""
+    """Computed ARE as in the text, mm: for IRS and ERS of their own points."""
     own = measures.own_are_mm
     return own if np.isfinite(own) else measures.are_mm
 
@@ -193,7 +193,7 @@ def laser_places(step: float) -> list[Laser]:
 
 def _errors(task: tuple[Pool, Rig, tuple[str, ...]]) -> FloatArray:
     cap, rig, schemes = task
-    seen = followed(cap, rig)
+    seen = trace_once(cap, rig)
     match = exact_match(seen, rig)
     return np.array([errors_of(match, seen, rig, cap, scheme) for scheme in schemes])
 

@@ -87,7 +87,7 @@ def calibration_budget(
     return tuple(found)
 
 
-def together(*contributions: FloatArray) -> FloatArray:
+def root_sum_of_squares(*contributions: FloatArray) -> FloatArray:
     """Root of the sum of squares of independent contributions, shapes (6,); NaN counts as 0."""
     return np.asarray(np.sqrt(np.nansum(np.square(contributions), axis=0)))
 

@@ -26,8 +26,8 @@ from labapp.studies import SCHEMES
 from labapp.studies.error_analysis import (
     circle_settings,
     computed_are,
-    followed,
     relative_errors,
+    trace_once,
 )
 from labapp.studies.parameter_deviation import AxisPoints, KnownPool
 from labapp.studies.tables import Table
@@ -110,7 +110,7 @@ def axes_of(view: CameraView) -> AxisPoints:
 
 def exactly_seen(cap: Pool, rig: Rig, view: CameraView = VIEW) -> KnownPool:
     """A known pool with its dots where they truly are; those that miss the plane are lost."""
-    return KnownPool(cap, exact_match(followed(cap, rig), rig), rig, axes_of(view))
+    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, axes_of(view))
 
 
 def frame_errors(
@@ -137,7 +137,7 @@ def frame_errors(
 def rendered(cap: Pool, rig: Rig, number: int) -> Frame:
     """One of the frames of a known surface, the same each time."""
     seed = [round(1000 * cap.footprint.width_mm), round(1000 * abs(cap.peak_mm)), number]
-    return render(followed(cap, rig), VIEW, LOOK, np.random.default_rng(seed))
+    return render(trace_once(cap, rig), VIEW, LOOK, np.random.default_rng(seed))
 
 
 def _frame_errors(task: tuple[Pool, Rig, int, tuple[str, ...]]) -> FrameErrors:

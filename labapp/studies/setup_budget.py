@@ -1,4 +1,4 @@
-"""The error budget of a set-up: what each source does to the height of a pool, fit being used.
+"""The error budget of a set-up: contribution of each source to the height by the fit scheme.
 
 Every part is predicted (`predicted_error`) and, beside it, simulated: pools like the expected one,
 measured from dots with noise, and with the calibrated quantities moved.
@@ -32,10 +32,10 @@ from labapp.studies.parameter_deviation import (
 from labapp.studies.tables import Table
 
 POOLS, MOVED_POOLS = 24, 6
-"""So many pools are simulated, and so many of them with each quantity moved."""
+"""Pools simulated, and of them those with each quantity moved."""
 
 SHIFT_MM, STRETCH = 0.3, 0.05
-"""How far pools like one lie off it along X and Y at most, and how much larger or smaller."""
+"""Largest shift along X and Y, and relative change of size, of `similar_pool`."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def setup_budget(
 ) -> SetupBudget:
     """Predict and simulate the error budget of a set-up for a kind of pool."""
     rng = np.random.default_rng(831)
-    pools = [like(pool, rng) for _ in range(POOLS)]
+    pools = [similar_pool(pool, rng) for _ in range(POOLS)]
     tasks = [(bench, one, k) for k, one in enumerate(pools)]
     found = in_parallel(_simulated, tasks, "budget", progress, workers)
     moved = np.array([changes for _, _, changes in found[:MOVED_POOLS]])
@@ -102,8 +102,8 @@ def setup_budget(
     )
 
 
-def like(pool: Pool, rng: np.random.Generator) -> Pool:
-    """A pool of the same shape, a little larger or smaller and a little to the side."""
+def similar_pool(pool: Pool, rng: np.random.Generator) -> Pool:
+    """Pool of the same shape with a random small shift and change of size."""
     scale = rng.uniform(1 - STRETCH, 1 + STRETCH)
     foot = pool.footprint
     x, y = np.array(foot.center_mm) + rng.uniform(-SHIFT_MM, SHIFT_MM, 2)
@@ -141,7 +141,7 @@ def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, Fl
 
 
 def budget_table(budget: SetupBudget) -> Table:
-    """The budget, in % of the pool's height: predicted and simulated."""
+    """Budget in % of the pool's height, predicted and simulated."""
     height = abs(budget.pool.peak_mm)
     rows: list[tuple[str | float | None, ...]] = []
     parts = (

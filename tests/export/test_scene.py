@@ -13,7 +13,7 @@ from labapp.export import drawing as draws
 from labapp.export import scene as scenes
 from labapp.export.heights import difference_at, profile, sigma_at
 from labapp.export.scene import difference_scene, rays_of, scene_of
-from labapp.export.studio import draw_scene
+from labapp.export.studio import Studio
 from tests.scenes import BENCH_RIG
 
 RADIUS_MM, HEIGHT_MM = 3.0, 0.3
@@ -335,6 +335,6 @@ def test_heights_are_drawn_as_told_and_the_axes_stay_true(
 
 
 def test_a_picture_is_drawn_at_its_size(plotter: Any, pool: Reconstruction) -> None:
-    picture = draw_scene(scene_of(pool), (320, 240), "side")
+    picture = Studio((320, 240), "side").draw(scene_of(pool))
     assert picture.shape == (240, 320, 3)
     assert picture.std() > 10

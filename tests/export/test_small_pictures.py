@@ -6,7 +6,7 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.export.drawing import Direction
 from labapp.export.scene import scene_of
-from labapp.export.studio import draw_scene
+from labapp.export.studio import Studio
 
 
 @pytest.mark.parametrize("size_px", [(367, 226), (285, 170)])
@@ -16,7 +16,7 @@ def test_names_and_numbers_stay_within_a_small_picture(
 ) -> None:
     pool = measured.reconstruction
     assert pool is not None
-    picture = draw_scene(scene_of(pool), size_px, view).astype(int)
+    picture = Studio(size_px, view).draw(scene_of(pool)).astype(int)
     ink = np.abs(picture - picture[-1, 0]).max(axis=2) > 40
     assert not ink[:, -2:].any()  # what ends at the edge is cut there
     assert not ink[-2:].any()

@@ -41,7 +41,7 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import TOOLS
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.views.canvas import Drawn, Plotted
-from labapp.studies.analysis import Made
+from labapp.studies.analysis import AnalysisPart
 from labapp.studies.tables import Table
 from tests.gui.conftest import CopySample, let_draw
 
@@ -355,7 +355,7 @@ def fill_adviser(tool: Any, qtbot: QtBot) -> None:
 def fill_analysis(tool: Any, qtbot: QtBot) -> None:
     """A part is done."""
     table = Table("error_budget", "Budget", ("source", "predicted_pct"), (("dots", 1.0),))
-    tool.show_part(Made((table,), {}, (table,)))
+    tool.show_part(AnalysisPart((table,), {}, (table,)))
 
 
 FILL = {"simulator": fill_simulator, "adviser": fill_adviser, "analysis": fill_analysis}

@@ -15,7 +15,7 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import advising
 from labapp.gui.tools.adviser import AdviserWindow
 from labapp.session.session import Session
-from labapp.studies.adviser.keys import parse_question
+from labapp.studies.adviser.keys import parse_request
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
 
@@ -52,12 +52,12 @@ def click(button: QPushButton) -> None:
 def test_the_question_is_the_sessions_pool_and_rig(copy_sample: CopySample):
     with Session.open(copy_sample("gtaw")) as session:
         values = advising.question(session)
-        expected, limits = parse_question(values, "here")
+        expected, limits = parse_request(values, "here")
     assert expected.width_mm == pytest.approx((0.9 * 6.7, 1.1 * 6.7))
     assert expected.kind == "convex"
     assert limits.angle_deg == (25.0, 35.0)
     assert limits.pattern.rows == 19
-    parse_question(advising.question(None), "here")
+    parse_request(advising.question(None), "here")
 
 
 def test_it_gives_what_the_command_gives_and_undo_takes_it_back(

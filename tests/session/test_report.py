@@ -32,7 +32,7 @@ from labapp.session.report.results import add_corrections, add_example, add_resu
 from labapp.session.session import Session
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap
-from labapp.studies.error_budget import SIZES, Contribution, calibration_budget, together
+from labapp.studies.error_budget import SIZES, Contribution, calibration_budget, root_sum_of_squares
 from tests.scenes import FRAME_SHAPE, as_dots
 
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
@@ -300,7 +300,7 @@ def test_the_total_is_the_root_of_the_sum_of_squares(seen: Measurement):
     cells = data.budget_cells([line], parts)
     assert [row[0] for row in cells[2:4]] == ["a*", "b"]
     assert cells[-1][2:5] == ["0.0500", "0.1000", "0.0000"]
-    np.testing.assert_allclose(together(changes, changes)[:2], np.sqrt(2) * changes[:2])
+    np.testing.assert_allclose(root_sum_of_squares(changes, changes)[:2], np.sqrt(2) * changes[:2])
 
 
 # --- the pages --------------------------------------------------------------------------------

@@ -14,8 +14,8 @@ import pytest
 
 from labapp.simulation.parallel import (
     NICE,
-    behind_a_window,
     in_parallel,
+    low_priority,
     shared_processes,
 )
 from tests.waiting import PATIENCE_S, wait_until
@@ -42,7 +42,7 @@ if __name__ == "__main__":
 
 def test_they_give_way_to_a_window_and_use_one_thread() -> None:
     own = os.nice(0)
-    with behind_a_window():
+    with low_priority():
         assert in_parallel(os.nice, [0, 0, 0], workers=2) == [min(own + NICE, 19)] * 3
     assert in_parallel(os.nice, [0, 0], workers=2) == [own] * 2
     assert in_parallel(os.getenv, ["OMP_NUM_THREADS"] * 2, workers=2) == ["1", "1"]

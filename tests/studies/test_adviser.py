@@ -14,7 +14,7 @@ from labapp.studies.adviser.check import Check, check, check_text
 from labapp.studies.adviser.expected_pools import ExpectedPools
 from labapp.studies.adviser.height_error import Trial, predicted_errors, simulated_errors
 from labapp.studies.adviser.report import cost_table
-from labapp.studies.adviser.search import Advice, Effort, Sweep, advise, constraint_words
+from labapp.studies.adviser.search import Advice, Effort, Sweep, advise, constraint_text
 
 EXPECTED = ExpectedPools((6.0, 7.0), (6.5, 8.0), (0.12, 0.2))
 # A roughly calibrated bench: what its plane's distance is worth shows on few pools.
@@ -205,7 +205,7 @@ def test_where_nothing_is_possible_it_says_what_stands_in_the_way() -> None:
     assert not found.possible
     assert np.isnan(found.error_mm)
     assert found.best.margins["up"] < 0
-    assert constraint_words("up", -2.0) == ("dots on the plate, above and below: 2 mm too little")
+    assert constraint_text("up", -2.0) == ("dots on the plate, above and below: 2 mm too little")
 
 
 def test_what_progress_raises_ends_the_search() -> None:

@@ -19,7 +19,7 @@ from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, predict_error
 from labapp.studies.error_analysis import ErrorSurvey, aside, error_table, survey
 from labapp.studies.image_error import BENCH, TACK, TACK_RIG, VIEW, axes_of, exactly_seen
 from labapp.studies.parameter_deviation import NOMINAL, OFFSETS, QUANTITIES, move
-from labapp.studies.setup_budget import Bench, SetupBudget, budget_table, like
+from labapp.studies.setup_budget import Bench, SetupBudget, budget_table, similar_pool
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +193,7 @@ def test_a_calibration_known_worse_makes_the_prediction_worse() -> None:
 def test_a_budget_table_adds_up_in_squares() -> None:
     rng = np.random.default_rng(0)
     pool = spherical_cap(6.0, 0.3)
-    pools = [like(pool, rng) for _ in range(3)]
+    pools = [similar_pool(pool, rng) for _ in range(3)]
     assert all(abs(one.footprint.width_mm / 6.0 - 1) <= 0.05 for one in pools)
     bench = Bench(BENCH, axes_of(VIEW))
     predicted = tuple(

@@ -24,7 +24,7 @@ from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies.adviser import search as adviser
 from labapp.studies.adviser.files import advice_files
-from labapp.studies.adviser.keys import parse_question
+from labapp.studies.adviser.keys import parse_request
 from labapp.studies.adviser.report import cost_table
 from labapp.studies.adviser.search import Advice, Effort, advise
 
@@ -160,7 +160,7 @@ class AdviserWindow(ToolWindow):
 
     def start(self) -> None:
         """Search, in the background."""
-        asked = self.workspace.tried(lambda: parse_question(self.values(), "the adviser"))
+        asked = self.workspace.tried(lambda: parse_request(self.values(), "the adviser"))
         if asked is None:
             return
         effort = adviser.QUICK if self.effort.value() == "quick" else Effort()

@@ -20,7 +20,7 @@ ABOUT = 0.1
 """Pools are expected within so much of the size that the session has."""
 
 Values = dict[str, dict[str, Any]]
-"""Table → key → value, as `advice_keys.parse_question` takes them."""
+"""Table → key → value, as `advice_keys.parse_request` takes them."""
 
 
 def question(session: Session | None) -> Values:

@@ -18,8 +18,8 @@ from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
 from labapp.studies import SCHEMES
 from labapp.studies.analysis import (
-    Made,
-    Question,
+    AnalysisOptions,
+    AnalysisPart,
     analyze_budget,
     analyze_errors,
     expected_pool,
@@ -110,7 +110,7 @@ class AnalysisWindow(ToolWindow):
             "Draws", lowest=10, highest=100_000, step=100, decimals=0,
             tooltip="Of the calibration, in parameter deviation",
         )  # fmt: skip
-        usual = Question()
+        usual = AnalysisOptions()
         for field, value in (
             (self.step, usual.step),
             (self.frames, usual.frames),
@@ -162,7 +162,7 @@ class AnalysisWindow(ToolWindow):
             field.flush()
         ticked = tuple(key for key, box in self.parts.items() if box.isChecked())
         scheme = self.scheme.value()
-        question = Question(
+        options = AnalysisOptions(
             parts=tuple(key for key in ticked if key != BUDGET),
             schemes=tuple(one for one in SCHEMES if scheme in ("", one)),
             step=float(self.step.value() or 0),
@@ -176,7 +176,7 @@ class AnalysisWindow(ToolWindow):
         def work(control: Control) -> None:
             if budget is not None:
                 control.part(analyze_budget(*budget, told(control)))
-            for made in analyze_errors(question, told(control)):
+            for made in analyze_errors(options, told(control)):
                 control.part(made)
 
         self._anew = True
@@ -194,7 +194,7 @@ class AnalysisWindow(ToolWindow):
 
     # --- what came out -------------------------------------------------------------------------
 
-    def show_part(self, made: Made) -> None:
+    def show_part(self, made: AnalysisPart) -> None:
         """Show what a part gave; what an earlier run gave goes with the first one."""
         if self._anew:
             self.tables, self.pictures, self.files = {}, {}, {}

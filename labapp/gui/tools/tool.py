@@ -27,7 +27,7 @@ from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm
 from labapp.gui.widgets.labels import Message
-from labapp.simulation.parallel import Progress, behind_a_window
+from labapp.simulation.parallel import Progress, low_priority
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
@@ -200,7 +200,7 @@ class ToolWindow(QDialog):
 
         def behind(control: Control) -> Any:
             try:
-                with behind_a_window():
+                with low_priority():
                     return work(control)
             except BrokenProcessPool as error:
                 raise ValueError("a process that simulates has ended: begin again") from error

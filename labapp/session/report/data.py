@@ -21,7 +21,7 @@ from labapp.export.summary import format_ranges
 from labapp.session.contents import SessionContents
 from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
-from labapp.studies.error_budget import SIZES, Contribution, together
+from labapp.studies.error_budget import SIZES, Contribution, root_sum_of_squares
 
 DOUBTFUL_MARGIN = 5.0
 """A frame is doubtful where another correspondence comes within this factor of the residual."""
@@ -322,7 +322,7 @@ def budget_cells(lines: Sequence[FrameLine], contributions: Sequence[Contributio
         ]
         for one in contributions
     ]
-    total = together(noise, *(one.change for one in contributions))
+    total = root_sum_of_squares(noise, *(one.change for one in contributions))
     rows.append(["root of the sum of squares", "", *_row(total, digits)])
     return [["source", "±", *(STATISTICS[name][0] for name in SIZES)], *rows]
 

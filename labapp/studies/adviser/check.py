@@ -13,7 +13,7 @@ from labapp.simulation.parallel import Progress, in_parallel
 from labapp.studies.adviser.bench_limits import LaserPlace, Place
 from labapp.studies.adviser.expected_pools import Sample
 from labapp.studies.adviser.height_error import blocks, simulated_errors
-from labapp.studies.adviser.search import Advice, constraint_words
+from labapp.studies.adviser.search import Advice, constraint_text
 
 TEXT_PLACE = Place(31.14, 31.48, 50.0, 50.8, 0.0)
 """The set-up of §8.3.1, on the 4″ plane."""
@@ -74,7 +74,7 @@ class Check:
         angle, distance = TEXT_PLACE.projection_angle_deg, TEXT_PLACE.distance_mm
         laser = LaserPlace(self.advice.expected, self.advice.limits, angle, distance)
         margins = laser.margins(TEXT_PLACE)
-        return tuple(constraint_words(name, much) for name, much in margins.items() if much < 0)
+        return tuple(constraint_text(name, much) for name, much in margins.items() if much < 0)
 
     @property
     def off_prediction(self) -> float:

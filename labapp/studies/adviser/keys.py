@@ -1,4 +1,4 @@
-"""What the adviser is asked, as TOML: the pools expected and the bench's limits."""
+"""Input of the adviser as TOML: the expected pools and the limits of the bench."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from labapp.studies.adviser.bench_limits import BenchLimits
 from labapp.studies.adviser.expected_pools import ExpectedPools
 from labapp.studies.parameter_deviation import NOMINAL, QUANTITIES
 
-A_QUESTION = "a file for labapp advise (TOML, UTF-8)"
+A_REQUEST = "a file for labapp advise (TOML, UTF-8)"
 
 CALIBRATION = (
     "projection_angle_deg",
@@ -78,13 +78,13 @@ TABLES: dict[str, dict[str, Rule]] = {
     "camera": CAMERA,
     "calibration": {name: _number(0, 10, "standard uncertainty") for name in CALIBRATION},
 }
-"""Every table and key; only the pools must be told."""
+"""All tables and keys; only the pools are required."""
 
 RANGES = {"projection_angle_deg": "angle_deg", "plane_distance_mm": "plane_mm"}
 
 
-def read_question(path: Path) -> dict[str, Any]:
-    """Read a question's tables; `parse_question` checks them.
+def read_request(path: Path) -> dict[str, Any]:
+    """Read the tables of a request; `parse_request` checks them.
 
     Raises
     ------
@@ -94,15 +94,15 @@ def read_question(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except OSError as error:
-        raise InputError(path, "file", error.strerror, A_QUESTION) from error
+        raise InputError(path, "file", error.strerror, A_REQUEST) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(path, "syntax", error, A_QUESTION) from error
+        raise InputError(path, "syntax", error, A_REQUEST) from error
 
 
-def parse_question(
+def parse_request(
     values: Mapping[str, Any], source: str | Path
 ) -> tuple[ExpectedPools, BenchLimits]:
-    """Check what the adviser is asked.
+    """Expected pools and limits of the bench from the tables of a request.
 
     Parameters
     ----------

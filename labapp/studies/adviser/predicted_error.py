@@ -1,4 +1,4 @@
-"""The error of a pool's height that a set-up lets expect, without measuring: fast enough to search.
+"""Predicted error of a pool's height for a set-up, without simulation: fast enough to search.
 
 One linear step from the truth takes the place of the fit: the smooth surface is fitted once to the
 true slopes at the true reflection points, and what the parts of the budget do to it is worked out
@@ -42,7 +42,7 @@ DECIDING = 4
 
 @dataclass(frozen=True)
 class PredictedError:
-    """What a set-up lets expect of a pool's height; standard uncertainties, mm.
+    """Predicted standard uncertainties of a pool's height, mm.
 
     Parameters
     ----------
@@ -57,8 +57,6 @@ class PredictedError:
     dots, blocked, off_plane, lost
         Dots that show; rays from the pool that the torch hides; whose reflection misses the
         plane's edges; that meet the pool again.
-    closest_mm
-        Distance of the two dots that lie closest on the plane; NaN with fewer than two.
     """
 
     boundary_mm: float
@@ -69,19 +67,18 @@ class PredictedError:
     blocked: int
     off_plane: int
     lost: int
-    closest_mm: float
 
     def __post_init__(self) -> None:
         freeze(self)
 
     @property
     def random_mm(self) -> float:
-        """All but the calibration: what varies from pool to pool and from frame to frame."""
+        """Combined standard uncertainty but for the calibration: what varies between frames."""
         return float(np.sqrt(self.boundary_mm**2 + self.shape_mm**2 + self.dots_mm**2))
 
     @property
     def total_mm(self) -> float:
-        """Everything together."""
+        """Combined standard uncertainty."""
         return float(np.hypot(self.random_mm, np.linalg.norm(self.parameters_mm)))
 
 
@@ -123,7 +120,6 @@ def predict_error(
         blocked=int((seen.lit & seen.blocked).sum()),
         off_plane=int((seen.lit & ~seen.blocked & ~seen.on_plane).sum()),
         lost=int((seen.lit & ~seen.blocked & seen.hits_again).sum()),
-        closest_mm=_closest(seen.plane_mm[seen.visible]),
     )
     if counted.dots < LEAST_DOTS:
         return counted
@@ -137,13 +133,8 @@ def predict_error(
     )
 
 
-def together(predicted: Sequence[PredictedError]) -> float:
-    """Root mean square of the whole error over pools of a kind, mm; infinite if one has none."""
-    return float(np.sqrt(np.mean([one.total_mm**2 for one in predicted])))
-
-
 class _Model:
-    """The smooth surface through the true slopes, and what it makes of changes to them."""
+    """Smooth surface through the true slopes, and its response to changes of them."""
 
     def __init__(self, pool: Pool, rig: Rig, seen: Reflections, dot_sigma_mm: float) -> None:
         from labapp.core.surface import kernels
@@ -181,7 +172,7 @@ class _Model:
         return fit_slopes(self.basis, points[:, :2], slopes, self.weights, self.stiffness)
 
     def height(self, fitted: SlopeFit, rim: FloatArray) -> float:
-        """Of the peak over the boundary's mean, positive for either sign of pool."""
+        """Height of the peak over the boundary's mean, mm, positive for either sign of pool."""
         peak = fitted.surface.height(self.peak_xy[:1], self.peak_xy[1:])[0]
         return self.sign * float(peak - fitted.surface.height(*rim.T).mean())
 
@@ -252,10 +243,3 @@ def _axes(laser: Laser) -> tuple[FloatArray, FloatArray, FloatArray]:
     alpha = np.radians(laser.projection_angle_deg)
     forward = np.array([0.0, -np.cos(alpha), -np.sin(alpha)])
     return forward, np.array([1.0, 0.0, 0.0]), np.array([0.0, -np.sin(alpha), np.cos(alpha)])
-
-
-def _closest(plane_mm: FloatArray) -> float:
-    if len(plane_mm) < 2:
-        return float("nan")
-    apart = np.linalg.norm(plane_mm[:, None] - plane_mm, axis=-1)
-    return float(apart[np.triu_indices(len(plane_mm), 1)].min())

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from labapp.simulation.forward import trace
 from labapp.studies.adviser.bench_limits import CONSTRAINTS
-from labapp.studies.adviser.search import MOVED, Advice, Candidate, constraint_words
+from labapp.studies.adviser.search import MOVED, Advice, Candidate, constraint_text
 from labapp.studies.plotting import INCHES, STYLE, new_figure
 from labapp.studies.tables import Cell, Table
 
@@ -42,7 +42,7 @@ def advice_text(advice: Advice) -> str:
             "",
             "It keeps:",
             "",
-            *(f"* {constraint_words(name, margin)}" for name, margin in best.margins.items()),
+            *(f"* {constraint_text(name, margin)}" for name, margin in best.margins.items()),
         ]
     else:
         lines = [
@@ -55,7 +55,7 @@ def advice_text(advice: Advice) -> str:
             "What stands in the way:",
             "",
             *(
-                f"* {constraint_words(name, margin)}"
+                f"* {constraint_text(name, margin)}"
                 for name, margin in best.margins.items()
                 if margin < 0
             ),

@@ -1,9 +1,9 @@
-"""The configuration adviser: where laser and imaging plane should stand for the pools expected.
+"""The configuration adviser: optimal places of laser and imaging plane for expected pools.
 
-Of all set-ups within a bench's limits the one that lets expect the least error of the height: every
-place of a grid is held against what it must keep (`LaserPlace`), those that are possible are
-compared by the predicted error on ever more pools, the best are moved on from there, and the pools
-are measured with the finalists in simulation.
+The set-up within a bench's limits with the least expected error of the height: every place of a
+grid is checked against the constraints (`LaserPlace`), the feasible ones are compared by the
+predicted error on ever more pools, the best are refined by Nelder–Mead, and the pools are measured
+with the finalists in simulation.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ MOVED: dict[str, str] = {
     "s_mm": "s_mm",
     "h_mm": "h_mm",
 }
-"""What the adviser chooses, `Place`, and the range of it in `BenchLimits`."""
+"""Quantities of a `Place`, and their ranges in `BenchLimits`."""
 
 SEED = 4
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How thoroughly is searched; the defaults take some minutes on two cores.
+    """Effort of the search; the defaults take some minutes on two cores.
 
     Parameters
     ----------
     grid
-        Angles, distances and plane distances of the grid.
+        Numbers of angles, distances and plane distances of the grid.
     pools
-        On so many pools all possible places are compared, the best ten of them, and the finalists.
+        Numbers of pools on which all feasible places, the best ten, and the finalists are compared.
     steps
-        Of the way on from the best.
+        Function evaluations of a refinement.
     finalists
-        So many set-ups are simulated.
+        Number of set-ups that are simulated.
     sweep
-        Points of each curve of what a mm or a degree away costs.
+        Points of each sensitivity curve.
     """
 
     grid: tuple[int, int, int] = (6, 6, 4)
@@ -76,16 +76,16 @@ QUICK = Effort(grid=(5, 4, 3), pools=(2, 4, 12), steps=6, finalists=2, sweep=3)
 
 @dataclass(frozen=True)
 class Candidate:
-    """A set-up that was looked at.
+    """An evaluated set-up.
 
     Parameters
     ----------
     place
-        Where laser and plane stand.
+        Places of laser and plane.
     margins
-        By how much it keeps each of `CONSTRAINTS`; below 0 it does not.
+        Margin of each of `CONSTRAINTS`; negative where it is violated.
     error_mm
-        Predicted mean error of the height, infinite where not all is kept.
+        Predicted mean error of the height; infinite if a constraint is violated.
     """
 
     place: Place
@@ -94,22 +94,22 @@ class Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether it keeps them all."""
+        """Whether all constraints hold."""
         return broken(self.margins) == 0
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What it costs to have one quantity elsewhere, the others as recommended; n places.
+    """Sensitivity to one quantity, with the others as recommended; n places.
 
     Parameters
     ----------
     name
         Of the quantity in `Place`.
     value
-        Where it is, mm or degrees, shape (n,).
+        Its values, mm or degrees, shape (n,).
     error_mm
-        Predicted mean error there, whatever is broken, shape (n,).
+        Predicted mean error there, constraints ignored, shape (n,).
     margins
         Margins there, n of them.
     """
@@ -123,29 +123,29 @@ class Sweep:
         freeze(self)
 
     def breaks(self, number: int) -> tuple[Constraint, ...]:
-        """What is not kept there."""
+        """Constraints that are violated there."""
         return tuple(name for name, margin in self.margins[number].items() if margin < 0)
 
 
 @dataclass(frozen=True)
 class Advice:
-    """The recommended set-up, what to expect of it, and what was looked at on the way.
+    """The recommended set-up, its expected error, and the set-ups compared with it.
 
     Parameters
     ----------
     expected, limits
-        What was asked.
+        The request.
     best
-        The recommended set-up; where none is possible, the one that breaks least.
+        The recommended set-up; where none is feasible, the one with the least violation.
     error_mm, sigma_mm
-        Mean error of the height to be expected of it, and the standard uncertainty of that mean;
-        NaN where none is possible.
+        Expected mean error of its height, and the standard uncertainty of that mean; NaN where no
+        set-up is feasible.
     random_mm
         The same mean with the calibration known exactly.
     grid
         The places of the grid, laser place by laser place.
     sweeps
-        The cost of each mm and degree away.
+        Sensitivity to each quantity.
     """
 
     expected: ExpectedPools
@@ -381,10 +381,10 @@ def spans(limits: BenchLimits) -> dict[str, Range]:
     return {name: getattr(limits, field) for name, field in MOVED.items()}
 
 
-def constraint_words(name: Constraint, margin: float) -> str:
-    """A margin in words: by how much a set-up keeps, or breaks, a constraint."""
-    words, unit = CONSTRAINTS[name]
+def constraint_text(name: Constraint, margin: float) -> str:
+    """Text of a margin: by how much a constraint holds or is violated."""
+    label, unit = CONSTRAINTS[name]
     much = f"{abs(margin):.3g} {unit}"
     if name == "once":
-        return f"{words}: {much} do" if margin < 0 else words
-    return f"{words}: {much} {'too little' if margin < 0 else 'to spare'}"
+        return f"{label}: {much} do" if margin < 0 else label
+    return f"{label}: {much} {'too little' if margin < 0 else 'to spare'}"
