@@ -253,10 +253,10 @@ def _stream_sinks(at_end: ExitStack, places: dict[str, str | None], anywhere: bo
     asked = {kind: place for kind, place in places.items() if place is not None}
     if not asked:
         return []
-    from labapp.run.streams import open_stream, told_values
+    from labapp.run.streams import open_stream, stream_values
 
     def sink(stream: Stream) -> Sink:
-        return lambda result: stream.publish(told_values(result))
+        return lambda result: stream.publish(stream_values(result))
 
     sinks = []
     for kind, place in asked.items():

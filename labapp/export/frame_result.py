@@ -1,4 +1,4 @@
-"""What one frame gave: one value, from what measures to all that keeps, writes or shows it."""
+"""The result of one frame, from what measures it to all that stores, writes or shows it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from labapp.core.pipeline import Measurement
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What one frame gave.
+    """The result of one frame.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ class FrameResult:
     track_lost
         Why it was not measured from the frame before; None if it was, or was not to be.
     rows
-        Its rows of each table as CSV text (`tables.table_rows`), where they are made already.
+        Its rows of each table as CSV text (`tables.table_rows`); None: not made yet.
     """
 
     frame: int
@@ -32,5 +32,5 @@ class FrameResult:
 
 
 def without_surface(measurement: Measurement) -> Measurement:
-    """Status, reason and measures alone: little to hand from one process to another."""
+    """Status, reason and measures alone: little to pass from process to process."""
     return replace(measurement, dots=None, lattice=None, match=None, reconstruction=None)

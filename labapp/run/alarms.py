@@ -33,13 +33,13 @@ class Alarm:
     code
         ``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``.
     words
-        What is wrong, in a sentence without its end.
+        What is wrong, a sentence without its full stop.
     frame, time_s
         The camera's number of the frame that raised it, and its time by the camera's clock, s.
     holds
         Whether it is so still.
     acknowledged
-        Whether the operator has said that it was seen.
+        Whether the operator has acknowledged it.
     at
         When it was raised.
     """
@@ -53,7 +53,7 @@ class Alarm:
     at: datetime = field(default_factory=lambda: datetime.now().astimezone())
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """What is wrong, since which frame."""
         return f"{self.words} (frame {self.frame}, {self.at:%H:%M:%S})"
 
@@ -83,7 +83,7 @@ class Alarms:
         return self._limits
 
     def set_limits(self, limits: Limits) -> list[Alarm]:
-        """Watch other limits from the next frame on; gives the alarms that are over with it."""
+        """Watch other limits from the next frame on; returns the alarms that this ends."""
         with self._turn:
             former, self._limits = self._limits, limits
             changed = [name for name in NAMES if former.of(name) != limits.of(name)]
@@ -140,7 +140,7 @@ class Alarms:
             return changed
 
     def silence(self, words: str) -> list[Alarm]:
-        """Take it that no frame is measured, which words say; gives the alarm if it is new."""
+        """Raise the alarm that no frame is measured, with the reason; returns it if it is new."""
         with self._turn:
             if not self._limits.are_set:
                 return []
@@ -148,12 +148,12 @@ class Alarms:
             return self._raise(SILENT, words, *self._newest)
 
     def acknowledge(self) -> list[Alarm]:
-        """Take it that the operator has seen all that is shown; gives those not seen before."""
+        """Acknowledge all alarms shown; returns those that were not yet acknowledged."""
         with self._turn:
-            seen = [alarm for alarm in self._shown.values() if not alarm.acknowledged]
-            kept = (alarm for alarm in self._shown.values() if alarm.holds)
-            self._shown = {alarm.code: replace(alarm, acknowledged=True) for alarm in kept}
-            return seen
+            new = [alarm for alarm in self._shown.values() if not alarm.acknowledged]
+            held = (alarm for alarm in self._shown.values() if alarm.holds)
+            self._shown = {alarm.code: replace(alarm, acknowledged=True) for alarm in held}
+            return new
 
     def _misses(self, measures: Measures) -> bool:
         """Whether a size that has limits is not known."""
@@ -162,7 +162,7 @@ class Alarms:
         )
 
     def _causes(self, measures: Measures | None, reason: str) -> dict[str, str | None]:
-        """Codes of what is wrong in a frame, in words; None: it may be, but cannot be told."""
+        """Code → words of what is wrong in a frame; None in place of words where it is unknown."""
         if measures is None:
             unknown: dict[str, str | None] = dict.fromkeys(self._shown)
             unknown.pop(SILENT, None)
@@ -182,7 +182,7 @@ class Alarms:
         return found
 
     def _raise(self, code: str, words: str, frame: int, time_s: float) -> list[Alarm]:
-        """Raise an alarm; none if it holds already."""
+        """Raise an alarm; returns none if it holds already."""
         held = self._shown.get(code)
         if held is not None and held.holds:
             return []
@@ -190,7 +190,7 @@ class Alarms:
         return [alarm]
 
     def _end(self, code: str) -> list[Alarm]:
-        """Take it that an alarm holds no more; none if it did not."""
+        """End an alarm; returns none if it did not hold."""
         held = self._shown.get(code)
         if held is None or not held.holds:
             return []

@@ -29,7 +29,7 @@ def detect_dots(
     Returns
     -------
     dots, lattice, doubt
-        The lattice is None, and the doubt a sentence, where rows and columns cannot be told.
+        The lattice is None, and the doubt a sentence, where rows and columns are not found.
 
     Raises
     ------

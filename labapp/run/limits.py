@@ -15,11 +15,11 @@ from labapp.errors import InputError
 CHANCE = 2.0
 """Beyond a limit by no more than so many σ, a size may be there by chance: that is no alarm.
 
-In σ are noise and level only: a set-up that is off moves all frames one way, and no σ tells.
+σ covers noise and level only: an error of the set-up moves all frames one way and is not in it.
 """
 
 UNMEASURED = 3
-"""So many frames in a row that cannot be measured are an alarm, unless told otherwise."""
+"""So many frames in a row that cannot be measured are an alarm, by default."""
 
 LARGEST_MM = 1000.0
 
@@ -102,13 +102,13 @@ class Limits:
     @property
     def words(self) -> str:
         """What they are: "width 6 to 6.9 mm, height from 0.2 mm"."""
-        told = []
+        parts = []
         for name in NAMES:
             low, high = self.of(name)
-            parts = [f"{'from ' * (high is None)}{low:g}"] if low is not None else []
-            parts += [f"to {high:g}"] if high is not None else []
-            told += [f"{name} {' '.join(parts)} mm"] if parts else []
-        return ", ".join(told) or "none"
+            ends = [f"{'from ' * (high is None)}{low:g}"] if low is not None else []
+            ends += [f"to {high:g}"] if high is not None else []
+            parts += [f"{name} {' '.join(ends)} mm"] if ends else []
+        return ", ".join(parts) or "none"
 
 
 def sizes_of(measures: Measures | None) -> tuple[Size, Size, Size]:

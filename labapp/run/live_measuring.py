@@ -18,12 +18,11 @@ from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import end_processes, start_worker
 
 JUDGED_S = 0.2
-"""So long the verdict on a frame stands for those that are followed from it."""
-
+"""How long the quality of a frame stands for those that follow, s."""
 
 SOUGHT_S = 1.0
-"""So long after a frame that was measured those that are not followed are left out: the pool may
-swing back to where it was, and a frame that is measured by itself takes seconds."""
+"""For so long after a frame that was measured, s, frames that cannot be followed are left out: the
+pool may swing back to where it was, and a frame that is measured by itself takes seconds."""
 
 
 class LiveMeasuringEnded(Exception):
@@ -32,7 +31,7 @@ class LiveMeasuringEnded(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveResult(FrameResult):
-    """What a live frame gave: status, reason and sizes; dots, rays and surface stay behind.
+    """What a live frame gave: status, reason and measures, without dots, rays and surface.
 
     Parameters
     ----------
@@ -41,9 +40,10 @@ class LiveResult(FrameResult):
     arrived_s
         `time.monotonic` when it came, s: the sizes are as old.
     quality
-        How fit frames are to be measured; while each is followed, of one some times a second.
+        How fit the frame is to be measured; of a followed one, that of a frame at most `JUDGED_S`
+        before.
     scene
-        Its surface to be drawn, where that was asked for; None where it could not be measured.
+        Its surface to be drawn, if wanted; None where it could not be measured.
     """
 
     time_s: float
@@ -67,13 +67,13 @@ class LiveMeasuring:
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
         spawn = multiprocessing.get_context("spawn")
-        nice, given = 0, (setup, settings, bit_depth)  # its figures are looked at now
+        nice, given = 0, (setup, settings, bit_depth)  # its results are needed now
         self._pool = ProcessPoolExecutor(
             1, spawn, initializer=start_worker, initargs=(nice, _begin, *given)
         )
 
     def measure(self, frame: CameraFrame, drawn: bool = False) -> LiveResult | None:
-        """Measure the next frame; None where it is left out, for one after it may be followed.
+        """Measure the next frame; None where it is left out (`SOUGHT_S`).
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class LiveMeasuring:
             raise LiveMeasuringEnded(str(error)) from error
 
     def close(self) -> None:
-        """End the process, whatever it is at. Twice does no harm."""
+        """Terminate the process. May be called twice."""
         end_processes(self._pool)
 
 
@@ -130,10 +130,7 @@ class LiveChain:
         )
 
     def _quality(self, frame: CameraFrame, found: Measurement) -> Quality:
-        """How fit the frame is, or one just before that it was followed from.
-
-        To judge takes nearly half as long as to measure.
-        """
+        """Quality of the frame, or of one just before: that takes half as long as measuring."""
         now_s, is_followed = time.monotonic(), self._chain.broke is None
         if self._judged is not None and is_followed and now_s < self._judged[0] + JUDGED_S:
             return self._judged[1]

@@ -19,8 +19,8 @@ in their order, however old: the present one would be too far from it. Where one
 measured by itself, too, the newest is next, or figures would become older and older."""
 
 SWING_S = 0.0125
-"""Until twice as many have followed each other steps are no smaller: what they tell is then a whole
-swing, among which what comes next is found again after a jump."""
+"""Until twice as many have followed each other steps are no smaller: they then cover a full swing,
+from which what comes next is found again after a jump."""
 
 FAR_S = 0.1
 """Steps are no larger: frames farther from each other are hardly measured from each other."""
@@ -31,7 +31,7 @@ much; steps are made smaller only where this part of the smaller one would do.""
 
 
 class FrameQueue:
-    """The frames that wait to be measured. `put` never waits; the rest belongs into one thread."""
+    """The frames that wait to be measured. `put` never waits; call the rest from one thread."""
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -82,7 +82,7 @@ class FrameQueue:
             return frame
 
     def done(self, followed: bool, took_s: float) -> None:
-        """Hear whether the frame was measured from those before, and how long it took, s."""
+        """Report whether the frame was measured from those before, and how long it took, s."""
         with self._turn:
             if not followed:
                 self._followed = 0
@@ -117,7 +117,7 @@ def _mean(former: float, newest: float) -> float:
 
 
 def newest_of(frames: deque[CameraFrame]) -> CameraFrame | None:
-    """Take the newest frame; those before it are let go."""
+    """Take the newest frame; those before it are dropped."""
     while len(frames) > 1:
         frames.popleft()
     return frames.popleft() if frames else None

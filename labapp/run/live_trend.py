@@ -72,7 +72,7 @@ class Pace:
 
 
 class _Frame(NamedTuple):
-    """What is kept of a frame: numbers alone, for there are thousands.
+    """A frame of the trend: numbers alone, for there are thousands.
 
     Sizes are their values and then their σ, shape (6,), mm.
     """
@@ -85,7 +85,7 @@ class _Frame(NamedTuple):
 
 
 class LiveTrend:
-    """Keeps the sizes of the last frames. `add` belongs into one thread."""
+    """Sizes of the last frames. Call `add` from one thread, the rest from any."""
 
     def __init__(self) -> None:
         self._frames: deque[_Frame] = deque(maxlen=MOST_KEPT)
@@ -93,7 +93,7 @@ class LiveTrend:
         self._turn = threading.Lock()
 
     def add(self, result: LiveResult) -> None:
-        """Take what the next frame gave."""
+        """Add the next frame."""
         done_s, measures = time.monotonic(), result.measurement.measures
         sizes = sizes_of(measures)
         numbers = (*(s.value_mm for s in sizes), *(s.sigma_mm for s in sizes))
@@ -114,7 +114,7 @@ class LiveTrend:
         return Pace((len(late) - failed) / RATE_S, len(late), failed)
 
     def over(self, last_s: float, limits: Limits) -> Trend:
-        """Sizes of the frames that came in the last so many seconds, held against limits."""
+        """Sizes of the frames that came in the last so many seconds, compared with limits."""
         now_s = time.monotonic()
         with self._turn:
             late = [each for each in self._frames if each.arrived_s > now_s - last_s]

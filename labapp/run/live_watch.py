@@ -1,4 +1,4 @@
-"""Frames of a live camera measured while they come: figures, their trend, alarms, who is told."""
+"""Frames of a live camera measured as they come: sizes, their trend, alarms, streams."""
 
 from __future__ import annotations
 
@@ -12,35 +12,34 @@ from labapp.core.pipeline import Measurement, Settings
 from labapp.export.frame_result import FrameResult
 from labapp.export.scene import Scene
 from labapp.media.cameras import CameraFrame
-from labapp.media.events import Event, Kind
+from labapp.media.events import Event
 from labapp.run.alarms import Alarm, Alarms
 from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveMeasuring, LiveResult
 from labapp.run.live_queue import FrameQueue
 from labapp.run.live_trend import LiveTrend
-from labapp.run.streams import Stream, live_values
+from labapp.run.streams import Stream, stream_values
 
 SILENT_S = 10.0
-"""No figure for so long is an alarm. A frame that is measured by itself takes seconds."""
+"""No result for so long, s, is an alarm. A frame that is measured by itself takes seconds."""
 
 
 class LiveWatch:
     """Measures a camera's frames as they come, each from the one before, and watches the sizes.
 
-    `take` never waits. `next_frame` and `measure` belong into one thread; what is looked at may be
-    looked at from any.
+    `take` never waits. Call `next_frame` and `measure` from one thread, the rest from any.
 
     Parameters
     ----------
     name
-        Of the camera, for what is said.
+        Of the camera, for events.
     setup, settings, bit_depth
         As of `LiveMeasuring`.
     limits
         Of the sizes.
-    say
-        Called with alarms that are raised, over, or acknowledged, and with other limits, and the
-        time of the frame by the camera's clock, s (None: now); from any thread.
+    on_event
+        Called when an alarm is raised, over, or acknowledged, and when limits change, with the
+        event and the time of its frame by the camera's clock, s (None: now); from any thread.
 
     Attributes
     ----------
@@ -57,10 +56,10 @@ class LiveWatch:
         settings: Settings,
         bit_depth: int,
         limits: Limits,
-        say: Callable[[Event, float | None], None],
+        on_event: Callable[[Event, float | None], None],
     ) -> None:
         self.alarms, self.trend = Alarms(limits), LiveTrend()
-        self._name, self._scheme, self._say = name, settings.scheme, say
+        self._name, self._scheme, self._on_event = name, settings.scheme, on_event
         self._measuring = LiveMeasuring(setup, settings, bit_depth)
         self._queue = FrameQueue()
         self._newest: deque[LiveResult] = deque(maxlen=1)
@@ -68,16 +67,16 @@ class LiveWatch:
         self._turn = threading.Lock()
         self._streams: dict[str, Stream] = {}
         self._is_closed = False
-        self._heard_s, self._last = time.monotonic(), (0, 0.0)
+        self._measured_s, self._last = time.monotonic(), (0, 0.0)
         self._is_drawn = threading.Event()
-        self._sinks = (self._judge, self.trend.add, self._show, self._tell)
+        self._sinks = (self._judge, self.trend.add, self._show, self._publish)
 
     def take(self, frame: CameraFrame) -> None:
         """Take a frame of the camera; never waits."""
         self._queue.put(frame)
 
     def close(self) -> None:
-        """End the measuring, whatever it is at, and who is told is told so. Twice does no harm."""
+        """End the measuring, and the streams. May be called twice."""
         with self._turn:
             self._is_closed = True  # that measuring ends now is no alarm
             streams, self._streams = self._streams, {}
@@ -91,11 +90,11 @@ class LiveWatch:
         """The next frame to be measured; None while there is none (`FrameQueue`)."""
         frame = self._queue.next()
         if frame is None:
-            self._heed_silence()
+            self._check_silence()
         return frame
 
     def measure(self, frame: CameraFrame) -> None:
-        """Measure a frame, watch its sizes, and tell them; or leave it out (`LiveMeasuring`).
+        """Measure a frame and pass the result to all sinks; or leave it out (`LiveMeasuring`).
 
         Raises
         ------
@@ -107,7 +106,7 @@ class LiveWatch:
             result = self._measuring.measure(frame, drawn)
         except Exception as error:
             if not self._is_closed:
-                self._fall_silent(f"Nothing is measured any more: {error}")
+                self._raise_silence(f"Nothing is measured any more: {error}")
             raise
         is_followed = result is not None and result.track_lost is None
         self._queue.done(is_followed, time.monotonic() - began_s)
@@ -117,83 +116,84 @@ class LiveWatch:
 
     def _judge(self, result: LiveResult) -> None:
         """Raise alarms, or end them."""
-        self._heard_s, self._last = time.monotonic(), (result.frame, result.time_s)
+        self._measured_s, self._last = time.monotonic(), (result.frame, result.time_s)
         found = result.measurement
         for alarm in self.alarms.judge(*self._last, found.measures, found.reason):
-            self._say(Event(self._name, *_told(alarm)), result.time_s)
+            self._on_event(self._changed(alarm), result.time_s)
 
     def _show(self, result: LiveResult) -> None:
-        """Keep the result, and its surface, until they are looked at."""
+        """Hold the result and its surface for `newest` and `scene`."""
         if result.scene is not None:
             self._is_drawn.clear()
             self._scene.append(result.scene)
         self._newest.append(result)
 
-    def _heed_silence(self) -> None:
-        """Raise an alarm, and tell it, where no figure has come for long."""
-        silent_s = time.monotonic() - self._heard_s
+    def _check_silence(self) -> None:
+        silent_s = time.monotonic() - self._measured_s
         if silent_s > SILENT_S:
-            self._heard_s = float("inf")
-            self._fall_silent(f"No frame has been measured for {silent_s:.0f} s")
+            self._measured_s = float("inf")  # once
+            self._raise_silence(f"No frame has been measured for {silent_s:.0f} s")
 
-    def _fall_silent(self, words: str) -> None:
+    def _raise_silence(self, words: str) -> None:
         for alarm in self.alarms.silence(words):
-            self._say(Event(self._name, *_told(alarm)), None)
-        self._tell(FrameResult(*self._last, Measurement("silent", words, self._scheme)))
+            self._on_event(self._changed(alarm), None)
+        self._publish(FrameResult(*self._last, Measurement("silent", words, self._scheme)))
 
-    def _tell(self, result: FrameResult) -> None:
-        values = live_values(result, self.alarms.shown)
-        with self._turn:  # one that is told must not be closed meanwhile
+    def _publish(self, result: FrameResult) -> None:
+        values = stream_values(result, self.alarms.shown)
+        with self._turn:  # no stream may be closed meanwhile
             for stream in self._streams.values():
                 stream.publish(values)
 
-    # --- to look at ---------------------------------------------------------------------------
+    # --- what there is ------------------------------------------------------------------------
 
     def newest(self) -> LiveResult | None:
-        """The frame measured last; None if it was given already."""
+        """The last result; None if it was returned before."""
         return self._newest.popleft() if self._newest else None
 
     def ask_for_scene(self) -> None:
-        """Have the surface of the next frame that is measured be drawn, too: once."""
+        """Have the surface of the next frame that is measured drawn, once."""
         self._is_drawn.set()
 
     def scene(self) -> Scene | None:
-        """The surface that was asked for; None before it is there, and if it was given already."""
+        """The surface asked for; None before it is there, and if it was returned before."""
         return self._scene.popleft() if self._scene else None
 
     def stream(self, kind: str) -> Stream | None:
-        """What tells by this kind; None: nothing does."""
+        """The open stream of a kind, if any."""
         return self._streams.get(kind)
 
-    # --- to do --------------------------------------------------------------------------------
-
     def standing(self) -> list[tuple[Event, float | None]]:
-        """What a recording that begins is to be told: the limits, and the alarms that hold."""
+        """Events for the notes of a recording that begins: limits, and alarms that hold."""
         limits = self.alarms.limits
-        told: list[tuple[Event, float | None]] = []
+        events: list[tuple[Event, float | None]] = []
         if limits.are_set:
-            told.append((Event(self._name, "note", f"limits: {limits.words}"), None))
+            events.append((Event(self._name, "note", f"limits: {limits.words}"), None))
         for alarm in self.alarms.shown:
             if alarm.holds:
-                told.append((Event(self._name, "warning", f"ALARM: {alarm.told}"), alarm.time_s))
-        return told
+                words = f"ALARM: {alarm.description}"
+                events.append((Event(self._name, "warning", words), alarm.time_s))
+        return events
+
+    # --- what is changed ----------------------------------------------------------------------
 
     def set_limits(self, limits: Limits) -> None:
-        """Watch other limits from the next frame on, which is said."""
+        """Watch other limits from the next frame on."""
         if limits != self.alarms.limits:
             for alarm in self.alarms.set_limits(limits):
-                self._say(Event(self._name, *_told(alarm)), None)
-            self._say(Event(self._name, "note", f"limits now: {limits.words}"), None)
+                self._on_event(self._changed(alarm), None)
+            self._on_event(Event(self._name, "note", f"limits now: {limits.words}"), None)
 
     def acknowledge(self) -> None:
-        """Take it that the operator has seen all alarms."""
+        """Acknowledge all alarms."""
         for alarm in self.alarms.acknowledge():
-            self._say(Event(self._name, "note", f"alarm acknowledged: {alarm.told}"), None)
+            words = f"alarm acknowledged: {alarm.description}"
+            self._on_event(Event(self._name, "note", words), None)
 
-    def tell_by(self, kind: str, stream: Stream | None) -> None:
-        """Tell every frame that is measured by a stream in place of the one of its kind.
+    def set_stream(self, kind: str, stream: Stream | None) -> None:
+        """Publish results by a stream in place of the one of its kind, which is closed.
 
-        That one is closed; `close` closes all. None tells no more by that kind.
+        None only closes that one; `close` closes all.
         """
         with self._turn:
             former = self._streams.pop(kind, None)
@@ -203,9 +203,8 @@ class LiveWatch:
             if each is not None:
                 each.close()
 
-
-def _told(alarm: Alarm) -> tuple[Kind, str]:
-    """How bad it is that an alarm has changed, and that in words."""
-    if alarm.holds:
-        return "warning", f"ALARM: {alarm.words} (frame {alarm.frame})"
-    return "note", f"alarm over: {alarm.told}"
+    def _changed(self, alarm: Alarm) -> Event:
+        """The event of an alarm that is raised, or over."""
+        if alarm.holds:
+            return Event(self._name, "warning", f"ALARM: {alarm.words} (frame {alarm.frame})")
+        return Event(self._name, "note", f"alarm over: {alarm.description}")

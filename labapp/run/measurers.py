@@ -37,13 +37,13 @@ from labapp.simulation.parallel import NICE, start_worker
 T = TypeVar("T")
 
 AHEAD = 8
-"""So many frames are given to a pool before the first of them must be done."""
+"""So many frames are submitted to a pool beyond the one whose result is awaited."""
 
 STRETCH = 1000
 """Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
 
 BATCH = 20
-"""Frames that a process gives back at a time."""
+"""Frames that a process returns at a time."""
 
 Read = Callable[[int], Frame]
 Corrected = Callable[[int], Correction | None]
@@ -87,14 +87,14 @@ class ColdMeasurer:
 
 
 def _here(work: Callable[..., T], *given: Any) -> Future[T]:
-    """Work that is done at once; what it raises is raised here."""
+    """Do some work at once, as a pool without processes would."""
     future: Future[T] = Future()
     future.set_result(work(*given))
     return future
 
 
 def _read(read: Read, number: int, settings: Settings) -> Frame | FrameResult:
-    """The frame, or what one gives that cannot be read."""
+    """The frame; if it cannot be read, its result."""
     try:
         return read(number)
     except InputError as error:
@@ -104,21 +104,21 @@ def _read(read: Read, number: int, settings: Settings) -> Frame | FrameResult:
 def _cold(
     number: int, frame: Frame, setup: Setup, settings: Settings, correction: Correction | None
 ) -> FrameResult:
-    """What a frame gives by itself, with its dots and rows as they were corrected."""
+    """Measure a frame by itself, with its dots and rows as they were corrected."""
     with _one_thread():
         found = measure(frame.image, setup.rig, setup.calibration, settings, correction)
     return FrameResult(number, frame.time_s, found)
 
 
 def _one_thread() -> AbstractContextManager[object]:
-    """Have matrices multiplied in one thread: they are small, and more get in each other's way."""
+    """Limit BLAS to one thread: the matrices are small, and more threads are slower."""
     limited: AbstractContextManager[object] = _threads().limit(limits=1, user_api="blas")
     return limited
 
 
 @functools.cache
 def _threads() -> ThreadpoolController:
-    """What measures is loaded when this is first asked for; to look through it takes long."""
+    """Made once: it searches all loaded libraries. Those that measure are loaded by then."""
     return ThreadpoolController()
 
 
@@ -129,7 +129,7 @@ def measuring_pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
-    """Results in their order, so many of them begun ahead; closed early, those are cancelled."""
+    """Results in their order, so many begun ahead, which are cancelled if it is closed early."""
     waiting: deque[Future[T]] = deque()
     try:
         for future in begun:
@@ -198,8 +198,8 @@ class RecordingMeasurer:
     setup, settings
         What it is measured with.
     whole
-        Whether results have dots, rays and surface, too: to hand them over takes a twentieth of the
-        time that it took to measure them.
+        Whether results have dots, rays and surface, too: to pass them from process to process takes
+        a twentieth of the time that it took to measure them.
     pools
         Where to measure (`stretch_pools`); none: here.
 
@@ -249,11 +249,11 @@ class RecordingMeasurer:
 
 
 _stretch: Generator[FrameResult] | None = None
-"""The stretch that this process is at."""
+"""The stretch that this process measures."""
 
 
 def _first_batch(measurer: RecordingMeasurer, frames: Sequence[int]) -> list[FrameResult]:
-    """Begin a stretch in this process, in place of the one that it was at."""
+    """Begin a stretch in this process, in place of the one before."""
     global _stretch  # noqa: PLW0603 - a stretch stays in the process that began it
     if _stretch is not None:
         _stretch.close()
@@ -269,7 +269,7 @@ def _next_batch() -> list[FrameResult]:
 
 @contextmanager
 def stretch_pools(frames: int, workers: int | None = None) -> Iterator[list[Executor]]:
-    """Begin processes for a `RecordingMeasurer`; they load meanwhile what they need.
+    """Start processes for a `RecordingMeasurer`; each loads its modules meanwhile.
 
     Parameters
     ----------
@@ -289,13 +289,13 @@ def stretch_pools(frames: int, workers: int | None = None) -> Iterator[list[Exec
 
 
 def await_loaded(pools: Sequence[Executor]) -> None:
-    """Wait until processes have loaded what they need."""
+    """Wait until `stretch_pools` have loaded their modules."""
     for loaded in [pool.submit(_load) for pool in pools]:
         loaded.result()
 
 
 def _load() -> None:
-    """Have a process start, and load what it measures with."""
+    """Load in this process all that measures."""
     import labapp.core.matching.match_kernels
     import labapp.core.rows.lattice_kernels
     import labapp.core.sequence.warm

@@ -1,7 +1,7 @@
-"""A run: frames are measured, and what each gave goes to all who want it, frame by frame.
+"""The loop that measures frames: `run`, for the command line, sessions and the benchmark.
 
-The command line, sessions and the benchmark run by `run`: they differ in what measures (a
-`Measurer`, see `measurers`) and in where results go (`Sink`).
+They differ in what measures (a `Measurer`, see `measurers`) and in where results go (`Sink`). A
+live camera has a loop of its own (`live_watch`): how long a frame took says which is next.
 """
 
 from __future__ import annotations
@@ -28,10 +28,9 @@ SOME_FRAMES = "A:B:STEP, frames A to before B (from 0), every STEP-th; each may 
 
 
 def run(frames: Iterable[int], measurer: Measurer, sinks: Sequence[Sink]) -> Generator[FrameResult]:
-    """Measure frames and give each result to every sink; yields it when all have it.
+    """Measure frames and pass each result to every sink; yields it once all have it.
 
-    Closing the generator stops the run, as does what a sink raises: frames that were begun are
-    cancelled then, and no sink hears of them.
+    To stop, close the generator, or raise in a sink: frames that were begun are cancelled.
 
     Parameters
     ----------
@@ -80,7 +79,7 @@ def provenance(
     frames: range,
     warm: bool = False,
 ) -> dict[str, object]:
-    """What `run.json` tells of where results come from."""
+    """Origin of the results, for `run.json`."""
     return {
         "source": {
             "path": str(Path(source_path).absolute()),

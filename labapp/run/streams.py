@@ -1,7 +1,7 @@
-"""Measures told to control software while they are made: lines of JSON over TCP, or OPC UA.
+"""Measures streamed to control software as they are made: lines of JSON over TCP, or OPC UA.
 
-Each stream has an event loop in a thread of its own: telling never waits for who listens. They are
-heard on this machine only unless told otherwise, as neither asks who connects.
+Each stream has an event loop in a thread of its own: publishing never waits for a client. Only
+programs of this machine can connect by default, as neither protocol authenticates its clients.
 """
 
 from __future__ import annotations
@@ -26,36 +26,41 @@ from labapp.run.alarms import Alarm
 from labapp.version import VERSION
 
 MOST_LISTENERS, AT_ONCE = 32, 16
-"""Each takes an open file, of which the measurement needs some itself."""
+"""Most clients, and most that OPC UA accepts at once: each takes an open file, of which the
+measurement needs some itself."""
 
 MOST_WAITING = 1_000_000
-"""Bytes that may wait for a listener; one that does not read misses lines, and is told so."""
+"""Bytes buffered for a client; one that does not read misses lines, and is sent how many."""
 
 OPCUA_S = 0.05
-"""The variables of OPC UA take the newest frame so often: clients sample them."""
+"""Period at which the OPC UA variables are updated, s: clients sample them."""
 
 ALARMS = ("alarm", "unacknowledged")
-"""What is told of alarms, while a camera is live."""
+"""Names of the alarms' values, while a camera is live."""
 
 NAMESPACE = "urn:labapp:measures"
 
 STARTING_S = 20.0
 
 PATIENCE_S = 1.0
-"""At the end a listener has so long to read what waits for it."""
+"""How long a client has to read what is buffered when the stream closes, s."""
 
 Values = Mapping[str, int | float | str | None]
 
 
-def told_values(result: FrameResult) -> Values:
-    """What is told of a frame, with the names and units of ``measures.csv``; None: not known."""
+def stream_values(result: FrameResult, alarms: Iterable[Alarm] | None = None) -> Values:
+    """Values of a frame, with the names and units of ``measures.csv``; None where unknown.
+
+    Of a live camera alarms are added, by their codes with spaces between: ``alarm``, those that
+    hold, and ``unacknowledged``.
+    """
     measurement = result.measurement
 
     def number(name: str) -> float | None:
         value = float(getattr(measurement.measures, name, math.nan))
         return value if math.isfinite(value) else None
 
-    return {
+    values = {
         "frame": result.frame,
         "time_s": result.time_s,
         "status": measurement.status,
@@ -64,47 +69,42 @@ def told_values(result: FrameResult) -> Values:
         **{name: number(name) for name in SIZES},
         "sigma_of": sigma_of(measurement),
     }
-
-
-def live_values(result: FrameResult, alarms: Iterable[Alarm]) -> Values:
-    """The same of a frame of a live camera, and the alarms by their codes, with spaces between.
-
-    ``alarm``: what is so now; ``unacknowledged``: what the operator has not said to have seen.
-    """
+    if alarms is None:
+        return values
     shown = tuple(alarms)
     return {
-        **told_values(result),
+        **values,
         ALARMS[0]: " ".join(each.code for each in shown if each.holds),
         ALARMS[1]: " ".join(each.code for each in shown if not each.acknowledged),
     }
 
 
 class Stream(Protocol):
-    """Somebody to tell measures to."""
+    """A server of measures."""
 
     address: str
-    """Where it is heard, for who connects."""
+    """Where clients connect."""
 
-    told: int
-    """How many frames were told while somebody listened."""
+    sent: int
+    """How many frames were sent while a client was connected."""
 
     @property
     def listeners(self) -> int:
-        """How many programs are connected."""
+        """How many clients are connected."""
 
     def publish(self, values: Values) -> None:
-        """Tell a frame; does not wait."""
+        """Send the values of a frame; does not wait."""
 
     def close(self) -> None:
-        """Tell what is waiting, and end."""
+        """Send what is buffered, and end."""
 
 
 class LineStream:
-    """A line of JSON a frame, to every program that connects by TCP.
+    """A line of JSON per frame, to every TCP client.
 
-    The first line says what sends: ``{"labapp": "0.1.0"}``. A line has ``missed`` where lines
-    before it were not sent because the listener did not read. Beyond `MOST_LISTENERS` the first
-    line says ``refused``, and is the last.
+    The first line names the program: ``{"labapp": "0.1.0"}``. A line has ``missed`` where lines
+    before it were dropped because the client did not read. Beyond `MOST_LISTENERS` the first line
+    has ``refused``, and is the last.
 
     Parameters
     ----------
@@ -116,12 +116,12 @@ class LineStream:
     Raises
     ------
     InputError
-        If the host is another machine's way in and ``anywhere`` is not said, or the port is taken.
+        If other machines could connect and ``anywhere`` is false, or the port is taken.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, anywhere: bool = False) -> None:
         check_host(host, anywhere)
-        self.told = 0
+        self.sent = 0
         self._missed: dict[asyncio.StreamWriter, int] = {}
         self._loop = _Loop("labapp line stream")
         try:
@@ -136,16 +136,16 @@ class LineStream:
 
     @property
     def listeners(self) -> int:
-        """How many programs are connected."""
+        """How many clients are connected."""
         return len(self._missed)
 
     def publish(self, values: Values) -> None:
-        """Tell a frame; does not wait."""
+        """Send the values of a frame; does not wait."""
         line = json.dumps(values, allow_nan=False).encode()
         self._loop.soon(lambda: self._send(line))
 
     def close(self) -> None:
-        """Send what is waiting for those who read, and end."""
+        """Send what is buffered, and end."""
         self._loop.run(self._close())
         self._loop.close()
 
@@ -160,23 +160,23 @@ class LineStream:
         self._missed[writer] = 0
         try:
             while await reader.read(1024):
-                pass  # what listeners say is not for us
-            await writer.wait_closed()  # one that says no more may still read
+                pass  # what clients send is ignored
+            await writer.wait_closed()  # one that has ended its side may still read
         except OSError:
-            pass  # it is gone
+            pass  # disconnected
         finally:
             self._missed.pop(writer, None)
             writer.close()
 
     def _send(self, line: bytes) -> None:
-        self.told += bool(self._missed)
+        self.sent += bool(self._missed)
         for writer, missed in self._missed.items():
             if writer.transport.get_write_buffer_size() > MOST_WAITING:
                 self._missed[writer] += 1
                 continue
-            told = line[:-1] + b', "missed": %d}' % missed if missed else line
+            full = line[:-1] + b', "missed": %d}' % missed if missed else line
             self._missed[writer] = 0
-            writer.write(told + b"\n")
+            writer.write(full + b"\n")
 
     async def _close(self) -> None:
         self._server.close()
@@ -195,10 +195,10 @@ class LineStream:
 
 
 class OpcuaStream:
-    """Measures as variables of an OPC UA server, the newest frame some twenty times a second.
+    """Measures as variables of an OPC UA server, updated every `OPCUA_S` from the newest frame.
 
-    They are ``Objects/Pool/NAME`` in the namespace ``urn:labapp:measures``; NaN is what is not
-    known. It needs asyncua, which the extra ``control`` brings.
+    They are ``Objects/Pool/NAME`` in the namespace ``urn:labapp:measures``; NaN where unknown.
+    Needs asyncua, which the extra ``control`` installs.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ class OpcuaStream:
     Raises
     ------
     InputError
-        If asyncua is not there, the host is another machine's way in and ``anywhere`` is not said,
-        or the port is taken.
+        If asyncua is not installed, other machines could connect and ``anywhere`` is false, or the
+        port is taken.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 4840, anywhere: bool = False) -> None:
@@ -222,13 +222,13 @@ class OpcuaStream:
         except ImportError as error:
             expected = "asyncua, which pip install 'labapp[control]' brings"
             raise InputError("OPC UA", "library", "missing", expected) from error
-        # What it says of security policies and ports is said here in words of our own.
+        # Its messages on security policies and ports are replaced by errors of our own.
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)
         self._ua = ua
         self._newest: Values | None = None
         self._variables: dict[str, Any] = {}
         self._ended = False
-        self.told = 0
+        self.sent = 0
         self._loop = _Loop("labapp OPC UA stream")
         self.address = f"opc.tcp://{host}:{port}/labapp"
         try:
@@ -236,21 +236,21 @@ class OpcuaStream:
         except OSError as error:
             self._loop.close()
             raise _taken(host, port, error) from error
-        self._telling = self._loop.start(self._tell())
+        self._updating = self._loop.start(self._update())
 
     @property
     def listeners(self) -> int:
-        """How many programs are connected."""
+        """How many clients are connected."""
         return len(self._server.bserver.clients)
 
     def publish(self, values: Values) -> None:
-        """Tell a frame; does not wait. A frame that another follows at once may be left out."""
+        """Set the values of a frame; does not wait. The next frame may replace them unseen."""
         self._newest = values
 
     def close(self) -> None:
-        """Tell the newest frame, and end."""
+        """Write the newest frame, and end."""
         self._ended = True
-        self._telling.result(STARTING_S)
+        self._updating.result(STARTING_S)
         self._loop.run(self._server.stop())
         self._loop.close()
 
@@ -273,15 +273,15 @@ class OpcuaStream:
         await server.start()
         return server
 
-    async def _tell(self) -> None:
+    async def _update(self) -> None:
         while not self._ended or self._newest is not None:
             values, self._newest = self._newest, None
             try:
                 for name, value in (values or {}).items():
                     await self._variables[name].write_value(math.nan if value is None else value)
-                self.told += values is not None and self.listeners > 0
-            except Exception as error:  # what one frame does must not end the telling
-                logging.getLogger(NAME).error("not told by OPC UA", exc_info=error)
+                self.sent += values is not None and self.listeners > 0
+            except Exception as error:  # one frame must not end the stream
+                logging.getLogger(NAME).error("not sent by OPC UA", exc_info=error)
             if not self._ended:
                 await asyncio.sleep(OPCUA_S)
 
@@ -292,7 +292,7 @@ def open_stream(kind: str, place: str, anywhere: bool) -> Stream:
     Raises
     ------
     InputError
-        If the place is none, or cannot be listened at.
+        If the place has another form, or the port cannot be opened.
     """
     host, _, port = place.rpartition(":")
     if not (port.isdecimal() and int(port) < 65536):
@@ -302,12 +302,12 @@ def open_stream(kind: str, place: str, anywhere: bool) -> Stream:
 
 
 def check_host(host: str, anywhere: bool) -> None:
-    """Refuse a way in for other machines, unless it was asked for.
+    """Refuse an address that other machines can reach, unless ``anywhere``.
 
     Raises
     ------
     InputError
-        If it is one.
+        If it is refused.
     """
     try:
         is_own = host == "localhost" or ipaddress.ip_address(host).is_loopback
@@ -319,7 +319,7 @@ def check_host(host: str, anywhere: bool) -> None:
 
 
 def _taken(host: str, port: int, error: OSError) -> InputError:
-    """What to tell when nobody can be heard at a place: the port is taken, or the host not here."""
+    """The error for an address that cannot be bound: port taken, or not this machine's host."""
     if error.errno in (errno.EADDRINUSE, errno.EACCES):
         why = os.strerror(error.errno)
         return InputError("stream", "port", f"{host}:{port}: {why}", "a free one, from 1024 on")

@@ -15,7 +15,7 @@ from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
 from labapp.run.alarms import Alarm, Alarms
 from labapp.run.limits import Limits, Size, sizes_of, standing
-from labapp.run.streams import live_values
+from labapp.run.streams import stream_values
 from labapp.session.session import Session
 
 MEASURES = Measures(*[0.0] * 4, 6.7, 7.5, 0.30, -0.01, *[0.0] * 6, *[0.03, 0.04, 0.003] * 2)
@@ -56,7 +56,7 @@ def test_of_a_hollow_pool_the_depth_is_watched():
     # A pool that was to rise and is hollow is too low.
     alarms = Alarms(Limits(height_mm=(0.2, 0.4)))
     assert codes(alarms.judge(1, 0.1, hollow, "")) == [("height-low", True)]
-    assert "Depth -0.300 ± 0.004 mm is below 0.2 mm" in alarms.shown[0].told
+    assert "Depth -0.300 ± 0.004 mm is below 0.2 mm" in alarms.shown[0].description
 
 
 def test_limits_that_cannot_be_are_refused():
@@ -171,12 +171,12 @@ def test_alarms_are_told_by_their_codes():
     alarms.judge(3, 0.0, measured(7.2), "")
     alarms.judge(4, 1.0, measured(6.8), "")
     measured_ok = Measurement("ok", "", "fit", measures=MEASURES)
-    told = live_values(FrameResult(4, 0.0, measured_ok), alarms.shown)
+    told = stream_values(FrameResult(4, 0.0, measured_ok), alarms.shown)
     assert told["alarm"] == "length-high"
     assert told["unacknowledged"] == "width-high length-high"
     assert told["width_mm"] == MEASURES.width_mm
     alarms.acknowledge()
-    told = live_values(FrameResult(5, 0.0, Measurement("ok", "", "fit")), alarms.shown)
+    told = stream_values(FrameResult(5, 0.0, Measurement("ok", "", "fit")), alarms.shown)
     assert (told["alarm"], told["unacknowledged"]) == ("length-high", "")
 
 

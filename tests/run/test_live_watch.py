@@ -168,7 +168,7 @@ def test_no_figure_for_long_is_an_alarm_until_there_is_one(
 
 def test_measuring_that_ends_by_itself_is_an_alarm_and_is_told(watch: LiveWatch, told: Told):
     stream = LineStream()
-    watch.tell_by("lines", stream)
+    watch.set_stream("lines", stream)
     with connect(stream.port) as heard:
         lines = heard.makefile(encoding="utf-8")
         lines.readline()
@@ -227,7 +227,7 @@ def test_a_surface_is_drawn_when_it_is_asked_for_and_only_once(watch: LiveWatch)
 def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
     prepare(watch, {1: 7.2, 2: None})
     stream = LineStream()
-    watch.tell_by("lines", stream)
+    watch.set_stream("lines", stream)
     assert watch.stream("lines") is stream
     with connect(stream.port) as connected:
         file = connected.makefile("rb")
@@ -238,7 +238,7 @@ def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
         watch.acknowledge()
         watch.measure(frame(3))
         lines.append(json.loads(file.readline()))
-        assert (stream.told, stream.listeners) == (4, 1)
+        assert (stream.sent, stream.listeners) == (4, 1)
         file.close()
     assert [line["width_mm"] for line in lines] == [6.7, 7.2, None, 6.7]
     assert [line["status"] for line in lines] == ["ok", "ok", "no-dots", "ok"]
@@ -246,14 +246,14 @@ def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
     assert [line["alarm"] for line in lines] == ["", "width-high", "width-high", ""]
     assert [line["unacknowledged"] for line in lines] == ["", "width-high", "width-high", ""]
     assert lines[0]["scheme"] == "fit"
-    watch.tell_by("lines", None)
+    watch.set_stream("lines", None)
     assert watch.stream("lines") is None
 
 
 def test_a_stream_that_comes_when_all_is_over_is_closed(watch: LiveWatch):
     watch.close()
     stream = LineStream()
-    watch.tell_by("lines", stream)
+    watch.set_stream("lines", stream)
     with pytest.raises(OSError, match="refused"):
         connect(stream.port)
 

@@ -23,7 +23,7 @@ from labapp.export.frame_result import FrameResult
 from labapp.export.tables import SIZES
 from labapp.run import streams
 from labapp.run.alarms import Alarm
-from labapp.run.streams import LineStream, OpcuaStream, live_values, open_stream, told_values
+from labapp.run.streams import LineStream, OpcuaStream, open_stream, stream_values
 from labapp.text import SIGMA_OF
 from tests.waiting import PATIENCE_S, connect
 
@@ -52,13 +52,13 @@ def listener(stream: LineStream) -> Any:
 
 
 def test_a_measurement_is_told_with_the_names_of_the_table(measured: Measurement) -> None:
-    told = told_values(FrameResult(7, 0.1, measured))
+    told = stream_values(FrameResult(7, 0.1, measured))
     assert list(told)[:5] == ["frame", "time_s", "status", "reason", "scheme"]
     assert list(told)[5:] == [*SIZES, "sigma_of"]
     assert told["sigma_of"] == SIGMA_OF
     assert measured.measures is not None
     assert told["height_mm"] == measured.measures.height_mm
-    without = told_values(FrameResult(8, None, DARK))
+    without = stream_values(FrameResult(8, None, DARK))
     assert without["time_s"] is without["height_mm"] is without["height_sigma_mm"] is None
     assert without["reason"] == "It is dark"
 
@@ -276,7 +276,9 @@ def test_opc_ua_clients_read_the_newest_frame(port: int, measured: Measurement) 
     asyncua = pytest.importorskip("asyncua")
     stream = OpcuaStream(port=port)
     alarm = Alarm("width-high", "Width 7.1 mm is above 6.9 mm", 40, 0.4, acknowledged=True)
-    wanted = live_values(FrameResult(41, 0.5, measured), [alarm, replace(alarm, code="height-low")])
+    wanted = stream_values(
+        FrameResult(41, 0.5, measured), [alarm, replace(alarm, code="height-low")]
+    )
     assert wanted["alarm"] == "width-high height-low"
 
     async def read() -> dict[str, Any]:
@@ -296,7 +298,7 @@ def test_opc_ua_clients_read_the_newest_frame(port: int, measured: Measurement) 
             return found
 
     try:
-        stream.publish(told_values(FrameResult(40, None, DARK)))
+        stream.publish(stream_values(FrameResult(40, None, DARK)))
         stream.publish(wanted)
         found = asyncio.run(read())
     finally:

@@ -264,5 +264,5 @@ def alarms_in_words(alarms: Sequence[Alarm]) -> str:
     lines = []
     for alarm in alarms:
         sign = "▲ ALARM" if alarm.holds else "△ over"
-        lines.append(f"{sign}: {alarm.told}{', acknowledged' * alarm.acknowledged}")
+        lines.append(f"{sign}: {alarm.description}{', acknowledged' * alarm.acknowledged}")
     return "\n".join(lines)

@@ -115,10 +115,10 @@ class LiveStreams(QWidget):
             return
 
         def work(_: Control) -> str:
-            watch.tell_by(kind, None)  # it may have this very port
+            watch.set_stream(kind, None)  # it may have this very port
             if place:
                 try:
-                    watch.tell_by(kind, open_stream(kind, place, anywhere))
+                    watch.set_stream(kind, open_stream(kind, place, anywhere))
                 except InputError as error:
                     return problem_in_words(error)
             return ""
@@ -175,7 +175,7 @@ def stream_in_words(stream: Stream | None, at_work: bool, problem: str) -> str:
     if stream is None:
         return "○ One moment …" if at_work else "○ Off"
     listen = "program listens" if stream.listeners == 1 else "programs listen"
-    told = pluralize(stream.told, "frame")
+    told = pluralize(stream.sent, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
     return f"● {where or stream.address}: {stream.listeners} {listen}, {told} told"
 
