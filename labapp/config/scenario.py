@@ -42,7 +42,7 @@ SWINGS = 6
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario that was found right.
+    """A valid scenario.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Scenario:
 
     @property
     def title(self) -> str:
-        """What the comment says that it begins with; empty without one."""
+        """First comment of the file; empty without one."""
         first = self.text.partition("\n")[0]
         return first.lstrip("# ").rstrip(". \r") if first.startswith("#") else ""
 

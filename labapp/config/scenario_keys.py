@@ -1,4 +1,4 @@
-"""The keys of a scenario besides those of a set-up: which there are, and what each may hold."""
+"""Rules for the keys of a scenario besides those of a setup."""
 
 from __future__ import annotations
 

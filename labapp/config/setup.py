@@ -1,4 +1,4 @@
-"""The setup file: what is bolted to the bench, and where its pixels are (TOML)."""
+"""The setup file (TOML): rig and image calibration."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LEAST_ANGLE_DEG = 10.0
 
 @dataclass(frozen=True)
 class Setup:
-    """A setup file that was found right.
+    """A valid setup.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
 
 
 def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]) -> None:
-    """Put values into a setup file and leave everything else, comments included, as it was.
+    """Set keys of a setup file; everything else, comments included, stays as it was.
 
     The file, and sections it lacks, are made. Values go in as they are: read the file back to
     know what is still missing or wrong.
@@ -115,7 +115,7 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
 def updated_setup(
     text: str, path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]
 ) -> str:
-    """Put values into a setup's text, read from ``path``; see `update_setup`."""
+    """Text of a setup with keys set; ``path`` is for errors. See `update_setup`."""
     try:
         document = tomlkit.parse(text)
     except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
@@ -135,7 +135,7 @@ def updated_setup(
 
 
 def pattern_values(pattern: DotPattern) -> dict[str, object]:
-    """What a setup file says of a pattern: key → value."""
+    """Keys of a pattern in a setup file: key → value."""
     values: dict[str, object] = {
         "rows": pattern.rows,
         "columns": pattern.columns,
@@ -155,7 +155,7 @@ def _text(path: Path) -> str:
 
 
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
-    """Find values that are right by themselves and impossible together."""
+    """Problems of values that are valid by themselves and contradict each other."""
     pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
     rows, columns = pattern["rows"], pattern["columns"]
     step = pattern["inter_beam_angle_deg"]

@@ -1,4 +1,4 @@
-"""The keys of a setup file: which there are, and what each may hold."""
+"""Rules for the keys of a setup file."""
 
 from __future__ import annotations
 

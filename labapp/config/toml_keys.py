@@ -1,4 +1,4 @@
-"""Keys of TOML files that people write: what each may hold, and what is wrong with those given."""
+"""Validation of TOML files: rules for keys, and the problems of a table."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LARGEST = 1e9
 
 @dataclass(frozen=True)
 class Rule:
-    """What a key may hold.
+    """Rule for the value of a key.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def between(low: float, high: float, unit: str, required: bool = True) -> Rule:
 def check_keys(
     path: Path, table: str, keys: object, rules: Mapping[str, Rule], form: str = ""
 ) -> list[InputError]:
-    """Find unknown, missing and wrong keys of one table.
+    """Problems of one table: unknown, missing and invalid keys.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def check_keys(
 
 
 def unknown_key(path: Path, full: str, known: Mapping[str, object]) -> InputError:
-    """Say that there is no such key or table, and which was meant, perhaps."""
+    """Error for an unknown key or table, with the most similar known one."""
     near = difflib.get_close_matches(full.rpartition(".")[2], known, 1)
     expected = f"{near[0]}, perhaps" if near else f"one of {', '.join(known)}"
     return InputError(path, full, "unknown key", expected)

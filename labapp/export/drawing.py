@@ -56,7 +56,7 @@ ROOMY = 1.5
 
 
 def build_scene(plotter: Any, scene: Scene, steady: bool = False) -> Drawing:
-    """Draw a scene with a `pyvista.Plotter`, of a window or off-screen; it does not render yet.
+    """Add a scene to a `pyvista.Plotter`, of a window or off-screen, without rendering.
 
     The drawing that it returns takes further scenes.
     """
@@ -92,7 +92,7 @@ class Drawing:
         self._made_for: dict[str, object] = {}
 
     def update(self, scene: Scene) -> None:
-        """Show another scene; it does not render yet, and the camera stays."""
+        """Replace the scene, without rendering; the camera stays."""
         colours = (scene.foreground, scene.background)
         if self._is_new("colours", colours):
             self.plotter.clear()
@@ -115,10 +115,10 @@ class Drawing:
             ends = scene.rays_mm.get(name, EMPTY).reshape(-1, 3) * self._stretch
             self._put(name, _polydata(ends, "lines", 2), COLOURS[name], line_width=1)
         self._axes(scene)
-        self._say("stamp", scene.stamp, scene.foreground, **self._in_corner("upper_right"))
+        self._set_text("stamp", scene.stamp, scene.foreground, **self._in_corner("upper_right"))
         size = max(5, int(self.plotter.window_size[0] / self._scale) // 90)
         middle = {"position": (0.12, 0.75), "viewport": True, "font_size": size}
-        self._say("notice", scene.notice, scene.foreground, **middle)
+        self._set_text("notice", scene.notice, scene.foreground, **middle)
 
     def look(self, direction: Direction) -> None:
         """Look from one of the `VIEWS`; from the top, side and front without perspective."""
@@ -138,17 +138,17 @@ class Drawing:
 
     @property
     def _scale(self) -> float:
-        """How many pixels the picture has for one of a usual screen; texts follow by themselves."""
+        """Pixels of the picture per pixel of a usual screen; text scales by itself."""
         return float(self.plotter.render_window.GetDPI()) / USUAL_DPI
 
     def _is_new(self, part: str, made_for: object) -> bool:
-        """Whether a part must be made anew: it was made for something else."""
+        """Whether a part was made for something else and must be created again."""
         changed = self._made_for.get(part) != made_for
         self._made_for[part] = made_for
         return changed
 
     def _put(self, name: str, mesh: Any, colour: str, **style: Any) -> None:
-        """Add a part or move it to another place; None hides it."""
+        """Add or update a part; None hides it."""
         held = self._parts.get(name)
         if mesh is None:
             if held is not None:
@@ -252,14 +252,14 @@ class Drawing:
         high = scene.exaggeration
         told = [f"heights drawn {high:g} times as high"] if high != 1 else []
         words = "\n".join(told + ["upright line: the electrode's axis"] * scene.electrode)
-        self._say("caption", words, scene.foreground, **self._in_corner("upper_left"))
+        self._set_text("caption", words, scene.foreground, **self._in_corner("upper_left"))
 
     def _in_corner(self, position: str) -> dict[str, Any]:
-        """Style of words in a corner, whose size VTK does not scale."""
+        """Style of text in a corner, whose size VTK does not scale."""
         return {"position": position, "font_size": round(6 * self._scale)}
 
-    def _say(self, name: str, words: str, colour: str, **style: Any) -> None:
-        """Put words over the picture; none take away those that were there."""
+    def _set_text(self, name: str, words: str, colour: str, **style: Any) -> None:
+        """Set a text over the picture; an empty one removes it."""
         if not self._is_new(name, words):
             return
         if words:
@@ -284,7 +284,7 @@ def _box(scene: Scene) -> tuple[FloatArray, IntArray]:
 
 
 def _holds(box: FloatArray, other: FloatArray) -> bool:
-    """Whether another box is within this one, and fills it well."""
+    """Whether another box lies within this one and is not much smaller."""
     within = (box[0] <= other[0] + 1e-9).all() and (other[1] <= box[1] + 1e-9).all()
     return bool(within and (np.ptp(box, axis=0) <= ROOMY * np.ptp(other, axis=0) + 1e-9).all())
 
@@ -314,13 +314,13 @@ def _normals(vertices: FloatArray, triangles: IntArray) -> npt.NDArray[np.float3
 
 
 def _label_format(limits: tuple[float, float]) -> str:
-    """Digits that tell the labels of a colour scale to a tenth of their distance."""
+    """Number format that resolves the labels of a colour scale to a tenth of their distance."""
     step = max((limits[1] - limits[0]) / 4, 1e-9)
     return f"%.{max(0, int(np.ceil(-np.log10(0.2 * step))))}f"
 
 
 def draw_without_display() -> None:
-    """Have VTK draw through EGL where there is no display; before it draws for the first time."""
+    """Let VTK draw through EGL where there is no display; call before the first drawing."""
     if IS_LINUX and not os.environ.get("DISPLAY"):
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
 

@@ -46,14 +46,14 @@ LINE = 60
 
 
 class Extent:
-    """What all frames of a film have room in: found by adding one after the other."""
+    """Common extent of all frames of a film, accumulated frame by frame."""
 
     def __init__(self) -> None:
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
         self._depth, self._height = np.inf, -np.inf
 
     def add(self, measurement: Measurement) -> None:
-        """Make room for a frame; one without a surface needs none."""
+        """Extend to a frame; one without a surface has no effect."""
         if measurement.reconstruction is None or measurement.measures is None:
             return
         outline, sizes = measurement.reconstruction.boundary.points_mm, measurement.measures
@@ -127,7 +127,7 @@ def write_film(
 
 
 def film_scene(result: FrameResult, extent: Extent) -> Scene:
-    """What a film shows of a frame: its surface, or why there is none."""
+    """Scene of a frame: its surface, or the reason why there is none."""
     measurement, stamp = result.measurement, f"frame {result.frame}"
     if result.time_s is not None:
         stamp += f", {result.time_s:.4f} s"
@@ -142,7 +142,7 @@ def film_scene(result: FrameResult, extent: Extent) -> Scene:
 def film_times(
     frames: Sequence[tuple[int, float | None]], rate_hz: float | None = None
 ) -> FloatArray:
-    """When each frame begins, and when the last ends, shape (n + 1,), s.
+    """Begin of each frame and end of the last, shape (n + 1,), s.
 
     Frames that are left out leave their time: what is shown stays until the next.
 
@@ -165,7 +165,7 @@ def film_times(
 
 
 def write_video(path: Path, pictures: Iterable[Picture], times_s: FloatArray) -> None:
-    """Write pictures as a video, beside its place first.
+    """Write pictures as a video, atomically.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def _encode(container: OutputContainer, pictures: Iterable[Picture], ticks: IntA
 
 
 def _drawn(scenes: Iterable[Scene], process: Executor) -> Iterator[Picture]:
-    """Pictures of scenes, in their order, a few of them drawn ahead."""
+    """Pictures of scenes, in order, a few drawn ahead."""
     waiting: deque[Future[Picture]] = deque()
     rest = iter(scenes)
     try:

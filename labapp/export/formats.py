@@ -1,6 +1,6 @@
-"""The formats of an export: a line here, and a function or a class that writes the files.
+"""Registry of export formats: an entry here, and a function or a class that writes the files.
 
-Commands and the Export page read these lines; what writes a format is loaded when it is used.
+Commands and the Export page read the registry; a writer is loaded when it is used.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ class SurfaceFormat:
     writer: str
 
     def content(self, shape: object) -> bytes:
-        """What is in the file of a mesh, or of nodes."""
+        """Content of the file for a mesh, or for nodes."""
         content: bytes = _load(self.writer)(shape)
         return content
 
 
 class RunWriter(Protocol):
-    """Writes a run into one file, frame by frame; the file is whole once its ``with`` ends well."""
+    """Writes a run into one file, frame by frame; complete when its ``with`` ends without error."""
 
     def write(
         self, frame: int, tables: Mapping[str, Table], reconstruction: Reconstruction | None
@@ -80,7 +80,7 @@ class RunFormat:
     def open(
         self, path: str | os.PathLike[str], about: Mapping[str, object], spacing_mm: float
     ) -> AbstractContextManager[RunWriter]:
-        """What writes the file; see ``writer``."""
+        """Writer of the file; see ``writer``."""
         opened: AbstractContextManager[RunWriter] = _load(self.writer)(
             Path(path), about, spacing_mm
         )
@@ -116,7 +116,7 @@ RUN_FORMATS: dict[str, RunFormat] = {
 
 
 def mesh_formats() -> list[str]:
-    """The surface formats of triangles."""
+    """Names of the surface formats that hold triangles."""
     return [name for name, each in SURFACE_FORMATS.items() if each.of == "mesh"]
 
 

@@ -48,7 +48,7 @@ AXES = (
 
 
 class Hdf5Writer:
-    """Writes a run, frame by frame; use it in a ``with``. The file is whole once that ends well.
+    """Writes a run, frame by frame; use it in a ``with``. The file is complete when that ends.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Hdf5Writer:
 
 
 def _put(group: Any, column: Column, values: npt.NDArray[Any], kind: Any = None) -> None:
-    """A dataset with its unit and description."""
+    """Create a dataset with unit and description."""
     packing = {"compression": "gzip", "shuffle": True, "chunks": values.shape}
     dataset = group.create_dataset(
         column.name, data=values, dtype=kind, **(packing if values.size else {})
@@ -159,7 +159,7 @@ def _texts(texts: list[str]) -> npt.NDArray[Any]:
 
 
 def _put_surface(group: Any, reconstruction: Reconstruction, spacing_mm: float) -> None:
-    """The nodes of the surface within the boundary, as a grid."""
+    """Write the nodes of the surface within the boundary, as a grid."""
     x, y, z = surface_grid(reconstruction, spacing_mm)
     columns, column = np.unique(x, return_inverse=True)
     rows, row = np.unique(y, return_inverse=True)
@@ -170,7 +170,7 @@ def _put_surface(group: Any, reconstruction: Reconstruction, spacing_mm: float) 
 
 
 class _Disk(io.RawIOBase):
-    """The file that HDF5 writes to, which never fails while HDF5 looks.
+    """File object for HDF5 that defers errors of writing to `check`: HDF5 cannot handle them.
 
     HDF5 drops errors of writing that it meets while it tidies up, and then ends the process. So
     the first error is kept for `check`; what is written from then on stays in memory, where HDF5
@@ -184,7 +184,7 @@ class _Disk(io.RawIOBase):
         self._kept: list[tuple[int, bytes]] = []
 
     def check(self) -> None:
-        """Raise the error that writing met, if it met one."""
+        """Raise the first error of writing, if there was one."""
         if self._failure is not None:
             raise self._failure
 
@@ -234,7 +234,7 @@ class _Disk(io.RawIOBase):
         return size
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: writes are unbuffered."""
 
     def close(self) -> None:
         self._file.close()

@@ -1,4 +1,4 @@
-"""The pool surface as triangles, and the files that other programs open them from.
+"""The pool surface as triangles, and mesh files of it.
 
 Lengths are in mm. Triangles are counter-clockwise seen from outside, those of the pool surface
 from above: its normals point up. The same reconstruction gives the same bytes.
@@ -58,7 +58,7 @@ class Mesh:
 
 
 def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:
-    """Refuse a surface that has more nodes than `MOST_NODES`, as a grid or as a mesh.
+    """Raise if a surface has more nodes than `MOST_NODES`, as a grid or as a mesh.
 
     Raises
     ------
@@ -148,13 +148,13 @@ def solid(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
 
 
 def _base_height(center_mm: FloatArray, rim_mm: FloatArray) -> float:
-    """Height at the centre of the plane that comes nearest to the boundary, shape (m, 3), mm."""
+    """Height at the centre of the least-squares plane of the boundary, shape (m, 3), mm."""
     terms = np.column_stack([np.ones(len(rim_mm)), rim_mm[:, :2] - center_mm])
     return float(np.linalg.lstsq(terms, rim_mm[:, 2], rcond=None)[0][0])
 
 
 def _filled(vertices: FloatArray, count: int) -> FloatArray:
-    """The same vertices, heights that are not known interpolated from the centre outwards."""
+    """Vertices with unknown heights interpolated from the centre outwards."""
     if np.isfinite(vertices).all():
         return vertices
     filled = vertices.copy()
@@ -186,7 +186,7 @@ def stl(mesh: Mesh) -> bytes:
 
 
 def stl_ascii(mesh: Mesh) -> bytes:
-    """ASCII STL, with the digits that tell 32-bit numbers apart."""
+    """ASCII STL, with enough digits for 32-bit numbers."""
     facet = (
         "facet normal {:.8e} {:.8e} {:.8e}\nouter loop\n"
         + "vertex {:.8e} {:.8e} {:.8e}\n" * 3

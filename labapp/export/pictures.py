@@ -84,7 +84,7 @@ def _write(
 
 
 def _row_colour(row: int) -> tuple[int, int, int]:
-    """A colour (B, G, R) that differs most between neighbouring rows."""
+    """Colour (B, G, R) of a row; neighbouring rows differ most."""
     red, green, blue = colorsys.hsv_to_rgb(row * 0.381966 % 1, 0.55, 1.0)
     return int(blue * 255), int(green * 255), int(red * 255)
 

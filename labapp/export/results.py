@@ -1,4 +1,4 @@
-"""The result files of one run: whole rows, whole surfaces, whatever happens in between."""
+"""The result files of one run, complete frame by frame even if the run is interrupted."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def surface_files(
     *,
     as_solid: bool = False,
 ) -> dict[str, bytes]:
-    """The files of a frame's surface, by name; none without a surface.
+    """Files of a frame's surface, name → content; empty without a surface.
 
     Parameters
     ----------
@@ -68,12 +68,12 @@ def surface_files(
 class ResultsWriter:
     """Writes a run's results into a folder, one frame at a time.
 
-    A frame's rows go in with one write per file, `measures.csv` last: a frame that has a row
-    there has everything else too. When a write fails or is interrupted, what was written of that
-    frame is taken back. `run.json` tells where the results come from and how the run ended.
+    A frame's rows are appended with one write per file, `measures.csv` last: a frame with a row
+    there is complete. When a write fails or is interrupted, that frame is rolled back. `run.json`
+    holds the provenance of the results and how the run ended.
 
-    A former run's results in the folder are replaced; a folder with files of the same names and
-    no `run.json` is refused, as they may be somebody's own.
+    Results of a former run are replaced; a folder with files of the same names and no `run.json`
+    is refused, as they may be the user's own.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class ResultsWriter:
         Raises
         ------
         InputError
-            If it cannot be written (disk full, folder gone); the frames before are whole.
+            If it cannot be written (disk full, folder gone); earlier frames are complete.
         """
         before = {file: os.fstat(file.fileno()).st_size for file in self._files.values()}
         formats = SURFACES if self.surfaces else ()
@@ -166,7 +166,7 @@ class ResultsWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Say in `run.json` how the run ended."""
+        """Record in `run.json` how the run ended."""
         state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         self._run |= {
             "state": state if error else "finished",
@@ -200,7 +200,7 @@ class ResultsWriter:
 
 
 def _clear(folder: Path) -> None:
-    """Take away a former run's results, `measures.csv` first: no row without its files."""
+    """Delete a former run's results, `measures.csv` first: no row without its files."""
     if (folder / RUN_FILE).is_symlink():  # `write_atomically` would write to where it points
         raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
     ours = [path for path in folder.iterdir() if OURS.fullmatch(path.name)]
@@ -224,12 +224,12 @@ def _is_run(path: Path) -> bool:
 
 
 def _append(file: io.FileIO, text: str) -> None:
-    """Write all of it: a disk that fills takes a part first, and fails at the next try."""
+    """Append a text; a partial write is repeated, so that a full disk raises."""
     content = as_bytes(text)
     while content:
         content = content[file.write(content) :]
 
 
 def now() -> str:
-    """The time, ISO 8601, with the time zone."""
+    """Present time, ISO 8601 with the time zone."""
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

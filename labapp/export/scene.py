@@ -1,4 +1,4 @@
-"""The pool in 3-D: what is in the picture. The window, the exports and the tests draw the same."""
+"""Scene of the pool in 3-D, independent of what draws it: window, exports or tests."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ EMPTY = np.empty((0, 3))
 
 @dataclass(frozen=True)
 class Scene:
-    """What a 3-D picture shows, in mm, UCS; n vertices.
+    """Content of a 3-D picture, mm, UCS; n vertices.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def scene_of(
     colour: Literal["height", "sigma"] = "height",
     limits: tuple[float, float] | None = None,
 ) -> Scene:
-    """The pool's surface, its boundary and reflection points.
+    """Scene of a pool's surface, boundary and reflection points.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def scene_of(
 
 
 def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
-    """The first pool coloured by its height minus the other's, where both are."""
+    """Scene of the first pool, coloured by its height minus the other's where both are known."""
     vertices, triangles = _mesh(one)
     # Slightly within, so that the rim of one of two equal boundaries is not lost to rounding.
     x, y = (one.boundary.center_mm + (vertices[:, :2] - one.boundary.center_mm) * (1 - 1e-9)).T
@@ -165,7 +165,7 @@ def rays_of(reconstruction: Reconstruction, match: Match, rig: Rig) -> dict[str,
 
 
 def _mesh(reconstruction: Reconstruction) -> tuple[FloatArray, IntArray]:
-    """Vertices and triangles, as few as show the surface well: the view is to be quick."""
+    """Vertices and triangles, coarse enough for a responsive view."""
     boundary = reconstruction.boundary
     some = slice(None, None, max(len(boundary.points_mm) // SPOKES, 1))
     thinned = replace(
@@ -176,7 +176,7 @@ def _mesh(reconstruction: Reconstruction) -> tuple[FloatArray, IntArray]:
 
 
 def _known(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
-    """The same without what is not known (NaN)."""
+    """Mesh without vertices of unknown height (NaN)."""
     if np.isfinite(vertices).all():
         return vertices, triangles
     triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]

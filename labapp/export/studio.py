@@ -1,4 +1,4 @@
-"""Scenes drawn off-screen, here or in a process of their own.
+"""Off-screen drawing of scenes, in this process or another.
 
 VTK ends the process it runs in where there is no OpenGL.
 """
@@ -70,7 +70,7 @@ def drawing_process(
 
 
 def draw_there(scene: Scene) -> Picture:
-    """What a `drawing_process` does; its studio is made for the first picture."""
+    """Draw a scene in a `drawing_process`; its studio is made for the first picture."""
     if "studio" not in _there:
         _there["studio"] = Studio(*_there["view"])
     picture: Picture = _there["studio"].draw(scene)
@@ -79,7 +79,7 @@ def draw_there(scene: Scene) -> Picture:
 
 @contextmanager
 def drawing_errors(what: str) -> Iterator[None]:
-    """Turn what is missing to draw pictures of an export into what a user can act on."""
+    """Translate errors of drawing into `InputError`."""
     try:
         yield
     except ImportError as error:
@@ -95,7 +95,7 @@ _there: dict[str, Any] = {}
 
 
 def _begin(*view: Any) -> None:
-    """Keep VTK's warnings off the terminal, and note what pictures are wanted."""
+    """Initialise a drawing process: silence VTK and set size and direction."""
     _there["view"] = view
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)

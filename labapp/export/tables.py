@@ -1,7 +1,6 @@
-"""A measurement as tables: their columns, units and values, and the CSV text of both.
+"""A measurement as tables: columns, units and values, and their CSV text.
 
-The values are the exact ones; only CSV rounds them. A value that is unknown is NaN, and an empty
-cell in CSV.
+Values are exact; only CSV rounds them. An unknown value is NaN, and an empty cell in CSV.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ Table = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Column:
-    """What a column holds.
+    """A column of a table.
 
     Parameters
     ----------
@@ -177,13 +176,13 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
 
 
 def sigma_of(measurement: Measurement) -> str:
-    """What is in the standard uncertainties of a frame; empty where it has none."""
+    """Contributions to the standard uncertainties of a frame; empty where it has none."""
     sigma = (getattr(measurement.measures, name, math.nan) for name in SIZES if "_sigma_" in name)
     return SIGMA_OF if any(map(math.isfinite, sigma)) else ""
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:
-    """Every dot found; NaN for the row, column or ray that it has not."""
+    """Columns of all dots; NaN for an unknown row, column or ray."""
     dots, lattice, match = measurement.dots, measurement.lattice, measurement.match
     if dots is None:
         return []
@@ -205,7 +204,7 @@ def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.N
 
 
 def _points(reconstruction: Reconstruction, measures: Measures | None) -> list[npt.NDArray[Any]]:
-    """Reflection points, and how far their dots are off on either plane."""
+    """Columns of the reflection points, with their residuals on either plane."""
     residual = reconstruction.residual_mm
     scale = (math.nan, math.nan) if measures is None else (measures.scale_x, measures.scale_z)
     return [
@@ -229,7 +228,7 @@ def table_rows(result: FrameResult, calibration: ImageCalibration) -> dict[str, 
 
 
 def csv_header(name: str) -> str:
-    """The first line of a table's CSV file."""
+    """Header line of a table's CSV file."""
     return as_csv([[column.name for column in TABLES[name]]])
 
 
@@ -278,19 +277,19 @@ def nodes_csv(nodes: FloatArray) -> bytes:
 
 
 def number(value: float | None, digits: int = MM_DIGITS) -> str:
-    """A number as a cell; empty where it is unknown."""
+    """A number as a CSV cell; empty where unknown."""
     return f"{value:z.{digits}f}" if value is not None and math.isfinite(value) else ""
 
 
 def as_csv(rows: Iterable[Sequence[object]]) -> str:
-    """Rows as CSV text; no text in it is run by a spreadsheet (`as_cell`)."""
+    """CSV text of rows; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
     lines = _Lines()
     csv.writer(lines).writerows([as_cell(cell) for cell in row] for row in rows)
     return "".join(lines)
 
 
 class _Lines(list[str]):
-    """Lines that end with a line feed alone; told so, csv would leave carriage returns unquoted."""
+    """Lines ending with a line feed alone; with csv's own option carriage returns stay unquoted."""
 
     def write(self, line: str) -> None:
         self.append(line.removesuffix("\r\n") + "\n")

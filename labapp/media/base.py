@@ -1,4 +1,4 @@
-"""A frame, where frames come from, and how any picture becomes grey levels."""
+"""Frames, sources of frames, and conversion to grey levels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GreyImage = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture of a source.
+    """A frame of a source.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class FrameSource(Protocol):
         return copy.copy(self)
 
     def close(self) -> None:
-        """Let go of the file. Closing twice does no harm."""
+        """Close the file. Closing twice does no harm."""
         return
 
     def __iter__(self) -> Iterator[Frame]:

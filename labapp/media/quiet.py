@@ -1,4 +1,4 @@
-"""Keep OpenCV's own messages off the user's terminal; ours say what is wrong."""
+"""Silence OpenCV's own messages on the terminal; ours report what is wrong."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ NAMED_FRAMES = 10
 
 @dataclass(frozen=True)
 class Survey:
-    """What reading a recording through has shown.
+    """Findings of reading a recording through.
 
     Parameters
     ----------

@@ -103,7 +103,7 @@ class NumpyStack(StoredFrames):
         )
 
     def close(self) -> None:
-        """Let go of the file, which is mapped as long as its array is there."""
+        """Release the file, which is mapped as long as its array exists."""
         self._frames = self._frames[:0].copy()
 
     def _grey(self, index: int) -> GreyImage:
@@ -131,8 +131,8 @@ def _header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtyp
     def entry(key: str, form: str) -> str:
         found = re.search(rf"""['"]{key}['"]\s*:\s*{form}""", text)
         if found is None:
-            said = re.search(rf"""['"]{key}['"]\s*:\s*(\S[^,]*)""", text)
-            value = said[1] if said else "missing"
+            other = re.search(rf"""['"]{key}['"]\s*:\s*(\S[^,]*)""", text)
+            value = other[1] if other else "missing"
             raise InputError(path, NAMED.get(key, key), value, EXPECTED[key])
         return found[1]
 
@@ -197,10 +197,10 @@ def _from_archive(
             if len(frames) > 1:
                 rate = plausible_rate(float(1 / np.median(np.diff(time_s))))
         if "frame_rate_hz" in members:
-            said = _load(path, archive, members["frame_rate_hz"], _is_one)
-            rate = plausible_rate(float(said.ravel()[0]))
+            rate_array = _load(path, archive, members["frame_rate_hz"], _is_one)
+            rate = plausible_rate(float(rate_array.ravel()[0]))
             if rate is None:
-                raise InputError(path, "frame_rate_hz", said, "frames a second, above 0")
+                raise InputError(path, "frame_rate_hz", rate_array, "frames a second, above 0")
         return frames, time_s, rate
 
 

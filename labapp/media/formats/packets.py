@@ -1,4 +1,4 @@
-"""What reading a video through tells of its packets, and how it is kept for the next opening."""
+"""Index of a video's packets: built by reading it through, stored for the next opening."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ BoolArray = npt.NDArray[np.bool_]
 MAGIC = b"labapp video index 1\n"
 
 MOST_HEADERS_BYTE = 256
-"""No more lies between two packets of a video alone in its file, unless one was there."""
+"""Most bytes between two packets of a file with a video only; more are a missing packet."""
 
 MOST_AHEAD = 16
-"""No codec stores a frame before more than these that are shown before it."""
+"""Most frames by which a codec's decoding order differs from the display order."""
 
 MOST_BYTES = 2**28
-"""An index unpacks to no more: six million frames."""
+"""Largest unpacked index, bytes: six million frames."""
 
 ARRAYS = {"place": "i8", "key": "?", "seek": "i8", "number": "i8", "time_s": "f8"}
-"""What is kept of a `PacketTable` as arrays, and their types."""
+"""Arrays of a stored `PacketTable`, and their types."""
 
 UNKNOWN = np.iinfo(np.int64).min
 """Stamp of a packet that has none."""
@@ -42,22 +42,22 @@ UNKNOWN = np.iinfo(np.int64).min
 
 @dataclass(frozen=True)
 class Packets:
-    """Packets of a video in the order of the file, n of them.
+    """Packets of a video in file order; n packets.
 
     Parameters
     ----------
     placed_by
-        What tells one packet from another: its place in the file ("pos") or its stamp.
+        What identifies a packet: its offset in the file ("pos") or a time stamp ("pts", "dts").
     place
-        That, shape (n,).
+        That identifier, shape (n,).
     pts, dts
-        When it is to be shown and decoded, shape (n,), ticks; `UNKNOWN` where it does not say.
+        Presentation and decoding time stamps, shape (n,), ticks; `UNKNOWN` where there is none.
     key
-        Whether decoding can begin with it, shape (n,).
+        Whether it is a key frame, shape (n,).
     shown
-        Whether a frame comes of it, shape (n,): edited MP4s hold some that are not shown.
+        Whether it gives a frame, shape (n,): edited MP4s hold packets that are not shown.
     holed
-        Whether more than headers lies between them: packets that are damaged. True if in doubt.
+        Whether there are gaps, by damaged packets. True if in doubt.
     """
 
     placed_by: str
@@ -73,7 +73,7 @@ class Packets:
 
     @classmethod
     def read(cls, packets: Iterable[Packet[Any]], file_byte: int) -> Self:
-        """List packets; no more of them than the file has bytes for."""
+        """Packets as read; no more of them than the file has bytes for."""
         rows = []
         ends = []
         byte = 0
@@ -102,7 +102,7 @@ class Packets:
     def listed(
         cls, entries: Sequence[IndexEntry], stream: int, claimed: int, path: Path
     ) -> Self | None:
-        """List packets as the index at the end of an AVI has them, without reading them.
+        """Packets by the index at the end of an AVI, without reading them.
 
         Every chunk that it names must be in the file, in their order and hardly anything else
         between them; after the last nothing but the index; and there must be as many as the header
@@ -111,7 +111,7 @@ class Packets:
         Returns
         -------
         Packets or None
-            None if the index does not fit the file: it is to be read through.
+            None if the index does not fit the file, which must then be read through.
         """
         if not entries or len(entries) != claimed:
             return None
@@ -138,7 +138,7 @@ class Packets:
         return cls("pos", place + 8, stamp, stamp, key, np.ones(len(shown), bool))
 
     def completed(self, entries: Iterable[IndexEntry], file_byte: int) -> Self:
-        """These as the index at the end of an AVI has them; itself where it has others.
+        """Packets completed by the index at the end of an AVI; unchanged if it contradicts them.
 
         Reading counts packets and may stop at a damaged one; the index knows them all.
         """
@@ -154,21 +154,21 @@ class Packets:
         return type(self)("pos", place, stamp, stamp, key > 0, np.ones(len(place), bool))
 
     def without_last(self) -> Self:
-        """The same but for the last in the file."""
+        """Packets without the last in the file."""
         names = ("place", "pts", "dts", "key", "shown")
         return dataclasses.replace(self, **{name: getattr(self, name)[:-1] for name in names})
 
     def with_keys(self, key: BoolArray) -> Self:
-        """The same with other key frames."""
+        """Packets with other key frames."""
         return dataclasses.replace(self, key=key)
 
     def stamps_differ(self) -> bool:
-        """Whether every packet has a stamp that is its own."""
+        """Whether every packet has a unique presentation time stamp."""
         return _differ(self.pts)
 
 
 def _chunk(file: BinaryIO, at: int) -> tuple[bytes, int, int]:
-    """Name and size of the chunk that is at a byte of an AVI, and where it ends."""
+    """Name, size and end of the chunk at an offset of an AVI."""
     file.seek(at)
     head = file.read(8)
     size = int.from_bytes(head[4:], "little")
@@ -180,7 +180,7 @@ def _differ(values: IntArray) -> bool:
 
 
 def number_by_order(packets: Packets) -> IntArray:
-    """Frame number of each packet, shape (n,), for codecs that keep frames in order; −1: none."""
+    """Frame number of each packet, shape (n,), for codecs without reordering; −1: none."""
     return np.where(packets.shown, np.cumsum(packets.shown) - 1, -1)
 
 
@@ -195,20 +195,20 @@ def number_by_stamp(packets: Packets) -> IntArray:
 
 @dataclass(frozen=True)
 class Timing:
-    """What a video's header says of time.
+    """Timing in a video's header.
 
     Parameters
     ----------
     tick_s
-        Unit of the stamps, s.
+        Unit of the time stamps, s.
     rate_hz
-        Frames a second on average; None where it does not say.
+        Average frame rate; None where unknown.
     claimed
-        Number of frames; 0 where it does not say.
+        Number of frames; 0 where unknown.
     stamped
-        Whether stamps tell when frames are shown.
+        Whether presentation time stamps are reliable.
     from_0
-        Whether the stamp of the first frame would be 0, else it is the first there is.
+        Whether time begins at stamp 0, else at the first stamp.
     """
 
     tick_s: float
@@ -220,22 +220,22 @@ class Timing:
 
 @dataclass(frozen=True)
 class PacketTable:
-    """What there is to know to find any frame of a video.
+    """Index by which any frame of a video is found.
 
     Parameters
     ----------
     placed_by, place, key
         As in `Packets`.
     seek
-        Stamps to seek to for each key frame, shape (keys, 2), ticks.
+        Time stamps to seek to for each key frame, shape (keys, 2), ticks.
     number
-        The frame that comes of each packet, shape (n,); −1: none.
+        Frame number of each packet, shape (n,); −1: none.
     time_s
         Time of each frame since the first, shape (frames,), s; NaN where there is no time base.
     frame_rate_hz, shape, bit_depth, description, warnings
         As of a `FrameSource`.
     seekable
-        Whether frames may be got to by seeking.
+        Whether seeking is reliable.
     slice_crc
         Whether packets carry checksums, as FFV1's may.
     """
@@ -259,7 +259,7 @@ class PacketTable:
 
     @classmethod
     def build(cls, packets: Packets, number: IntArray, timing: Timing, name: str) -> Self:
-        """Give every packet its frame and every frame its time.
+        """Build the index: number of every packet's frame, and time of every frame.
 
         ``number`` is the frame of each packet, shape (n,), were no packet missing.
         """
@@ -293,18 +293,18 @@ class PacketTable:
         )
 
     def seek_stamps(self, packet: int) -> list[int]:
-        """Stamps to seek to for a key packet, the likeliest first; none to be read from 0."""
+        """Time stamps to seek to for a key packet, the likeliest first; empty: read from 0."""
         if not self.seekable or packet == 0:
             return []
         stamps = self.seek[np.count_nonzero(self.key[:packet])].tolist()
         return [stamp for stamp in dict.fromkeys(stamps) if stamp != UNKNOWN]
 
     def without_seeking(self) -> Self:
-        """The same, with every frame got to from the start."""
+        """Index by which every frame is decoded from the start."""
         return dataclasses.replace(self, seekable=False)
 
     def to_bytes(self, fingerprint: tuple[int, int]) -> bytes:
-        """All of it as bytes, for the file of this fingerprint."""
+        """Serialise, for the file with this fingerprint."""
         buffer = io.BytesIO()
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         arrays = {k: v for k, v in values.items() if isinstance(v, np.ndarray)}
@@ -317,7 +317,7 @@ class PacketTable:
 
     @classmethod
     def from_bytes(cls, content: bytes, fingerprint: tuple[int, int]) -> Self | None:
-        """What `to_bytes` gave; None if it is damaged, forged or made for another file."""
+        """Inverse of `to_bytes`; None if damaged, forged or of another file."""
         head = len(MAGIC)
         body = content[head + 4 :]
         if content[:head] != MAGIC or content[head : head + 4] != zlib.crc32(body).to_bytes(
@@ -347,7 +347,7 @@ class PacketTable:
 
 
 def _is_as_built(table: Any) -> bool:
-    """Whether all is as `build` makes it: the index of a session may be anybody's."""
+    """Whether an index is valid: that of a session may be forged."""
     packets, frames = table.place.shape, table.time_s.shape
     shapes = (packets, packets, (np.count_nonzero(table.key), 2), packets, frames)
     arrays = [getattr(table, name) for name in ARRAYS]
@@ -367,10 +367,10 @@ def _is_as_built(table: Any) -> bool:
 
 
 def _places(elapsed_s: FloatArray, timing: Timing, packets: Packets) -> IntArray:
-    """Number of each frame, shape (n,), with those that are missing counted where stamps tell.
+    """Number of each frame, shape (n,), with missing frames counted where time stamps show them.
 
-    They do where all stand at multiples of the interval and the last in its place. Where the file
-    has no hole, and gaps are not near an end that may have been cut, the camera left them out.
+    They do if all are multiples of the interval and the last is where the header claims. If the
+    file has no gaps, and those of time are not near a cut end, the camera left the frames out.
     """
     plain = np.arange(len(elapsed_s))
     missing = len(plain) < timing.claimed <= 2 * len(plain)

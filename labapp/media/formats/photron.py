@@ -45,30 +45,30 @@ FIELDS = {
 
 @dataclass(frozen=True)
 class _Header:
-    """What a header says, each field by its own name in the file."""
+    """Fields of a header; errors name them as in the file."""
 
     path: Path
-    said: dict[str, str]
+    texts: dict[str, str]
 
     def name(self, field: str) -> str:
-        """What the file calls ``field``."""
+        """Name of ``field`` in the file."""
         xml, text = FIELDS[field]
         return xml if self.path.suffix.lower() == ".cihx" else text
 
     def wrong(self, field: str, expected: str) -> InputError:
-        return InputError(self.path, self.name(field), self.said.get(field) or "missing", expected)
+        return InputError(self.path, self.name(field), self.texts.get(field) or "missing", expected)
 
-    def whole(self, field: str, low: int, high: int) -> int:
-        """A whole number in ``low`` … ``high``."""
-        said = self.said.get(field, "")
+    def integer(self, field: str, low: int, high: int) -> int:
+        """Integer in ``low`` … ``high``."""
+        text = self.texts.get(field, "")
         # Not longer than any number in range: int() takes its time with thousands of digits.
-        if said.isascii() and said.isdigit() and len(said) < 20 and low <= int(said) <= high:
-            return int(said)
+        if text.isascii() and text.isdigit() and len(text) < 20 and low <= int(text) <= high:
+            return int(text)
         raise self.wrong(field, f"a whole number, {low} to {high}")
 
     def rate(self) -> float | None:
         try:
-            return plausible_rate(float(self.said.get("rate", "")))
+            return plausible_rate(float(self.texts.get("rate", "")))
         except ValueError:
             return None
 
@@ -94,23 +94,23 @@ class PhotronSource(StoredFrames):
     def __init__(self, path: Path) -> None:
         self._raw, header_path = _pair(path)
         header = _read_header(header_path)
-        form = header.said.get("format", "mraw")
+        form = header.texts.get("format", "mraw")
         if form.lower() != "mraw":
             raise header.wrong("format", "MRaw; open the file of that format itself")
-        rows, columns = (header.whole(field, 1, MAX_SIDE) for field in ("rows", "columns"))
-        colour = header.said.get("colour", "").lower() == "color"
+        rows, columns = (header.integer(field, 1, MAX_SIDE) for field in ("rows", "columns"))
+        colour = header.texts.get("colour", "").lower() == "color"
         self._channels = 3 if colour else 1
-        bits = header.whole("bits", 1, 48)
+        bits = header.integer("bits", 1, 48)
         self._bits = bits // self._channels
         if bits not in {stored * self._channels for stored in (8, 10, 12, 16)}:
             raise header.wrong("bits", "24, 30, 36 or 48" if colour else "8, 10, 12 or 16")
-        depth = header.whole("depth", 1, 16) if "depth" in header.said else self._bits
+        depth = header.integer("depth", 1, 16) if "depth" in header.texts else self._bits
         depth = min(depth, self._bits)
-        side = header.said.get("side", "lower").lower()
+        side = header.texts.get("side", "lower").lower()
         if side not in ("lower", "higher"):
             raise header.wrong("side", "Lower or Higher")
         self._shift = self._bits - depth if side == "higher" else 0
-        claimed = header.whole("frames", 1, 2**40)
+        claimed = header.integer("frames", 1, 2**40)
         self._frame_bytes, rest = divmod(rows * columns * bits, 8)
         if rest:
             raise header.wrong("columns", f"columns that make whole bytes of {bits} bit levels")
@@ -125,10 +125,10 @@ class PhotronSource(StoredFrames):
         warnings = [*ends_early(self._raw.name, claimed, whole)]
         if header.rate() is None:
             warnings.append(f"{header_path.name} gives no record rate: its frames have no time")
-        if header.said.get("step", "1") not in ("", "0", "1"):
+        if header.texts.get("step", "1") not in ("", "0", "1"):
             warnings.append(
                 f"{header_path.name} says that not every frame was saved "
-                f"({header.name('step')} {header.said['step']}): times follow the record rate"
+                f"({header.name('step')} {header.texts['step']}): times follow the record rate"
             )
         self.warnings = tuple(warnings)
         super().__init__(
@@ -201,10 +201,10 @@ def _from_xml(path: Path, content: bytes) -> dict[str, str]:
 
 
 def _from_text(content: bytes) -> dict[str, str]:
-    said: dict[str, str] = {}
+    texts: dict[str, str] = {}
     keys = {key: field for field, (_, key) in FIELDS.items()}
     for line in content.decode("utf-8", "replace").splitlines():
         key, colon, value = line.partition(":")
         if colon and (field := keys.get(key.strip())):
-            said.setdefault(field, value.strip())
-    return said
+            texts.setdefault(field, value.strip())
+    return texts

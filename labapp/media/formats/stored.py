@@ -1,4 +1,4 @@
-"""Frames that each lie at a known place in a file: what the readers of such recordings share."""
+"""Base of readers whose frames lie at known offsets in a file."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from labapp.pixels import MOST_PIXELS
 
 
 class StoredFrames(FrameSource):
-    """Frames read one at a time by `_grey`, in any order, with no place kept in the file.
+    """Source that reads frames by `_grey`, in any order and without state.
 
     Parameters
     ----------
     path
         The file or folder.
     kind
-        What it is, as the description begins: "Phantom cine".
+        Begin of the description: "Phantom cine".
     count
         Number of frames, at least 1.
     shape
@@ -33,9 +33,9 @@ class StoredFrames(FrameSource):
     bit_depth
         Significant bits of a grey level.
     colour
-        Whether it was recorded in colour.
+        Whether the recording is in colour.
     frame_rate_hz
-        Frames a second; None where the recording does not say.
+        Frame rate, Hz; None where unknown.
     time_s
         Time of every frame since the first, shape (count,), s; None: from the frame rate.
 
@@ -93,42 +93,42 @@ class StoredFrames(FrameSource):
 
 
 def too_large(path: Path, rows: int, columns: int) -> InputError:
-    """The error for a frame of more pixels than are decoded."""
+    """Error for a frame of more than `MOST_PIXELS` pixels."""
     size = f"{columns}×{rows} px"
     return InputError(path, "frame size", size, f"at most {MOST_PIXELS} px in a frame")
 
 
 def ends_early(name: str, claimed: int, whole: int) -> tuple[str, ...]:
-    """The sentence for a recording whose header promises more frames than are whole, if it does."""
+    """Warning for a recording with fewer complete frames than its header claims; else empty."""
     if whole >= claimed:
         return ()
     return (f"{name} ends early: its header says {claimed} frames, {whole} of them whole",)
 
 
 def plausible_rate(value: float) -> float | None:
-    """``value`` as frames a second; None where it cannot be one."""
+    """``value`` as a frame rate, Hz; None where it cannot be one."""
     return float(value) if np.isfinite(value) and 0 < value < 1e12 else None
 
 
 def increasing(time_s: FloatArray) -> bool:
-    """Whether times are finite and each is later than the one before."""
+    """Whether times are finite and strictly increasing."""
     return bool(np.isfinite(time_s).all() and (np.diff(time_s) > 0).all())
 
 
 def finite(path: Path, image: GreyImage) -> GreyImage:
-    """Give ``image`` back; refuse it where a level is NaN or infinite."""
+    """Return ``image``; raise if a level is NaN or infinite."""
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise InputError(path, "grey levels", "NaN or infinity", "finite grey levels")
     return image
 
 
 def regular_size(path: Path) -> int:
-    """Bytes in a regular file. A device has no end, and a pipe would be waited for: neither is one.
+    """Size of a regular file, bytes; a device has no end, and a pipe would block.
 
     Raises
     ------
     OSError
-        If it is none, or not there.
+        If it is not regular, or does not exist.
     """
     try:
         found = path.stat()
@@ -142,12 +142,12 @@ def regular_size(path: Path) -> int:
 
 
 def file_size(path: Path) -> int:
-    """Bytes in a regular file.
+    """Size of a regular file, bytes.
 
     Raises
     ------
     InputError
-        If it is none, or not there.
+        If it is not regular, or does not exist.
     """
     try:
         return regular_size(path)

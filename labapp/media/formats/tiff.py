@@ -51,10 +51,10 @@ UNPACKERS: dict[int, Callable[[], Any]] = {
     32946: zlib.decompressobj,
     34925: lzma.LZMADecompressor,
 }
-"""By compression: Deflate and LZMA, of which tifffile unpacks all there is."""
+"""By compression: Deflate and LZMA, which tifffile unpacks without a bound."""
 
 BY_TIFFFILE = {1, *UNPACKERS}
-"""Compressions left to tifffile. It may know others, without bounds: OpenCV has them."""
+"""Compressions decoded by tifffile; others, which it may unpack without a bound, by OpenCV."""
 
 MIN_IS_WHITE, MIN_IS_BLACK, RGB, COLOUR_FILTER = 0, 1, 2, 32803
 """Photometric interpretations whose levels are read as they are; others go through OpenCV."""
@@ -132,7 +132,7 @@ class TiffStack(StoredFrames):
         return type(self)(self._path)
 
     def close(self) -> None:
-        """Let go of the file. Closing twice does no harm."""
+        """Close the file. Closing twice does no harm."""
         self._tiff.close()
 
     def _first_whole(self, count: int) -> tuple[tifffile.TiffPage, GreyImage]:
@@ -187,7 +187,7 @@ class TiffStack(StoredFrames):
         return grey
 
     def _whole_pages(self, pages: int) -> int:
-        """Number of pages without those at the end that are cut off."""
+        """Number of pages without those cut off at the end."""
         for count in range(pages, 1, -1):
             with contextlib.suppress(InputError):
                 page = self._page(count - 1)
@@ -196,7 +196,7 @@ class TiffStack(StoredFrames):
         return 1
 
     def _names_another(self, pages: int) -> bool:
-        """Whether the last directory names one more, which is not in the file."""
+        """Whether the last directory refers to another, which is not in the file."""
         last = self._page(pages - 1)
         tiff = self._tiff.tiff
         end = last.offset + tiff.tagnosize + len(last.tags) * tiff.tagsize
@@ -206,14 +206,14 @@ class TiffStack(StoredFrames):
 
 
 def _guarded(path: Path, read: Callable[[], Result]) -> Result:
-    """Call ``read``; whatever a damaged file makes tifffile raise becomes an `InputError`."""
+    """Result of ``read``; any error of tifffile on a damaged file becomes an `InputError`."""
     try:
         return read()
     except InputError:
         raise
     except OSError as error:
-        said = error.strerror or error
-        raise InputError(path, "file", said, "a file that may be read") from error
+        reason = error.strerror or error
+        raise InputError(path, "file", reason, "a file that may be read") from error
     except Exception as error:
         # Its readers of tags raise nearly every kind of error, none of them by contract.
         raise InputError(path, "content", "cannot be decoded", A_TIFF) from error
@@ -230,7 +230,7 @@ def _end(page: tifffile.TiffPage) -> int:
 
 
 def _described_frames(tiff: tifffile.TiffFile) -> int:
-    """Pictures that the first page says there are; 0 where it says nothing."""
+    """Number of pictures by the first page's metadata; 0 where unknown."""
     page = _page_of(tiff, 0)
     if tiff.is_imagej:
         return int((tiff.imagej_metadata or {}).get("images", 0))
@@ -243,7 +243,7 @@ def _described_frames(tiff: tifffile.TiffFile) -> int:
 def _read_page(
     path: Path, page: tifffile.TiffPage, size: int, offset: int | None
 ) -> GreyImage | None:
-    """Grey levels of a page, or of the picture at ``offset``; None where tifffile cannot."""
+    """Grey levels of a page, or of the picture at ``offset``; None if tifffile cannot read it."""
     _check_room(path, page, size)
     if page.photometric not in (MIN_IS_WHITE, MIN_IS_BLACK, RGB, COLOUR_FILTER):
         return None
@@ -265,7 +265,7 @@ def _read_page(
 
 
 def _check_room(path: Path, page: tifffile.TiffPage, size: int) -> None:
-    """Refuse a page whose data are not in the file of ``size`` bytes, before it is allocated."""
+    """Raise if the data of a page are not in the file of ``size`` bytes, before allocation."""
     stored = sum(page.databytecounts)
     bits = math.prod(page.shape) * page.bitspersample
     if page.is_tiled:
@@ -279,7 +279,7 @@ def _check_room(path: Path, page: tifffile.TiffPage, size: int) -> None:
 
 
 def _check_unpacked(path: Path, page: tifffile.TiffPage) -> None:
-    """Refuse strips and tiles that unpack to more than they should hold."""
+    """Raise if strips or tiles unpack to more than they should hold."""
     if (unpacker := UNPACKERS.get(page.compression)) is None:
         return
     most = math.prod(page.chunks) * -(-page.bitspersample // 8)
@@ -337,12 +337,12 @@ def _bit_depth(page: tifffile.TiffPage, image: GreyImage) -> int:
 
 def _time_base(tiff: tifffile.TiffFile, count: int) -> tuple[float | None, FloatArray | None]:
     """Frame rate, Hz, and times of the frames, s, as far as the metadata give them."""
-    said = tiff.imagej_metadata or {} if tiff.is_imagej else {}
-    interval = _seconds(said.get("finterval"), str(said.get("tunit", "s")))
+    metadata = tiff.imagej_metadata or {} if tiff.is_imagej else {}
+    interval = _seconds(metadata.get("finterval"), str(metadata.get("tunit", "s")))
     if interval is not None:
         return plausible_rate(1 / interval), None
-    if "fps" in said:
-        return plausible_rate(float(said["fps"])), None
+    if "fps" in metadata:
+        return plausible_rate(float(metadata["fps"])), None
     description = _page_of(tiff, 0).description
     if not description.lstrip().startswith("<") or "<Pixels" not in description[:100_000]:
         return None, None
@@ -374,7 +374,7 @@ def _ome_time_base(description: str, count: int) -> tuple[float | None, FloatArr
 
 
 def _seconds(value: object, unit: str) -> float | None:
-    """A time above 0 in seconds; None where it is none."""
+    """Positive time in s; None where invalid."""
     number = _number(value)
     scale = SECONDS.get(unit.replace("\\u00B5", "µ"))
     return None if number is None or scale is None or number <= 0 else number * scale

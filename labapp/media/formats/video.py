@@ -80,7 +80,7 @@ SEEK_WARNING = (
 
 
 class VideoSource(FrameSource):
-    """A video of which every packet is known, so that any frame is found exactly.
+    """A video with an index of all packets, so that any frame is found exactly.
 
     The file is read through once without decoding, unless it is an AVI whose index fits it: where
     each packet is, which are key frames, and which frame, in the order they are shown, comes of
@@ -96,7 +96,7 @@ class VideoSource(FrameSource):
     path
         The file.
     index
-        What an earlier source gave as its `index`, to open the file without reading it through.
+        `index` of an earlier source, to open the file without reading it through.
 
     Raises
     ------
@@ -105,13 +105,13 @@ class VideoSource(FrameSource):
     """
 
     _shown: tuple[int, VideoFrame] | None
-    """The frame read last."""
+    """Last frame read, with its number."""
     _ahead: tuple[int, VideoFrame] | None
-    """A frame that was decoded while looking for one that cannot be."""
+    """A later frame, decoded while looking for one that cannot be decoded."""
     _next: int
-    """Frames from this one on may still come out of the decoder."""
+    """Number of the next frame that the decoder can give."""
     _fed: int
-    """The packet read last."""
+    """Index of the packet read last."""
 
     def __init__(self, path: Path, index: bytes | None = None) -> None:
         self._path = path
@@ -139,13 +139,13 @@ class VideoSource(FrameSource):
         self._table = table
         self._ordinal = {place: k for k, place in enumerate(table.place.tolist())}
         self._keys = np.flatnonzero(table.key)
-        self._stand(self._listed_packets())
+        self._continue_with(self._listed_packets())
 
     def __len__(self) -> int:
         return len(self._table.time_s)
 
     def close(self) -> None:
-        """Let go of the file. Closing twice does no harm."""
+        """Close the file. Closing twice does no harm."""
         self._container.close()
 
     def reopen(self) -> Self:
@@ -154,11 +154,11 @@ class VideoSource(FrameSource):
 
     @property
     def seekable(self) -> bool:
-        """Whether frames are got to by seeking; if not, by decoding from the start."""
+        """Whether frames are found by seeking; if not, by decoding from the start."""
         return self._table.seekable
 
     def decode_from_start(self) -> None:
-        """From now on get to no frame by seeking; kept in `index`, said in `warnings`."""
+        """Disable seeking; `index` and `warnings` are updated."""
         self._open()
         table = self._table.without_seeking()
         self._use(table, table.to_bytes(self._fingerprint))
@@ -183,7 +183,7 @@ class VideoSource(FrameSource):
         return Frame(index, None if math.isnan(time_s) else time_s, image)
 
     def _find(self, index: int) -> tuple[int, VideoFrame] | None:
-        """Frame ``index`` with its number; None when decoding passes it by."""
+        """Number and frame ``index``; None if it cannot be decoded."""
         before = np.flatnonzero(self._table.number[self._keys] <= index)
         key = int(self._keys[before[-1]]) if len(before) else 0
         far = self._table.seekable and key > self._fed + NEAR_PACKETS
@@ -214,16 +214,16 @@ class VideoSource(FrameSource):
     def _restart(self) -> None:
         """Open the file again and go on before its first frame."""
         self._open()
-        self._stand(self._listed_packets())
+        self._continue_with(self._listed_packets())
 
     def _open(self) -> None:
         self._container.close()
         self._container, self._stream = _open(self._path)
 
-    def _stand(
+    def _continue_with(
         self, packets: Iterator[tuple[int, Packet[VideoStream]]], *, from_start: bool = True
     ) -> None:
-        """Go on with ``packets``, with nothing left of what was decoded before."""
+        """Reset the decoder state and continue with ``packets``."""
         self._decoded = self._decode(packets)
         self._from_start = from_start
         self._shown = None
@@ -232,7 +232,7 @@ class VideoSource(FrameSource):
         self._fed = -1
 
     def _seek(self, key: int) -> None:
-        """Get to packet ``key`` or one before it; which is known by the packet that is there."""
+        """Seek to packet ``key`` or one before it, identified by the packet found there."""
         if self._fed < 0:
             # A palette comes with the first packet only.
             next(self._decoded, None)
@@ -242,12 +242,12 @@ class VideoSource(FrameSource):
                 packets = self._listed_packets()
                 first = next(packets, None)
                 if first is not None and first[0] <= key:
-                    self._stand(itertools.chain([first], packets), from_start=first[0] == 0)
+                    self._continue_with(itertools.chain([first], packets), from_start=first[0] == 0)
                     return
         self._restart()
 
     def _listed_packets(self) -> Iterator[tuple[int, Packet[VideoStream]]]:
-        """Packets from here on, each with its place in the table."""
+        """Packets from here on, each with its index in the table."""
         for packet in _packets(self._container, self._stream):
             ordinal = self._ordinal.get(getattr(packet, self._table.placed_by))
             if ordinal is not None:
@@ -256,7 +256,7 @@ class VideoSource(FrameSource):
     def _decode(
         self, packets: Iterator[tuple[int, Packet[VideoStream]]]
     ) -> Iterator[tuple[int, VideoFrame]]:
-        """Frames with their numbers, as they come out of the decoder.
+        """Numbers and frames, in the decoder's order.
 
         After a packet that is missing or damaged nothing is decoded before the next key frame:
         decoders would go on with what they have, and only some would say so.
@@ -284,7 +284,7 @@ class VideoSource(FrameSource):
                 yield number, frame
 
     def _table_of_file(self) -> PacketTable:
-        """Everything there is to know about the file, by its index or reading all of it once."""
+        """Index of the file, by its own index or by reading it through."""
         is_avi = self._container.format.name == "avi"
         codec = self._stream.codec_context.codec
         timing = Timing(
@@ -327,7 +327,7 @@ class VideoSource(FrameSource):
         )
 
     def _all_packets(self, is_avi: bool, claimed: int) -> tuple[Packets, bool, bool]:
-        """All packets, whether an index has them so, and whether a last one was cut off."""
+        """All packets, whether the file's index confirms them, and whether the last is cut off."""
         entries = list(self._stream.index_entries) if is_avi else []
         listed = Packets.listed(entries, self._stream.index, claimed, self._path)
         if listed is not None:
@@ -373,7 +373,7 @@ class VideoSource(FrameSource):
         return key, number
 
     def _first_frame(self) -> tuple[VideoFrame, Packet[VideoStream]]:
-        """The first frame that is whole, and the packet after which it came out."""
+        """First complete frame, and the packet after which the decoder gave it."""
         last = None
         for packet in itertools.chain(_packets(self._container, self._stream), [None]):
             last = packet or last
@@ -387,7 +387,7 @@ class VideoSource(FrameSource):
         return rate if math.isfinite(rate) and rate > 0 else None
 
     def _claimed(self) -> int:
-        """Number of frames the header speaks of; 0 where it does not."""
+        """Number of frames in the header; 0 where unknown."""
         if self._stream.frames:
             return self._stream.frames
         whole_file = self._container.format.name.startswith("matroska")
@@ -413,7 +413,7 @@ class VideoSource(FrameSource):
 
 
 def _fingerprint(path: Path) -> tuple[int, int]:
-    """Size, byte, and checksum of both ends of a file: whether it is still the same."""
+    """Size, bytes, and checksum of both ends of a file, to tell whether it is the same."""
     part = 1 << 16
     try:
         with path.open("rb") as file:
@@ -461,7 +461,7 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
 
 
 def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """Whole packets in the file's order; those that cannot be read are passed over."""
+    """Complete packets in file order; unreadable ones are skipped."""
     failures = 0
     while failures < DAMAGED_READS:
         try:
@@ -481,7 +481,7 @@ def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[
 def _kept(
     packets: Iterable[Packet[VideoStream]], last: deque[Packet[VideoStream]]
 ) -> Iterator[Packet[VideoStream]]:
-    """Packets as they come, the last of which stay in ``last``."""
+    """Pass packets through; the latest stay in ``last``."""
     for packet in packets:
         last.append(packet)
         yield packet
@@ -490,7 +490,7 @@ def _kept(
 def _decode_as(
     stream: VideoStream, packet: Packet[VideoStream] | None, stamp: int
 ) -> list[VideoFrame] | None:
-    """Frames that come out when ``packet`` goes in as ``stamp``; None when it is damaged."""
+    """Frames of the decoder for ``packet`` with time stamp ``stamp``; None if it is damaged."""
     if packet is not None:
         packet.pts = packet.dts = stamp
     try:
