@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from labapp.config.setup import Setup, read_setup
+from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.sequence import warm
 from labapp.core.surface.measures import Measures
@@ -26,7 +27,7 @@ from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.run import live_measuring, live_trend, live_watch
 from labapp.run.limits import Limits, Size, standing
-from labapp.run.live_measuring import SOUGHT_S, LiveChain, LiveMeasuring, LiveResult
+from labapp.run.live_measuring import JUDGED_S, SOUGHT_S, LiveChain, LiveMeasuring, LiveResult
 from labapp.run.live_watch import LiveWatch
 from labapp.run.streams import LineStream
 from tests.waiting import PATIENCE_S, connect
@@ -311,43 +312,73 @@ def test_a_frame_that_is_left_out_is_none_that_failed(watch: LiveWatch, told: To
     assert told == []
 
 
-def test_a_frame_is_searched_for_only_when_none_was_followed_for_long(
-    setup: Setup, monkeypatch: pytest.MonkeyPatch
-):
-    now_s, found = [100.0], Measurement("ok", "", "fit", measures=MEASURES)
-    is_lost, searched = [True], []
+class Chain:
+    """Follows frames unless it is lost, and notes when it searches and when frames are judged."""
 
-    class Chain:
-        broke: str | None = None
+    def __init__(self) -> None:
+        self.now_s, self.is_lost = 100.0, True
+        self.searched: list[float] = []
+        self.judged: list[float] = []
+        self.broke: str | None = None
+        self.found = Measurement("ok", "", "fit", Dots(*np.ones((7, 2))), measures=MEASURES)
 
-        def __init__(self, *_: object) -> None:
-            pass
+    def follow(self, _: np.ndarray) -> Measurement | None:
+        self.broke = "it jumped" if self.is_lost else None
+        return None if self.is_lost else self.found
 
-        def follow(self, _: np.ndarray) -> Measurement | None:
-            self.broke = "it jumped" if is_lost[0] else None
-            return None if is_lost[0] else found
+    def measure(self, _: np.ndarray) -> Measurement:
+        self.searched.append(self.now_s)
+        return self.found
 
-        def measure(self, _: np.ndarray) -> Measurement:
-            searched.append(now_s[0])
-            return found
+    def judge(self, *_: object) -> Any:
+        self.judged.append(self.now_s)
 
-    monkeypatch.setattr(warm, "WarmChain", Chain)
-    monkeypatch.setattr(live_measuring, "judge_quality", lambda *_: None)
-    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+
+@pytest.fixture
+def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
+    chain = Chain()
+    monkeypatch.setattr(warm, "WarmChain", lambda *_: chain)
+    monkeypatch.setattr(live_measuring, "judge_quality", chain.judge)
+    monkeypatch.setattr(time, "monotonic", lambda: chain.now_s)
+    return chain
+
+
+def test_a_frame_is_searched_for_only_when_none_was_followed_for_long(setup: Setup, chain: Chain):
     measure, one = LiveChain(setup, Settings(), 8).measure, frame(1)
     assert measure(one, False) is not None  # the first
-    assert searched == [100.0]
-    now_s[0] += 0.9 * SOUGHT_S
+    assert chain.searched == [100.0]
+    chain.now_s += 0.9 * SOUGHT_S
     assert measure(one, False) is None
-    is_lost[0] = False
+    chain.is_lost = False
     followed = measure(one, False)
     assert followed is not None
     assert followed.track_lost is None
-    is_lost[0] = True
-    now_s[0] += 0.9 * SOUGHT_S
+    chain.is_lost = True
+    chain.now_s += 0.9 * SOUGHT_S
     assert measure(one, False) is None
-    now_s[0] += 0.2 * SOUGHT_S
+    chain.now_s += 0.2 * SOUGHT_S
     again = measure(one, False)
     assert again is not None
     assert again.track_lost == "it jumped"
-    assert searched == [100.0, now_s[0]]
+    assert chain.searched == [100.0, chain.now_s]
+
+
+def test_frames_are_judged_some_times_a_second_while_they_are_followed(setup: Setup, chain: Chain):
+    measure, one = LiveChain(setup, Settings(), 8).measure, frame(7)
+    result = measure(one, False)
+    assert result is not None
+    assert (result.frame, result.time_s, result.arrived_s) == (7, one.time_s, one.arrived_s)
+    assert result.measurement.measures == MEASURES
+    assert result.measurement.dots is None  # what stays in the process
+    chain.is_lost = False
+    wanted = [100.0]
+    for share in (0.6, 1.2, 1.8, 2.3):
+        chain.now_s = 100.0 + share * JUDGED_S
+        measure(one, False)
+        wanted += [chain.now_s] if share in (1.2, 2.3) else []
+        assert chain.judged == wanted
+    chain.is_lost, chain.now_s = True, chain.now_s + 1.1 * SOUGHT_S
+    for _ in range(2):  # each that is searched for
+        measure(one, False)
+        chain.now_s += 1.1 * SOUGHT_S
+    assert len(chain.judged) == len(wanted) + 2
