@@ -46,7 +46,10 @@ BATCH = 20
 """Frames that a process returns at a time."""
 
 Read = Callable[[int], Frame]
+"""Reads a frame by its number; raises `InputError` if it cannot."""
+
 Corrected = Callable[[int], Correction | None]
+"""The dots and rows of a frame as they were corrected by hand; None: they were not."""
 
 
 # --- each frame by itself -----------------------------------------------------------------------
@@ -59,11 +62,11 @@ class ColdMeasurer:
     Parameters
     ----------
     read
-        Reads a frame; one that raises `InputError` gets the status ``unreadable``.
+        Reads frames; one that cannot be read gets the status ``unreadable``.
     setup, settings
         What frames are measured with.
     corrected
-        The dots and rows of a frame as they were corrected by hand, or None.
+        Gives the corrections by hand.
     pool
         Where to measure (`measuring_pool`), some frames ahead; None: here, one after the other.
     """
