@@ -37,11 +37,16 @@ class FrameQueue:
         self._turn = threading.Lock()
         self._waiting: deque[CameraFrame] = deque()
         self._every, self._due = 1, 0
+        """Steps between frames, and the number from which the next frame is taken."""
         self._last: CameraFrame | None = None
-        self._given_s = 0.0
         self._interval_s = self._took_s = 0.0
+        """Running means of the time between frames, and of the time that measuring takes."""
+        self._given_s = 0.0
+        """When the frame that is measured now arrived."""
         self._in_order = self._followed = 0
+        """How many of those that wait come next in any case, and how many followed of late."""
         self._is_behind = self._is_old = False
+        """Whether a frame found no room, and whether the one measured now came in its order."""
 
     @property
     def every(self) -> int:
@@ -117,7 +122,7 @@ def _mean(former: float, newest: float) -> float:
 
 
 def newest_of(frames: deque[CameraFrame]) -> CameraFrame | None:
-    """Take the newest frame; those before it are dropped."""
+    """Take the newest frame; those before it are left out."""
     while len(frames) > 1:
         frames.popleft()
     return frames.popleft() if frames else None
