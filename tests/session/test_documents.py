@@ -46,6 +46,17 @@ def test_a_document_is_what_was_set_last(documents: Documents):
     assert documents.get("record") is None
 
 
+def test_a_document_of_no_frame_is_unpacked_once_per_content(documents: Documents):
+    documents.change("table", {("signals", NO_FRAME): ["long"]})
+    first = documents.get("signals")
+    note(documents, "a")
+    assert documents.get("signals") is first
+    documents.change("table", {("signals", NO_FRAME): ["other"]})
+    assert documents.get("signals") == ["other"]
+    documents.undo()
+    assert documents.get("signals") == ["long"]
+
+
 def test_a_change_to_what_already_is_is_no_step(documents: Documents):
     assert note(documents, "a")
     assert not note(documents, "a")
