@@ -219,11 +219,13 @@ def reconstruct(
     ] = False,
     lines: Annotated[
         str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Tell measures as lines of JSON over TCP there."),
+        typer.Option(
+            metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP from there."
+        ),
     ] = None,
     opcua: Annotated[
         str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Tell measures as variables of OPC UA there."),
+        typer.Option(metavar="[HOST:]PORT", help="Publish measures as variables of OPC UA there."),
     ] = None,
     anywhere: Annotated[
         bool, typer.Option("--anywhere", help="Let other machines connect: nobody is asked who.")
@@ -262,7 +264,7 @@ def _stream_sinks(at_end: ExitStack, places: dict[str, str | None], anywhere: bo
     for kind, place in asked.items():
         stream = open_stream(kind, place, anywhere)
         at_end.callback(stream.close)
-        typer.echo(f"Measures are told at {stream.address}", err=True)
+        typer.echo(f"Measures are sent from {stream.address}", err=True)
         sinks.append(sink(stream))
     return sinks
 

@@ -102,7 +102,7 @@ def record(
 ) -> None:
     """Record from a camera, without loss: docs/cameras.md.
 
-    What happens meanwhile is told on stderr, and kept beside the recording as FILE-notes.csv.
+    Events are reported on stderr, and kept beside the recording as FILE-notes.csv.
 
     Ctrl-C or SIGTERM ends the recording: what was recorded is kept, and the exit code is 0.
     """
@@ -133,7 +133,7 @@ def _film(
     settings: CameraSettings,
     seconds: float | None,
 ) -> Take:
-    """Record for some seconds, or until Ctrl-C or SIGTERM; what happens is told on stderr."""
+    """Record for some seconds, or until Ctrl-C or SIGTERM; events are reported on stderr."""
     from labapp.media.cameras import CameraError
     from labapp.simulated.cameras import camera_opener
     from labapp.simulated.cameras import record as film

@@ -1,4 +1,4 @@
-"""`labapp session correct`: dots and rows of a frame put right, and carried on from frame to frame.
+"""`labapp session correct`: dots and rows of a frame corrected, and carried on from frame to frame.
 
 Each option is an edit of `labapp.core.rows.correction`; they are applied in the order they are
 given in.
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from labapp.cli.shared import frames_text, measure_frames, told_effect
+from labapp.cli.shared import frames_text, measure_frames, report_stale_results
 from labapp.errors import InputError
 from labapp.text import pluralize
 
@@ -116,7 +116,7 @@ def correct(
     ] = False,
     measure: Annotated[bool, typer.Option(help="Measure the corrected frames.")] = True,
 ) -> None:
-    """Put the dots and rows of a frame right, by edits applied in the order given.
+    """Correct the dots and rows of a frame, by edits applied in the order given.
 
     Rows are counted from the bottom up, columns from left to right, both from 1.
 
@@ -144,7 +144,7 @@ def correct(
             corrections |= _carried_on(session, frame, kept)
         frames = list(corrections)
         before = session.result(frame)
-        with nullcontext() if measure else told_effect(session):
+        with nullcontext() if measure else report_stale_results(session):
             session.correct(corrections, _label(frames, edits))
             typer.echo(f"Corrected: {frames_text(frames)} (labapp session undo takes it back)")
         if measure:

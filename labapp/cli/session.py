@@ -28,7 +28,7 @@ from labapp.cli.shared import (
     frames_text,
     measure_frames,
     progress_shown,
-    told_effect,
+    report_stale_results,
 )
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
@@ -138,7 +138,7 @@ def set_setup(
     from labapp.session.session import Session
 
     text = read_setup(setup).text
-    with Session.open(file) as session, told_effect(session):
+    with Session.open(file) as session, report_stale_results(session):
         same = session.setup_text == text
         session.set_setup(text)
         typer.echo("The set-up is the same as before" if same else f"The set-up is that of {setup}")
@@ -196,7 +196,7 @@ def import_recording(
 
 
 INEXACT = (
-    "not frame-exact: frames that come out wrong are refused; encode it anew, "
+    "not frame-exact: frames that come out wrong are refused; encode it again, "
     "as FFV1 or MJPG in AVI"
 )
 
@@ -246,7 +246,7 @@ def measure(
     if everything and frames is not None:
         raise InputError("--all", "frames", f"and --frames {frames}", "one of the two")
     with Session.open(file) as session:
-        _ = session.setup  # what is missing in it is told before anything is changed
+        _ = session.setup  # what is missing in it is reported before anything is changed
         chosen = choose_frames(session, frames or ":")
         options = {"scheme": scheme, "algorithm": algorithm, "correspondence": correspondence}
         _set(session, {name: value for name, value in options.items() if value is not None})
@@ -372,7 +372,7 @@ def _words(text: str) -> frozenset[str]:
 def _step(file: Path, way: Literal["undo", "redo"]) -> None:
     from labapp.session.session import Session
 
-    with Session.open(file) as session, told_effect(session):
+    with Session.open(file) as session, report_stale_results(session):
         change = session.undo() if way == "undo" else session.redo()
         done = "Undone" if way == "undo" else "Done again"
         told = f"{done}: {change.label} (of {change.made})" if change else f"Nothing to {way}"

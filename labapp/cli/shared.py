@@ -153,7 +153,7 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
 
 
 @contextmanager
-def told_effect(session: Session) -> Iterator[None]:
+def report_stale_results(session: Session) -> Iterator[None]:
     """Tell what a change does to results: which no longer stand, which stand again."""
     before = _stale(session)
     yield

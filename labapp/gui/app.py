@@ -102,7 +102,7 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     window = make_window(preferences, file)
     window.apply_theme()
     app.styleHints().colorSchemeChanged.connect(window.apply_theme)
-    faults = Faults(window.say, window)
+    faults = ErrorReporter(window.say, window)
     faults.install()
     heartbeat = QTimer(window)
     rounds = itertools.count(1)
@@ -185,7 +185,7 @@ def start_app() -> QApplication:
     return app
 
 
-class Faults(QObject):
+class ErrorReporter(QObject):
     """Uncaught errors: all of them to the log, and in words to the operator; the window stays.
 
     Parameters

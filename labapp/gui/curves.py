@@ -62,7 +62,7 @@ class Curve:
     limits
         Lines at the lowest and the highest that y is to be, which are always seen; None for none.
     quick
-        Whether points have a mark only where it is not the usual one: the curve is drawn anew many
+        Whether points have a mark only where it is not the usual one: the curve is redrawn many
         times a second.
     """
 
@@ -117,7 +117,7 @@ class Axis:
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
 
-def point_in_words(curve: Curve, index: int, axis: Axis) -> str:
+def point_text(curve: Curve, index: int, axis: Axis) -> str:
     """A point for the read-out and the screen reader."""
     sigma = float(curve.sigma[index]) if len(curve.sigma) else None
     value, spread = rounded(float(curve.y[index]), sigma, curve.decimals)

@@ -61,7 +61,7 @@ class InUse:
 
 
 @dataclass(frozen=True)
-class Found:
+class DevicesFound:
     """What was found plugged in.
 
     Parameters
@@ -111,7 +111,7 @@ class FootSwitches(QObject):
         Others are in use, or their pedals do something else: as plain values, to be remembered.
     pressed
         The name of the menus' action that a pedal was pressed for.
-    said
+    notified
         Something for the operator to read: a sentence, and whether it is a problem.
 
     Attributes
@@ -127,20 +127,20 @@ class FootSwitches(QObject):
     changed = Signal()
     kept = Signal(object)
     pressed = Signal(str)
-    said = Signal(str, bool)
+    notified = Signal(str, bool)
 
     def __init__(self, tasks: Tasks, parent: QObject | None = None) -> None:
         super().__init__(parent)
         self._tasks = tasks
         self.in_use: dict[str, InUse] = {}
-        self.found: Found | None = None
+        self.found: DevicesFound | None = None
         self.learned: Learned | None = None
-        self.unheard: tuple[str, ...] = ()
+        self.unavailable: tuple[str, ...] = ()
         """Why some devices cannot be listened to while a pedal is waited for."""
         self._deaf_until_s = 0.0
         self._learning: Task | None = None
         self._looking: Task | None = None
-        self._heard: queue.SimpleQueue[tuple[str, Action | Event]] = queue.SimpleQueue()
+        self._received: queue.SimpleQueue[tuple[str, Action | Event]] = queue.SimpleQueue()
         self._timer = QTimer(self)
         self._timer.setInterval(POLL_MS)
         self._timer.timeout.connect(self._take)
@@ -154,7 +154,7 @@ class FootSwitches(QObject):
             try:
                 pedals = PedalMap.from_dict(values)
             except InputError as error:
-                self.said.emit(f"A foot switch is to be learned anew: {error}", True)
+                self.notified.emit(f"A foot switch must be learned again: {error}", True)
                 continue
             self._begin(pedals)
         self.changed.emit()
@@ -181,7 +181,7 @@ class FootSwitches(QObject):
         if pedals.device in self.in_use or not pedals.actions:
             return
         # Calls come in the device's thread: it is given the queue, and nothing of Qt.
-        hear = partial(_put, self._heard, pedals.device)
+        hear = partial(_put, self._received, pedals.device)
         switch = FootSwitch(pedals, hear, hear, hid.find_hid, hid.open_hid)
         self.in_use[pedals.device] = InUse(switch)
         if not self._timer.isActive():
@@ -194,14 +194,14 @@ class FootSwitches(QObject):
     def _take(self) -> None:
         """Do what was pressed, and tell what happened."""
         deaf = self.learns or time.monotonic() < self._deaf_until_s
-        for _ in range(self._heard.qsize()):
-            key, heard = self._heard.get_nowait()
+        for _ in range(self._received.qsize()):
+            key, heard = self._received.get_nowait()
             if key not in self.in_use:
                 continue
             if isinstance(heard, Event):
                 self.in_use[key].told = heard
                 warned = heard.kind == "warning" and heard.words != AWAY
-                self.said.emit(str(heard), warned)
+                self.notified.emit(str(heard), warned)
                 if warned and heard.words != UNPLUGGED:
                     self.look()  # what it may not be read for
                 self.changed.emit()
@@ -210,7 +210,9 @@ class FootSwitches(QObject):
 
     def _do(self, action: Action) -> None:
         if action == "next" and QApplication.activeModalWidget() is not None:
-            self.said.emit("The pedal goes to the next step when the question is answered", False)
+            self.notified.emit(
+                "The pedal goes to the next step when the question is answered", False
+            )
         else:
             self.pressed.emit(CALLS[action])
 
@@ -229,7 +231,7 @@ class FootSwitches(QObject):
     def look(self) -> None:
         """See what is plugged in, in the background."""
 
-        def done(found: Found) -> None:
+        def done(found: DevicesFound) -> None:
             self.found = found
             self.changed.emit()
 
@@ -240,20 +242,20 @@ class FootSwitches(QObject):
         """Wait for a pedal to be pressed, in the background, until `give_up`."""
         if self.learns:
             return
-        self.learned, self.unheard = None, ()
+        self.learned, self.unavailable = None, ()
 
         def done(answer: Learned | str | None) -> None:
-            self._learning, self.unheard = None, ()
+            self._learning, self.unavailable = None, ()
             self._deaf_until_s = time.monotonic() + DEAF_S
             if isinstance(answer, str):
-                self.said.emit(answer, True)
+                self.notified.emit(answer, True)
                 self.look()
             else:
                 self.learned = answer
             self.changed.emit()
 
         def told(problems: list[str]) -> None:
-            self.unheard = tuple(problems)
+            self.unavailable = tuple(problems)
             self.changed.emit()
 
         self._learning = self._tasks.start("Waiting for a pedal", _learned, done, told)
@@ -304,15 +306,15 @@ def _put(heard: queue.SimpleQueue[tuple[str, Any]], key: str, what: object) -> N
     heard.put((key, what))
 
 
-def _found() -> Found:
+def _found() -> DevicesFound:
     try:
         devices = {info.key: info for info in hid.find_hid()}
     except HidError as error:
-        return Found(problem=str(error))
+        return DevicesFound(problem=str(error))
     known_first = sorted(devices.values(), key=lambda info: not (info.is_pedal or info.is_3d))
     usable = [info.name for info in known_first if info.is_pedal and hid.may_be_read(info)]
     closed = [info for info in known_first if not hid.may_be_read(info)]
-    return Found(tuple(dict.fromkeys(usable)), tuple(closed))
+    return DevicesFound(tuple(dict.fromkeys(usable)), tuple(closed))
 
 
 def _learned(control: Control) -> Learned | str | None:

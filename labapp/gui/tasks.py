@@ -144,7 +144,7 @@ class Tasks(QObject):
         self._timer = QTimer(self)
         self._timer.setInterval(POLL_MS)
         self._timer.timeout.connect(self._poll)
-        self._told: tuple[float, list[tuple[int, int]]] = (0.0, [])
+        self._reported: tuple[float, list[tuple[int, int]]] = (0.0, [])
 
     def start(
         self,
@@ -197,14 +197,14 @@ class Tasks(QObject):
             for _ in range(task.control.events.qsize()):
                 if task in self.active:
                     self._take(task, *task.control.events.get_nowait())
-        self._tell_progress()
+        self._report_progress()
         if not self.active:
             self._timer.stop()
 
-    def _tell_progress(self) -> None:
+    def _report_progress(self) -> None:
         now, reached = time.monotonic(), [task.control.reached for task in self.active]
-        if reached != self._told[1] and (now - self._told[0]) * 1000 >= PROGRESS_MS:
-            self._told = now, reached
+        if reached != self._reported[1] and (now - self._reported[0]) * 1000 >= PROGRESS_MS:
+            self._reported = now, reached
             self.progressed.emit()
 
     def _take(self, task: Task, kind: str, value: Any) -> None:
@@ -232,10 +232,10 @@ def _run(work: Work, control: Control) -> None:
             logging.getLogger(NAME).info("after a cancel", exc_info=error)
             control.events.put(("cancelled", None))
         else:
-            control.events.put(("failed", in_words(error)))
+            control.events.put(("failed", error_text(error)))
 
 
-def in_words(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """What to tell the operator of an error; the log gets all of it."""
     log = logging.getLogger(NAME)
     if isinstance(error, InputError | CannotMeasure | ValueError):

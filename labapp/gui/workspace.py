@@ -1,4 +1,4 @@
-"""What is open in a window: a session and a frame. Everybody is told when something changes."""
+"""What is open in a window: a session and a frame; signals say when something changes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QObject, Signal
 
-from labapp.gui.tasks import Control, Task, Tasks, in_words
+from labapp.gui.tasks import Control, Task, Tasks, error_text
 from labapp.simulation import parallel
 
 if TYPE_CHECKING:
@@ -39,24 +39,24 @@ class Workspace(QObject):
     Signals
     -------
     closing
-        The session that is open will be closed: what the hand is at can still be kept in it.
+        The session that is open will be closed: an edit under way can still be kept in it.
     opened
         Another session is open, or none.
     changed
-        A document, the recording or a result changed; pages in view show the session anew.
+        A document, the recording or a result changed; pages in view show the session again.
     measured
         Frames that are not in view were measured; told some times a second while more follow.
     frame_changed
         Another frame is in view.
-    said
+    notified
         Something for the operator to read: a sentence, and whether it is a problem.
     settled
         What was said to be wrong no longer is: its words.
-    asked
+    action_requested
         An action of the window's menus is wanted, by its name.
-    next_wanted
+    next_session_requested
         A session like this one is wanted for a recording: its file.
-    pedals_kept
+    foot_switches_changed
         What the pedals of foot switches do is to be remembered, as plain values.
     """
 
@@ -65,11 +65,11 @@ class Workspace(QObject):
     changed = Signal()
     measured = Signal()
     frame_changed = Signal(int)
-    said = Signal(str, bool)
+    notified = Signal(str, bool)
     settled = Signal(str)
-    asked = Signal(str)
-    next_wanted = Signal(object)
-    pedals_kept = Signal(object)
+    action_requested = Signal(str)
+    next_session_requested = Signal(object)
+    foot_switches_changed = Signal(object)
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -78,7 +78,7 @@ class Workspace(QObject):
         self._pool: ProcessPoolExecutor | None = None
         self._overview: Overview | None = None
         self._measuring: list[Task] = []
-        # Connected before anybody else: whoever hears of a change sees the frames as they are.
+        # Connected first: the slots connected later see the frames as they are.
         self.opened.connect(self._forget)
         self.changed.connect(self._forget)
         self.tasks = Tasks(self)
@@ -93,9 +93,9 @@ class Workspace(QObject):
         from labapp.gui.foot_switches import FootSwitches
 
         made = FootSwitches(self.tasks, self)
-        made.pressed.connect(self.asked)
-        made.said.connect(self.said)
-        made.kept.connect(self.pedals_kept)
+        made.pressed.connect(self.action_requested)
+        made.notified.connect(self.notified)
+        made.kept.connect(self.foot_switches_changed)
         return made
 
     @property
@@ -125,7 +125,7 @@ class Workspace(QObject):
         """Open a session file; False if it was refused, which is said."""
         from labapp.session.session import Session
 
-        session = self.tried(lambda: Session.open(path, read_only))
+        session = self.run_or_report(lambda: Session.open(path, read_only))
         if session is not None:
             self.show(session)
         return session is not None
@@ -134,7 +134,7 @@ class Workspace(QObject):
         """Make a new session file and open it; False if it was refused, which is said."""
         from labapp.session.session import Session
 
-        session = self.tried(lambda: Session.create(path))
+        session = self.run_or_report(lambda: Session.create(path))
         if session is not None:
             self.show(session)
         return session is not None
@@ -147,7 +147,7 @@ class Workspace(QObject):
         self.show(None)
 
     def _stop_measuring(self) -> None:
-        """End the processes: what they are at is not kept, and can take seconds of a hard frame."""
+        """End the processes: a frame that is half measured is not kept, and could take seconds."""
         for task in self.tasks.active:
             task.cancel()  # or it would take the end of its processes for a fault
         pool, self._pool = self._pool, None
@@ -158,7 +158,7 @@ class Workspace(QObject):
         """Tell of a problem that lasts until its cause is settled, or another session is open."""
         self.settle(cause)
         self._problems[cause] = words
-        self.said.emit(words, True)
+        self.notified.emit(words, True)
 
     def settle(self, cause: str) -> None:
         """Take it that a problem is over, if there was one."""
@@ -166,7 +166,7 @@ class Workspace(QObject):
         if words:
             self.settled.emit(words)
 
-    def tried(
+    def run_or_report(
         self, work: Callable[[], T], cause: str = "", beside: Callable[[str], object] | None = None
     ) -> T | None:
         """Do something short; a refusal is said in words and gives None.
@@ -183,11 +183,11 @@ class Workspace(QObject):
         try:
             done = work()
         except Exception as error:
-            words = in_words(error)
+            words = error_text(error)
             if cause:
                 self.say_wrong(cause, words)
             else:
-                self.said.emit(words, True)
+                self.notified.emit(words, True)
             if beside is not None:
                 beside(f"▲ {words}")
             return None
@@ -209,10 +209,10 @@ class Workspace(QObject):
         change
             What is done to it.
         cause, beside
-            As of `tried`.
+            As of `run_or_report`.
         """
         session = self.session
-        if session is None or self.tried(lambda: (change(session),), cause, beside) is None:
+        if session is None or self.run_or_report(lambda: (change(session),), cause, beside) is None:
             return False
         self.changed.emit()
         return True
@@ -229,8 +229,8 @@ class Workspace(QObject):
         session = self.session
         if session is None:
             return
-        step = self.tried(session.undo if name == "undo" else session.redo)
-        self.said.emit(nothing if step is None else f"{done}: {step.label}", False)
+        step = self.run_or_report(session.undo if name == "undo" else session.redo)
+        self.notified.emit(nothing if step is None else f"{done}: {step.label}", False)
         if step is not None:
             frames = [frame for _, frame in step.keys if frame >= 0]
             if frames and self.frame not in frames:
@@ -293,7 +293,7 @@ class Workspace(QObject):
             return done
 
         def finished(count: int) -> None:
-            self.said.emit(f"{count} frame{'s' * (count != 1)} measured", False)
+            self.notified.emit(f"{count} frame{'s' * (count != 1)} measured", False)
 
         def kept(seen: Overview | None) -> None:
             if seen is None:

@@ -224,7 +224,7 @@ class Run:
     def __init__(self, folder: Path, seconds: float, rate_hz: float, faulty: bool) -> None:
         self.seconds, self.rate_hz, self.faulty = seconds, rate_hz, faulty
         self.samples: list[Sample] = []
-        self.said: list[str] = []
+        self.notified: list[str] = []
         self.stalls = 0
         self._goes = threading.Event()
         self._goes.set()
@@ -263,7 +263,7 @@ class Run:
         LiveMeasuring.measure = counted
 
     def _hear(self, _: object, first: int, last: int) -> None:
-        self.said += [self.log.item(row).text() for row in range(first, last + 1)]
+        self.notified += [self.log.item(row).text() for row in range(first, last + 1)]
 
     def _stall(self) -> None:
         self._goes.clear()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.shell.standing import Standing
+from labapp.gui.shell.standing import FrameStatus
 from labapp.gui.shell.window import MainWindow
 from labapp.media.survey import Survey, survey
 from labapp.session import frames as frames_module
@@ -115,7 +115,7 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
     window.measure_all()
     line, kinds = window.status_line, window.timeline.scrubber
     qtbot.waitUntil(lambda: line.bar.value() > 0)
-    qtbot.waitUntil(lambda: bool((kinds.kinds == Standing.NOT_MEASURABLE).any()))
+    qtbot.waitUntil(lambda: bool((kinds.kinds == FrameStatus.NOT_MEASURABLE).any()))
     assert line.bar.maximum() == FRAMES
     window.workspace.show_frame(STOPS_AT + 5)  # the window answers meanwhile
     assert window.timeline.scrubber.position == STOPS_AT + 5
@@ -127,13 +127,13 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
     assert 0 < len(kept) <= STOPS_AT
     assert kept == list(range(len(kept)))
     # What was kept is shown, though nothing follows it.
-    qtbot.waitUntil(lambda: int((kinds.kinds != Standing.NOT_MEASURED).sum()) == len(kept))
+    qtbot.waitUntil(lambda: int((kinds.kinds != FrameStatus.NOT_MEASURED).sum()) == len(kept))
     read.clear()
     window.measure_all()
     idle(window, qtbot)
     assert read == list(range(len(kept), FRAMES))  # nothing is measured twice
     assert set(session.overview().status) == {"no-dots"}
-    qtbot.waitUntil(lambda: int((kinds.kinds != Standing.NOT_MEASURED).sum()) == FRAMES)
+    qtbot.waitUntil(lambda: int((kinds.kinds != FrameStatus.NOT_MEASURED).sum()) == FRAMES)
     assert session.problems() == []
 
 

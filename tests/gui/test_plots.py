@@ -12,7 +12,7 @@ from PySide6.QtGui import QGuiApplication
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.curves import Axis, Curve, Mark, as_table, nearest, next_key, point_in_words
+from labapp.gui.curves import Axis, Curve, Mark, as_table, nearest, next_key, point_text
 from labapp.gui.theme import palette
 from labapp.gui.views.plots import MOST_POINTS, PlotStack
 from tests.gui.conftest import KEPT, let_draw
@@ -43,11 +43,11 @@ def current() -> Curve:
 
 
 def test_points_in_words() -> None:
-    assert point_in_words(curve(), 0, TIME) == "Frame 0, 0.0000 s: Height 0.3000 ± 0.0040 mm"
-    assert point_in_words(curve(), 2, TIME).startswith("Frame 4, 0.4000 s, in doubt: ")
+    assert point_text(curve(), 0, TIME) == "Frame 0, 0.0000 s: Height 0.3000 ± 0.0040 mm"
+    assert point_text(curve(), 2, TIME).startswith("Frame 4, 0.4000 s, in doubt: ")
     frames = Axis("Frame", "", decimals=0)
-    assert point_in_words(curve(), 0, frames).startswith("Frame 0: ")
-    assert point_in_words(current(), 0, TIME) == "Time 0.0000 s: Current 75.000 A"
+    assert point_text(curve(), 0, frames).startswith("Frame 0: ")
+    assert point_text(current(), 0, TIME) == "Time 0.0000 s: Current 75.000 A"
 
 
 def test_the_nearest_point_and_the_next_one() -> None:

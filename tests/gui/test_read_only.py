@@ -30,7 +30,7 @@ def test_what_can_be_entered_is_taken(
 ) -> None:
     assert window.workspace.open(copy_sample("gtaw"), read_only=True)
     said: list[str] = []
-    window.workspace.said.connect(lambda words, problem: said.append(words))
+    window.workspace.notified.connect(lambda words, problem: said.append(words))
     entered = 0
     for step in STEPS:
         window.show_step(step.key)

@@ -23,8 +23,12 @@ CALIBRATE = "calibrate the picture (step Imaging plane)"
         ("", f"Enter the laser, the dot pattern, {TYPED}; {CALIBRATE}"),
         (LASER, f"Enter the dot pattern, {TYPED}; {CALIBRATE}"),
         (
+            LASER.replace("distance_mm = 31.48\n", "") + PATTERN,
+            f"Enter the laser (distance mm), {TYPED}; {CALIBRATE}",
+        ),
+        (
             LASER.replace("31.48", "-3") + PATTERN,
-            "Put right the laser, distance mm: -3 is not a number above 0 and below 10000 (mm); "
+            "Correct the laser, distance mm: -3 is not a number above 0 and below 10000 (mm); "
             f"enter {TYPED}; {CALIBRATE}",
         ),
     ],

@@ -6,7 +6,7 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtGui import QImage
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.shell.standing import Standing, next_frame, standings
+from labapp.gui.shell.standing import FrameStatus, next_frame, standings
 from labapp.gui.shell.window import TICKS
 from labapp.gui.widgets.scrubber import aggregated
 from labapp.gui.widgets.timeline import Timeline
@@ -38,7 +38,7 @@ def test_how_frames_stand():
         [False, False, True, True, False, True, True],
         [False, False, False, True, False, False, False],
     )
-    assert [Standing(kind).name for kind in standings(seen)] == [
+    assert [FrameStatus(kind).name for kind in standings(seen)] == [
         "NOT_MEASURED", "MEASURED", "CORRECTED", "DOUBTFUL", "NOT_MEASURABLE", "CORRECTED",
         "NOT_MEASURABLE",
     ]  # fmt: skip
@@ -50,7 +50,7 @@ def test_a_frame_that_stands_out_is_in_doubt():
     none = np.zeros(40, bool)
     measures = dict.fromkeys(MEASURES, np.full(40, 1.0)) | {"width_mm": width}
     seen = Overview(np.arange(40), np.arange(40) / 60, ("ok",) * 40, none, none, measures)
-    assert np.flatnonzero(standings(seen) == Standing.DOUBTFUL).tolist() == [17]
+    assert np.flatnonzero(standings(seen) == FrameStatus.DOUBTFUL).tolist() == [17]
 
 
 def test_the_next_frame_that_is_wanted():
@@ -63,11 +63,11 @@ def test_the_next_frame_that_is_wanted():
 
 
 def test_one_bad_frame_in_ten_thousand_is_seen():
-    kinds = np.full(10_000, Standing.MEASURED, np.int64)
-    kinds[4321] = Standing.NOT_MEASURABLE
+    kinds = np.full(10_000, FrameStatus.MEASURED, np.int64)
+    kinds[4321] = FrameStatus.NOT_MEASURABLE
     columns = aggregated(kinds, 700)
-    assert (columns == Standing.NOT_MEASURABLE).sum() == 1
-    assert columns[4321 * 700 // 10_000] == Standing.NOT_MEASURABLE
+    assert (columns == FrameStatus.NOT_MEASURABLE).sum() == 1
+    assert columns[4321 * 700 // 10_000] == FrameStatus.NOT_MEASURABLE
     assert aggregated(np.array([1, 2]), 4).tolist() == [1, 1, 2, 2]
 
 

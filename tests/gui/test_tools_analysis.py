@@ -78,13 +78,13 @@ def test_the_budget_is_that_of_the_sessions_set_up(
     setup = tmp_path / "setup.toml"
     setup.write_text(session.setup_text, "utf-8")
     size = ("--width", "6.7", "--length", "7.4", "--height", "0.3")
-    code, told, _ = labapp(
+    code, progress_of, _ = labapp(
         "analyze", "budget", "--setup", setup, *size, "--out", tmp_path / "command"
     )
     assert code == 0
     check_same(tmp_path / "window", tmp_path / "command")
     assert set(analysis.files) == {"error_budget.csv", "error_budget.md", "error_budget.png"}
-    assert analysis.words.text() in told
+    assert analysis.words.text() in progress_of
     shown = analysis.table
     assert shown.horizontalHeaderItem(1).text() == "predicted, %"
     assert shown.item(shown.rowCount() - 1, 0).text() == "everything"

@@ -57,9 +57,9 @@ def test_it_shows_the_first_frame_with_its_true_dots(
     ringed = np.column_stack(simulator._rings.getData())
     np.testing.assert_allclose(ringed, true, atol=6e-4)
     assert f"{len(true)} dots" in simulator.picture.accessibleDescription()
-    told = {row.name: row for row in simulator.table.rows}
-    assert told["Dots in the picture"].value == len(true)
-    assert told["Recording lasts"].texts[1:] == ("0.50", "", "s")
+    progress_of = {row.name: row for row in simulator.table.rows}
+    assert progress_of["Dots in the picture"].value == len(true)
+    assert progress_of["Recording lasts"].texts[1:] == ("0.50", "", "s")
     before = simulator.picture.picture
     simulator.seed.set_value(1)
     simulator.seed.edited.emit(1)

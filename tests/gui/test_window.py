@@ -609,7 +609,7 @@ def test_looking_at_sessions_changes_none(copy_sample: CopySample, tmp_path: Pat
 
 
 def test_a_fault_goes_to_the_log_and_is_said(plain: MainWindow, qtbot: QtBot):
-    faults = app.Faults(plain.say, plain)
+    faults = app.ErrorReporter(plain.say, plain)
     try:
         raise ZeroDivisionError("in a slot")
     except ZeroDivisionError as error:

@@ -44,7 +44,7 @@ def test_measuring_that_is_left_for_another_session_is_no_fault(
     log.addHandler(noting)
     space = Workspace()
     said: list[str] = []
-    space.said.connect(lambda words, _: said.append(words))
+    space.notified.connect(lambda words, _: said.append(words))
     assert space.open(copy_sample("blocked_rows"))
     task = space.measure([0, 1, 2])
     assert task is not None

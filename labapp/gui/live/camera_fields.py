@@ -138,7 +138,7 @@ class CameraFields(QObject):
         self.trigger.set_choices([(name, TRIGGERS[name]) for name in limits.triggers])
         self.trigger.set_value(settings.trigger or "free")
         whole = (0, 0, *limits.sensor)
-        self.region.set_value(region_in_words(settings.region or whole))
+        self.region.set_value(region_text(settings.region or whole))
         for name, field in self.fields.items():
             for part in (field, field.label):
                 part.setVisible(there[name])
@@ -155,13 +155,13 @@ class CameraFields(QObject):
     # --- to set it ----------------------------------------------------------------------------
 
     def _set(self, name: str, value: Any) -> None:
-        """Ask for another value; what comes of it is told by `take_answers`."""
+        """Ask for another value; `take_answers` shows what the camera made of it."""
         if name == "region":
             try:
                 value = region_of(value)
             except InputError as error:
                 kept = None if self._feed is None else self._feed.settings.region
-                self.region.set_value("" if kept is None else region_in_words(kept))
+                self.region.set_value("" if kept is None else region_text(kept))
                 self.region.refuse(f"“{error.value}” is not {error.expected}")
                 return
         self._ask(name, value)
@@ -205,7 +205,7 @@ class CameraFields(QObject):
         else:
             differs = now != wanted
         if differs and now is not None:
-            words = f"The camera takes {in_words(now)}, not {in_words(wanted)}"
+            words = f"The camera takes {setting_text(now)}, not {setting_text(wanted)}"
             self.fields[name].refuse(words)
         if name in ("rate_hz", "trigger", "region"):
             self.reset.emit()
@@ -216,7 +216,7 @@ class CameraFields(QObject):
             self.fields[name].refuse(str(error))
             return
         for problem in error.problems:
-            words = f"{in_words(problem.value)} is refused; right is {problem.expected}"
+            words = f"{setting_text(problem.value)} is refused; right is {problem.expected}"
             self.fields.get(problem.field, self.fields[name]).refuse(words)
 
 
@@ -236,15 +236,15 @@ def region_of(text: str) -> Region:
     return u, v, width, height
 
 
-def region_in_words(region: Region) -> str:
+def region_text(region: Region) -> str:
     """A region as it is typed."""
     return ", ".join(map(str, region))
 
 
-def in_words(value: object) -> str:
+def setting_text(value: object) -> str:
     """A value of a setting, for people."""
     if isinstance(value, tuple):
-        return region_in_words(value)
+        return region_text(value)
     if isinstance(value, str):
         return f"“{TRIGGERS.get(value, value)}”"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""What is seen of a live camera: its picture, the surface, the trends, or who is told."""
+"""The parts of a live camera's view: picture, surface, trends, and streams to other programs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PARTS = {
     "picture": ("Picture", "What the camera sees"),
     "surface": ("Surface", "The pool in 3-D as it is measured"),
     "trends": ("Trends and limits", "Sizes of the last seconds, and the limits that raise alarms"),
-    "streams": ("Control software", "Tell other programs what is measured"),
+    "streams": ("Control software", "Send measures to other programs"),
 }
 
 
@@ -83,15 +83,15 @@ class LiveCanvas(QWidget):
             self.streams.begin()
         else:
             self.tabs.setCurrentIndex(0)
-            self.surface.let_go()
-            self.alarms.keep_unseen()
+            self.surface.release()
+            self.alarms.keep_unacknowledged()
             self.streams.show_state()
 
     def follow(self, result: LiveResult | None, watch: LiveWatch) -> bool:
         """Show what was measured, at the camera's pace; whether anything was."""
         return self.surface.isVisible() and self.surface.follow(result, watch)
 
-    def tell(self, watch: LiveWatch) -> None:
+    def show_status(self, watch: LiveWatch) -> None:
         """Show what is renewed a few times a second."""
         self.alarms.show_alarms(watch.alarms.shown)
         if self.trends.isVisible():
@@ -105,7 +105,7 @@ class LiveCanvas(QWidget):
         self.stack.setCurrentIndex(index)
         watch = self._watch()
         if watch is not None:
-            self.tell(watch)
+            self.show_status(watch)
 
 
 def _scrolled(part: QWidget) -> QScrollArea:

@@ -90,12 +90,12 @@ def _figure(size: Size, limits: Limits, is_old: bool) -> Figure:
         plain(size.value_mm, DECIMALS) if known else NOTHING,
         f"± {plain(size.sigma_mm, DECIMALS)}" if np.isfinite(size.sigma_mm) else "",
         "mm",
-        standing_in_words(stands, limits, size.name),
+        standing_text(stands, limits, size.name),
         "alarm" if stands in ("low", "high") else "old" if is_old else "plain",
     )
 
 
-def standing_in_words(stands: Standing, limits: Limits, name: str) -> str:
+def standing_text(stands: Standing, limits: Limits, name: str) -> str:
     """How a size stands, in a few words after a sign."""
     low, high = limits.of(name)
     if stands == "low":
@@ -110,9 +110,7 @@ def standing_in_words(stands: Standing, limits: Limits, name: str) -> str:
     }[stands]
 
 
-def pace_in_words(
-    result: LiveResult | None, pace: Pace, came_hz: float | None, age_s: float
-) -> str:
+def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_s: float) -> str:
     """How measuring keeps up, and why there is no figure where there is none."""
     if result is None:
         return FIRST
@@ -156,7 +154,7 @@ class LiveFigures(QWidget):
             for column, text in enumerate(texts):
                 label = self._label(row, column)
                 label.setText(text)
-                self._dress(label, figure.look)
+                self._apply_look(label, figure.look)
 
     def _label(self, row: int, column: int) -> QLabel:
         if (row, column) not in self._labels:
@@ -171,7 +169,7 @@ class LiveFigures(QWidget):
             self._grid.addWidget(label, row, column)
         return self._labels[row, column]
 
-    def _dress(self, label: QLabel, look: Look) -> None:
+    def _apply_look(self, label: QLabel, look: Look) -> None:
         """Colour a label; only where that changes, for it is dear."""
         dark = is_dark(self.palette())
         if self._looks.get(label, ("plain", dark)) == (look, dark):
@@ -190,7 +188,7 @@ class LiveFigures(QWidget):
         super().changeEvent(event)
         if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_looks"):
             for label, (look, _) in list(self._looks.items()):
-                self._dress(label, look)
+                self._apply_look(label, look)
 
 
 class AlarmStrip(QFrame):
@@ -237,7 +235,7 @@ class AlarmStrip(QFrame):
     def show_alarms(self, alarms: Sequence[Alarm]) -> None:
         """Show alarms, after those that are kept; none hides it."""
         alarms = (*self._kept, *alarms)
-        told = alarms_in_words(alarms)
+        told = alarms_text(alarms)
         if told != self.words.text():
             self.words.setText(told)
             # A screen reader says it at once.
@@ -247,19 +245,19 @@ class AlarmStrip(QFrame):
         self.setVisible(bool(alarms))
         self._alarms = alarms
 
-    def keep_unseen(self) -> None:
+    def keep_unacknowledged(self) -> None:
         """Keep what was not acknowledged until it is: the camera is watched no more."""
         unseen = (alarm for alarm in self._alarms if not alarm.acknowledged)
         self._kept = tuple(replace(alarm, holds=False) for alarm in unseen)
         self.show_alarms(())
 
-    def let_go(self) -> None:
+    def clear(self) -> None:
         """Keep none any longer, and show none."""
         self._kept = ()
         self.show_alarms(())
 
 
-def alarms_in_words(alarms: Sequence[Alarm]) -> str:
+def alarms_text(alarms: Sequence[Alarm]) -> str:
     """Alarms, a line each."""
     lines = []
     for alarm in alarms:

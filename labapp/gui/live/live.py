@@ -45,7 +45,7 @@ SHOW_S, LOOK_S = 0.025, 0.25
 """Dots are looked for in a frame, and a frame is judged no more often."""
 
 LIGHT_S = 1.0
-"""Noise and size of the dots are told anew so often: it takes a seventh of a second."""
+"""Noise and size of the dots are estimated so often: it takes a seventh of a second."""
 
 IDLE_S = 0.005
 
@@ -58,7 +58,7 @@ STATES = {
 }
 
 WAITS = {
-    "software": "Live, takes a frame when it is told to",
+    "software": "Live, takes a frame on request",
     "line": "Live, takes a frame at a signal on its input",
 }
 """Of a camera that takes none by itself, by its trigger."""
@@ -75,7 +75,7 @@ def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
 
 
 @dataclass(frozen=True)
-class Looked:
+class JudgedFrame:
     """What was found in a frame.
 
     Parameters
@@ -94,7 +94,7 @@ class Looked:
 
 
 @dataclass(frozen=True)
-class Shown:
+class LiveFrame:
     """A frame to be shown.
 
     Parameters
@@ -160,8 +160,8 @@ class Live:
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._to_show: deque[CameraFrame] = deque(maxlen=1)
         self._to_judge: deque[CameraFrame] = deque(maxlen=1)
-        self._newest: deque[Shown] = deque(maxlen=1)
-        self._judged: deque[Looked] = deque(maxlen=1)
+        self._newest: deque[LiveFrame] = deque(maxlen=1)
+        self._judged: deque[JudgedFrame] = deque(maxlen=1)
         self._recorders: list[Recorder] = []
         self._told: set[Path] = set()
         self._discarded: list[Take] = []
@@ -197,7 +197,7 @@ class Live:
         feed.stop()
 
     def close(self) -> None:
-        """End the recording, write all of it, and let go of the camera. Twice does no harm."""
+        """End the recording, write all of it, and release the camera. May be called twice."""
         with self._turn:
             self._closing.set()
         if self.feed is not None:
@@ -293,7 +293,7 @@ class Live:
         light, places = self._light, None
         if light is not None and _fits(light, frame.image):
             places = _places_px(self._dots_in(frame.image, light))
-        self._newest.append(Shown(frame, places))
+        self._newest.append(LiveFrame(frame, places))
 
     def _dots_in(self, image: GreyImage, light: Exposure | None) -> Dots | None:
         """Dots of a frame, quickly where its light is known; None if there is none."""
@@ -320,15 +320,15 @@ class Live:
         except OSError:
             room_byte = None
         places = None if quick else _places_px(dots)
-        self._judged.append(Looked(places, quality, room_byte))
+        self._judged.append(JudgedFrame(places, quality, room_byte))
 
     # --- to look at ---------------------------------------------------------------------------
 
-    def newest(self) -> Shown | None:
+    def newest(self) -> LiveFrame | None:
         """The newest frame; None if it was given already."""
         return self._newest.popleft() if self._newest else None
 
-    def looked(self) -> Looked | None:
+    def looked(self) -> JudgedFrame | None:
         """What was found in the frame judged last; None if it was given already."""
         return self._judged.popleft() if self._judged else None
 
@@ -356,7 +356,7 @@ class Live:
         (first_s, first), (last_s, last) = counted[0], counted[-1]
         return (last - first) / (last_s - first_s) if last_s - first_s > RATE_S / 2 else None
 
-    def state_in_words(self) -> str:
+    def state_text(self) -> str:
         """Whether frames come, and how many."""
         state = "opening" if self.feed is None else self.feed.state
         rate = self.rate_hz()
@@ -366,7 +366,7 @@ class Live:
         fast = f", {rate:.1f} frames/s" if state == "running" and rate is not None else ""
         return f"{sign} {words}{fast}"
 
-    def counts_in_words(self) -> str:
+    def counts_text(self) -> str:
         """What came, and what did not."""
         if self.feed is None:
             return ""
@@ -385,7 +385,7 @@ class Live:
         kept_s = 0.0 if recorder is None else min(wanted_s, recorder.ring_s)
         return kept_s / wanted_s, f"{kept_s:.1f} of {wanted_s:g} s"
 
-    def recording_in_words(self, room_byte: int | None) -> str:
+    def recording_text(self, room_byte: int | None) -> str:
         """What is being recorded, or what became of the last recording, and for how long is room.
 
         Parameters

@@ -91,7 +91,7 @@ class PlanFields(QObject):
         """Say what recording so costs; nothing while size or rate of the frames is not known."""
         words = ""
         if frame_byte and rate_hz:
-            words = cost_in_words(self.plan(), frame_byte, rate_hz)
+            words = cost_text(self.plan(), frame_byte, rate_hz)
         if words != self.cost.text():
             self.cost.setText(words)
 
@@ -101,7 +101,7 @@ class PlanFields(QObject):
             field.setEnabled(enabled)
 
 
-def cost_in_words(plan: Plan, frame_byte: int, rate_hz: float) -> str:
+def cost_text(plan: Plan, frame_byte: int, rate_hz: float) -> str:
     """What recording by a plan costs, about: disk and work.
 
     Parameters

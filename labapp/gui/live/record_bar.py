@@ -26,7 +26,7 @@ class RecordBar(QWidget):
     mark
         Notes this moment beside it.
     stop
-        Lets go of the camera.
+        Stops the camera.
     """
 
     def __init__(
@@ -60,21 +60,21 @@ class RecordBar(QWidget):
             "Mark", "Note this moment beside the recording that runs (M)", mark
         )
         stop_button = button(
-            "Stop the camera", "Let go of the camera; a recording is written first", stop
+            "Stop the camera", "Release the camera; a recording is finished first", stop
         )
         for each, wide in ((self.record_button, 3), (self.mark_button, 1), (stop_button, 2)):
             each.setMinimumHeight(BUTTON_PX)
             row.addWidget(each, wide)
         layout.addLayout(row)
 
-    def tell(self, live: Live, room_byte: int | None) -> None:
+    def show_status(self, live: Live, room_byte: int | None) -> None:
         """Tell how a camera is, and what is recorded; ``room_byte`` is free on the disk."""
-        self.state.setText(live.state_in_words())
+        self.state.setText(live.state_text())
         part, told = live.ring()
         self.ring.setValue(round(100 * part))
         self.ring.setFormat(told)
         self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
-        self.recording.setText(live.recording_in_words(room_byte))
+        self.recording.setText(live.recording_text(room_byte))
 
     def show_recording(self, recording: bool) -> None:
         """Let the button that records say whether it does: by its words, its sign, and in red."""

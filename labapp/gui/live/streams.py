@@ -43,7 +43,7 @@ IN_USE = "Choose another port, or end the program that has this one."
 
 
 class LiveStreams(QWidget):
-    """What is told while a camera is watched; all of it is off at every start.
+    """Streams of live measures to other programs; all are off at every start.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class LiveStreams(QWidget):
         self._tasks: dict[str, Task] = {}
         outer = QVBoxLayout(self)
         outer.setContentsMargins(8, 8, 8, 8)
-        group, layout = headed("Tell control software every frame that is measured")
+        group, layout = headed("Send every measured frame to control software")
         outer.addWidget(group)
         grid = QGridLayout()
         grid.setColumnStretch(3, 1)
@@ -120,7 +120,7 @@ class LiveStreams(QWidget):
                 try:
                     watch.set_stream(kind, open_stream(kind, place, anywhere))
                 except InputError as error:
-                    return problem_in_words(error)
+                    return problem_text(error)
             return ""
 
         def done(problem: str) -> None:
@@ -129,9 +129,9 @@ class LiveStreams(QWidget):
             elif problem:
                 self._problems[kind] = problem
                 self.boxes[kind].setChecked(False)
-                self._workspace.said.emit(f"{words}: {problem}", True)
+                self._workspace.notified.emit(f"{words}: {problem}", True)
             elif place:
-                self._workspace.said.emit(f"{words}: measures are told at {place}", False)
+                self._workspace.notified.emit(f"{words}: measures are sent from {place}", False)
             self.show_state()
 
         title = f"Opening {words}" if place else f"Ending {words}"
@@ -159,7 +159,7 @@ class LiveStreams(QWidget):
         watch = self._watch()
         for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
-            told = stream_in_words(stream, self._is_at_work(kind), self._problems.get(kind, ""))
+            told = stream_text(stream, self._is_at_work(kind), self._problems.get(kind, ""))
             if told != self.words[kind].text():
                 self.words[kind].setText(told)
         warning = WARNING if self.anywhere.isChecked() else ""
@@ -168,7 +168,7 @@ class LiveStreams(QWidget):
         self.warning.setVisible(bool(warning))
 
 
-def stream_in_words(stream: Stream | None, at_work: bool, problem: str) -> str:
+def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
     """Where a stream is heard, by how many, and what was told."""
     if problem:
         return f"⚠ {problem}"
@@ -180,7 +180,7 @@ def stream_in_words(stream: Stream | None, at_work: bool, problem: str) -> str:
     return f"● {where or stream.address}: {stream.listeners} {listen}, {told} told"
 
 
-def problem_in_words(error: InputError) -> str:
+def problem_text(error: InputError) -> str:
     """Why a stream cannot be opened, and what to do."""
     if error.field == "port":
         return f"{error.value}. {IN_USE}"

@@ -1,4 +1,4 @@
-"""The live pool in 3-D: drawn as often as the window bears."""
+"""The live pool in 3-D, drawn as often as the window can keep up with."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ class LiveSurface(QWidget):
         self._show(None)
         self._limits = None
 
-    def let_go(self) -> None:
-        """Show nothing, and let go of OpenGL."""
+    def release(self) -> None:
+        """Show nothing, and release OpenGL."""
         self.clear()
         self.view.close_view()
 

@@ -19,7 +19,7 @@ from labapp.gui.live.figures import (
     OLD_S,
     LiveFigures,
     figures,
-    pace_in_words,
+    pace_text,
 )
 from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.live.plan_fields import PlanFields
@@ -55,7 +55,7 @@ TICK_MS = 33
 SLOW_MS = 300
 """It is renewed so often in any case."""
 
-TELL_S = 0.2
+STATUS_S = 0.2
 """Figures are renewed no more often."""
 
 RING, RING_PX = "#2fd39b", 15
@@ -77,7 +77,7 @@ class LiveView(QObject):
     Signals
     -------
     changed
-        A camera was started, or let go.
+        A camera was started or stopped.
     recorded
         A recording was written to its end: a `Take`.
 
@@ -109,7 +109,7 @@ class LiveView(QObject):
         self._pools: dict[str, SimulatedDevice] = {}
         self._opening: Task | None = None
         self._finding: Task | None = None
-        self._told_s = self.measured_s = 0.0
+        self._status_s = self.measured_s = 0.0
         self._result: LiveResult | None = None
         self._room_byte: int | None = None
         self._timer = QTimer(self)
@@ -138,7 +138,7 @@ class LiveView(QObject):
             self._choices = choices(found)
             self.camera.set_choices(self._choices)
             told = f"{pluralize(len(found), 'camera')} found"
-            self.workspace.said.emit(". ".join([told, *problems]), False)
+            self.workspace.notified.emit(". ".join([told, *problems]), False)
 
         if self._finding not in self.workspace.tasks.active:
             self._finding = self.workspace.tasks.start(
@@ -215,21 +215,21 @@ class LiveView(QObject):
         self.bar.record_button.setFocus()
 
     def stop(self) -> None:
-        """Let go of the camera; what is being recorded is written to its end first."""
+        """Stop the camera; a recording that runs is finished first."""
         live, self.live = self.live, None
         if live is None:
             return
         self._timer.stop()
         self._rings.hide()
         if live.watch is not None:
-            self.canvas.tell(live.watch)  # alarms, to the last
+            self.canvas.show_status(live.watch)  # alarms, to the last
         self.canvas.set_live(False)
         self._ending.append(live)
         title = "Stopping the camera" if live.running is None else "Finishing the recording"
 
         def done(_: object) -> None:
             self._ending.remove(live)
-            self._hear(live)
+            self._report_events(live)
 
         self.workspace.tasks.start(title, lambda _: live.close(), done)
         self._show_state()
@@ -240,14 +240,16 @@ class LiveView(QObject):
         for live in (*self._ending, *([self.live] if self.live is not None else [])):
             live.close()
             for event in live.events():
-                self._tell(event, live)
+                self._report(event, live)
             for take in live.ended_takes():
-                self.workspace.said.emit(f"Recorded beside the session: {take.path.name}", False)
+                self.workspace.notified.emit(
+                    f"Recorded beside the session: {take.path.name}", False
+                )
         self._ending.clear()
         self.refused.setText("")
         self.live = None
         self.canvas.set_live(False)
-        self.canvas.alarms.let_go()
+        self.canvas.alarms.clear()
         self._timer.stop()
         self._rings.hide()
         self._show_state()
@@ -268,14 +270,14 @@ class LiveView(QObject):
         """Begin a recording, or end the one that runs."""
         live = self.live
         if live is not None and live.is_open:
-            self.workspace.tried(live.trigger)
-            self._tell_figures(live)
+            self.workspace.run_or_report(live.trigger)
+            self._show_status(live)
             self._show_state()
 
     def discard(self, take: Take) -> None:
-        """Delete a recording that runs as soon as the camera is let go."""
+        """Delete a recording that runs as soon as the camera has stopped."""
         if self.live is not None and not self.live.discard(take):
-            self.workspace.said.emit(f"{take.path.name} had ended and is kept", False)
+            self.workspace.notified.emit(f"{take.path.name} had ended and is kept", False)
 
     def mark(self) -> bool:
         """Note the present frame beside the recording that runs; False if none does."""
@@ -287,10 +289,10 @@ class LiveView(QObject):
     def acknowledge(self) -> None:
         """Take it that the operator has seen the alarms."""
         watch = self._watch()
-        self.canvas.alarms.let_go()
+        self.canvas.alarms.clear()
         if watch is not None:
             watch.acknowledge()
-            self.canvas.tell(watch)
+            self.canvas.show_status(watch)
 
     def _watch(self) -> LiveWatch | None:
         return None if self.live is None else self.live.watch
@@ -301,7 +303,7 @@ class LiveView(QObject):
         if session is not None and watch is not None:
             watch.set_limits(session.limits)
             self._show_figures(watch)
-            self.canvas.tell(watch)
+            self.canvas.show_status(watch)
 
     def _replan(self) -> None:
         plan = self.plan_fields.plan()
@@ -332,9 +334,9 @@ class LiveView(QObject):
                 self._show_quality(looked.quality)
         if live.watch is not None:
             self._follow(live.watch)
-        if time.monotonic() - self._told_s > TELL_S:
-            self._tell_figures(live)
-        self._hear(live)
+        if time.monotonic() - self._status_s > STATUS_S:
+            self._show_status(live)
+        self._report_events(live)
         self.camera_fields.take_answers()
         took_ms = (time.perf_counter() - began_s) * 1000
         wanted = min(max(TICK_MS, round(2 * took_ms)), SLOW_MS)
@@ -349,7 +351,7 @@ class LiveView(QObject):
             self._result, self.measured_s = result, time.monotonic()
             self._show_figures(watch)
             if was_old or former is None or former.measurement.status != result.measurement.status:
-                self._told_s = 0.0  # what is said of the figures goes with them
+                self._status_s = 0.0  # what is said of the figures goes with them
             if self._age_s <= OLD_S:  # else it is not of what is in view
                 self._show_quality(result.quality)
         self.updates += self.canvas.follow(result, watch)
@@ -371,28 +373,28 @@ class LiveView(QObject):
         if dots_px is not None:
             self._rings.setData(pos=dots_px)
 
-    def _hear(self, live: Live) -> None:
+    def _report_events(self, live: Live) -> None:
         """Tell what happened, and hand on what is recorded."""
         for event in live.events():
-            self._tell(event, live)
+            self._report(event, live)
         for take in live.ended_takes():
             self.recorded.emit(take)
 
-    def _tell(self, event: Event, live: Live) -> None:
+    def _report(self, event: Event, live: Live) -> None:
         """Tell of an event; frames that are lost are a problem only where they are recorded."""
         recorded = live.running is not None or event.source != live.name
         problem = event.kind == "warning" or (event.kind == "loss" and recorded)
-        self.workspace.said.emit(str(event), problem)
+        self.workspace.notified.emit(str(event), problem)
 
-    def _tell_figures(self, live: Live) -> None:
-        self._told_s = time.monotonic()
-        self.bar.tell(live, self._room_byte)
-        self.counts.setText(live.counts_in_words())
+    def _show_status(self, live: Live) -> None:
+        self._status_s = time.monotonic()
+        self.bar.show_status(live, self._room_byte)
+        self.counts.setText(live.counts_text())
         if live.watch is not None:
             pace, came_hz = live.watch.trend.pace(), live.rate_hz()
             self._show_figures(live.watch)
-            self.figures.words.setText(pace_in_words(self._result, pace, came_hz, self._age_s))
-            self.canvas.tell(live.watch)
+            self.figures.words.setText(pace_text(self._result, pace, came_hz, self._age_s))
+            self.canvas.show_status(live.watch)
         picture = self._picture.picture
         if live.feed is not None and picture is not None:
             set_to = live.feed.settings

@@ -38,7 +38,7 @@ class Welcome(QWidget):
 
     Signals
     -------
-    asked
+    action_requested
         A button was pressed: the name of its action.
     chosen
         A session of the list was chosen.
@@ -46,7 +46,7 @@ class Welcome(QWidget):
         A session is to be taken off the list.
     """
 
-    asked = Signal(str)
+    action_requested = Signal(str)
     chosen = Signal(Path)
     forgotten = Signal(Path)
 
@@ -72,7 +72,7 @@ class Welcome(QWidget):
         )
         column.addWidget(about)
         for name, text, tip in BUTTONS:
-            made = self.buttons[name] = button(text, tip, partial(self.asked.emit, name))
+            made = self.buttons[name] = button(text, tip, partial(self.action_requested.emit, name))
             made.setMinimumHeight(made.fontMetrics().height() * 2)
         column.addLayout(button_row(*self.buttons.values()))
         self.label = plain_label("&Recent sessions")

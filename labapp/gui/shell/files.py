@@ -38,14 +38,14 @@ class Files(QObject):
 
     Signals
     -------
-    said
+    notified
         Something for the operator to read: a sentence, and whether it is a problem.
-    recording_wanted
+    recording_requested
         The step Recording is to be shown, and to take this file or folder, unless it is None.
     """
 
-    said = Signal(str, bool)
-    recording_wanted = Signal(object)
+    notified = Signal(str, bool)
+    recording_requested = Signal(object)
 
     def __init__(
         self,
@@ -90,7 +90,7 @@ class Files(QObject):
             return True
         if not self.may_close():
             return False
-        session = self.workspace.tried(lambda: self._opened(path))
+        session = self.workspace.run_or_report(lambda: self._opened(path))
         if session is None:
             return False
         self._show(session)
@@ -99,13 +99,13 @@ class Files(QObject):
     def take(self, path: Path) -> None:
         """Take a recording to the capture page, in a new session where none is open."""
         if not path.exists():
-            self.said.emit(f"{path} is not there", True)
+            self.notified.emit(f"{path} is not there", True)
         elif self.workspace.session is not None or self._create(
             dialogs.new_path(path.parent, path.stem)
         ):
             folder = str(path.parent)
             self.preferences.remember(lambda before: replace(before, last_folder=folder))
-            self.recording_wanted.emit(path)
+            self.recording_requested.emit(path)
 
     def save_copy(self) -> None:
         """Ask for a file and save the session in it as it is now."""
@@ -121,7 +121,7 @@ class Files(QObject):
             self.workspace.tasks.start(
                 "Saving a copy",
                 lambda _: copy_session(source, path),
-                lambda copied: self.said.emit(f"A copy is in {copied}", False),
+                lambda copied: self.notified.emit(f"A copy is in {copied}", False),
             )
 
     def begin_next(self, recording: Path) -> None:
@@ -136,20 +136,20 @@ class Files(QObject):
         path = dialogs.ask_new_session(self._window, proposed, title)
         if path is None or not self.may_close():
             return
-        session = self.workspace.tried(lambda: next_session(present, path))
+        session = self.workspace.run_or_report(lambda: next_session(present, path))
         if session is not None:
             self._show(session)
-            self.recording_wanted.emit(None)
+            self.recording_requested.emit(None)
 
     def try_sample(self) -> None:
         """Open a copy of the sample run, in a folder of the user's."""
         from labapp.session.copies import copy_sample
 
         folder = self.preferences.current.samples_folder / "gtaw"
-        path = self.workspace.tried(lambda: copy_sample("gtaw", folder))
+        path = self.workspace.run_or_report(lambda: copy_sample("gtaw", folder))
         if path is not None and self.open(path):
             words = f"This is a copy of the sample, in {path.parent}: change what you like"
-            self.said.emit(words, False)
+            self.notified.emit(words, False)
 
     def close(self) -> None:
         """Close the session and go back to the welcome page."""
@@ -173,7 +173,7 @@ class Files(QObject):
         path = dialogs.ask_new_session(self._window, proposed)
         if path is None or not self.may_close():
             return False
-        session = self.workspace.tried(lambda: Session.create(path))
+        session = self.workspace.run_or_report(lambda: Session.create(path))
         if session is None:
             return False
         self._show(session)
@@ -192,7 +192,7 @@ class Files(QObject):
     def _show(self, session: Session) -> None:
         self.preferences.remember(lambda before: before.with_recent(session.path))
         self.workspace.show(session)
-        missing = self.workspace.tried(lambda: session.missing_recording)
+        missing = self.workspace.run_or_report(lambda: session.missing_recording)
         if missing is not None:
             words = f"The recording is not where it was: {missing}"
             self.workspace.say_wrong(MISSING, words)

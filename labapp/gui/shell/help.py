@@ -14,7 +14,7 @@ from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayo
 
 from labapp.gui.shell.action import MENUS
 from labapp.gui.shell.actions import ACTIONS
-from labapp.gui.shell.standing import Standing
+from labapp.gui.shell.standing import FrameStatus
 from labapp.gui.shell.steps import STEPS
 from labapp.log import log_file
 from labapp.version import VERSION
@@ -44,7 +44,7 @@ def guide() -> str:
         f"<h3>{number} {escape(step.title)}</h3><p>{escape(step.hint)}</p>"
         for number, step in enumerate(STEPS, 1)
     )
-    ticks = "".join(f"<li>{escape(standing.words)}</li>" for standing in Standing)
+    ticks = "".join(f"<li>{escape(standing.words)}</li>" for standing in FrameStatus)
     frames = (
         "<h3>The frames</h3><p>The bar at the bottom has a tick for every frame. Its colour, its "
         f"height and its tip tell how the frame stands:</p><ul>{ticks}</ul>"
@@ -106,7 +106,7 @@ class HelpDialog(QDialog):
     kind
         ``guide``, ``keys`` or ``about``.
     page
-        The page in view, whose keys are told too.
+        The page in view, whose keys are listed, too.
     """
 
     def __init__(

@@ -23,7 +23,7 @@ from labapp.gui.widgets.labels import Message, plain_label
 KEPT_MESSAGES = 1000
 
 PROBLEM = "▲"
-"""Before a problem: what is wrong is told by shape too."""
+"""Before a problem, which is shown by shape as well as by colour."""
 
 TOLD = Qt.ItemDataRole.UserRole
 """Of a line of the log: what it tells, since when, and how often it was said."""

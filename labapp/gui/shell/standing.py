@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from labapp.session.measured import Overview
 
 
-class Standing(IntEnum):
+class FrameStatus(IntEnum):
     """How a frame stands; where several share a pixel, the greatest shows."""
 
     NOT_MEASURED = 0
@@ -30,37 +30,39 @@ class Standing(IntEnum):
 
 
 WORDS = {
-    Standing.NOT_MEASURED: "not measured",
-    Standing.MEASURED: "measured",
-    Standing.CORRECTED: "corrected by hand",
-    Standing.DOUBTFUL: "in doubt: stands out, or changed since it was measured",
-    Standing.NOT_MEASURABLE: "could not be measured",
+    FrameStatus.NOT_MEASURED: "not measured",
+    FrameStatus.MEASURED: "measured",
+    FrameStatus.CORRECTED: "corrected by hand",
+    FrameStatus.DOUBTFUL: "in doubt: stands out, or changed since it was measured",
+    FrameStatus.NOT_MEASURABLE: "could not be measured",
 }
 
 TICKS = (
-    Tick(Standing.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
-    Tick(Standing.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
-    Tick(Standing.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
-    Tick(Standing.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
-    Tick(Standing.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))),
+    Tick(FrameStatus.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
+    Tick(FrameStatus.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
+    Tick(FrameStatus.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
+    Tick(FrameStatus.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
+    Tick(
+        FrameStatus.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))
+    ),
 )
-"""By `Standing`."""
+"""By `FrameStatus`."""
 
-DOUBTFUL = (Standing.DOUBTFUL, Standing.NOT_MEASURABLE)
+DOUBTFUL = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
 """What an operator has to look at."""
 
 
 def standings(seen: Overview) -> IntArray:
-    """How every frame stands, values of `Standing`, shape (n,)."""
+    """How every frame stands, values of `FrameStatus`, shape (n,)."""
     from labapp.session.trends import doubtful_frames
 
     status = np.array(seen.status, dtype=object)
     measured, fine = status != "", status == "ok"
-    found = np.where(measured, Standing.MEASURED, Standing.NOT_MEASURED)
-    found = np.where(seen.corrected & (fine | ~measured), Standing.CORRECTED, found)
-    found = np.where(measured & ~fine, Standing.NOT_MEASURABLE, found)
+    found = np.where(measured, FrameStatus.MEASURED, FrameStatus.NOT_MEASURED)
+    found = np.where(seen.corrected & (fine | ~measured), FrameStatus.CORRECTED, found)
+    found = np.where(measured & ~fine, FrameStatus.NOT_MEASURABLE, found)
     doubtful = (measured & seen.stale) | (fine & doubtful_frames(seen))
-    return np.asarray(np.where(doubtful, Standing.DOUBTFUL, found), np.int64)
+    return np.asarray(np.where(doubtful, FrameStatus.DOUBTFUL, found), np.int64)
 
 
 def next_frame(

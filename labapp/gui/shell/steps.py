@@ -57,7 +57,7 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
             enter.append(f"{PARTS[part]} ({key.replace('_', ' ')})" if key else PARTS[part])
         else:
             told = f"{PARTS[part]}, {key.replace('_', ' ')}"
-            wrong.append(f"put right {told}: {problem.value} is not {problem.expected}")
+            wrong.append(f"correct {told}: {problem.value} is not {problem.expected}")
     typed = [f"enter {', '.join(dict.fromkeys(enter))}"] if enter else []
     words = "; ".join([*wrong, *typed, *calibrate])
     return words[:1].upper() + words[1:]
@@ -315,7 +315,7 @@ STEPS = (
     Step(
         "dots",
         "Dots",
-        "Check the dots and their rows. Where the program is in doubt it says so: put right what "
+        "Check the dots and their rows. Where the program is in doubt it says so: correct what "
         "is wrong, and go on to the next frame.",
         "DotsPage",
         _dots,

@@ -147,18 +147,18 @@ class MainWindow(QMainWindow):
         space, preferences = self.workspace, self.preferences
         preferences.changed.connect(lambda: self.menus.show_recent(preferences.current.recent))
         preferences.failed.connect(self.say)
-        self.files.said.connect(self.say)
-        self.files.recording_wanted.connect(self._show_recording)
+        self.files.notified.connect(self.say)
+        self.files.recording_requested.connect(self._show_recording)
         space.closing.connect(self._leave)
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
         space.measured.connect(self._show_measured)
         space.frame_changed.connect(self._frame_changed)
-        space.said.connect(self.say)
+        space.notified.connect(self.say)
         space.settled.connect(self.status_line.settle)
-        space.asked.connect(self.do)
-        space.next_wanted.connect(self.files.begin_next)
-        space.pedals_kept.connect(
+        space.action_requested.connect(self.do)
+        space.next_session_requested.connect(self.files.begin_next)
+        space.foot_switches_changed.connect(
             lambda held: preferences.remember(lambda before: replace(before, foot_switches=held))
         )
         space.tasks.changed.connect(self._show_actions)
@@ -166,7 +166,7 @@ class MainWindow(QMainWindow):
         self.timeline.moved.connect(space.show_frame)
         self.timeline.jumped.connect(self.jump)
         self.status_line.read.connect(self.read_messages)
-        self.welcome.asked.connect(self.do)
+        self.welcome.action_requested.connect(self.do)
         self.welcome.chosen.connect(self.files.open)
         self.welcome.forgotten.connect(self._forget)
 
@@ -220,7 +220,7 @@ class MainWindow(QMainWindow):
         if self.workspace.session is None or key not in PAGES:
             return
         if key not in self.pages:
-            made = self.workspace.tried(lambda: PAGES[key](self.workspace))
+            made = self.workspace.run_or_report(lambda: PAGES[key](self.workspace))
             if made is None:
                 return
             self.pages[key] = made
@@ -290,7 +290,7 @@ class MainWindow(QMainWindow):
     def _leave(self) -> None:
         if self.page is not None:
             finish_edit(self.page, self.page.panel)
-            self.workspace.tried(self.page.leave)
+            self.workspace.run_or_report(self.page.leave)
             self.page = None
 
     def _session_opened(self) -> None:
@@ -307,7 +307,7 @@ class MainWindow(QMainWindow):
             self._list_recent()
         elif self._steps:
             keys = [step.key for step in self._steps]
-            first = self.workspace.tried(lambda: first_step(session)) or "setup"
+            first = self.workspace.run_or_report(lambda: first_step(session)) or "setup"
             self.show_step(first if first in keys else keys[0])
         self._show_docks()
 
@@ -335,7 +335,7 @@ class MainWindow(QMainWindow):
     def _show_frames(self) -> None:
         """Show how all frames stand, and with them the steps."""
         session = self.workspace.session
-        seen = self.workspace.tried(self.workspace.overview)
+        seen = self.workspace.run_or_report(self.workspace.overview)
         if seen is None:
             self.standings = np.zeros(0, np.int64)
             self.timeline.set_frames(self.standings, np.zeros(0), self.standings)
@@ -343,7 +343,7 @@ class MainWindow(QMainWindow):
             self.standings = standings(seen)
             self.timeline.set_frames(seen.frame, seen.time_s, self.standings)
         self.timeline.set_frame(self.workspace.frame)
-        self._states = self.workspace.tried(lambda: states(session, seen)) or states(None)
+        self._states = self.workspace.run_or_report(lambda: states(session, seen)) or states(None)
         own = {key: page.state(self._states[key]) for key, page in self.pages.items()}
         self.step_list.show_states(self._states | own)
 
@@ -360,7 +360,7 @@ class MainWindow(QMainWindow):
     def _show_page(self) -> None:
         if self.page is not None and self.workspace.session is not None:
             self.side_panel.show_state(self.page.state(self._states[self.page.key]))
-            self.workspace.tried(self.page.refresh)
+            self.workspace.run_or_report(self.page.refresh)
 
     def _frame_changed(self, frame: int) -> None:
         self.timeline.set_frame(frame)

@@ -15,7 +15,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
-from labapp.gui.tools.tool import ToolWindow, told
+from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.labels import headed, wrapping_label
@@ -131,7 +131,7 @@ class AdviserWindow(ToolWindow):
 
     def prefill(self) -> None:
         """Take pool and rig from the session, where they are others than last time."""
-        values = self.workspace.tried(lambda: advising.question(self.workspace.session))
+        values = self.workspace.run_or_report(lambda: advising.question(self.workspace.session))
         if values is None or values == self._basis:
             return
         self._basis = values
@@ -160,13 +160,13 @@ class AdviserWindow(ToolWindow):
 
     def start(self) -> None:
         """Search, in the background."""
-        asked = self.workspace.tried(lambda: parse_request(self.values(), "the adviser"))
+        asked = self.workspace.run_or_report(lambda: parse_request(self.values(), "the adviser"))
         if asked is None:
             return
         effort = adviser.QUICK if self.effort.value() == "quick" else Effort()
 
         def work(control: Control) -> tuple[Advice, dict[str, bytes]]:
-            advice = advise(*asked, effort, progress=told(control))
+            advice = advise(*asked, effort, progress=progress_of(control))
             return advice, advice_files(advice)
 
         self.begin("Advising", work, lambda found: self.show_advice(*found))
@@ -204,7 +204,7 @@ class AdviserWindow(ToolWindow):
         """Put the set-up into the session's."""
         advice = self.advice
         if advice is not None and self.workspace.attempt(lambda s: advising.use(s, advice)):
-            self.workspace.said.emit(
+            self.workspace.notified.emit(
                 "The advised set-up is in: measure in steps 2 and 3 where it really stands", False
             )
 

@@ -57,7 +57,7 @@ def expected_mm(session: Session | None) -> tuple[float, float, float]:
     return width, length, height
 
 
-def in_words(name: str) -> str:
+def result_title(name: str) -> str:
     """Name of a table or picture in words: ``figure_8_6_CE`` is "Figure 8-6: CE"."""
     stem, _, kind = name.partition(".")
     figure = re.fullmatch(r"figure_(\d+)_(\d+)_(.+)", stem)

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QCheckBox, QFileDialog, QStackedWidget, QWidget
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysing
 from labapp.gui.tools.analysing import BUDGET, OPENED, PARTS, USUAL
-from labapp.gui.tools.tool import ToolWindow, told
+from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.sheet import Sheet
@@ -147,7 +147,10 @@ class AnalysisWindow(ToolWindow):
     def prefill(self) -> None:
         """Take pool and set-up from the session, where they are others than last time."""
         session = self.workspace.session
-        sizes = self.workspace.tried(lambda: analysing.expected_mm(session)) or analysing.USUAL_MM
+        sizes = (
+            self.workspace.run_or_report(lambda: analysing.expected_mm(session))
+            or analysing.USUAL_MM
+        )
         basis = (analysing.has_setup(session), sizes)
         if basis == self._basis:
             return
@@ -169,14 +172,14 @@ class AnalysisWindow(ToolWindow):
             frames=int(self.frames.value() or 0),
             draws=int(self.draws.value() or 0),
         )
-        budget = self.workspace.tried(self._budget) if BUDGET in ticked else None
+        budget = self.workspace.run_or_report(self._budget) if BUDGET in ticked else None
         if BUDGET in ticked and budget is None:
             return
 
         def work(control: Control) -> None:
             if budget is not None:
-                control.part(analyze_budget(*budget, told(control)))
-            for made in analyze_errors(options, told(control)):
+                control.part(analyze_budget(*budget, progress_of(control)))
+            for made in analyze_errors(options, progress_of(control)):
                 control.part(made)
 
         self._anew = True
@@ -203,7 +206,7 @@ class AnalysisWindow(ToolWindow):
         self.pictures |= made.pictures
         self.files |= made.files
         names = (*self.tables, *self.pictures)
-        self.which.set_choices([(name, analysing.in_words(name)) for name in names])
+        self.which.set_choices([(name, analysing.result_title(name)) for name in names])
         self.which.set_value(made.tables[0].name)
         for widget in (self._line, self.stack):
             widget.show()
@@ -217,7 +220,7 @@ class AnalysisWindow(ToolWindow):
             self.table.show_table(self.tables[name])
             self.stack.setCurrentWidget(self.table)
         else:
-            words = analysing.in_words(name)
+            words = analysing.result_title(name)
             self.words.setText(words)
             self.sheet.show_png(self.pictures[name], words)
             self.stack.setCurrentWidget(self.sheet)

@@ -13,7 +13,7 @@ from labapp.simulation.recording import RecordedFrame
 
 
 @dataclass(frozen=True)
-class Preview:
+class ScenarioPreview:
     """A scenario with its first frame.
 
     Parameters
@@ -36,7 +36,7 @@ class Preview:
         return self.frame.dot_px[self.frame.shown]
 
 
-def preview(path: Path, seed: int | None) -> Preview:
+def preview(path: Path, seed: int | None) -> ScenarioPreview:
     """Render the first frame of a scenario.
 
     Parameters
@@ -53,7 +53,7 @@ def preview(path: Path, seed: int | None) -> Preview:
     """
     scenario = read_scenario(path, 1, seed)
     frames = tomllib.loads(scenario.text.lstrip("\ufeff"))["recording"]["frames"]
-    return Preview(scenario, frames, scenario.recording.frame(0))
+    return ScenarioPreview(scenario, frames, scenario.recording.frame(0))
 
 
 def choices(own: Path | None) -> list[tuple[str, str]]:
@@ -71,7 +71,7 @@ def new_folder(parent: Path, scenario: Path) -> Path:
     return folder
 
 
-def rows(shown: Preview, frames: int) -> tuple[ResultRow, ...]:
+def rows(shown: ScenarioPreview, frames: int) -> tuple[ResultRow, ...]:
     """What is known of a scenario's first frame, and of a recording of so many."""
     recording, frame = shown.scenario.recording, shown.frame
     size, seen = frame.pool.size, frame.reflections

@@ -15,8 +15,8 @@ from labapp.config.scenario import Scenario, read_scenario
 from labapp.gui.dialogs import new_path
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import simulating
-from labapp.gui.tools.simulating import Preview
-from labapp.gui.tools.tool import ToolWindow, told
+from labapp.gui.tools.simulating import ScenarioPreview
+from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.labels import wrapping_label
@@ -47,7 +47,7 @@ class SimulatorWindow(ToolWindow):
     title = "Simulator"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
-        self.preview: Preview | None = None
+        self.preview: ScenarioPreview | None = None
         self.made: tuple[Scenario, Path] | None = None
         self._own: Path | None = None
         self._proposed = ""
@@ -167,7 +167,7 @@ class SimulatorWindow(ToolWindow):
             self._show_refusal("No scenario comes with this installation: choose one of your own")
             return
 
-        def work(control: Control) -> Preview:
+        def work(control: Control) -> ScenarioPreview:
             with self._turn:
                 control.check()
                 found = simulating.preview(Path(path), seed)
@@ -177,7 +177,7 @@ class SimulatorWindow(ToolWindow):
         self.previews.start("Drawing the first frame", work, lambda found: self._show(found, seed))
         self.show_state()
 
-    def _show(self, found: Preview, seed: int | None) -> None:
+    def _show(self, found: ScenarioPreview, seed: int | None) -> None:
         self.preview = found
         if seed is None:
             self.frames.set_value(found.frames)
@@ -222,7 +222,7 @@ class SimulatorWindow(ToolWindow):
 
         def work(control: Control) -> Scenario:
             scenario = read_scenario(path, frames, seed)
-            simulate(scenario, folder, progress=told(control))
+            simulate(scenario, folder, progress=progress_of(control))
             return scenario
 
         self.begin("Simulating", work, lambda scenario: self._written(scenario, folder))

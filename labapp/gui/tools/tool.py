@@ -1,4 +1,4 @@
-"""What every tool's window has: a form, results, work that is told of and can be stopped."""
+"""What all tool windows share: a form, results, and work with progress that can be stopped."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class ToolWindow(QDialog):
         self.tasks.failed.connect(lambda _, why: self.say(why, True))
         self.workspace.opened.connect(self.show_state)
         self.workspace.changed.connect(self.show_state)
-        self.workspace.said.connect(self._heard)
+        self.workspace.notified.connect(self._repeat_message)
         self._show_progress()
         room = self.screen().availableSize() * PART_OF_SCREEN
         self.resize(QSize(*SIZE_PX).boundedTo(room))
@@ -229,14 +229,14 @@ class ToolWindow(QDialog):
                 write_file(folder / name, content)
             return folder
 
-        if self.workspace.tried(write):
+        if self.workspace.run_or_report(write):
             self.say(f"Saved in {folder}")
 
     def say(self, text: str, problem: bool = False) -> None:
         """Tell something on the line below."""
         self.message.setText(f"{PROBLEM} {text}" if problem else text)
 
-    def _heard(self, text: str, problem: bool) -> None:
+    def _repeat_message(self, text: str, problem: bool) -> None:
         """What is said behind this window is said here too."""
         if self.isVisible():
             self.say(text, problem)
@@ -263,6 +263,6 @@ class ToolWindow(QDialog):
                 self.say("Stopped")
 
 
-def told(control: Control) -> Progress:
-    """How work of `labapp.simulation` tells how far it is, and hears of a cancel."""
+def progress_of(control: Control) -> Progress:
+    """Progress callback for `labapp.simulation`; it raises when the task is cancelled."""
     return lambda what, done, total: control.progress(done, total, what)

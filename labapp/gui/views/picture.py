@@ -63,7 +63,7 @@ class Tool:
         """Go on with the drag."""
 
     def end(self, u: float, v: float) -> None:
-        """Let go."""
+        """End the drag."""
 
     def takes(self, event: QKeyEvent) -> bool:
         """Whether a key is the tool's; the others go to the picture and to the window."""
@@ -73,7 +73,7 @@ class Tool:
         """A key that the tool takes was pressed, or repeats while it is held."""
 
     def release(self) -> None:
-        """The key was let go, or the picture lost the focus."""
+        """The key was released, or the picture lost the focus."""
 
 
 class PictureView(Drawn):
@@ -126,7 +126,7 @@ class PictureView(Drawn):
         layout.addWidget(self.canvas, 1)
         layout.addLayout(self._bar())
         self.canvas.scene().sigMouseMoved.connect(self._moved)
-        self.box.sigRangeChangedManually.connect(lambda *_: self._let_go())
+        self.box.sigRangeChangedManually.connect(lambda *_: self._stop_fitting())
         self.box.sigResized.connect(lambda *_: self._refit())
         self._paint()
 
@@ -199,16 +199,16 @@ class PictureView(Drawn):
 
     def zoom(self, factor: float) -> None:
         """Zoom about the middle; more than 1 makes it larger."""
-        self._let_go()
+        self._stop_fitting()
         self.box.scaleBy((1 / factor, 1 / factor))
 
     def pan(self, right: float, down: float) -> None:
         """Move what is seen by shares of the view."""
-        self._let_go()
+        self._stop_fitting()
         seen = self.box.viewRect()
         self.box.translateBy(x=right * seen.width(), y=down * seen.height())
 
-    def _let_go(self) -> None:
+    def _stop_fitting(self) -> None:
         """Leave what is seen to the hand."""
         self._fits = False
 
@@ -323,7 +323,7 @@ class PictureView(Drawn):
         super().keyReleaseEvent(event)
 
     def focusOutEvent(self, event: QFocusEvent) -> None:
-        """Tell the tool: the key may be let go elsewhere."""
+        """Tell the tool: the key may be released elsewhere."""
         self.tool.release()
         super().focusOutEvent(event)
 

@@ -24,7 +24,7 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QFrame, QGraphicsItem, QScrollArea, QSizePolicy, QVBoxLayout
 
 from labapp.core.values import IntArray
-from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_in_words
+from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_text
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
@@ -116,7 +116,9 @@ class PlotStack(Plotted):
             self.fit()
         self._show_legend()
         if not (same and self._current is None and self._place is None):
-            self.set_current(self._current, self._place)  # else what the pointer is at stays told
+            self.set_current(
+                self._current, self._place
+            )  # else the value under the pointer stays shown
 
     def set_current(self, key: int | None, place: float | None = None) -> None:
         """Mark the point with a key in every plot, or a place where no curve has it."""
@@ -127,7 +129,9 @@ class PlotStack(Plotted):
             place = float(points[0][0].x[points[0][1]])
         for plot in self._plots:
             plot.mark_place(place)
-        self._tell(_joined([point_in_words(curve, index, self.axis) for curve, index in points]))
+        self._show_read_out(
+            _joined([point_text(curve, index, self.axis) for curve, index in points])
+        )
 
     def fit(self) -> None:
         """Show all of the axis."""
@@ -196,7 +200,7 @@ class PlotStack(Plotted):
         look = self.palette()
         self.canvas.setBackground(look.color(Role.Base))
         for plot, curve in zip(self._plots, self.curves, strict=True):
-            plot.dress(curve, look)
+            plot.apply_palette(curve, look)
             plot.show_curve(curve)
 
     def _show_legend(self) -> None:
@@ -206,7 +210,7 @@ class PlotStack(Plotted):
         self.legend.setText("    ".join(f"{m.sign} {m.words}" for m in marks if m.words))
         self.legend.setVisible(len(marks) > 1)
 
-    def _tell(self, words: str) -> None:
+    def _show_read_out(self, words: str) -> None:
         self.read_out.setText(words or " ")
         # It grows where a line wraps, and does not shrink: what is above must not jump.
         height = self.read_out.heightForWidth(self.read_out.width())
@@ -232,7 +236,7 @@ class PlotStack(Plotted):
             each.show_cross(x)
         index = nearest(curve, x)
         if index is not None:
-            self._tell(point_in_words(curve, index, self.axis))
+            self._show_read_out(point_text(curve, index, self.axis))
 
     def _clicked(self, event: pg.GraphicsScene.mouseEvents.MouseClickEvent) -> None:
         self.setFocus(Qt.FocusReason.MouseFocusReason)
@@ -318,8 +322,8 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             item.hide()
         box.sigXRangeChanged.connect(lambda *_: self._show_points())
 
-    def dress(self, curve: Curve, look: QPalette) -> None:
-        """Take a palette's colours and a curve's title: an axis is drawn anew, which is dear."""
+    def apply_palette(self, curve: Curve, look: QPalette) -> None:
+        """Take a palette's colours and a curve's title: an axis is redrawn, which is expensive."""
         self._look = look
         accent, text = look.color(Role.Accent), look.color(Role.Text)
         paint_axes(self, look.color(Role.Mid), text)

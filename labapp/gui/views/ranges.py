@@ -45,7 +45,7 @@ class RangeField(Field):
         for field in (self.least, self.most):
             field.unit.hide()  # said once, after both
             line.addWidget(field, 1)
-            field.edited.connect(self._tell)
+            field.edited.connect(self._emit_change)
         super().__init__(label, pair, tooltip, unit)
         pair.setFocusProxy(self.least)
 
@@ -64,7 +64,7 @@ class RangeField(Field):
         self.least.flush()
         self.most.flush()
 
-    def _tell(self) -> None:
+    def _emit_change(self) -> None:
         self._judge()
         self.edited.emit(self.value())
 

@@ -23,7 +23,7 @@ TURN_DEG_S, MOVE_S, ZOOM_S = 120.0, 0.8, 1.5
 """At the stop: degrees a second; heights of the view a second; e-folds a second."""
 
 DEAD = 0.04
-"""A controller that is let go of may still tell so much."""
+"""A controller at rest may still report so much."""
 
 OBLIQUE = 0
 """The button that looks obliquely again."""

@@ -176,13 +176,13 @@ class View3d(Drawn):
         return None if picture is None else as_image(picture)
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Let go of OpenGL before the window goes."""
+        """Release OpenGL before the window is destroyed."""
         if event.type() == QEvent.Type.Close:
             self.close_view()
         return super().eventFilter(watched, event)
 
     def close_view(self) -> None:
-        """Let go of OpenGL; it is taken up again when the view is next shown."""
+        """Release OpenGL until the view is next shown."""
         if self._drawing is not None:
             self._wanted = self.camera
             self._drawing.plotter.close()
@@ -331,7 +331,7 @@ class OffscreenView(View3d):
             self._picture.setDevicePixelRatio(self.devicePixelRatioF())
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Draw anew, as large as the view is now."""
+        """Redraw at the new size."""
         super().resizeEvent(event)
         self._refresh()
 
@@ -429,7 +429,7 @@ class InteractiveView(View3d):
                 self.paint_frame(painter)
 
     def close_view(self) -> None:
-        """Let go of OpenGL; it is taken up again when the view is next shown."""
+        """Release OpenGL until the view is next shown."""
         self._late.stop()
         super().close_view()
 

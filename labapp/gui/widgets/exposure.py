@@ -11,7 +11,7 @@ from labapp.gui.widgets.labels import Message, headed, plain_tip
 
 
 @dataclass(frozen=True)
-class Bar:
+class ExposureBar:
     """A bar that shows how much.
 
     Parameters
@@ -62,25 +62,25 @@ class ExposureBars(QWidget):
         self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
 
 
-def bars(exposure: Exposure) -> tuple[Bar, Bar, Bar]:
+def bars(exposure: Exposure) -> tuple[ExposureBar, ExposureBar, ExposureBar]:
     """Exposure, saturation and contrast."""
     dots = exposure.snr > 0
     of = "dots" if dots else "pixels"
     contrast = f"{exposure.contrast:.0%}, {exposure.snr:.0f} × the noise" if dots else "no dots"
     return (
-        Bar(
+        ExposureBar(
             "Exposure",
             exposure.level,
             f"{exposure.level:.0%} of full scale",
             f"Level of the bright {of} as a part of the camera's full scale",
         ),
-        Bar(
+        ExposureBar(
             "Saturation",
             exposure.clipped,
             f"{exposure.clipped:.0%} of the {of} clipped",
             f"Part of the {of} at the top of the scale: their centres are inaccurate",
         ),
-        Bar(
+        ExposureBar(
             "Contrast",
             exposure.contrast,
             contrast,

@@ -35,7 +35,7 @@ from labapp.gui.digits import entered, parsed
 from labapp.gui.widgets.labels import heading, plain_label, plain_tip, wrapping_label
 
 MOUSE_MS = 20
-"""How often it is asked whether the mouse is let go."""
+"""How often it is checked whether the mouse button was released."""
 
 STEP_PAUSE_MS = 300
 """Steps that follow each other faster than this are one edit."""
@@ -112,14 +112,14 @@ class Field(QWidget):
         words = self._refusal or self._fault
         described = f"{words}. {self._tooltip}" if words else self._tooltip
         self.editor.setAccessibleDescription(described)
-        self._tell_problem()
+        self._show_problem_text()
 
-    def _tell_problem(self) -> None:
+    def _show_problem_text(self) -> None:
         """Make or take its room; not while a button of the mouse is down, or a click is lost."""
         words = self._refusal or self._fault
         told = f"⚠ {words}" if words else ""
         if told != self.problem.text() and QGuiApplication.mouseButtons():
-            QTimer.singleShot(MOUSE_MS, self, self._tell_problem)
+            QTimer.singleShot(MOUSE_MS, self, self._show_problem_text)
             return
         self.problem.setText(told)
         self.problem.setVisible(bool(told))
@@ -162,7 +162,7 @@ class NumberField(Field):
         self.lowest, self.highest, self.step = lowest, highest, step
         self.decimals, self.optional = decimals, optional
         self._value: float | None = None
-        self._told: float | None = None
+        self._emitted: float | None = None
         self._typed = False
         self._box.line.textEdited.connect(self._note_typing)
         self._box.stepped.connect(self._step)
@@ -170,7 +170,7 @@ class NumberField(Field):
         self._pause = QTimer(self)
         self._pause.setSingleShot(True)
         self._pause.setInterval(STEP_PAUSE_MS)
-        self._pause.timeout.connect(self._tell)
+        self._pause.timeout.connect(self._emit_change)
 
     def value(self) -> float | None:
         """What the field holds; None if it is empty."""
@@ -183,7 +183,7 @@ class NumberField(Field):
         typing = self._box.text() != self._shown(self._value) and self._box.line.isModified()
         if value != self._value:
             self.refuse("")
-        self._value = self._told = value
+        self._value = self._emitted = value
         if not typing:
             self._show()
             self.set_problem("")
@@ -213,7 +213,7 @@ class NumberField(Field):
         elif self._typed:  # what it held already, and is right
             self.refuse("")
         self._typed = False
-        self._tell()
+        self._emit_change()
 
     def _read(self, text: str) -> tuple[float | None, str]:
         """Value of a text, and what is wrong with it."""
@@ -244,10 +244,10 @@ class NumberField(Field):
         self._show()
         self._pause.start()
 
-    def _tell(self) -> None:
+    def _emit_change(self) -> None:
         self._pause.stop()
-        if self._value != self._told:
-            self._told = self._value
+        if self._value != self._emitted:
+            self._emitted = self._value
             self._enter(self._value)
 
 
@@ -306,7 +306,7 @@ class TextField(Field):
             line or QLineEdit() if lines == 1 else _Paragraphs(lines)
         )
         super().__init__(label, self._edit, tooltip)
-        self._told = ""
+        self._emitted = ""
         if isinstance(self._edit, QLineEdit):
             self._edit.editingFinished.connect(self.flush)
         else:
@@ -321,10 +321,10 @@ class TextField(Field):
         """Show other words; tells nobody, and leaves alone what is being typed."""
         edit = self._edit
         modified = edit if isinstance(edit, QLineEdit) else edit.document()
-        typing = modified.isModified() and self.value() != self._told
-        if value != self._told:
+        typing = modified.isModified() and self.value() != self._emitted
+        if value != self._emitted:
             self.refuse("")
-        self._told = value
+        self._emitted = value
         if typing or value == self.value():
             return
         if isinstance(self._edit, QLineEdit):
@@ -334,9 +334,9 @@ class TextField(Field):
 
     def flush(self) -> None:
         """Finish an edit under way, as leaving the field does."""
-        if self.value() != self._told:
-            self._told = self.value()
-            self._enter(self._told)
+        if self.value() != self._emitted:
+            self._emitted = self.value()
+            self._enter(self._emitted)
 
     def _set_locked(self, locked: bool) -> None:
         if isinstance(self._edit, QLineEdit):
@@ -391,7 +391,7 @@ class ChoiceField(Field):
         )
         self._combo.setMinimumContentsLength(8)
         self._combo.installEventFilter(self)
-        self._told = ""
+        self._emitted = ""
         self.set_choices(choices)
         self._combo.activated.connect(self._activated)
 
@@ -402,9 +402,9 @@ class ChoiceField(Field):
     def set_value(self, key: str) -> None:
         """Choose by key; tells nobody."""
         self._combo.setCurrentIndex(self._combo.findData(key))
-        if self.value() != self._told:
+        if self.value() != self._emitted:
             self.refuse("")
-        self._told = self.value()
+        self._emitted = self.value()
 
     def set_choices(self, choices: Sequence[tuple[str, str]]) -> None:
         """Offer other choices; the present one stays if it is among them."""
@@ -424,9 +424,9 @@ class ChoiceField(Field):
         return super().eventFilter(watched, event)
 
     def _activated(self, _: int) -> None:
-        if self.value() != self._told:
-            self._told = self.value()
-            self._enter(self._told)
+        if self.value() != self._emitted:
+            self._emitted = self.value()
+            self._enter(self._emitted)
 
 
 class FieldForm(QWidget):

@@ -102,12 +102,12 @@ class Message(QLabel):
         """Say something else; empty: nothing."""
         if words != self.text():
             super().setText(words)
-            self._tell()
+            self._update_tip()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Tell all of it where not all is shown."""
         super().resizeEvent(event)
-        self._tell()
+        self._update_tip()
 
     def shown(self) -> list[str]:
         """The lines that are seen."""
@@ -136,6 +136,6 @@ class Message(QLabel):
             place = self.contentsRect().adjusted(max(self.indent(), 0), 0, 0, 0)
             painter.drawText(place, Qt.AlignmentFlag.AlignTop, "\n".join(self.shown()))
 
-    def _tell(self) -> None:
+    def _update_tip(self) -> None:
         shown = self.shown()
         self.setToolTip(plain_tip(self.text()) if shown and shown[-1].endswith("…") else "")

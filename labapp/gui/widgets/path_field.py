@@ -26,9 +26,9 @@ class PathField(TextField):
         line = PathLine()
         super().__init__(label, tooltip=tooltip, line=line)
         self._purpose = tooltip
-        line.textChanged.connect(self._tell_whole)
+        line.textChanged.connect(self._show_whole_path)
 
-    def _tell_whole(self, path: str) -> None:
+    def _show_whole_path(self, path: str) -> None:
         self._tooltip = f"{path}\n{self._purpose}" if path else self._purpose
         self.editor.setToolTip(plain_tip(self._tooltip))
         self._show_problem()

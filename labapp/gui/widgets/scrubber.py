@@ -126,10 +126,10 @@ class Scrubber(QAbstractSlider):
         self._tell()
 
     def _tell(self) -> None:
-        seen = self.in_words(self.value()) if len(self._kinds) else "There are no frames"
+        seen = self.position_text(self.value()) if len(self._kinds) else "There are no frames"
         self.setAccessibleDescription(f"{seen}. {KEYS}")
 
-    def in_words(self, position: int) -> str:
+    def position_text(self, position: int) -> str:
         """A frame and how it stands."""
         return f"{self.describe(position)}: {self._ticks[int(self._kinds[position])].words}"
 
@@ -221,12 +221,12 @@ class Scrubber(QAbstractSlider):
         return np.array(colours, np.uint32), np.array(masks, bool)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Draw the ticks anew for another width."""
+        """Redraw the ticks for another width."""
         self._picture = None
         super().resizeEvent(event)
 
     def changeEvent(self, event: QEvent) -> None:
-        """Draw the ticks anew for another palette."""
+        """Redraw the ticks for another palette."""
         if event.type() in (QEvent.Type.PaletteChange, QEvent.Type.StyleChange):
             self._picture = None
         super().changeEvent(event)
@@ -262,6 +262,6 @@ class Scrubber(QAbstractSlider):
         """Tell of the frame under the pointer."""
         if isinstance(event, QHelpEvent) and len(self._kinds):
             position = self.position_at(event.pos().x())
-            QToolTip.showText(event.globalPos(), self.in_words(position), self)
+            QToolTip.showText(event.globalPos(), self.position_text(position), self)
             return True
         return super().event(event)

@@ -11,8 +11,8 @@ from pytestqt.qtbot import QtBot
 
 from labapp.errors import InputError
 from labapp.gui.live import view as live_view
-from labapp.gui.live.camera_fields import CameraFields, region_in_words, region_of
-from labapp.gui.live.plan_fields import cost_in_words
+from labapp.gui.live.camera_fields import CameraFields, region_of, region_text
+from labapp.gui.live.plan_fields import cost_text
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field
@@ -207,7 +207,7 @@ def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, dev
 
 def test_a_region_that_is_typed_is_what_is_shown():
     assert region_of("1;2, 300  40") == (1, 2, 300, 40)
-    assert region_of(region_in_words((8, 4, 32, 20))) == (8, 4, 32, 20)
+    assert region_of(region_text((8, 4, 32, 20))) == (8, 4, 32, 20)
     with pytest.raises(InputError, match="four whole numbers"):
         region_of("1.5, 2, 3, 4")
 
@@ -218,12 +218,12 @@ def test_a_region_that_is_typed_is_what_is_shown():
 def test_what_raw_and_ffv1_cost_is_told():
     byte = 640 * 480
     raw, small = Plan(), Plan(codec="ffv1")
-    assert cost_in_words(raw, byte, 200) == "About 61.4 MB a second, 14 % of a core"
-    told = cost_in_words(small, byte, 200)
+    assert cost_text(raw, byte, 200) == "About 61.4 MB a second, 14 % of a core"
+    told = cost_text(small, byte, 200)
     assert told.startswith("⚠ About 25.8 MB a second, 92 % of a core: little is left")
     assert told.endswith("Raw takes 14 %")
-    assert "frames will be lost" in cost_in_words(small, byte, 500)
-    assert cost_in_words(replace(small, every=4), byte, 200) == (
+    assert "frames will be lost" in cost_text(small, byte, 500)
+    assert cost_text(replace(small, every=4), byte, 200) == (
         "About 6.5 MB a second, 23 % of a core"
     )
 

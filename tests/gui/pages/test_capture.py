@@ -23,10 +23,10 @@ from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
-    choice_in_words,
+    choice_text,
     look,
-    missing_in_words,
-    recording_in_words,
+    missing_text,
+    recording_facts,
     refusal,
 )
 from labapp.gui.shell.steps import Mark, State
@@ -55,11 +55,11 @@ def test_what_would_be_imported(stack: Path, copy_sample) -> None:
     assert preview.frames == 12
     assert Choice(2, 9, 3).frames == "2:10:3"
     assert Choice(2, 9, 3).count == 3
-    assert choice_in_words(preview, Choice(0, 11)) == (
+    assert choice_text(preview, Choice(0, 11)) == (
         "12 of 12 frames; without a frame rate there are no times"
     )
-    assert choice_in_words(preview, Choice(0, 11, 2, 100.0)).endswith("0.120 s at 100 frames/s")
-    assert choice_in_words(preview, Choice(0, 11, 2, 1.0)).endswith("12.000 s at 1 frame/s")
+    assert choice_text(preview, Choice(0, 11, 2, 100.0)).endswith("0.120 s at 100 frames/s")
+    assert choice_text(preview, Choice(0, 11, 2, 1.0)).endswith("12.000 s at 1 frame/s")
     seen = preview.look(3, DotSettings())
     assert seen.image is not None
     assert seen.image.shape == (40, 50)
@@ -81,7 +81,7 @@ def test_what_was_read_is_told(copy_sample) -> None:
     with Session.open(copy_sample("gtaw")) as session:
         recording = session.recording
         assert recording is not None
-        told = dict(recording_in_words(recording))
+        told = dict(recording_facts(recording))
         assert told["Frames"] == "30 in the recording, used: all"
         assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d", told["Imported"])
         assert told["Time base"] == "60 frames/s"
@@ -91,7 +91,7 @@ def test_what_was_read_is_told(copy_sample) -> None:
         other = replace(
             recording, selected=(2, 20, 3), rate_is_given=True, frame_exact=False, embedded=True
         )
-        told = dict(recording_in_words(other))
+        told = dict(recording_facts(other))
         assert told["Frames"] == "30 in the recording, used: 6, 2 to 19, every 3."
         assert told["Time base"] == "60 frames/s (entered)"
         assert told["Seeking"].startswith("not frame-exact")
@@ -110,7 +110,7 @@ def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
     path = copy_sample("gtaw")
     (path.parent / "recording.avi").rename(path.parent / "moved.avi")
     with Session.open(path) as session:
-        assert missing_in_words(session).startswith("recording.avi is not where it was")
+        assert missing_text(session).startswith("recording.avi is not where it was")
         seen = look(session, 0)
         assert seen.image is None
         assert seen.words == "recording.avi is not where it was: say where it is now"
@@ -198,7 +198,7 @@ def test_an_import_that_is_cancelled_leaves_the_session_as_it_was(
 
 def test_what_cannot_be_opened_is_said(page: CapturePage, tmp_path: Path, qtbot: QtBot) -> None:
     said: list[tuple[str, bool]] = []
-    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
     (tmp_path / "notes.txt").write_text("no video")
     page.choose(tmp_path / "notes.txt")
     qtbot.waitUntil(lambda: bool(said))
@@ -224,7 +224,7 @@ def test_a_missing_recording_is_found_again(copy_sample, tmp_path: Path, qtbot: 
     workspace.open(path)
     page = made(workspace)
     said: list[tuple[str, bool]] = []
-    workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    workspace.notified.connect(lambda words, problem: said.append((words, problem)))
     assert page.find_button.isVisibleTo(page.panel)
     page.relink(path.parent / "calibration.png")
     qtbot.waitUntil(lambda: len(said) == 1)

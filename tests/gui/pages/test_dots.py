@@ -311,7 +311,7 @@ def test_buttons_are_of_use_when_what_they_need_is_chosen(
 
     # The keys still answer, and say what is lacking.
     said: list[str] = []
-    page.workspace.said.connect(lambda words, _: said.append(words))
+    page.workspace.notified.connect(lambda words, _: said.append(words))
     key(page, Qt.Key.Key_Delete)
     assert len(said) == 1
     assert session.correction(0) is None
@@ -386,7 +386,7 @@ def test_a_refused_edit_says_why_and_changes_nothing(
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 0)
     steps, said = len(session.history), []
-    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
     for which in (Qt.Key.Key_Delete, Qt.Key.Key_M, Qt.Key.Key_S, Qt.Key.Key_B, Qt.Key.Key_N):
         key(page, which)
     lattice = page.editor.correction.lattice if page.editor.correction else None
@@ -486,7 +486,7 @@ def test_a_correction_is_carried_on_and_taken_back(
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 2)
     said: list[str] = []
-    page.workspace.said.connect(lambda words, problem: said.append(words))
+    page.workspace.notified.connect(lambda words, problem: said.append(words))
     earlier = session.correction(2)
     key(page, Qt.Key.Key_Return, CONTROL)
     qtbot.waitUntil(lambda: bool(said))

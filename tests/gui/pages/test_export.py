@@ -16,7 +16,7 @@ from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, Surfa
 from labapp.gui.pages.export.page import ExportPage
 from labapp.gui.pages.export.presenter import (
     USUAL,
-    Wish,
+    ExportRequest,
     Written,
     folder_within,
     groups,
@@ -36,20 +36,20 @@ def gtaw(copy_sample) -> Path:
 
 
 def test_the_usual_ticks_are_the_usual_export() -> None:
-    assert Wish().choice() == ExportChoice()
+    assert ExportRequest().choice() == ExportChoice()
     keys = {item.key for _, items in groups() for item in items}
-    everything = Wish(ticked=frozenset(keys)).choice()
+    everything = ExportRequest(ticked=frozenset(keys)).choice()
     assert everything.solid
     assert [each.file for each in everything.run_formats] == ["results.h5"]
     assert len(everything.surfaces) == 5
     assert everything.pictures == {"frames", "surfaces", "trends", "film"}
     assert keys > USUAL
-    assert not Wish(ticked=frozenset({"solid", "surfaces:csv"})).choice().solid
+    assert not ExportRequest(ticked=frozenset({"solid", "surfaces:csv"})).choice().solid
 
 
 def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
     with Session.open(gtaw) as session:
-        every = plan(session, Wish(), 3)
+        every = plan(session, ExportRequest(), 3)
         assert len(every.frames) == 30
         assert every.why_not == ""
         assert every.files[:5] == (
@@ -60,31 +60,31 @@ def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
             "surface_NNNNNN.csv, 30 of them",
         )
         assert every.files[-1].startswith("manifest.json")
-        assert plan(session, Wish(which="view"), 3).frames.tolist() == [3]
-        part = plan(session, Wish(which="part", first=4, last=11, every=3), 0)
+        assert plan(session, ExportRequest(which="view"), 3).frames.tolist() == [3]
+        part = plan(session, ExportRequest(which="part", first=4, last=11, every=3), 0)
         assert part.frames.tolist() == [4, 7, 10]
-        assert plan(session, Wish(ticked=frozenset()), 0).why_not.startswith("Tick what")
-        assert "measure them first" in plan(session, Wish(scheme="ers"), 0).why_not
+        assert plan(session, ExportRequest(ticked=frozenset()), 0).why_not.startswith("Tick what")
+        assert "measure them first" in plan(session, ExportRequest(scheme="ers"), 0).why_not
         assert schemes(session) == (("", "fit (as in the settings)"),)
 
 
 def test_frames_without_a_surface_are_told_and_the_recording_missed(copy_sample) -> None:
     path = copy_sample("blocked_rows")
     with Session.open(path) as session:
-        made = plan(session, Wish(), 0)
+        made = plan(session, ExportRequest(), 0)
         assert made.notes == ("3 frames without a surface: in the tables with the reason.",)
         assert "surface_NNNNNN.stl, 3 of them" in made.files
     (path.parent / "recording.mkv").unlink()
     with Session.open(path) as session:
-        assert plan(session, Wish(), 0).why_not == ""
-        pictures = Wish(ticked=frozenset({"pictures:frames"}))
+        assert plan(session, ExportRequest(), 0).why_not == ""
+        pictures = ExportRequest(ticked=frozenset({"pictures:frames"}))
         assert "recording.mkv is not where it was" in plan(session, pictures, 0).why_not
 
 
 def test_what_no_longer_stands_is_explained_and_can_be_measured(gtaw: Path) -> None:
     with Session.open(gtaw) as session:
         session.update_setup({"laser": {"distance_mm": 32.0}})
-        made = plan(session, Wish(which="part", first=0, last=4), 0)
+        made = plan(session, ExportRequest(which="part", first=0, last=4), 0)
         assert made.why_not == (
             "5 frames no longer stand, because the rig or a calibration was changed. "
             "Measure again, or undo the change."
@@ -92,10 +92,10 @@ def test_what_no_longer_stands_is_explained_and_can_be_measured(gtaw: Path) -> N
         assert made.again.tolist() == [0, 1, 2, 3, 4]
         session.undo()
         session.set_settings(replace(session.settings, scheme="ers"))
-        made = plan(session, Wish(which="view"), 7)
+        made = plan(session, ExportRequest(which="view"), 7)
         assert made.again.tolist() == [7]
         assert schemes(session) == (("", "ERS (as in the settings)"), ("fit", "fit"))
-        other = plan(session, Wish(scheme="fit"), 0)
+        other = plan(session, ExportRequest(scheme="fit"), 0)
         assert (len(other.frames), other.why_not) == (30, "")
         assert len(other.again) == 0
 
@@ -184,7 +184,7 @@ def test_a_folder_of_somebody_s_is_refused_in_words(
     page: ExportPage, qtbot: QtBot, tmp_path: Path
 ) -> None:
     said: list[tuple[str, bool]] = []
-    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     page.folder.set_value(str(tmp_path / "mine"))
@@ -234,6 +234,6 @@ def test_a_format_that_is_added_can_be_ticked(gtaw: Path, tmp_path: Path, monkey
         box.setChecked(box in (points, whole))
     assert page.files.text().splitlines()[:2] == ["surface_NNNNNN.xyz, 30 of them", "toy.bin"]
     whole.setChecked(False)
-    write(session_of(page), page.wish, [3], tmp_path / "out", lambda done, total: None)
+    write(session_of(page), page.request, [3], tmp_path / "out", lambda done, total: None)
     assert (tmp_path / "out/surface_000003.xyz").read_bytes().endswith(b" points")
     workspace.close()

@@ -211,7 +211,7 @@ def test_lengths_from_a_picture_are_a_reading_and_the_picture_is_kept(
 
 def test_a_picture_that_cannot_be_read_is_said(qtbot: QtBot, page: LaserPage, tmp_path) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
-    with qtbot.waitSignal(page.workspace.said) as said:
+    with qtbot.waitSignal(page.workspace.notified) as said:
         page.load_picture(tmp_path / "bad.png")
     assert "bad.png" in said.args[0]
     assert page.picture_view.picture is None

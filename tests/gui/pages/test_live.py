@@ -122,7 +122,7 @@ def test_the_newest_frame_is_given_once_and_judged(live: Live):
     gate.set()
     assert found[-1].quality.exposure.verdict in ("no dots", "too dark", "good", "dots merge")
     assert found[-1].room_byte > 0
-    assert "room for" in live.recording_in_words(found[-1].room_byte) or live.rate_hz() is None
+    assert "room for" in live.recording_text(found[-1].room_byte) or live.rate_hz() is None
 
 
 def test_unplugged_garbage_and_stalled_are_said_and_nothing_recorded_is_lost(live: Live):
@@ -132,17 +132,17 @@ def test_unplugged_garbage_and_stalled_are_said_and_nothing_recorded_is_lost(liv
     live.trigger()
     device.unplug()
     wait_until(lambda: live.feed.state == "lost")
-    assert live.state_in_words().startswith("▲ Not connected")
+    assert live.state_text().startswith("▲ Not connected")
     kept = live.takes[0].frames
     device.plug()
     wait_until(lambda: live.feed.state == "running" and live.takes[0].frames > kept + 40)
-    assert live.state_in_words().startswith("● Live")
+    assert live.state_text().startswith("● Live")
     live.close()
     counts = live.feed.counts
     assert (counts.lost, live.takes[0].lost) == (1, 0)
     assert counts.broken > 0
     assert counts.dropped > 0
-    assert "lost 1 time" in live.counts_in_words()
+    assert "lost 1 time" in live.counts_text()
     words = [str(event) for event in live.events()]
     assert any("unplugged" in each for each in words)
     assert any("it is back" in each for each in words)

@@ -28,9 +28,9 @@ from labapp.gui.live.figures import (
     FIRST,
     NO_SETUP,
     OLD_S,
-    alarms_in_words,
+    alarms_text,
     figures,
-    pace_in_words,
+    pace_text,
 )
 from labapp.gui.live.surface import steady_limits
 from labapp.gui.live.trends import trend_curves
@@ -90,21 +90,21 @@ def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known(
 
 
 def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():
-    assert pace_in_words(None, Pace(0.0, 0, 0), 60.0, 0.0) == FIRST
+    assert pace_text(None, Pace(0.0, 0, 0), 60.0, 0.0) == FIRST
     assert (
-        pace_in_words(live_result(), Pace(38.0, 76, 0), 60.0, 0.04)
+        pace_text(live_result(), Pace(38.0, 76, 0), 60.0, 0.04)
         == "38.0 of 60.0 frames/s measured; 0.04 s old"
     )
-    assert pace_in_words(live_result(), Pace(38.0, 76, 2), None, 0.0).startswith(
+    assert pace_text(live_result(), Pace(38.0, 76, 2), None, 0.0).startswith(
         "◆ 2 of the last 76 frames could not be measured. 38.0 frames/s measured"
     )
-    dark = pace_in_words(live_result(DARK), Pace(0.0, 3, 3), 60.0, 5.2)
+    dark = pace_text(live_result(DARK), Pace(0.0, 3, 3), 60.0, 5.2)
     assert dark.startswith("▲ Not measured (no-dots): it is dark. ▲ The figures are 5 s old.")
 
 
 def test_alarms_in_words():
     alarm = Alarm("width-high", "Width 7.100 mm is above 6.9 mm", 312, 5.2)
-    told = alarms_in_words([alarm, replace(alarm, holds=False, acknowledged=True)]).split("\n")
+    told = alarms_text([alarm, replace(alarm, holds=False, acknowledged=True)]).split("\n")
     assert told[0] == f"▲ ALARM: Width 7.100 mm is above 6.9 mm (frame 312, {alarm.at:%H:%M:%S})"
     assert told[1].startswith("△ over: Width")
     assert told[1].endswith(", acknowledged")

@@ -182,7 +182,7 @@ def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage
 
 def test_the_target_is_written_for_the_printer(page: PlanePage, tmp_path: Path) -> None:
     said: list[tuple[str, bool]] = []
-    page.workspace.said.connect(lambda text, problem: said.append((text, problem)))
+    page.workspace.notified.connect(lambda text, problem: said.append((text, problem)))
     page.save_target(tmp_path / "target.svg")
     assert (tmp_path / "target.svg").read_text("utf-8") == target_svg(Target())
     assert not said[-1][1]
@@ -228,7 +228,7 @@ def test_a_picture_without_a_target_is_said_and_points_can_be_placed(
 ) -> None:
     cv2.imwrite(str(tmp_path / "bare.png"), np.full((200, 300), 90, np.uint8))
     said: list[str] = []
-    page.workspace.said.connect(lambda words, _: said.append(words))
+    page.workspace.notified.connect(lambda words, _: said.append(words))
     page.load(tmp_path / "bare.png")
     qtbot.waitUntil(lambda: len(said) == 1)
     assert "no dark marks" in said[0]

@@ -177,7 +177,7 @@ def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:
 
 def test_a_wrong_file_is_refused_in_words(page: SetupPage, tmp_path: Path) -> None:
     said: list[tuple[str, bool]] = []
-    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
     bad = tmp_path / "bad.toml"
     bad.write_text("no = [")
     page.load(bad)

@@ -60,7 +60,7 @@ def page(qapp: QApplication, copy_sample: CopySample) -> SurfacePage:
 
 def told(page: SurfacePage) -> list[tuple[str, bool]]:
     said: list[tuple[str, bool]] = []
-    page.workspace.said.connect(lambda words, bad: said.append((words, bad)))
+    page.workspace.notified.connect(lambda words, bad: said.append((words, bad)))
     return said
 
 
@@ -99,7 +99,7 @@ def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) ->
     assert not page.side.one.isEnabled()
     assert "under way" in page.side.one.toolTip()
     assert not page.side.progress.isHidden()
-    with qtbot.waitSignal(page.workspace.said):
+    with qtbot.waitSignal(page.workspace.notified):
         pass
     assert page.side.status.text() == "✓ Measured."
     assert page.side.one.isEnabled()

@@ -12,7 +12,7 @@ from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.trends.page import TrendsPage
-from labapp.gui.pages.trends.presenter import CORRECTED, STALE, Wish, show
+from labapp.gui.pages.trends.presenter import CORRECTED, STALE, TrendOptions, show
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.session.signals import Signals
@@ -31,7 +31,7 @@ def logged(start_s: float = 0.0) -> Signals:
 
 def test_the_course_of_the_sample(gtaw: Path) -> None:
     with Session.open(gtaw) as session:
-        shown = show(session, Wish())
+        shown = show(session, TrendOptions())
     assert [curve.name for curve in shown.curves] == ["Width", "Length", "Height", "ARE"]
     assert shown.axis.unit == "s"
     assert all(len(curve.key) == 30 for curve in shown.curves)
@@ -45,13 +45,13 @@ def test_the_course_of_the_sample(gtaw: Path) -> None:
 
 def test_marks_say_how_frames_stand(copy_sample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
-        curve = show(session, Wish()).curves[0]
+        curve = show(session, TrendOptions()).curves[0]
         assert dict(zip(curve.key.tolist(), curve.mark.tolist(), strict=True))[2] == CORRECTED
-        words = show(session, Wish()).words
+        words = show(session, TrendOptions()).words
         assert words == "3 of 6 frames count, 3 without a surface"
         fit = replace(session.settings.fit, jerk=0.06)
         session.set_settings(replace(session.settings, fit=fit))
-        shown = show(session, Wish())
+        shown = show(session, TrendOptions())
         assert (shown.curves[0].mark == STALE).all()
         assert shown.rows[0].texts[1:3] == ("–", "")
         assert "3 no longer stand" in shown.words
@@ -59,12 +59,12 @@ def test_marks_say_how_frames_stand(copy_sample) -> None:
 
 def test_the_spectrum_is_told_or_why_there_is_none(gtaw: Path, copy_sample) -> None:
     with Session.open(gtaw) as session:
-        shown = show(session, Wish(spectrum_of="height_mm"))
+        shown = show(session, TrendOptions(spectrum_of="height_mm"))
         assert len(shown.spectrum[0].x) == 15
         assert shown.spectrum_axis.unit == "Hz"
         assert shown.spectrum_words.startswith("Strongest at 2.0 Hz: 0.025 mm. Frames 0 to 29 (30)")
     with Session.open(copy_sample("concave")) as session:
-        shown = show(session, Wish(spectrum_of="depth_mm"))
+        shown = show(session, TrendOptions(spectrum_of="depth_mm"))
         assert shown.spectrum == ()
         assert shown.spectrum_words.startswith("A spectrum needs 8 frames in a row")
         assert shown.axis.unit == ""  # a folder of pictures has no times
@@ -73,21 +73,23 @@ def test_the_spectrum_is_told_or_why_there_is_none(gtaw: Path, copy_sample) -> N
 def test_current_is_shown_while_the_recording_runs(gtaw: Path, copy_sample) -> None:
     with Session.open(gtaw) as session:
         session.set_signals(logged())
-        current = show(session, Wish()).curves[-1]
+        current = show(session, TrendOptions()).curves[-1]
         assert (current.name, current.unit) == ("Current", "A")
         assert current.x.min() >= -0.03
         assert current.x.max() <= 0.52
-        assert [curve.name for curve in show(session, Wish(shown=("voltage",))).curves] == []
+        assert [
+            curve.name for curve in show(session, TrendOptions(shown=("voltage",))).curves
+        ] == []
         session.set_signals(logged(start_s=0.25))
-        moved = show(session, Wish()).curves[-1]
+        moved = show(session, TrendOptions()).curves[-1]
         assert np.interp(0.25, moved.x, moved.y) == pytest.approx(75.0)
         session.set_signals(logged(start_s=50))
-        shown = show(session, Wish())
+        shown = show(session, TrendOptions())
         assert "None of it falls into" in shown.signals_words
         assert len(shown.curves) == 4
     with Session.open(copy_sample("concave")) as session:
         session.set_signals(logged())
-        assert "no time base" in show(session, Wish()).signals_words
+        assert "no time base" in show(session, TrendOptions()).signals_words
 
 
 @pytest.fixture
@@ -138,7 +140,7 @@ def test_a_table_is_read_kept_moved_and_undone(
     page: TrendsPage, qtbot: QtBot, tmp_path: Path
 ) -> None:
     said: list[tuple[str, bool]] = []
-    page.workspace.said.connect(lambda words, problem: said.append((words, problem)))
+    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
     table = tmp_path / "log.csv"
     table.write_text("time_s,current_a\n0,75\n0.2,x\n")
     page.read_signals(table)
@@ -170,6 +172,6 @@ def test_every_control_has_a_name_and_a_tip(page: TrendsPage) -> None:
 
 def test_the_axis_holds_frames_without_a_surface(copy_sample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
-        shown = show(session, Wish())
+        shown = show(session, TrendOptions())
     assert shown.curves[0].x.max() < shown.places[5] == 5.0
     assert shown.axis.span == (0.0, 5.0)

@@ -95,7 +95,9 @@ class FootSwitchPanel(QWidget):
         self.commands.setWordWrapMode(QTextOption.WrapMode.WrapAtWordBoundaryOrAnywhere)
         self.commands.setFixedHeight(LINES * self.commands.fontMetrics().lineSpacing() + 14)
         self.commands.setAccessibleName("Commands that let you read it")
-        self.commands.setToolTip("Type them in a terminal, then plug the device in anew")
+        self.commands.setToolTip(
+            "Type them in a terminal, then unplug the device and plug it in again"
+        )
         inner.addWidget(self.commands)
         self.copy_button = button(
             "Copy the commands",
@@ -104,7 +106,7 @@ class FootSwitchPanel(QWidget):
         )
         inner.addWidget(self.copy_button)
         self.closed.edited.connect(lambda _: self._show_commands())
-        inner.addWidget(selectable_label("Then plug it in anew."))
+        inner.addWidget(selectable_label("Then unplug it and plug it in again."))
         self._layout.addWidget(self.rights)
 
     # --- what is shown ------------------------------------------------------------------------
@@ -120,7 +122,7 @@ class FootSwitchPanel(QWidget):
         self.learn_button.setText("Stop waiting" if switches.learns else "Learn a pedal")
         self.look_button.setEnabled(not (switches.looks or switches.learns))
         learned = switches.learned
-        words = "\n".join((LISTENING, *switches.unheard)) if switches.learns else ""
+        words = "\n".join((LISTENING, *switches.unavailable)) if switches.learns else ""
         if learned is not None:
             name = pedal_name(learned.pedal, learned.info.is_keyboard)
             words = f"{learned.info.name}: {name} was pressed."
@@ -134,7 +136,7 @@ class FootSwitchPanel(QWidget):
         self._show_commands()
 
     def _show_rows(self) -> None:
-        """A field for each pedal; made anew only where there are others."""
+        """A field for each pedal; rebuilt only where the pedals have changed."""
         held = {key: each.pedals for key, each in self.switches.in_use.items()}
         wanted = {(key, pedal): does for key in held for pedal, does in held[key].actions.items()}
         if wanted.keys() != self.pedals.keys():
@@ -182,7 +184,7 @@ class FootSwitchPanel(QWidget):
 
     def _copy(self) -> None:
         QGuiApplication.clipboard().setText(self.commands.toPlainText())
-        self.switches.said.emit("The commands are on the clipboard, for a terminal", False)
+        self.switches.notified.emit("The commands are on the clipboard, for a terminal", False)
 
 
 def _put(label: QLabel, words: str) -> None:

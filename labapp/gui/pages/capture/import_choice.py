@@ -7,7 +7,7 @@ from collections.abc import Callable
 from PySide6.QtCore import Signal
 from PySide6.QtWidgets import QCheckBox, QVBoxLayout, QWidget
 
-from labapp.gui.pages.capture.presenter import Choice, Preview, choice_in_words, refusal
+from labapp.gui.pages.capture.presenter import Choice, Preview, choice_text, refusal
 from labapp.gui.widgets.buttons import button, button_row
 from labapp.gui.widgets.fields import FieldForm, NumberField, whole
 from labapp.gui.widgets.labels import Message, headed, plain_tip, selectable_label
@@ -137,7 +137,7 @@ class ImportChoice(QWidget):
         tip = why_not or (MEASURED if wants_own else "Read it through once, and take its frames in")
         self.import_button.setToolTip(plain_tip(tip))
         if preview is not None and choice is not None:
-            words = choice_in_words(preview, choice)
+            words = choice_text(preview, choice)
             self.choice_words.setText(f"{words}. {why_not}" if why_not else words)
         self.replace_words.setText(MEASURED if measured else REPLACED)
         self.replace_words.setVisible(has_one and not why_not)

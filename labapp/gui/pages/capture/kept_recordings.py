@@ -60,13 +60,13 @@ class KeptRecordings(QWidget):
         except OSError:
             found = []  # what is wrong with the folder is said where something is written in it
         kept = [path for path in reversed(found) if path not in others]
-        self.choice.set_choices([(str(path), _in_words(path)) for path in kept])
+        self.choice.set_choices([(str(path), _choice_text(path)) for path in kept])
         if kept:
             self.choice.set_value(str(kept[0]))
         self.setVisible(bool(kept))
 
 
-def told_of(take: Take, why_kept: str) -> str:
+def kept_text(take: Take, why_kept: str) -> str:
     """What became of a recording that is not imported."""
     return (
         f"{take.path.name} is kept beside the session: {why_kept}. To measure it, press New "
@@ -74,7 +74,7 @@ def told_of(take: Take, why_kept: str) -> str:
     )
 
 
-def _in_words(path: Path) -> str:
+def _choice_text(path: Path) -> str:
     """Name of a recording beside the session, and whether a session was begun with it."""
     used = path.with_suffix(SUFFIX).exists()
     return f"{path.name}, has a session of its own" if used else path.name

@@ -17,14 +17,14 @@ from labapp.gui.live.camera_fields import calibrated_px, other_size
 from labapp.gui.live.view import LiveView
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.pages.capture.import_choice import ImportChoice
-from labapp.gui.pages.capture.kept_recordings import KeptRecordings, told_of
+from labapp.gui.pages.capture.kept_recordings import KeptRecordings, kept_text
 from labapp.gui.pages.capture.presenter import (
     Choice,
     Preview,
     Seen,
     look,
-    missing_in_words,
-    recording_in_words,
+    missing_text,
+    recording_facts,
 )
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Mark, State
@@ -105,7 +105,7 @@ class CapturePage(Page):
         if session is None:
             return
         recording = session.recording
-        missing = missing_in_words(session)
+        missing = missing_text(session)
         self.missing.setText(missing)
         self.find_button.setEnabled(not session.read_only)
         for widget in (self.missing, self.find_button):
@@ -149,7 +149,7 @@ class CapturePage(Page):
         return event.isAutoRepeat() or self.live_view.take_key(Qt.Key(event.key()))
 
     def _live_changed(self) -> None:
-        """A camera was started, or let go: its picture is in view, or the session's."""
+        """A camera was started or stopped: its picture is in view, or the session's."""
         live = self.live_view.live
         self._rest.stop()
         self._wanted = self._seen = None
@@ -165,7 +165,7 @@ class CapturePage(Page):
         """Import what was recorded, or say why not."""
         session, why_kept = self.workspace.session, ""
         if session is None or not take.frames:
-            self.workspace.said.emit(f"{take.path.name}: nothing was recorded", True)
+            self.workspace.notified.emit(f"{take.path.name}: nothing was recorded", True)
             return
         if session.read_only:
             why_kept = "the session is open read-only"
@@ -174,7 +174,7 @@ class CapturePage(Page):
         if why_kept:
             self._listed = None
             self._show_import()
-            self.workspace.said.emit(told_of(take, why_kept), False)
+            self.workspace.notified.emit(kept_text(take, why_kept), False)
         else:
             self._import(take.path, ":", None, False)
 
@@ -193,7 +193,7 @@ class CapturePage(Page):
             if widget is not None:
                 widget.hide()  # it is deleted only later
                 widget.deleteLater()
-        rows = recording_in_words(recording)
+        rows = recording_facts(recording)
         for row, (name, words) in enumerate(rows):
             self.told.addWidget(plain_label(f"{name}:"), row, 0)
             self.told.addWidget(selectable_label(words), row, 1)
@@ -206,7 +206,7 @@ class CapturePage(Page):
         working = self._importing in self.workspace.tasks.active
         session, seen = self.workspace.session, None
         if self.preview is not None:
-            seen = self.workspace.tried(self.workspace.overview)
+            seen = self.workspace.run_or_report(self.workspace.overview)
         measured = seen is not None and (any(seen.status) or bool(seen.corrected.any()))
         self.chosen.show_choice(session, self.preview, working, measured)
         self.slider.setVisible(self.preview is not None and self.preview.frames > 1)
@@ -343,8 +343,8 @@ class CapturePage(Page):
 
     def _import_next(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
         former = self.workspace.session
-        self.workspace.next_wanted.emit(path)
-        if self.workspace.session is not former:  # it was not given up
+        self.workspace.next_session_requested.emit(path)
+        if self.workspace.session is not former:  # the dialog was not cancelled
             self._import(path, frames, rate_hz, embed)
 
     def _import(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
@@ -367,7 +367,7 @@ class CapturePage(Page):
                 self.workspace.show_frame(frames[0])
             self._seen = None
             told = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
-            self.workspace.said.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
+            self.workspace.notified.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
             self.workspace.changed.emit()
 
         def failed(why: str) -> None:
@@ -426,7 +426,7 @@ class CapturePage(Page):
             if self.workspace.session is session:
                 self._seen = None
                 self.workspace.settle(MISSING)
-                self.workspace.said.emit(f"The recording is found at {path}", False)
+                self.workspace.notified.emit(f"The recording is found at {path}", False)
                 self.workspace.changed.emit()
 
         def failed(why: str) -> None:

@@ -76,7 +76,7 @@ class Preview:
         return Seen(title, image, _judged(image, settings, depth))
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         with self._turn:
             self._source.close()
 
@@ -136,7 +136,7 @@ class Choice:
         return len(range(self.first, self.last + 1, self.every))
 
 
-def choice_in_words(preview: Preview, choice: Choice) -> str:
+def choice_text(preview: Preview, choice: Choice) -> str:
     """What would be imported."""
     told = f"{choice.count} of {preview.frames} frames"
     rate = choice.rate_hz or preview.frame_rate_hz
@@ -160,7 +160,7 @@ def refusal(session: Session | None, choice: Choice | None, working: bool) -> st
     return ""
 
 
-def recording_in_words(recording: Recording) -> tuple[tuple[str, str], ...]:
+def recording_facts(recording: Recording) -> tuple[tuple[str, str], ...]:
     """What was read at import: (what, words) pairs."""
     start, stop, step = recording.selected
     used = len(range(start, stop, step))
@@ -189,7 +189,7 @@ def local_time(iso: str) -> str:
     return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
 
 
-def missing_in_words(session: Session) -> str:
+def missing_text(session: Session) -> str:
     """That the recording is not where it was, and what follows; empty if it is."""
     missing = session.missing_recording
     if missing is None:

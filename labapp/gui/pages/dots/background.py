@@ -6,7 +6,7 @@ from PySide6.QtCore import QObject, QTimer, Signal
 
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.presenter import Carried, Found, Shown
+from labapp.gui.pages.dots.presenter import Carried, DetectedDots, DotsState
 from labapp.gui.shell.steps import recording_gone, why_not_measurable
 from labapp.gui.tasks import Control, Task
 from labapp.gui.workspace import Workspace
@@ -56,7 +56,7 @@ class Looking(QObject):
         self.frame: int | None = None
         self.image: GreyImage | None = None
         self.why = ""
-        self.found: Found | None = None
+        self.found: DetectedDots | None = None
         self._rest.stop()
 
     def read(self, frame: int) -> None:
@@ -100,7 +100,7 @@ class Looking(QObject):
             return
         frame, dots, lattice = missing
 
-        def done(found: Found) -> None:
+        def done(found: DetectedDots) -> None:
             self.found = found
             self.ready.emit()
 
@@ -109,7 +109,7 @@ class Looking(QObject):
         )
 
 
-def carry_on(workspace: Workspace, seen: Shown, most: int | None) -> None:
+def carry_on(workspace: Workspace, seen: DotsState, most: int | None) -> None:
     """Carry the correction of a frame on, one step that can be undone; then measure."""
     session = workspace.session
     assert session is not None
@@ -121,7 +121,7 @@ def carry_on(workspace: Workspace, seen: Shown, most: int | None) -> None:
             )
         ):
             return
-        workspace.said.emit(carried.words, not carried.corrections)
+        workspace.notified.emit(carried.words, not carried.corrections)
         if carried.corrections and not why_not_measurable(session):
             workspace.measure(list(carried.corrections))
 

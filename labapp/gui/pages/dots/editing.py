@@ -19,7 +19,7 @@ from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.dots import picking
 
 Commit = Callable[[str, Callable[[], Correction | None]], bool]
-"""Make an edit, one step of that name; False if it was refused, which the operator is told."""
+"""Make an edit, one step of that name; False if it was refused, which is reported."""
 
 NOTHING: IntArray = np.zeros(0, np.int64)
 
@@ -76,7 +76,7 @@ class Editor:
         return picking.nearest(self.dots_px, u, v, within_px)
 
     def click(self, u: float, v: float, within_px: float, add: bool) -> None:
-        """Choose the dot at a place, alone or in addition; a chosen one is let go by adding it."""
+        """Choose the dot at a place, alone or in addition; adding a chosen one deselects it."""
         dot = self.at(u, v, within_px)
         if dot is None:
             self.selection = self.selection if add else NOTHING
@@ -182,7 +182,7 @@ class Editor:
         rows = self.rows
 
         def edit(correction: Correction) -> Correction:
-            # The rows may be counted anew after each; they are shifted from what they were.
+            # The rows may be renumbered after each; they are shifted from what they were.
             for row in _wanted(rows):
                 correction = core.shift_row(correction, row, columns)
             return correction

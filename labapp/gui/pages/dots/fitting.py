@@ -11,7 +11,7 @@ from PySide6.QtCore import QTimer
 
 from labapp.core.pipeline import Settings
 from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.presenter import Shown
+from labapp.gui.pages.dots.presenter import DotsState
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.tasks import Cancelled, Control, Task
 from labapp.gui.workspace import Workspace
@@ -55,7 +55,7 @@ class Processes:
         return len(self._pools) == 2 and self._pools[1][1].done()
 
     def replace(self) -> None:
-        """End the first, whatever it is at, and put the second in its place."""
+        """Kill the first, and put the second in its place."""
         end_processes(self._pools.pop(0)[0], wait=False)
         self.begin()
 
@@ -66,7 +66,7 @@ class Processes:
 
 
 class Refit:
-    """Measures a frame anew whenever its dots or rows were changed by hand.
+    """Measures a frame again whenever its dots or rows were changed by hand.
 
     One fit at a time, in a process of its own: a long measurement does not hold it up. An edit made
     meanwhile ends it at once and begins another, of what the frame has then.
@@ -81,7 +81,7 @@ class Refit:
         self._space = workspace
         self._task: Task | None = None
         self._begun: tuple[int, object] | None = None
-        self._seen: Shown | None = None
+        self._seen: DotsState | None = None
         self.processes = Processes()
         self._warm, self._again = QTimer(workspace), QTimer(workspace)
         for timer, rest_ms, work in (
@@ -98,7 +98,7 @@ class Refit:
         """Whether a fit is under way."""
         return self._task is not None and self._task in self._space.tasks.active
 
-    def want(self, seen: Shown) -> None:
+    def want(self, seen: DotsState) -> None:
         """Fit a frame if what it was measured from has been changed."""
         session = self._space.session
         if session is None or why_not_measurable(session):

@@ -59,7 +59,7 @@ class DotsPanel(QWidget):
         self.seen, self.chosen, self.why = Message(3), Message(2), wrapping_label()
         self.fit = ResultTable("Fit before the last edit and after it")
         layout.addWidget(self.seen)
-        layout.addWidget(heading("Put right"))
+        layout.addWidget(heading("Correct"))
         layout.addWidget(self.chosen)
         layout.addLayout(self._sites())
         self.buttons: dict[str, QToolButton] = {}
@@ -102,7 +102,7 @@ class DotsPanel(QWidget):
         self.row.set_value(site[0] or None)
         self.column.set_value(site[1] or None)
 
-    def show_lacking(self, lacking: Mapping[str, str]) -> bool:
+    def show_unmet_needs(self, unmet_need: Mapping[str, str]) -> bool:
         """Grey out the buttons of edits that lack something, and say what; by their words.
 
         Returns
@@ -111,7 +111,7 @@ class DotsPanel(QWidget):
             Whether the one with the focus is among them.
         """
         focused = False
-        for words, why in lacking.items():
+        for words, why in unmet_need.items():
             button = self.buttons[words]
             focused |= bool(why) and button.hasFocus()
             button.setEnabled(not why)

@@ -9,7 +9,7 @@ from labapp.core.rows.lattice import Site
 from labapp.core.values import FloatArray, IntArray
 
 NEIGHBOURS = 8
-"""A site is told from so many numbered dots round it."""
+"""A site is estimated from so many numbered dots around it."""
 
 FAR_OFF = 0.35
 """A dot farther than this share of a step from every site is not numbered."""

@@ -33,7 +33,7 @@ Origin = Literal["corrected", "measured", "found", "looked for"]
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectedDots:
     """What a detector found in a frame.
 
     Parameters
@@ -55,7 +55,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Shown:
+class DotsState:
     """What the page shows of one frame.
 
     Parameters
@@ -119,22 +119,22 @@ class RowLine:
 # --- the frame in view ------------------------------------------------------------------------
 
 
-def shown(session: Session, frame: int, found: Found | None) -> Shown:
+def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState:
     """What a frame shows: its correction, else what was measured, else what was found."""
     correction = session.correction(frame)
     result, damage = _result(session, frame)
     computed = computed_px(result)
     if correction is not None:
         why = damage if result is None or result.stale else result.measurement.reason
-        return Shown(frame, "corrected", correction, computed, result, why)
+        return DotsState(frame, "corrected", correction, computed, result, why)
     by = _by(session)
     if result is not None and _automatic(result, by):
         measurement = result.measurement
         start = start_correction(measurement)
-        return Shown(frame, "measured", start, computed, result, measurement.reason)
+        return DotsState(frame, "measured", start, computed, result, measurement.reason)
     if found is not None and (found.frame, found.by) == (frame, by):
-        return Shown(frame, "found", found.correction, computed, result, damage or found.why)
-    return Shown(frame, "looked for", None, NO_PLACES, result, damage)
+        return DotsState(frame, "found", found.correction, computed, result, damage or found.why)
+    return DotsState(frame, "looked for", None, NO_PLACES, result, damage)
 
 
 def wanted(session: Session, frame: int) -> Wanted | None:
@@ -165,7 +165,7 @@ def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
     return same and measurement.correction is None and measurement.dots is not None
 
 
-def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) -> Found:
+def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) -> DetectedDots:
     """Find dots and rows in a frame without measuring it."""
     dots: Dots | None = None
     lattice: Lattice | None = None
@@ -176,7 +176,7 @@ def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) ->
     except CannotMeasure as answer:
         why = answer.reason
     start = start_correction(Measurement("", "", "fit", dots, lattice))
-    return Found(frame, by, start, why)
+    return DetectedDots(frame, by, start, why)
 
 
 def computed_px(result: Result | None) -> FloatArray:
@@ -201,7 +201,7 @@ def computed_px(result: Result | None) -> FloatArray:
     return parse_setup(result.setup, "setup").calibration.to_image(plane[met])
 
 
-def needs_fit(seen: Shown) -> bool:
+def needs_fit(seen: DotsState) -> bool:
     """Whether a frame's fit has to be redone because its dots or rows were changed by hand."""
     if seen.result is None:
         return seen.origin == "corrected"
@@ -211,7 +211,7 @@ def needs_fit(seen: Shown) -> bool:
 # --- in words and numbers ---------------------------------------------------------------------
 
 
-def sentence(seen: Shown) -> str:
+def sentence(seen: DotsState) -> str:
     """What is seen, in a sentence or two."""
     if seen.correction is None:
         return "Looking for the dots …"
@@ -269,7 +269,7 @@ Need = Literal["", "rows", "reference", "dots", "site", "row", "two rows", "corr
 """What an edit is of use for."""
 
 
-def lacking(need: Need, seen: Shown | None, selection: IntArray, rows: Sequence[int]) -> str:
+def unmet_need(need: Need, seen: DotsState | None, selection: IntArray, rows: Sequence[int]) -> str:
     """What an edit lacks that needs something, as what to do; empty if it is all there.
 
     Parameters
@@ -294,10 +294,10 @@ def lacking(need: Need, seen: Shown | None, selection: IntArray, rows: Sequence[
         "two rows": len(rows) == 2,
         "corrected": seen.origin == "corrected",
     }
-    return "" if there[need] else LACKING[need]
+    return "" if there[need] else UNMET[need]
 
 
-LACKING: dict[Need, str] = {
+UNMET: dict[Need, str] = {
     "rows": "There are no rows yet",
     "reference": "No reference is known",
     "dots": "Choose a dot first",
@@ -370,7 +370,7 @@ class Carried:
     words: str
 
 
-def carry(session: Session, seen: Shown, most: int | None, control: Control) -> Carried:
+def carry(session: Session, seen: DotsState, most: int | None, control: Control) -> Carried:
     """Carry a frame's dots and rows on over the following frames, as far as they fit.
 
     What was carried when the operator cancels stays.
@@ -402,7 +402,7 @@ def carry(session: Session, seen: Shown, most: int | None, control: Control) -> 
     return Carried(carried, f"Carried on over {pluralize(len(carried), 'frame')}, {stopped}")
 
 
-def _confirmed(seen: Shown) -> Correction:
+def _confirmed(seen: DotsState) -> Correction:
     """The dots of a frame with the rows that its measurement has confirmed, if it stands."""
     assert seen.correction is not None
     result = seen.result

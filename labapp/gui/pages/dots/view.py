@@ -17,7 +17,7 @@ from labapp.gui.pages.dots.editing import Editor
 from labapp.gui.pages.dots.fitting import Refit
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
-from labapp.gui.pages.dots.presenter import Figures, Need, Shown
+from labapp.gui.pages.dots.presenter import DotsState, Figures, Need
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.views.drag_point import SHIFT, arrow_step
@@ -46,7 +46,7 @@ class Command(NamedTuple):
 
 
 class DotsPage(Page):
-    """Step 5; see `operator.md`: what is found is shown, and put right by hand."""
+    """Step 5: what was found is shown, and corrected by hand."""
 
     key = "dots"
 
@@ -58,11 +58,11 @@ class DotsPage(Page):
         self.view.tool = self.hand = Hand(self)
         self.looking = Looking(workspace)
         self.refit = Refit(workspace)
-        self.seen: Shown | None = None
+        self.seen: DotsState | None = None
         self._before: tuple[int, Figures | None] | None = None
         self._pointer: tuple[float, float] | None = None
         self._in_view = False
-        self._lacking: dict[str, str] = {}
+        self._unmet: dict[str, str] = {}
         self._needs = {c.text: c.needs for c in (*self._edits(), *self._frame_commands())}
         edits = [self._action(command) for command in self._edits()]
         frames = [self._action(command) for command in self._frame_commands()]
@@ -162,20 +162,20 @@ class DotsPage(Page):
         chosen = presenter.chosen_words(editor.correction, editor.selection.tolist())
         words = self.hand.asked or chosen
         self.dots_panel.show_chosen(words, editor.rows, site)
-        self._show_lacking()
+        self._show_unmet_needs()
 
-    def _show_lacking(self) -> None:
+    def _show_unmet_needs(self) -> None:
         """Grey out what is of no use now."""
         seen, editor = self.seen, self.editor
 
-        def lacking(need: Need) -> str:
-            return self.locked or presenter.lacking(need, seen, editor.selection, editor.rows)
+        def unmet_need(need: Need) -> str:
+            return self.locked or presenter.unmet_need(need, seen, editor.selection, editor.rows)
 
-        found = {text: lacking(need) for text, need in self._needs.items()}
-        if found != self._lacking:  # a drag draws the marks all the time
-            self._lacking = found
-            self.dots_panel.lock_sites(lacking("dots"), lacking(""))
-            if self.dots_panel.show_lacking(found):
+        found = {text: unmet_need(need) for text, need in self._needs.items()}
+        if found != self._unmet:  # a drag draws the marks all the time
+            self._unmet = found
+            self.dots_panel.lock_sites(unmet_need("dots"), unmet_need(""))
+            if self.dots_panel.show_unmet_needs(found):
                 self.view.setFocus()  # or the focus would go on to another button
 
     def choose(self, way: Callable[..., None], *given: object) -> None:
@@ -184,7 +184,7 @@ class DotsPage(Page):
         self.draw()
 
     def leave(self) -> None:
-        """Let go of what is under the hand; a fit under way goes on."""
+        """End a drag or nudge under way; a fit under way goes on."""
         self._in_view = False
         self.hand.release()
         self.hand.give_up()  # a click that is asked for is not to follow into another session
@@ -205,7 +205,7 @@ class DotsPage(Page):
 
     def _again(self) -> None:
         if self._in_view:
-            self.workspace.tried(self.refresh)
+            self.workspace.run_or_report(self.refresh)
 
     def _forget(self) -> None:
         self.seen = self._before = None
@@ -222,7 +222,7 @@ class DotsPage(Page):
             return False
         stood = seen.result is not None and not seen.result.stale
         if presenter.needs_fit(seen) and seen.origin == "found" and self.refit.pending:
-            self.workspace.said.emit(NOT_YET, True)
+            self.workspace.notified.emit(NOT_YET, True)
             self.draw()
             return False
         before, self._before = self._before, (seen.frame, presenter.figures(seen.result))
@@ -269,14 +269,16 @@ class DotsPage(Page):
     def _carry_on(self) -> None:
         seen = self.seen
         if seen is None or seen.correction is None:
-            self.workspace.said.emit("There are no dots yet to carry on", True)
+            self.workspace.notified.emit("There are no dots yet to carry on", True)
             return
         most = self.dots_panel.most.value()
         carry_on(self.workspace, seen, None if most is None else int(most))
 
     def _automatic(self) -> None:
         if self.seen is not None and self.seen.origin != "corrected":
-            self.workspace.said.emit("This frame is as it was found: nothing was corrected", False)
+            self.workspace.notified.emit(
+                "This frame is as it was found: nothing was corrected", False
+            )
         else:
             self.editor.back_to_automatic()
 
@@ -288,8 +290,8 @@ class DotsPage(Page):
         self.draw()
 
     def _type_row(self) -> None:
-        if why := self._lacking.get("Delete", ""):  # which needs as much
-            self.workspace.said.emit(why, True)
+        if why := self._unmet.get("Delete", ""):  # which needs as much
+            self.workspace.notified.emit(why, True)
         else:
             self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
 
@@ -442,7 +444,7 @@ class Hand(Tool):
             self._page.draw()
 
     def end(self, u: float, v: float) -> None:
-        """Let go: one step that can be undone, or a choice."""
+        """End the drag: one step that can be undone, or a selection."""
         if self._start is None:
             return
         start, self._start = self._start, None

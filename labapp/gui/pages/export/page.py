@@ -24,8 +24,8 @@ from labapp.gui.pages.export.presenter import (
     SIZES,
     USUAL,
     VIEWS,
-    Plan,
-    Wish,
+    ExportPlan,
+    ExportRequest,
     Written,
     folder_within,
     groups,
@@ -57,8 +57,8 @@ class ExportPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.wish = Wish()
-        self.plan: Plan | None = None
+        self.request = ExportRequest()
+        self.plan: ExportPlan | None = None
         self.written: Written | None = None
         self._writing: Task | None = None
         self._failed = ""
@@ -79,31 +79,31 @@ class ExportPage(Page):
         moved = self._in_view not in (None, frame)
         self._in_view = frame
         if moved:  # the frame in view is another one, and nothing else
-            if self.wish.which == "view":
+            if self.request.which == "view":
                 self._show_plan(session)
             return
         if not self.folder.value():
             self.folder.set_value(str(proposed_folder(session)))
         self.scheme.set_choices(schemes(session))
-        self.wish = replace(self.wish, scheme=self.scheme.value())
-        if len(session.frames) and not self.wish.last:
+        self.request = replace(self.request, scheme=self.scheme.value())
+        if len(session.frames) and not self.request.last:
             first, last = int(session.frames[0]), int(session.frames[-1])
-            self.wish = replace(self.wish, first=first, last=last)
+            self.request = replace(self.request, first=first, last=last)
             self.first.set_value(first)
             self.last.set_value(last)
         self._show_plan(session)
 
     def leave(self) -> None:
-        """Show everything anew when it comes back."""
+        """Refresh everything when the page comes back into view."""
         self._in_view = None
 
     def _show_plan(self, session: Session) -> None:
-        self.plan = made = plan(session, self.wish, self.workspace.frame)
+        self.plan = made = plan(session, self.request, self.workspace.frame)
         self.files.setText("\n".join(made.files) or "Nothing.")
         self.notes.setText("\n".join(made.notes))
-        self._boxes["solid"].setEnabled(self.wish.has_mesh)
-        part, drawn = self.wish.which == "part", self.wish.has_view
-        film = "film" in self.wish.some("pictures")
+        self._boxes["solid"].setEnabled(self.request.has_mesh)
+        part, drawn = self.request.which == "part", self.request.has_view
+        film = "film" in self.request.some("pictures")
         # Greyed, not hidden: what is below stays where it is.
         for fields, used in (
             ((self.first, self.last, self.every), part),
@@ -144,17 +144,19 @@ class ExportPage(Page):
         self.written = self.plan = self._in_view = None
         self._failed = ""
         self.folder.set_value("")
-        self.wish = replace(self.wish, scheme="", first=0, last=0)
+        self.request = replace(self.request, scheme="", first=0, last=0)
 
     # --- what the operator does ---------------------------------------------------------------
 
-    def _wish(self, **values: object) -> None:
-        self.wish = replace(self.wish, **values)  # type: ignore[arg-type]
+    def _change_request(self, **values: object) -> None:
+        self.request = replace(self.request, **values)  # type: ignore[arg-type]
         if self.workspace.session is not None:
             self._show_plan(self.workspace.session)
 
     def _ticked(self) -> None:
-        self._wish(ticked=frozenset(key for key, box in self._boxes.items() if box.isChecked()))
+        self._change_request(
+            ticked=frozenset(key for key, box in self._boxes.items() if box.isChecked())
+        )
 
     def choose_folder(self) -> None:
         """Ask for a folder; where it holds something else, a new one in it is taken."""
@@ -173,7 +175,7 @@ class ExportPage(Page):
 
     def export(self) -> None:
         """Write what is ticked, in the background."""
-        session, made, wish = self.workspace.session, self.plan, self.wish
+        session, made, request = self.workspace.session, self.plan, self.request
         if session is None or made is None or made.why_not:
             return
         folder = Path(self.folder.value() or proposed_folder(session)).expanduser()
@@ -182,12 +184,12 @@ class ExportPage(Page):
         frames = made.frames.tolist()
 
         def work(control: Control) -> Written:
-            return write(session, wish, frames, folder, control.progress)
+            return write(session, request, frames, folder, control.progress)
 
         def done(written: Written) -> None:
             if self.workspace.session is session:
                 self.written = written
-                self.workspace.said.emit(written.words, bool(written.problems))
+                self.workspace.notified.emit(written.words, bool(written.problems))
                 self._show_state()
 
         def failed(why: str) -> None:
@@ -206,7 +208,7 @@ class ExportPage(Page):
         if self.written is not None:
             folder = self.written.folder
             if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(folder))):
-                self.workspace.said.emit(f"The files are in {folder}", False)
+                self.workspace.notified.emit(f"The files are in {folder}", False)
 
     # --- the widgets --------------------------------------------------------------------------
 
@@ -262,15 +264,19 @@ class ExportPage(Page):
     def _make_panel(self) -> None:
         form = FieldForm()
         self.which = ChoiceField("Frames", WHICH, tooltip="Which frames to write")
-        self.which.edited.connect(lambda key: self._wish(which=key))
-        self.first = _whole("From frame", 0, "The first frame to write", "first", self._wish)
-        self.last = _whole("To frame", 0, "The last frame to write", "last", self._wish)
-        self.every = _whole("Every n-th", 1, "1: every frame; 2: every second", "every", self._wish)
+        self.which.edited.connect(lambda key: self._change_request(which=key))
+        self.first = _whole(
+            "From frame", 0, "The first frame to write", "first", self._change_request
+        )
+        self.last = _whole("To frame", 0, "The last frame to write", "last", self._change_request)
+        self.every = _whole(
+            "Every n-th", 1, "1: every frame; 2: every second", "every", self._change_request
+        )
         self.every.set_value(1)
         self.scheme = ChoiceField(
             "Results of", tooltip="The scheme whose results are written; others must be measured"
         )
-        self.scheme.edited.connect(lambda key: self._wish(scheme=key))
+        self.scheme.edited.connect(lambda key: self._change_request(scheme=key))
         self.spacing = NumberField(
             "Grid of surfaces",
             "mm",
@@ -280,9 +286,9 @@ class ExportPage(Page):
             decimals=2,
             tooltip="Distance of the surfaces' points: finer makes larger files",
         )
-        self.spacing.set_value(self.wish.spacing_mm)
+        self.spacing.set_value(self.request.spacing_mm)
         self.spacing.edited.connect(
-            lambda value: self._wish(spacing_mm=value) if value is not None else None
+            lambda value: self._change_request(spacing_mm=value) if value is not None else None
         )
         self._make_view_fields()
         for field in (self.which, self.first, self.last, self.every, self.scheme, self.spacing):
@@ -317,13 +323,13 @@ class ExportPage(Page):
         self.view = ChoiceField(
             "3-D seen", VIEWS, tooltip="Where pictures of surfaces and the film look from"
         )
-        self.view.edited.connect(lambda key: self._wish(view=key))
+        self.view.edited.connect(lambda key: self._change_request(view=key))
         sizes = [(f"{width}x{height}", f"{width} × {height} px") for width, height in SIZES]
         self.picture_size = ChoiceField(
             "Picture size", sizes, tooltip="Of pictures of surfaces and of the film"
         )
         self.picture_size.edited.connect(
-            lambda key: self._wish(size_px=tuple(int(side) for side in key.split("x")))
+            lambda key: self._change_request(size_px=tuple(int(side) for side in key.split("x")))
         )
         self.rate = NumberField(
             "Film",
@@ -335,10 +341,12 @@ class ExportPage(Page):
             tooltip="How fast the film runs; empty: as fast as the frames were recorded",
             optional=True,
         )
-        self.rate.edited.connect(lambda value: self._wish(film_rate_hz=value))
+        self.rate.edited.connect(lambda value: self._change_request(film_rate_hz=value))
 
 
-def _whole(label: str, lowest: int, tip: str, name: str, wish: Callable[..., None]) -> NumberField:
+def _whole(
+    label: str, lowest: int, tip: str, name: str, request: Callable[..., None]
+) -> NumberField:
     field = whole(label, lowest, tip)
-    field.edited.connect(lambda value: wish(**{name: value}) if value is not None else None)
+    field.edited.connect(lambda value: request(**{name: value}) if value is not None else None)
     return field

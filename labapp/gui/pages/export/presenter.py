@@ -130,7 +130,7 @@ USUAL = frozenset(
 
 
 @dataclass(frozen=True)
-class Wish:
+class ExportRequest:
     """What the operator wants to take along.
 
     Parameters
@@ -190,7 +190,7 @@ class Wish:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExportPlan:
     """What would be written.
 
     Parameters
@@ -217,20 +217,20 @@ class Plan:
     files: tuple[str, ...]
 
 
-def plan(session: Session, wish: Wish, frame: int) -> Plan:
+def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
     """What would be written, and whether it can be.
 
     Parameters
     ----------
-    session, wish
+    session, request
         Of what, and what of it.
     frame
         The frame in view.
     """
     own = scheme_name(session.settings)
-    scheme = wish.scheme or own
+    scheme = request.scheme or own
     seen = session.overview(scheme)
-    chosen = _chosen(seen.frame, wish, frame)
+    chosen = _chosen(seen.frame, request, frame)
     status = np.array(seen.status, dtype=object)
     measured = chosen & (status != "")
     stale = seen.frame[measured & seen.stale]
@@ -246,17 +246,17 @@ def plan(session: Session, wish: Wish, frame: int) -> Plan:
         notes.append(
             f"{pluralize(without, 'frame')} without a surface: in the tables with the reason."
         )
-    if "film" in wish.some("pictures") and surfaces:
-        notes.append(film_note(seen.frame[measured], seen.time_s[measured], wish.film_rate_hz))
+    if "film" in request.some("pictures") and surfaces:
+        notes.append(film_note(seen.frame[measured], seen.time_s[measured], request.film_rate_hz))
     frames = seen.frame[measured]
     again = np.union1d(stale, unmeasured) if scheme == own else np.zeros(0, np.int64)
-    return Plan(
+    return ExportPlan(
         scheme=scheme,
         frames=frames,
         again=np.asarray(again, np.int64),
-        why_not=_why_not(session, wish, scheme, frames, stale),
+        why_not=_why_not(session, request, scheme, frames, stale),
         notes=tuple(notes),
-        files=_files(wish, len(frames), surfaces),
+        files=_files(request, len(frames), surfaces),
     )
 
 
@@ -272,16 +272,20 @@ def film_note(frames: IntArray, time_s: FloatArray, rate_hz: float | None) -> st
     return told
 
 
-def _chosen(frames: IntArray, wish: Wish, frame: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    if wish.which == "view":
+def _chosen(
+    frames: IntArray, request: ExportRequest, frame: int
+) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    if request.which == "view":
         return np.asarray(frames == frame)
-    if wish.which == "part":
-        step = (frames - wish.first) % max(1, wish.every) == 0
-        return np.asarray((frames >= wish.first) & (frames <= wish.last) & step)
+    if request.which == "part":
+        step = (frames - request.first) % max(1, request.every) == 0
+        return np.asarray((frames >= request.first) & (frames <= request.last) & step)
     return np.ones(len(frames), bool)
 
 
-def _why_not(session: Session, wish: Wish, scheme: str, frames: IntArray, stale: IntArray) -> str:
+def _why_not(
+    session: Session, request: ExportRequest, scheme: str, frames: IntArray, stale: IntArray
+) -> str:
     if not len(frames):
         return f"None of these frames is measured by {_named(scheme)}: measure them first."
     if len(stale):
@@ -291,35 +295,35 @@ def _why_not(session: Session, wish: Wish, scheme: str, frames: IntArray, stale:
             f"{pluralize(len(stale), 'frame')} no longer stand{'s' * (len(stale) == 1)}, "
             f"because {why}. Measure again, or undo the change."
         )
-    if not wish.ticked - {"solid"}:
+    if not request.ticked - {"solid"}:
         return "Tick what you want to take along."
     missing = session.missing_recording
-    if "frames" in wish.some("pictures") and missing is not None:
+    if "frames" in request.some("pictures") and missing is not None:
         return f"Pictures of frames need the recording, and {missing.name} is not where it was."
     return ""
 
 
-def _files(wish: Wish, count: int, surfaces: int) -> tuple[str, ...]:
+def _files(request: ExportRequest, count: int, surfaces: int) -> tuple[str, ...]:
     if not count:
         return ()
     lines = [f"{name}.csv" for name in ("measures", "dots", "points", "boundary")]
-    lines = [line for line in lines if line.removesuffix(".csv") in wish.some("tables")]
-    formats = wish.some("surfaces")
+    lines = [line for line in lines if line.removesuffix(".csv") in request.some("tables")]
+    formats = request.some("surfaces")
     many = [each.end for name, each in SURFACE_FORMATS.items() if name in formats]
-    if "surfaces" in wish.some("pictures"):
+    if "surfaces" in request.some("pictures"):
         many.append(".png")
     lines += [f"surface_NNNNNN{end}, {surfaces} of them" for end in many if surfaces]
-    if wish.choice().solid and surfaces:
+    if request.choice().solid and surfaces:
         lines.append(f"the same as solids, {surfaces} of each format")
-    if "frames" in wish.some("pictures"):
+    if "frames" in request.some("pictures"):
         lines.append(f"frame_NNNNNN.png, {count} of them")
-    if "trends" in wish.some("pictures"):
+    if "trends" in request.some("pictures"):
         lines.append(TREND_FILE)
-    if "film" in wish.some("pictures") and surfaces:
+    if "film" in request.some("pictures") and surfaces:
         lines.append(FILM_FILE)
-    whole = wish.some("together")
+    whole = request.some("together")
     lines += [each.file for name, each in RUN_FORMATS.items() if name in whole]
-    lines += [REPORT_FILE] * ("report" in wish.ticked)
+    lines += [REPORT_FILE] * ("report" in request.ticked)
     return (*lines, f"{MANIFEST}: source, set-up, versions, every file with its SHA-256")
 
 
@@ -383,7 +387,7 @@ class Written:
 
 def write(
     session: Session,
-    wish: Wish,
+    request: ExportRequest,
     frames: Sequence[int],
     folder: Path,
     progress: Progress,
@@ -393,10 +397,10 @@ def write(
     with threadpool_limits(limits=1, user_api="blas"):
         files = session.export(
             folder,
-            wish.choice(),
+            request.choice(),
             frames=frames,
-            scheme=wish.scheme or None,
-            report="report" in wish.ticked,
+            scheme=request.scheme or None,
+            report="report" in request.ticked,
             progress=progress,
         )
     return Written(folder, files, tuple(verify_export(folder)))

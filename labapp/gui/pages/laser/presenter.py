@@ -54,7 +54,7 @@ class Readings:
 
 
 @dataclass(frozen=True)
-class Result:
+class LaserResult:
     """What follows from readings.
 
     Parameters
@@ -102,7 +102,7 @@ def kept(session: Session) -> Readings | None:
     return Readings(lengths, calibration.fan_angle_deg)
 
 
-def result(readings: Readings) -> Result:
+def result(readings: Readings) -> LaserResult:
     """The laser that follows from readings, or why none does."""
     spread = tuple(
         _mean_row(name, meaning, np.array(lengths, float))
@@ -110,13 +110,13 @@ def result(readings: Readings) -> Result:
     )
     missing = [name for name, found in zip(NAMES, readings.lengths_mm, strict=True) if not found]
     if readings.wrong:
-        return Result(None, "; ".join(readings.wrong), spread)
+        return LaserResult(None, "; ".join(readings.wrong), spread)
     if missing:
-        return Result(None, f"Enter at least one reading of {', '.join(missing)}", spread)
+        return LaserResult(None, f"Enter at least one reading of {', '.join(missing)}", spread)
     try:
         found = calibrate_laser(*readings.lengths_mm, readings.fan_angle_deg)
     except ValueError as error:
-        return Result(None, _spoken(str(error)), spread)
+        return LaserResult(None, _spoken(str(error)), spread)
     check = ResultRow(
         "l₁ that follows", found.expected_l1_mm, unit="mm", note="From l₂, l₃ and the fan angle"
     )
@@ -126,7 +126,7 @@ def result(readings: Readings) -> Result:
         ResultRow("Height", found.height_mm, found.height_sigma_mm, "mm"),
         ResultRow("Horizontal distance", found.horizontal_mm, found.horizontal_sigma_mm, "mm"),
     )
-    return Result(found, "", (*spread, check, *rows))
+    return LaserResult(found, "", (*spread, check, *rows))
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:

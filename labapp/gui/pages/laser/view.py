@@ -110,7 +110,9 @@ class LaserPage(Page):
         if self.workspace.attempt(
             lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture)
         ):
-            self.workspace.said.emit("The laser is in the rig; undo brings the former back", False)
+            self.workspace.notified.emit(
+                "The laser is in the rig; undo brings the former back", False
+            )
 
     # --- the panel --------------------------------------------------------------------------
 

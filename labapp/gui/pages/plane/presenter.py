@@ -93,7 +93,7 @@ def places(found: PlaneCalibration) -> tuple[Place, Place, Place]:
 
 
 @dataclass(frozen=True)
-class Result:
+class PlaneResult:
     """What follows from the points and the marks.
 
     Parameters
@@ -111,20 +111,20 @@ class Result:
     warnings: tuple[str, ...] = ()
 
 
-def result(found: PlaneCalibration | None) -> Result:
+def result(found: PlaneCalibration | None) -> PlaneResult:
     """Scales, angle and their ± of a calibration, and what is wrong with it."""
     if found is None:
-        return Result(why_not="Load a picture of the target first")
+        return PlaneResult(why_not="Load a picture of the target first")
     try:
         _ = found.image_calibration
     except ValueError as error:
-        return Result(why_not=str(error))
+        return PlaneResult(why_not=str(error))
     waiting = [
         name for name, sigma in zip(POINTS, found.sigma_px, strict=True) if sigma == UNPLACED
     ]
     if waiting:
         are = "it is" if len(waiting) == 1 else "they are"
-        return Result(why_not=f"Drag {' and '.join(waiting)} to where {are} in the picture")
+        return PlaneResult(why_not=f"Drag {' and '.join(waiting)} to where {are} in the picture")
     values = (*found.px_per_mm, found.angle_deg)
     sigmas = found.scales_and_angle_sigma.tolist()
     units = (("Scale along O′X′", "px/mm"), ("Scale along O′Z′", "px/mm"), ("Angle", "°"))
@@ -143,7 +143,7 @@ def result(found: PlaneCalibration | None) -> Result:
         warnings.append("The two scales differ by more than a camera in front of the plane sees")
     if abs(angle - 90) > DESIGN.angle_tolerance_deg:
         warnings.append(f"The axes are {angle:.0f}° apart, which should be about 90°")
-    return Result(tuple(rows), "", tuple(warnings))
+    return PlaneResult(tuple(rows), "", tuple(warnings))
 
 
 def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:

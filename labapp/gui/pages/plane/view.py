@@ -133,7 +133,7 @@ class PlanePage(Page):
         if self.workspace.attempt(
             lambda session: session.use_plane(found, unit, image, self._name)
         ):
-            self.workspace.said.emit(
+            self.workspace.notified.emit(
                 "The imaging plane is in use; undo brings the former back", False
             )
 
@@ -229,8 +229,8 @@ class PlanePage(Page):
 
     def save_target(self, path: Path) -> None:
         """Write the target for the printer."""
-        if self.workspace.tried(lambda: write_file(path, target_svg(Target()).encode())):
-            self.workspace.said.emit(f"Target saved as {path.name}: print it at 100 %", False)
+        if self.workspace.run_or_report(lambda: write_file(path, target_svg(Target()).encode())):
+            self.workspace.notified.emit(f"Target saved as {path.name}: print it at 100 %", False)
 
     # --- the picture ------------------------------------------------------------------------
 
@@ -278,7 +278,7 @@ class PlanePage(Page):
             self._place(replace(self.found, model=model))
 
     def _show_residuals(self) -> None:
-        """Draw the residual map anew."""
+        """Redraw the residual map."""
         for item in self._residuals:
             self.view.remove(item)
         self._residuals = []

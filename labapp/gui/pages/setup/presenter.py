@@ -237,7 +237,7 @@ SAFETY: tuple[tuple[str, str], ...] = (
 
 
 @dataclass(frozen=True)
-class Shown:
+class SetupState:
     """What the page shows.
 
     Parameters
@@ -258,7 +258,7 @@ class Shown:
     record: Record
 
 
-def shown(session: Session) -> Shown:
+def shown(session: Session) -> SetupState:
     """What the page shows of a session."""
     sections: dict[str, Any] = tomllib.loads(session.setup_text)
     keys = [entry.key for _, entries in RIG for entry in entries]
@@ -278,7 +278,7 @@ def shown(session: Session) -> Shown:
             others.append("The imaging plane is not calibrated: that is step 3.")
         else:
             others.append(f"{problem.field}: {words}")
-    return Shown(values, problems, tuple(dict.fromkeys(others)), session.record)
+    return SetupState(values, problems, tuple(dict.fromkeys(others)), session.record)
 
 
 def _number(sections: dict[str, Any], key: str) -> float | None:
@@ -302,7 +302,7 @@ def rig(session: Session) -> Rig | None:
 
 
 @dataclass(frozen=True)
-class Bench:
+class BenchState:
     """The bench from the side.
 
     Parameters
@@ -320,11 +320,13 @@ class Bench:
     rows: tuple[ResultRow, ...] = ()
 
 
-def bench(session: Session) -> Bench:
+def bench(session: Session) -> BenchState:
     """The bench as it is set up, with the pool that is expected."""
     found, record = rig(session), session.record
     if found is None:
-        return Bench(None, "The drawing appears when laser, pattern, torch and plane are entered.")
+        return BenchState(
+            None, "The drawing appears when laser, pattern, torch and plane are entered."
+        )
     size = (
         record.expected_width_mm or USUAL_WIDTH_MM,
         record.expected_length_mm or USUAL_LENGTH_MM,
@@ -333,7 +335,7 @@ def bench(session: Session) -> Bench:
     try:
         view = side_view(found, *size)
     except ValueError as error:
-        return Bench(None, f"There is no such pool: {error}.")
+        return BenchState(None, f"There is no such pool: {error}.")
     tally, room = view.tally, view.clearance
     width, length, height = size
     given = None not in (record.expected_width_mm, record.expected_length_mm)
@@ -353,7 +355,7 @@ def bench(session: Session) -> Bench:
         ResultRow("Least plane distance", room.least_plane_mm, unit="mm", decimals=1, note=REACH),
         ResultRow("Most plane distance", room.most_plane_mm, unit="mm", decimals=1, note=REACH),
     )
-    return Bench(view, words, rows)
+    return BenchState(view, words, rows)
 
 
 REACH = "The plane catches the steepest ray that passes the torch between these two (Eq. 4-16)"

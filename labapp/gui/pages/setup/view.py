@@ -105,7 +105,7 @@ class SetupPage(Page):
             "Loading",
             self.refused.setText,
         ):
-            self.workspace.said.emit(f"Set-up loaded from {path.name}", False)
+            self.workspace.notified.emit(f"Set-up loaded from {path.name}", False)
 
     def save(self, path: Path) -> None:
         """Write the setup to a file."""
@@ -113,8 +113,10 @@ class SetupPage(Page):
         if session is None:
             return
         content = session.setup_text.encode()
-        if self.workspace.tried(lambda: write_file(path, content), "Saving", self.refused.setText):
-            self.workspace.said.emit(f"Set-up saved as {path.name}", False)
+        if self.workspace.run_or_report(
+            lambda: write_file(path, content), "Saving", self.refused.setText
+        ):
+            self.workspace.notified.emit(f"Set-up saved as {path.name}", False)
 
     # --- within -----------------------------------------------------------------------------
 
@@ -187,7 +189,7 @@ class SetupPage(Page):
             button(
                 "Advise …",
                 "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
-                lambda: self.workspace.asked.emit("adviser"),
+                lambda: self.workspace.action_requested.emit("adviser"),
             )
         )
         self.table = ResultTable("What the bench lets through")

@@ -1,4 +1,4 @@
-"""What is told of two schemes, computed from the session. Without Qt."""
+"""The comparison of two schemes, computed from the session. Without Qt."""
 
 from __future__ import annotations
 

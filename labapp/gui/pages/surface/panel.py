@@ -10,7 +10,7 @@ from labapp.gui.pages.surface.presenter import (
     CORRESPONDENCES,
     SCHEME_CHOICES,
     SCHEMES,
-    Shown,
+    SurfaceState,
     with_scheme,
 )
 from labapp.gui.shell.steps import why_not_measurable
@@ -56,7 +56,7 @@ class SurfacePanel:
         self.status, self.provenance, self.verdict = (wrapping_label() for _ in range(3))
         self.status.setAccessibleName("How this frame stands")
         self.again = button(
-            "Measure &again", "Measure this frame anew: its figures no longer stand", self.this_one
+            "Measure &again", "Measure this frame again: its figures are out of date", self.this_one
         )
         self.sizes = ResultTable("Size of the pool")
         self.errors = ResultTable("Reflection errors")
@@ -81,7 +81,7 @@ class SurfacePanel:
             "Measure every frame that is not measured, or no longer stands (F5)",
             self.not_measured,
         )
-        self.all = button("A&ll frames", "Measure every frame anew", self.all_frames)
+        self.all = button("A&ll frames", "Measure every frame again", self.all_frames)
         self.progress = QProgressBar()
         self.progress.setAccessibleName("How far the measurement is")
         self.progress.setToolTip("How far the measurement is")
@@ -97,15 +97,15 @@ class SurfacePanel:
 
     # --- what is shown -----------------------------------------------------------------------
 
-    def show(self, told: Shown) -> None:
-        """Show what is told of the frame in view, and what the session's settings are."""
+    def show(self, told: SurfaceState) -> None:
+        """Show the state of the frame in view and the session's settings."""
         session = self.workspace.session
         if session is None:
             return
         settings = session.settings
         self.scheme.set_value(scheme_name(settings))
         self.correspondence.set_value(settings.correspondence)
-        remedy = " Its dots can be put right in step 5." if told.state == "failed" else ""
+        remedy = " Its dots can be corrected in step 5." if told.state == "failed" else ""
         self.status.setText(f"{SIGNS[told.state]} {told.words}{remedy}")
         self.again.setVisible(told.state == "stale")
         self.provenance.setText(told.provenance)
@@ -151,7 +151,7 @@ class SurfacePanel:
         self._show_progress()
 
     def all_frames(self) -> None:
-        """Measure every frame anew."""
+        """Measure every frame again."""
         if self.workspace.session is not None:
             self._task = self.workspace.measure(self.workspace.session.frames.tolist())
             self._show_progress()

@@ -55,7 +55,7 @@ ERRORS = (
         "ARE of the scheme's own points, as in the dissertation: the boundary is not in it",
     ),
 )
-"""Words, value in `Measures`, and what it is; the last is told where the scheme gives it."""
+"""Words, value in `Measures`, and what it is; the last is shown where the scheme gives it."""
 
 SIGMA, NO_SIGMA = f"±: one σ, {SIGMA_OF}", "This scheme gives no ±"
 
@@ -98,8 +98,8 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What is told of one frame.
+class SurfaceState:
+    """What the page shows of one frame.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ class Shown:
         return None if self.result is None else self.result.measurement.reconstruction
 
 
-def shown(session: Session, frame: int) -> Shown:
+def shown(session: Session, frame: int) -> SurfaceState:
     """What to tell of a frame by the scheme that the settings choose.
 
     Raises
@@ -143,13 +143,15 @@ def shown(session: Session, frame: int) -> Shown:
         If what the session holds is damaged.
     """
     if not len(session.frames):
-        return Shown(None, "unmeasured", "There are no frames yet: import a recording first.")
+        return SurfaceState(
+            None, "unmeasured", "There are no frames yet: import a recording first."
+        )
     result = session.result(frame)
     if result is None:
         scheme = SCHEMES[scheme_name(session.settings)].title
-        return Shown(None, "unmeasured", f"Frame {frame} is not measured by {scheme} yet.")
+        return SurfaceState(None, "unmeasured", f"Frame {frame} is not measured by {scheme} yet.")
     measurement = result.measurement
-    told = Shown(
+    told = SurfaceState(
         result,
         *_state(result),
         provenance=provenance(result),

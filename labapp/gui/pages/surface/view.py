@@ -41,7 +41,7 @@ from labapp.gui.pages.surface.compare import CompareView
 from labapp.gui.pages.surface.panel import SurfacePanel
 from labapp.gui.pages.surface.presenter import (
     Options,
-    Shown,
+    SurfaceState,
     height_limits,
     reflected_dots,
     rig_of,
@@ -81,7 +81,7 @@ class SurfacePage(Page):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
         self.options = Options()
-        self.told = Shown(None, "unmeasured", "")
+        self.told = SurfaceState(None, "unmeasured", "")
         self.view = make_view3d("The pool in 3-D")
         self.dots, self.plan, self.profile = DotsChart(), PlanChart(), ProfileChart()
         self.plan.setMinimumWidth(LEAST_PLAN_WIDTH)
@@ -96,7 +96,9 @@ class SurfacePage(Page):
         self.stack = QStackedWidget()
         self.stack.addWidget(self._single())
         self.stack.addWidget(self.compare)
-        self.steering = Steering(self._steered, lambda told: workspace.said.emit(told, False), self)
+        self.steering = Steering(
+            self._steered, lambda told: workspace.notified.emit(told, False), self
+        )
         self.canvas_layout.addWidget(self._tools())
         self.canvas_layout.addWidget(self.stack, 1)
 
@@ -234,7 +236,7 @@ class SurfacePage(Page):
         try:
             self.told = shown(session, self.workspace.frame)
         except InputError as error:
-            self.told = Shown(None, "failed", str(error))
+            self.told = SurfaceState(None, "failed", str(error))
         self.side.show(self.told)
         self._show_options()
         if self.stack.currentWidget() is self.compare:
@@ -256,7 +258,7 @@ class SurfacePage(Page):
     def copy_picture(self) -> None:
         """Put the picture on the clipboard."""
         QGuiApplication.clipboard().setPixmap(self.picture())
-        self.workspace.said.emit("The picture is on the clipboard", False)
+        self.workspace.notified.emit("The picture is on the clipboard", False)
 
     def save_picture(self) -> None:
         """Ask for a file and write the picture to it."""
@@ -270,7 +272,7 @@ class SurfacePage(Page):
         path = path if path.suffix.lower() == ".png" else path.with_name(path.name + ".png")
         written = self.picture().save(str(path), "PNG")
         words = f"{path.name} is written" if written else f"{path} cannot be written"
-        self.workspace.said.emit(words, not written)
+        self.workspace.notified.emit(words, not written)
 
     def _show_surface(self) -> None:
         result, seen = self.told.result, self.workspace.overview()

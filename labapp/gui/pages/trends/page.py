@@ -18,7 +18,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.pages.page import Page
-from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, Shown, Wish, show
+from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, TrendOptions, TrendsState, show
 from labapp.gui.tasks import Control
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.widgets.buttons import button, button_row
@@ -40,8 +40,8 @@ class TrendsPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.wish = Wish()
-        self.shown: Shown | None = None
+        self.options = TrendOptions()
+        self.shown: TrendsState | None = None
         self._boxes: dict[str, QCheckBox] = {}
         self._in_view: int | None = None
         self._last_folder = Path()
@@ -72,7 +72,7 @@ class TrendsPage(Page):
             self._mark(frame)
             return
         self._in_view = frame
-        self.shown = shown = show(session, self.wish, self.workspace.overview())
+        self.shown = shown = show(session, self.options, self.workspace.overview())
         self.plots.show_curves(shown.curves, shown.axis)
         self._mark(frame)
         self.plots.setVisible(bool(shown.curves))
@@ -89,7 +89,7 @@ class TrendsPage(Page):
         self.plots.set_current(frame, None if self.shown is None else self.shown.places.get(frame))
 
     def leave(self) -> None:
-        """Show everything anew when it comes back."""
+        """Refresh everything when the page comes back into view."""
         self._in_view = None
 
     def picture(self) -> QPixmap:
@@ -109,13 +109,13 @@ class TrendsPage(Page):
 
     # --- what the operator does ---------------------------------------------------------------
 
-    def _wish(self, **values: object) -> None:
-        self.wish = replace(self.wish, **values)  # type: ignore[arg-type]
+    def _set_options(self, **values: object) -> None:
+        self.options = replace(self.options, **values)  # type: ignore[arg-type]
         self._in_view = None
         self.refresh()
 
     def _chosen(self) -> None:
-        self._wish(shown=tuple(key for key, box in self._boxes.items() if box.isChecked()))
+        self._set_options(shown=tuple(key for key, box in self._boxes.items() if box.isChecked()))
 
     def choose_signals(self) -> None:
         """Ask for a table with current and voltage."""
@@ -153,7 +153,7 @@ class TrendsPage(Page):
             return found
 
         def done(kept: Signals) -> None:
-            self.workspace.said.emit(f"{kept.file}: {len(kept.time_s)} samples", False)
+            self.workspace.notified.emit(f"{kept.file}: {len(kept.time_s)} samples", False)
             if self.workspace.session is session:
                 self.workspace.changed.emit()
 
@@ -186,7 +186,7 @@ class TrendsPage(Page):
             "Mean, deviation, range and spectrum are of the frames that do not stand out from "
             "their neighbours by size or ARE; open circles mark those that do"
         )
-        self.without.toggled.connect(lambda on: self._wish(without_doubtful=on))
+        self.without.toggled.connect(lambda on: self._set_options(without_doubtful=on))
         layout.addWidget(self.without)
         layout.addLayout(
             button_row(
@@ -220,7 +220,7 @@ class TrendsPage(Page):
         self.panel_layout.addWidget(heading("Spectrum"))
         choices = [("", "none"), *((q.key, q.label) for q in QUANTITIES)]
         self.of = ChoiceField("Spectrum of", choices, tooltip="Shows oscillations of a measure")
-        self.of.edited.connect(lambda key: self._wish(spectrum_of=key))
+        self.of.edited.connect(lambda key: self._set_options(spectrum_of=key))
         self.panel_layout.addLayout(_labelled(self.of))
         self.spectrum_words = Message(2)
         self.panel_layout.addWidget(self.spectrum_words)

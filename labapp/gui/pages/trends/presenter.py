@@ -29,7 +29,7 @@ SIGNALS = {"current": ("Current", "A"), "voltage": ("Voltage", "V")}
 
 
 @dataclass(frozen=True)
-class Wish:
+class TrendOptions:
     """What the operator wants to see.
 
     Parameters
@@ -48,7 +48,7 @@ class Wish:
 
 
 @dataclass(frozen=True)
-class Shown:
+class TrendsState:
     """What the page shows.
 
     Parameters
@@ -80,25 +80,25 @@ class Shown:
     signals_words: str
 
 
-def show(session: Session, wish: Wish, seen: Overview | None = None) -> Shown:
+def show(session: Session, options: TrendOptions, seen: Overview | None = None) -> TrendsState:
     """What to show of a session; ``seen`` is its overview, if it is at hand."""
     seen, signals = seen or session.overview(), session.signals
     doubtful = doubtful_frames(seen)
 
     def course_of(key: str) -> Trend:
-        return trend(seen, key, wish.without_doubtful, doubtful)
+        return trend(seen, key, options.without_doubtful, doubtful)
 
-    courses = [course_of(key) for key in BY_KEY if key in wish.shown]
+    courses = [course_of(key) for key in BY_KEY if key in options.shown]
     timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
     at = seen.time_s if timed else seen.frame.astype(float)
     span = (float(at.min()), float(at.max())) if len(at) else None
     axis = Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span)
     curves = [_curve(course) for course in courses if len(course.frame)]
     if signals is not None and timed:
-        curves += _signal_curves(signals, seen, wish.shown)
-    of = course_of(wish.spectrum_of) if wish.spectrum_of in BY_KEY else None
+        curves += _signal_curves(signals, seen, options.shown)
+    of = course_of(options.spectrum_of) if options.spectrum_of in BY_KEY else None
     found, spectrum_axis, told = _spectrum(of, timed)
-    return Shown(
+    return TrendsState(
         curves=tuple(curves),
         axis=axis,
         places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
