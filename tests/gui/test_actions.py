@@ -4,8 +4,7 @@ from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
 
-from labapp.gui.shell.action import MENUS
-from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.actions import ACTIONS, MENUS
 from labapp.gui.shell.commands import commands
 from labapp.gui.shell.help import TEXTS, keys
 from labapp.gui.shell.steps import STEPS

@@ -17,7 +17,7 @@ import pytest
 
 import labapp
 from labapp.gui.pages import PAGES
-from labapp.gui.shell.action import MENUS
+from labapp.gui.shell.actions import MENUS
 from labapp.gui.shell.help import TITLES
 from labapp.gui.tools import TOOLS
 from tests.screen import screen

@@ -12,8 +12,7 @@ from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
 
-from labapp.gui.shell.action import MENUS
-from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.actions import ACTIONS, MENUS
 from labapp.gui.shell.standing import FrameStatus
 from labapp.gui.shell.steps import STEPS
 from labapp.log import log_file

@@ -10,7 +10,7 @@ from PySide6.QtCore import QKeyCombination, Qt
 from PySide6.QtGui import QAction, QActionGroup, QKeyEvent, QKeySequence
 from PySide6.QtWidgets import QMainWindow, QMenu
 
-from labapp.gui.shell.action import MENUS, Action, Needs
+from labapp.gui.shell.actions import MENUS, Action, Needs
 from labapp.gui.widgets.labels import plain_tip
 
 if TYPE_CHECKING:

@@ -25,8 +25,7 @@ from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.welcome import Welcome
 from labapp.gui.preferences import THEMES, PreferencesStore
-from labapp.gui.shell.action import Needs
-from labapp.gui.shell.actions import ACTIONS
+from labapp.gui.shell.actions import ACTIONS, Needs
 from labapp.gui.shell.files import Files, title
 from labapp.gui.shell.focus import finish_edit
 from labapp.gui.shell.menus import Menus, steps_of
