@@ -100,12 +100,12 @@ def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", 
     return "discard" if box.clickedButton() is discard else "go on"
 
 
-def new_path(folder: Path, stem: str) -> Path:
-    """A name for a session that is not taken yet."""
-    path, number = folder / f"{stem}{SUFFIX}", 1
+def new_path(folder: Path, stem: str, suffix: str = SUFFIX) -> Path:
+    """A path that does not exist yet, for a session, or for a folder (no suffix)."""
+    path, number = folder / f"{stem}{suffix}", 1
     while path.exists():
         number += 1
-        path = folder / f"{stem} {number}{SUFFIX}"
+        path = folder / f"{stem} {number}{suffix}"
     return path
 
 

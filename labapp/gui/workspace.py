@@ -121,24 +121,6 @@ class Workspace(QObject):
         self.opened.emit()
         self.changed.emit()
 
-    def open(self, path: Path, read_only: bool = False) -> bool:
-        """Open a session file; False if it was refused, which is said."""
-        from labapp.session.session import Session
-
-        session = self.run_or_report(lambda: Session.open(path, read_only))
-        if session is not None:
-            self.show(session)
-        return session is not None
-
-    def create(self, path: Path) -> bool:
-        """Make a new session file and open it; False if it was refused, which is said."""
-        from labapp.session.session import Session
-
-        session = self.run_or_report(lambda: Session.create(path))
-        if session is not None:
-            self.show(session)
-        return session is not None
-
     def close(self) -> None:
         """Stop all work and close the session: the window goes."""
         if "foot_switches" in vars(self):
@@ -258,14 +240,19 @@ class Workspace(QObject):
             self.frame = number
             self.frame_changed.emit(number)
 
-    def measure(self, frames: Sequence[int] | None = None) -> Task | None:
+    @property
+    def measuring(self) -> Task | None:
+        """The measuring under way; None if there is none."""
+        return next((task for task in self.tasks.active if task.title == MEASURING), None)
+
+    def measure(self, frames: Sequence[int] | None = None) -> None:
         """Measure frames in the background; None: those not measured, or stale.
 
         Frames that are kept make `measured` go out; that in view, and the last, `changed`.
         """
         session = self.session
         if session is None:
-            return None
+            return
         if self._pool is None:
             from labapp.run.measurers import measuring_pool
 
@@ -302,9 +289,7 @@ class Workspace(QObject):
                 self._overview = seen
                 self.measured.emit()
 
-        task = self.tasks.start(MEASURING, work, finished, kept)
-        self._measuring.append(task)
-        return task
+        self._measuring.append(self.tasks.start(MEASURING, work, finished, kept))
 
     def _show_end(self) -> None:
         """Have everything shown that was kept, however the measuring has ended."""

@@ -287,7 +287,8 @@ def take_in(window: MainWindow, recording: Path, frames: int) -> None:
 def watch(window: MainWindow, part: Sequence[int], most: int) -> int:
     """Measure frames, at most so many, while others are looked at; how many were kept."""
     space = window.workspace
-    task = space.measure(part)
+    space.measure(part)
+    task = space.measuring
     assert task is not None
     looked = 0
     while task in space.tasks.active:
@@ -351,7 +352,7 @@ def main(arguments: Sequence[str]) -> None:
         assert isinstance(app, QApplication)
         idle(folder)
         window = new_window(folder)
-        window.workspace.create(folder / "large.labsession")
+        window.workspace.show(Session.create(folder / "large.labsession"))
         session = window.workspace.session
         assert session is not None
         if "import" in parts:

@@ -57,6 +57,7 @@ from labapp.media.recording.recorder import Recorder
 from labapp.media.recording.take_files import Take
 from labapp.run.live_measuring import LiveMeasuring
 from labapp.session.samples import sample_folder
+from labapp.session.session import Session
 
 LEAST_UPDATES = 20.0
 """Of the window, a second, in every minute."""
@@ -236,7 +237,7 @@ class Run:
         self.window.show()
         self.log: Any = self.window.log_panel
         self.log.model().rowsInserted.connect(self._hear)
-        self.window.workspace.open(folder / "run" / "gtaw.labsession")
+        self.window.workspace.show(Session.open(folder / "run" / "gtaw.labsession"))
         self.window.show_step("capture")
         self.page: Any = self.window.page
         self.view = self.page.live_view

@@ -64,7 +64,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
     app = start_app()
     window = make_window(Preferences(), path.with_name("preferences.json"))
     window.show()
-    window.workspace.open(path)
+    window.workspace.show(Session.open(path))
     session = window.workspace.session
     assert session is not None
 

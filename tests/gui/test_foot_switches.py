@@ -26,6 +26,7 @@ from labapp.media.cameras import SimulatedDevice
 from labapp.media.devices import foot_switch, hid
 from labapp.media.devices.foot_switch import PedalMap
 from labapp.media.devices.hid import HidInfo
+from labapp.session.session import Session
 from tests.gui.conftest import KEPT, CopySample, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
@@ -197,7 +198,7 @@ def test_pedals_act_on_the_live_recording_whatever_page_is_in_view(
     film = SimulatedDevice("test", lambda k: np.full((24, 32), k % 200, np.uint8), rate_hz=100)
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
     window = start(LEARNED)
-    assert window.workspace.create(tmp_path / "new.labsession")
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
     qtbot.waitUntil(connected(window))
     window.show_step("capture")
     view = window.page.live_view

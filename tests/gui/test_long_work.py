@@ -39,7 +39,7 @@ def recording(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def session(window: MainWindow, tmp_path: Path) -> Session:
-    assert window.workspace.create(tmp_path / "long.labsession")
+    window.workspace.show(Session.create(tmp_path / "long.labsession"))
     made = window.workspace.session
     assert made is not None
     made.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))

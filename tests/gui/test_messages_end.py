@@ -13,6 +13,7 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.pages.export import page as export_page
 from labapp.gui.pages.setup.view import BENCH_TAB
 from labapp.gui.shell.window import MainWindow
+from labapp.session.session import Session
 from tests.gui.conftest import CopySample, let_draw
 from tests.gui.hand import Hand
 
@@ -108,7 +109,7 @@ def test_an_incomplete_set_up_is_forgotten_when_frames_are_measured(
 ):
     sample = opened.workspace.session
     whole, recording = sample.setup_text, sample.path.parent / "recording.tif"
-    assert opened.workspace.create(tmp_path / "new.labsession")
+    opened.workspace.show(Session.create(tmp_path / "new.labsession"))
     assert opened.workspace.attempt(lambda session: session.import_recording(recording))
     opened.measure_frame()
     assert "not complete" in opened.status_line.message.text()

@@ -32,6 +32,7 @@ from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.help import guide, keys
+from labapp.session.session import Session
 from tests.tour import way
 
 
@@ -49,7 +50,7 @@ sys.modules["labapp.gui.pages.toy"] = module
 
 window = make_window(Preferences(theme="light"), Path(sys.argv[1]))
 window.show()
-window.workspace.open(Path(sys.argv[2]))
+window.workspace.show(Session.open(Path(sys.argv[2])))
 action = window.menus.actions["step_toy"]
 action.trigger()
 panel, listed = window.side_panel, window.step_list

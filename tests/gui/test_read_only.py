@@ -8,6 +8,7 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.shell.steps import READ_ONLY, STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import ChoiceField, Field, NumberField
+from labapp.session.session import Session
 from tests.gui.conftest import CopySample
 
 
@@ -28,7 +29,7 @@ def enter_something(field: Field) -> None:
 def test_what_can_be_entered_is_taken(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ) -> None:
-    assert window.workspace.open(copy_sample("gtaw"), read_only=True)
+    window.workspace.show(Session.open(copy_sample("gtaw"), read_only=True))
     said: list[str] = []
     window.workspace.notified.connect(lambda words, problem: said.append(words))
     entered = 0
@@ -52,7 +53,7 @@ def test_what_is_locked_says_why_and_is_free_in_the_next_session(
     window: MainWindow, copy_sample: CopySample
 ) -> None:
     path = copy_sample("gtaw")
-    assert window.workspace.open(path)
+    window.workspace.show(Session.open(path))
     window.show_step("setup")
     page = window.page
     height, notes = page.rig_fields["electrode.height_mm"], page.record_fields["notes"]
@@ -61,7 +62,7 @@ def test_what_is_locked_says_why_and_is_free_in_the_next_session(
     assert window.menus.actions["measure"].isEnabled()
     assert not window.side_panel.read_only.isVisible()
 
-    assert window.workspace.open(path, read_only=True)
+    window.workspace.show(Session.open(path, read_only=True))
     window.show_step("setup")
     for each in (height.editor, notes.editor, tick):
         assert each.toolTip() == READ_ONLY
@@ -76,7 +77,7 @@ def test_what_is_locked_says_why_and_is_free_in_the_next_session(
     assert not window.page.side.one.isEnabled()
     assert READ_ONLY in window.page.side.one.toolTip()
 
-    assert window.workspace.open(path)
+    window.workspace.show(Session.open(path))
     window.show_step("setup")
     assert height.editor.isEnabled()
     assert tick.isEnabled()

@@ -21,6 +21,7 @@ from labapp.gui.pages.setup.view import BENCH_TAB, SAFETY_TAB
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field
 from labapp.gui.widgets.labels import Message
+from labapp.session.session import Session
 from tests.gui.conftest import CopySample, let_draw
 
 LONG = "words that need more room than there is on a line, and on the next one, too; " * 4
@@ -116,7 +117,7 @@ def test_seven_clicks_tick_the_seven_lines_of_the_safety_list(
     window: MainWindow, tmp_path, qtbot: QtBot
 ):
     window.resize(1280, 1000)
-    assert window.workspace.create(tmp_path / "new.labsession")
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
     window.show_step("setup")
     window.activateWindow()
     qtbot.waitUntil(window.isActiveWindow)

@@ -135,7 +135,7 @@ def test_sessions_that_are_gone_stay_legible(tmp_path: Path, window: MainWindow)
 def test_live_figures_and_alarms_take_the_colours_of_the_theme(qapp: QApplication) -> None:
     figures, strip = LiveFigures(), AlarmStrip(lambda: None)
     qapp.setPalette(palette(True))
-    figures.show_figures([Figure("Width", "6.6", "", "mm", "▲ above 6", "alarm")])
+    figures.show_figures([Figure("Width", "6.6", "", "▲ above 6", "alarm")])
     strip.show_alarms([Alarm("width-high", "Width is 6.6 mm", 0, 0.0)])
     for dark in (True, False):
         qapp.setPalette(palette(dark))

@@ -179,7 +179,7 @@ def test_what_cannot_be_is_refused(analysis: AnalysisWindow, window: MainWindow,
     click(analysis.start_button)
     assert not analysis.working
     assert "no session is open" in analysis.message.text()
-    assert window.workspace.create(tmp_path / "empty.labsession")
+    window.workspace.show(Session.create(tmp_path / "empty.labsession"))
     click(analysis.start_button)
     assert not analysis.working
     assert "missing" in analysis.message.text()

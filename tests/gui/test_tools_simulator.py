@@ -14,8 +14,8 @@ from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
 from labapp.config.scenario import shipped_scenarios
+from labapp.gui.dialogs import new_path
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.tools import simulating
 from labapp.gui.tools.simulator import SimulatorWindow
 from tests.conftest import Run
 
@@ -188,8 +188,7 @@ def test_the_scenario_chosen_last_is_shown(simulator: SimulatorWindow, qtbot: Qt
 
 
 def test_a_folder_is_proposed_that_is_not_there_yet(tmp_path: Path):
-    scenario = tmp_path / "egg.toml"
-    assert simulating.new_folder(tmp_path, scenario) == tmp_path / "egg"
+    assert new_path(tmp_path, "egg", suffix="") == tmp_path / "egg"
     (tmp_path / "egg").mkdir()
     (tmp_path / "egg 2").mkdir()
-    assert simulating.new_folder(tmp_path, scenario) == tmp_path / "egg 3"
+    assert new_path(tmp_path, "egg", suffix="") == tmp_path / "egg 3"

@@ -13,6 +13,7 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.workspace import Workspace
 from labapp.log import NAME
 from labapp.run import measurers
+from labapp.session.session import Session
 from labapp.simulation import parallel
 from tests.gui.conftest import CopySample
 from tests.gui.watching import Noting
@@ -45,8 +46,9 @@ def test_measuring_that_is_left_for_another_session_is_no_fault(
     space = Workspace()
     said: list[str] = []
     space.notified.connect(lambda words, _: said.append(words))
-    assert space.open(copy_sample("blocked_rows"))
-    task = space.measure([0, 1, 2])
+    space.show(Session.open(copy_sample("blocked_rows")))
+    space.measure([0, 1, 2])
+    task = space.measuring
     assert task is not None
     qtbot.waitUntil(lambda: bool(stuck.begun))
     space.show(None)

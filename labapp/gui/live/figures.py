@@ -44,8 +44,8 @@ class Figure:
 
     Parameters
     ----------
-    name, value, sigma, unit
-        Texts.
+    name, value, sigma
+        Texts; value and sigma in mm.
     told
         How it stands to its limits, in words after a sign; empty where it has none.
     look
@@ -55,7 +55,6 @@ class Figure:
     name: str
     value: str
     sigma: str
-    unit: str
     told: str = ""
     look: Look = "plain"
 
@@ -89,7 +88,6 @@ def _figure(size: Size, limits: Limits, is_old: bool) -> Figure:
         size.name.capitalize(),
         plain(size.value_mm, DECIMALS) if known else NOTHING,
         f"± {plain(size.sigma_mm, DECIMALS)}" if np.isfinite(size.sigma_mm) else "",
-        "mm",
         standing_text(stands, limits, size.name),
         "alarm" if stands in ("low", "high") else "old" if is_old else "plain",
     )
@@ -150,7 +148,7 @@ class LiveFigures(QWidget):
             label.setVisible(row < len(shown))
         for row, figure in enumerate(shown):
             name = f"{figure.name}\n{figure.told}" if figure.told else figure.name
-            texts = (name, figure.value, figure.sigma, figure.unit)
+            texts = (name, figure.value, figure.sigma, "mm")
             for column, text in enumerate(texts):
                 label = self._label(row, column)
                 label.setText(text)

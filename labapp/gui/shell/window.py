@@ -383,7 +383,7 @@ class MainWindow(QMainWindow):
         session = self.workspace.session
         if session is None:
             return
-        if any(task.title == MEASURING for task in self.workspace.tasks.active):
+        if self.workspace.measuring is not None:
             self.say("Frames are being measured already")
             return
         if why := why_not_measurable(session):

@@ -62,15 +62,6 @@ def choices(own: Path | None) -> list[tuple[str, str]]:
     return [(str(path), path.stem.replace("_", " ")) for path in (*paths, *shipped_scenarios())]
 
 
-def new_folder(parent: Path, scenario: Path) -> Path:
-    """A folder for a simulation that is not there yet."""
-    folder, number = parent / scenario.stem, 1
-    while folder.exists():
-        number += 1
-        folder = parent / f"{scenario.stem} {number}"
-    return folder
-
-
 def rows(shown: ScenarioPreview, frames: int) -> tuple[ResultRow, ...]:
     """What is known of a scenario's first frame, and of a recording of so many."""
     recording, frame = shown.scenario.recording, shown.frame

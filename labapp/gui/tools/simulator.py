@@ -151,7 +151,7 @@ class SimulatorWindow(ToolWindow):
             self._propose(Path(name))
 
     def _propose(self, parent: Path) -> None:
-        folder = simulating.new_folder(parent, Path(self.scenario.value() or "simulation"))
+        folder = new_path(parent, Path(self.scenario.value() or "simulation").stem, suffix="")
         self._proposed = str(folder)
         self.folder.set_value(self._proposed)
 

@@ -21,6 +21,7 @@ from labapp.media.cameras import CameraSettings, Limits, Range, SimulatedDevice
 from labapp.media.cameras.base import check_settings
 from labapp.media.cameras.simulated import SimulatedCamera
 from labapp.media.recording.recorder import Plan
+from labapp.session.session import Session
 from tests.gui.hand import Hand
 
 SHAPE = (48, 64)
@@ -73,7 +74,7 @@ def page(
     monkeypatch: pytest.MonkeyPatch,
 ) -> CapturePage:
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
-    assert window.workspace.create(tmp_path / "new.labsession")
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
     window.show_step("capture")
     window.activateWindow()
     qtbot.waitUntil(window.isActiveWindow)

@@ -134,7 +134,7 @@ NOTHING = State(Mark.READY, "No recording yet")
 @pytest.fixture
 def page(qtbot: QtBot, tmp_path: Path) -> CapturePage:
     workspace = Workspace()
-    assert workspace.create(tmp_path / "new.labsession")
+    workspace.show(Session.create(tmp_path / "new.labsession"))
     yield made(workspace)
     workspace.close()
 
@@ -221,7 +221,7 @@ def test_a_missing_recording_is_found_again(copy_sample, tmp_path: Path, qtbot: 
     moved = tmp_path / "elsewhere.avi"
     shutil.move(path.parent / "recording.avi", moved)
     workspace = Workspace()
-    workspace.open(path)
+    workspace.show(Session.open(path))
     page = made(workspace)
     said: list[tuple[str, bool]] = []
     workspace.notified.connect(lambda words, problem: said.append((words, problem)))

@@ -62,7 +62,7 @@ def unfitted(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
 
 def show(page: DotsPage, qtbot: QtBot, path: Path, frame: int) -> Session:
-    assert page.workspace.open(path)
+    page.workspace.show(Session.open(path))
     page.workspace.show_frame(frame)
     session = page.workspace.session
     assert session is not None
@@ -328,7 +328,7 @@ def test_a_read_only_frame_is_looked_at_and_not_edited(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample
 ) -> None:
     path = copy_sample("gtaw")
-    assert page.workspace.open(path, read_only=True)
+    page.workspace.show(Session.open(path, read_only=True))
     qtbot.waitUntil(lambda: page.editor.correction is not None)
     page.refresh()
     let_draw()
@@ -612,7 +612,7 @@ def test_a_damaged_result_is_told_and_the_dots_are_looked_for(
 def test_arrow_keys_go_through_frames_until_a_dot_is_chosen(
     window: MainWindow, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
-    assert window.workspace.open(copy_sample("gtaw"))
+    window.workspace.show(Session.open(copy_sample("gtaw")))
     window.show_step("dots")
     page = window.page
     assert isinstance(page, DotsPage)
@@ -658,7 +658,7 @@ def test_rings_grow_with_the_dots_and_the_reference_is_ringed(
 def test_edits_that_follow_each_other_at_once_all_stand(
     window: MainWindow, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
-    assert window.workspace.open(copy_sample("gtaw"))
+    window.workspace.show(Session.open(copy_sample("gtaw")))
     window.show_step("dots")
     page, session = window.page, window.workspace.session
     assert isinstance(page, DotsPage)

@@ -115,7 +115,7 @@ def test_somebody_s_own_folder_is_not_proposed(gtaw: Path, tmp_path: Path) -> No
 @pytest.fixture
 def page(qtbot: QtBot, gtaw: Path) -> ExportPage:
     workspace = Workspace()
-    workspace.open(gtaw)
+    workspace.show(Session.open(gtaw))
     page = ExportPage(workspace)
     KEPT.extend((workspace, page))
     workspace.changed.connect(page.refresh)
@@ -224,7 +224,7 @@ def test_a_format_that_is_added_can_be_ticked(gtaw: Path, tmp_path: Path, monkey
     monkeypatch.setitem(SURFACE_FORMATS, "xyz", toy)
     monkeypatch.setitem(RUN_FORMATS, "toy", RunFormat("toy.bin", "Toy", "A toy", "toys:Toy"))
     workspace = Workspace()
-    workspace.open(gtaw)
+    workspace.show(Session.open(gtaw))
     page = ExportPage(workspace)
     KEPT.extend((workspace, page))
     page.refresh()

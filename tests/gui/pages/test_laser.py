@@ -118,7 +118,7 @@ def test_what_is_used_comes_back_with_its_readings(tmp_path: Path) -> None:
 @pytest.fixture
 def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[LaserPage]:
     workspace = Workspace()
-    assert workspace.open(copy_sample("gtaw"))
+    workspace.show(Session.open(copy_sample("gtaw")))
     made = LaserPage(workspace)
     KEPT.extend([workspace, made, made.panel])
     workspace.changed.connect(lambda: made.refresh() if workspace.session else None)

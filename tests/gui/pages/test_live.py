@@ -215,7 +215,7 @@ def test_what_is_kept_for_before_a_trigger_is_what_is_there(live: Live):
 
 def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
     assert live.watch is None
-    assert figures(None)[0] == Figure("Width", "–", "", "mm")
+    assert figures(None)[0] == Figure("Width", "–", "")
     folder = SAMPLES / "gtaw"
     with open_source(folder / "recording.avi") as video:
         image = video.frame(0).image
@@ -290,7 +290,7 @@ def page(
     monkeypatch: pytest.MonkeyPatch,
 ) -> CapturePage:
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
-    assert window.workspace.create(tmp_path / "new.labsession")
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
     window.show_step("capture")
     window.activateWindow()
     qtbot.waitUntil(window.isActiveWindow)

@@ -20,6 +20,7 @@ from labapp.media.cameras import Faults, feed
 from labapp.media.recording import recorder
 from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Recorder
+from labapp.session.session import Session
 from tests.benchmarks.filming import Disk, FilmedDevice, compare, how_many, times_told
 
 pytestmark = pytest.mark.soak
@@ -51,7 +52,7 @@ def test_nothing_recorded_is_lost_and_all_is_said(
     monkeypatch.setattr(live, "Recorder", partial(Recorder, writer=writer))
     monkeypatch.setattr(recorder, "STALL_S", 0.2)
     monkeypatch.setattr(feed, "RETRY_S", (0.01,))
-    assert window.workspace.create(tmp_path / "new.labsession")
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
     window.show_step("capture")
     view, truth = window.page.live_view, device.truth
 

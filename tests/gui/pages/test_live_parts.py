@@ -43,6 +43,7 @@ from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace, Trend
+from labapp.session.session import Session
 from tests.gui.conftest import SAMPLES
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
@@ -185,7 +186,7 @@ def page(
     monkeypatch.setattr(Prepared, "found", OK)
     monkeypatch.setattr(Prepared, "quality", QUALITY)
     Prepared.gate.set()
-    assert window.workspace.create(tmp_path / "new.labsession")
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
     setup = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
     window.workspace.attempt(lambda session: session.set_setup(setup))
     window.show_step("capture")

@@ -166,7 +166,7 @@ def test_a_picture_without_a_target_is_refused_in_words() -> None:
 @pytest.fixture
 def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage]:
     workspace = Workspace()
-    assert workspace.open(copy_sample("gtaw"))
+    workspace.show(Session.open(copy_sample("gtaw")))
     made = PlanePage(workspace)
     KEPT.extend([workspace, made, made.panel])
     workspace.changed.connect(lambda: made.refresh() if workspace.session else None)

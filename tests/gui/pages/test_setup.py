@@ -94,7 +94,7 @@ def test_a_tick_is_kept_with_its_time(empty: Session) -> None:
 @pytest.fixture
 def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[SetupPage]:
     workspace = Workspace()
-    assert workspace.open(copy_sample("gtaw"))
+    workspace.show(Session.open(copy_sample("gtaw")))
     made = SetupPage(workspace)
     KEPT.extend([workspace, made, made.panel])
     workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
@@ -145,7 +145,7 @@ def test_a_refusal_stays_while_other_fields_are_accepted(
     retype(qtbot, angle, "30")
     assert angle.problem.isHidden()
     assert not height.problem.isHidden()
-    assert page.workspace.open(copy_sample("concave"))
+    page.workspace.show(Session.open(copy_sample("concave")))
     assert height.problem.isHidden()
 
 

@@ -24,6 +24,7 @@ from pytestqt.qtbot import QtBot
 from labapp.export.heights import profile
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
 from tests.gui.conftest import KEPT, CopySample
 from tests.waiting import PATIENCE_S
 
@@ -50,7 +51,7 @@ def page(qapp: QApplication, copy_sample: CopySample) -> SurfacePage:
     KEPT.append(whole)
     workspace.changed.connect(made.refresh)
     workspace.frame_changed.connect(lambda _: made.refresh())
-    assert workspace.open(copy_sample("gtaw"))
+    workspace.show(Session.open(copy_sample("gtaw")))
     whole.show()
     yield made
     made.leave()

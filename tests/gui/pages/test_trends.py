@@ -95,7 +95,7 @@ def test_current_is_shown_while_the_recording_runs(gtaw: Path, copy_sample) -> N
 @pytest.fixture
 def page(qtbot: QtBot, gtaw: Path) -> TrendsPage:
     workspace = Workspace()
-    workspace.open(gtaw)
+    workspace.show(Session.open(gtaw))
     page = TrendsPage(workspace)
     KEPT.extend((workspace, page))
     workspace.changed.connect(page.refresh)

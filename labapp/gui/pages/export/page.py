@@ -121,7 +121,7 @@ class ExportPage(Page):
             return
         active = self.workspace.tasks.active
         writing = self._writing in active
-        measuring = any(task.title == "Measuring" for task in active)
+        measuring = self.workspace.measuring is not None
         why_not = "It is being written." if writing else made.why_not
         self.export_button.setEnabled(not why_not)
         self.export_button.setToolTip(

@@ -14,7 +14,6 @@ from labapp.gui.pages.surface.presenter import (
     with_scheme,
 )
 from labapp.gui.shell.steps import why_not_measurable
-from labapp.gui.tasks import Task
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
 from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
@@ -39,7 +38,6 @@ class SurfacePanel:
 
     def __init__(self, workspace: Workspace, layout: QVBoxLayout) -> None:
         self.workspace = workspace
-        self._task: Task | None = None
         self.scheme = ChoiceField(
             "Scheme", SCHEME_CHOICES, tooltip="How the surface is found from the dots"
         )
@@ -122,18 +120,18 @@ class SurfacePanel:
         self._show_progress()
 
     def _show_progress(self) -> None:
-        session, task = self.workspace.session, self._task
-        working = task is not None and task in self.workspace.tasks.active
-        why = "Measuring is under way" if working else "No session is open"
-        if session is not None and not working:
-            why = why_not_measurable(session)
+        session, task = self.workspace.session, self.workspace.measuring
+        if task is not None:
+            why = "Measuring is under way"
+        else:
+            why = "No session is open" if session is None else why_not_measurable(session)
         for each in self._tips:
             each.setEnabled(not why)
             tip = self._tips[each]
             each.setToolTip(plain_tip(f"{tip}. {why}" if why else tip))
-        self.progress.setVisible(working)
-        self.cancel.setVisible(working)
-        if working and task is not None:
+        self.progress.setVisible(task is not None)
+        self.cancel.setVisible(task is not None)
+        if task is not None:
             self.progress.setRange(0, task.total)
             self.progress.setValue(task.done)
             self.progress.setFormat(f"{task.done} of {task.total} frames")
@@ -142,24 +140,21 @@ class SurfacePanel:
 
     def this_one(self) -> None:
         """Measure the frame in view."""
-        self._task = self.workspace.measure([self.workspace.frame])
-        self._show_progress()
+        self.workspace.measure([self.workspace.frame])
 
     def not_measured(self) -> None:
         """Measure the frames that are not measured, or whose measures no longer stand."""
-        self._task = self.workspace.measure()
-        self._show_progress()
+        self.workspace.measure()
 
     def all_frames(self) -> None:
         """Measure every frame again."""
         if self.workspace.session is not None:
-            self._task = self.workspace.measure(self.workspace.session.frames.tolist())
-            self._show_progress()
+            self.workspace.measure(self.workspace.session.frames.tolist())
 
     def stop(self) -> None:
         """Stop measuring."""
-        if self._task is not None:
-            self._task.cancel()
+        if self.workspace.measuring is not None:
+            self.workspace.measuring.cancel()
 
     def _choose_scheme(self, name: str) -> None:
         self.workspace.attempt(
