@@ -178,11 +178,11 @@ def test_a_changed_setup_says_what_no_longer_stands(
     other.write_text(SETUP.read_text().replace("distance_mm = 31.48", "distance_mm = 31.9"))
     code, said, _ = labapp("session", "setup", measured, other)
     assert code == 0
-    assert "No longer standing: 6 results (frames 0 to 5)" in said
+    assert "Now stale: 6 results (frames 0 to 5)" in said
     assert f"labapp session measure {measured}" in said
     code, said, _ = labapp("session", "undo", measured)
     assert said.startswith("Undone: setup (of ")
-    assert "Standing again: 6 results (frames 0 to 5)" in said
+    assert "No longer stale: 6 results (frames 0 to 5)" in said
     _, said, _ = labapp("session", "setup", measured, SETUP)
     assert said == "The set-up is the same as before\n"
 
@@ -598,7 +598,7 @@ def test_a_correction_goes_back_to_automatic(labapp: Run, measured: Path) -> Non
         assert (len(correction.dots), correction.lattice.blocked_rows) == (48, frozenset({3}))
     code, said, _ = labapp(*correct, "--automatic", "--no-measure")
     assert code == 0
-    assert "No longer standing: 1 result (frame 0)" in said
+    assert "Now stale: 1 result (frame 0)" in said
     with opened(measured) as session:
         assert session.correction(0) is None
         assert len(session.history) == 4
@@ -704,10 +704,10 @@ def test_undo_and_redo_say_what_they_do(labapp: Run, measured: Path) -> None:
     code, said, _ = labapp("session", "undo", measured)
     assert code == 0
     assert said.startswith("Undone: frame 1: block-row 2 (of 2")
-    assert "No longer standing: 1 result (frame 1)" in said
+    assert "Now stale: 1 result (frame 1)" in said
     code, said, _ = labapp("session", "redo", measured)
     assert said.startswith("Done again: frame 1: block-row 2 (of 2")
-    assert "Standing again: 1 result (frame 1)" in said
+    assert "No longer stale: 1 result (frame 1)" in said
     assert labapp("session", "redo", measured)[:2] == (0, "Nothing to redo\n")
     labapp("session", "undo", measured)
     labapp("session", "undo", measured)

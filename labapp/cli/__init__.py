@@ -201,10 +201,7 @@ def reconstruct(
         Literal["auto", "S/S", "S/I", "I/I"],
         typer.Option(help="Order of columns/rows of dots to that of rays: same S, inverse I."),
     ] = "auto",
-    frames: Annotated[
-        str,
-        typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP),
-    ] = ":",
+    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
     surfaces: Annotated[
         Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
     ] = "all",
@@ -219,16 +216,14 @@ def reconstruct(
     ] = False,
     lines: Annotated[
         str | None,
-        typer.Option(
-            metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP from there."
-        ),
+        typer.Option(metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP."),
     ] = None,
     opcua: Annotated[
         str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Publish measures as variables of OPC UA there."),
+        typer.Option(metavar="[HOST:]PORT", help="Publish measures as variables of OPC UA."),
     ] = None,
     anywhere: Annotated[
-        bool, typer.Option("--anywhere", help="Let other machines connect: nobody is asked who.")
+        bool, typer.Option("--anywhere", help="Let other machines connect, unauthenticated.")
     ] = False,
 ) -> None:
     """Measure frames and write measures, dots, points, boundaries and surfaces.

@@ -37,9 +37,11 @@ def advise(
         bool | None, typer.Option("--convex/--concave", help="Above the work piece, or below it.")
     ] = None,
     angle: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Of the laser: it can stand so (degrees).")
+        str | None, typer.Option(metavar="A:B", help="Range of the laser's angle (degrees).")
     ] = None,
-    distance: Annotated[str | None, typer.Option(metavar="A:B", help="Of the laser (mm).")] = None,
+    distance: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Range of the laser's distance (mm).")
+    ] = None,
     plane: Annotated[
         str | None, typer.Option(metavar="A:B", help="Distance of the imaging plane (mm).")
     ] = None,
@@ -47,9 +49,12 @@ def advise(
         bool, typer.Option("--quick", help="A coarser search: a tenth of the time.")
     ] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Hold the advice against 50 fresh pools and a grid.")
+        bool, typer.Option("--check", help="Check the advice against 50 other pools and a grid.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="The same gives the same.")] = 4,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, max=2**31 - 1, help="Random seed."),
+    ] = 4,
 ) -> None:
     """Advise where laser and imaging plane should stand for the pools that are expected.
 
@@ -79,7 +84,7 @@ def advise(
 def _advised(
     expected: ExpectedPools, limits: BenchLimits, out: Path, quick: bool, check: bool, seed: int
 ) -> bool:
-    """Search, tell and write; whether any set-up is possible."""
+    """Search, print and write; whether any set-up is possible."""
     from labapp.studies.adviser import check as adviser_check
     from labapp.studies.adviser import search as adviser
     from labapp.studies.adviser.files import advice_files

@@ -100,13 +100,13 @@ def errors(
         int, typer.Option(min=1, max=1000, help="Frames that are rendered of each surface.")
     ] = 3,
     draws: Annotated[
-        int, typer.Option(min=10, max=100_000, help="Monte Carlo draws of the calibration.")
+        int, typer.Option(min=10, max=100_000, help="Monte Carlo samples of the calibration.")
     ] = 400,
     picture: Format = "png",
 ) -> None:
     """Work out the errors of chapter 8 by every scheme, beside the text's.
 
-    What is done is written before the next part begins. All of it takes long: see --part.
+    Each part is written before the next one begins. All of them take long: see --part.
     """
     options = AnalysisOptions(
         _chosen("part", part, PARTS),
@@ -149,7 +149,7 @@ def budget(
 
 
 def _chosen(name: str, asked: list[str] | None, known: tuple[T, ...]) -> tuple[T, ...]:
-    """What was asked for, in the usual order; all of it if nothing was."""
+    """The names asked for, in their usual order; all of them if none was."""
     for one in asked or ():
         if one not in known:
             raise InputError(f"--{name}", name, one, f"one of {', '.join(known)}")

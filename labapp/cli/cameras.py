@@ -79,7 +79,7 @@ def record(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.001, callback=finite, help="For so long (s); else until Ctrl-C."),
+        typer.Option(min=0.001, callback=finite, help="Duration (s); without it, until Ctrl-C."),
     ] = None,
     every: Annotated[int, typer.Option(min=1, help="Every n-th frame.")] = 1,
     codec: Annotated[
@@ -87,7 +87,7 @@ def record(
         typer.Option(help="Both lose nothing; ffv1 is less than half the size, and slower."),
     ] = "raw",
     exposure: Annotated[
-        float | None, typer.Option(callback=finite, help="How long light is gathered (µs).")
+        float | None, typer.Option(callback=finite, help="Exposure time (µs).")
     ] = None,
     gain: Annotated[float | None, typer.Option(callback=finite, help="Amplification (dB).")] = None,
     rate: Annotated[float | None, typer.Option(callback=finite, help="Frames a second.")] = None,
@@ -190,7 +190,7 @@ def _opened(path: Path | None) -> Iterator[Session | None]:
 
 
 def _tell(take: Take, session: Session | None) -> None:
-    """Say what was recorded; import it where a session was named."""
+    """Report what was recorded; import it where a session was named."""
     lost = f", {pluralize(take.lost, 'frame')} lost" * (take.lost > 0)
     typer.echo(f"{pluralize(take.frames, 'frame')}{lost} in {take.path.absolute()}")
     if session is not None and take.frames:

@@ -27,7 +27,7 @@ def info(
         bool, typer.Option("--history", help="Every change that can be undone or redone, too.")
     ] = False,
 ) -> None:
-    """Say what a session holds: also while another program writes to it."""
+    """Show what a session holds, even while another program writes to it."""
     from labapp.session.session import Session
 
     with Session.open(file, read_only=True) as session:
@@ -44,7 +44,7 @@ def info(
 
 
 def _facts(session: Session) -> dict[str, Any]:
-    """Everything about a session, as plain values."""
+    """All facts about a session, as plain values."""
     from labapp.core.pipeline import Settings
     from labapp.session.measured import scheme_name
     from labapp.session.record import Record

@@ -1,4 +1,4 @@
-"""What commands share: exit codes, progress, what they tell of frames and results, and files."""
+"""What commands share: exit codes, progress, messages about frames and results, and files."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def progress_bar() -> Progress:
 
 
 def note(console: Console, text: str) -> None:
-    """Tell something on stderr, above the progress bar."""
+    """Print a line on stderr, above the progress bar."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -84,7 +84,7 @@ def shown(progress: Progress, name: str, count: int) -> Sink:
 
 
 def command(name: str, file: Path) -> str:
-    """Tell how to call a command on a session, for the shell: names may have spaces."""
+    """The shell command line of a session command; file names may have spaces."""
     return f"labapp session {name} {quoted(str(file))}"
 
 
@@ -154,15 +154,15 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
 
 @contextmanager
 def report_stale_results(session: Session) -> Iterator[None]:
-    """Tell what a change does to results: which no longer stand, which stand again."""
+    """Report which results a change makes stale, and which it makes valid again."""
     before = _stale(session)
     yield
     after = _stale(session)
     if fallen := after - before:
-        typer.echo(f"No longer standing: {_results(fallen)}; to measure again:")
+        typer.echo(f"Now stale: {_results(fallen)}; to measure again:")
         typer.echo(f"  {command('measure', session.path)}")
     if risen := before - after:
-        typer.echo(f"Standing again: {_results(risen)}")
+        typer.echo(f"No longer stale: {_results(risen)}")
 
 
 def _stale(session: Session) -> set[tuple[int, str]]:

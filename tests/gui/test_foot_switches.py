@@ -359,7 +359,7 @@ def test_what_was_remembered_and_is_damaged_is_said(start, bench: Bench, qtbot: 
     held["foot_switches"].insert(0, {"device": "x", "actions": {"0": "explode"}})
     file.write_text(json.dumps(held))
     again = start()
-    assert "A foot switch is to be learned anew" in said_in(again)
+    assert "A foot switch must be learned again" in said_in(again)
     qtbot.waitUntil(connected(again))
 
 

@@ -12,6 +12,7 @@ from pytestqt.qtbot import QtBot
 from labapp.errors import InputError
 from labapp.gui.live import view as live_view
 from labapp.gui.live.camera_fields import CameraFields, region_of, region_text
+from labapp.gui.live.live import WAITS
 from labapp.gui.live.plan_fields import cost_text
 from labapp.gui.pages.capture.page import CapturePage
 from labapp.gui.shell.window import MainWindow
@@ -190,9 +191,7 @@ def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, dev
     hand.choose(fields.trigger, "when told: Take a frame")
     qtbot.waitUntil(lambda: device.settings.trigger == "software" and not fields.waiting)
     qtbot.waitUntil(fields.shoot_button.isVisible)
-    qtbot.waitUntil(
-        lambda: view.bar.state.text().startswith("● Live, takes a frame when it is told")
-    )
+    qtbot.waitUntil(lambda: view.bar.state.text().startswith(f"● {WAITS['software']}"))
     taken = device.taken
     for count in (1, 2, 3):
         hand.click(fields.shoot_button)
