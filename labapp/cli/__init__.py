@@ -246,7 +246,7 @@ def reconstruct(
 
 
 def _stream_sinks(at_end: ExitStack, places: dict[str, str | None], anywhere: bool) -> list[Sink]:
-    """Open the streams that are asked for; gives what tells results to each."""
+    """Open the streams that are asked for; returns a sink for each."""
     asked = {kind: place for kind, place in places.items() if place is not None}
     if not asked:
         return []

@@ -166,7 +166,7 @@ def _film(
 
 
 def _place(out: Path | None, session: Path | None) -> Callable[[], Path]:
-    """What gives the recording's file: the one named, or one beside the session."""
+    """A function that gives the recording's file: the one named, or one beside the session."""
     from labapp.media.recording.recorder import recording_path
 
     if session is None:

@@ -41,7 +41,7 @@ def open_app(arguments: Sequence[str]) -> int:
 
 
 def show_in_app(session: Path) -> None:
-    """Open a session in the app where there is a display; elsewhere tell how to."""
+    """Open a session in the app where there is a display; elsewhere print how to."""
     if not has_display(os.environ):
         typer.echo(f"To see it in the app: labapp {quoted(os.fspath(session))}")
         return

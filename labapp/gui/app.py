@@ -214,7 +214,7 @@ class ErrorReporter(QObject):
     def take(
         self, kind: type[BaseException], error: BaseException, trace: TracebackType | None
     ) -> None:
-        """Log an error and tell of it; may be called in any thread."""
+        """Log and report an error; may be called in any thread."""
         start_log().error("fault", exc_info=(kind, error, trace))
         words = f"A fault in the program: {kind.__name__}: {error}. Your session is saved; "
         self._happened.emit(f"{words}details are in the log (Help, Show the log folder)", True)

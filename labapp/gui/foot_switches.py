@@ -37,7 +37,7 @@ CALLS: dict[Action, str] = {"trigger": "record", "mark": "mark", "next": "next_s
 
 @dataclass
 class InUse:
-    """A foot switch in use, and what was told of it last."""
+    """A foot switch in use, and its last event."""
 
     switch: FootSwitch
     told: Event | None = None
@@ -192,7 +192,7 @@ class FootSwitches(QObject):
         self.changed.emit()
 
     def _take(self) -> None:
-        """Do what was pressed, and tell what happened."""
+        """Do the actions of pedals that were pressed, and report events."""
         deaf = self.learns or time.monotonic() < self._deaf_until_s
         for _ in range(self._received.qsize()):
             key, heard = self._received.get_nowait()

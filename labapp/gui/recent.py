@@ -1,4 +1,4 @@
-"""What the welcome page tells of a session without opening it to work on. Without Qt."""
+"""What the welcome page shows of a session. Without Qt."""
 
 from __future__ import annotations
 

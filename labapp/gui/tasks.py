@@ -236,7 +236,7 @@ def _run(work: Work, control: Control) -> None:
 
 
 def error_text(error: Exception) -> str:
-    """What to tell the operator of an error; the log gets all of it."""
+    """The message for an error; the log gets its traceback."""
     log = logging.getLogger(NAME)
     if isinstance(error, InputError | CannotMeasure | ValueError):
         log.error("refused", exc_info=error)

@@ -137,7 +137,7 @@ class Workspace(QObject):
             parallel.end_processes(pool)
 
     def say_wrong(self, cause: str, words: str) -> None:
-        """Tell of a problem that lasts until its cause is settled, or another session is open."""
+        """Report a problem that lasts until its cause is settled or another session is opened."""
         self.settle(cause)
         self._problems[cause] = words
         self.notified.emit(words, True)
@@ -151,7 +151,7 @@ class Workspace(QObject):
     def run_or_report(
         self, work: Callable[[], T], cause: str = "", beside: Callable[[str], object] | None = None
     ) -> T | None:
-        """Do something short; a refusal is said in words and gives None.
+        """Run something short; report a refusal as a message, and return None.
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class Workspace(QObject):
         cause: str = "",
         beside: Callable[[str], object] | None = None,
     ) -> bool:
-        """Change the session and tell everybody; False if it was refused, which is said.
+        """Change the session and emit `changed`; False if it was refused, which is reported.
 
         Parameters
         ----------

@@ -136,7 +136,7 @@ def test_refused_files_are_told_beside_their_buttons(
     assert opened.status_line.unread == []
     opened.show_step("capture")
     page = opened.page
-    page.choose(wrong)
+    page.take(wrong)
     qtbot.waitUntil(lambda: "wrong.toml" in page.refused.text())
     assert stands_beside(page.refused, hand.find("Choose a file …"))
     opened.show_step("plane")

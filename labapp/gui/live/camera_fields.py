@@ -221,7 +221,7 @@ class CameraFields(QObject):
 
 
 def region_of(text: str) -> Region:
-    """The region that four numbers in a text tell.
+    """The region given by four numbers in a text.
 
     Raises
     ------

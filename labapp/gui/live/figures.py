@@ -168,7 +168,7 @@ class LiveFigures(QWidget):
         return self._labels[row, column]
 
     def _apply_look(self, label: QLabel, look: Look) -> None:
-        """Colour a label; only where that changes, for it is dear."""
+        """Colour a label, only where its colour changes: that is expensive."""
         dark = is_dark(self.palette())
         if self._looks.get(label, ("plain", dark)) == (look, dark):
             return

@@ -17,7 +17,7 @@ BUTTON_PX, RING_BAR_PX = 44, 130
 
 
 class RecordBar(QWidget):
-    """Records, marks and stops; tells whether frames come and what becomes of them.
+    """Buttons to record, mark and stop; shows whether frames come, and the state of the recording.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class RecordBar(QWidget):
         layout.addLayout(row)
 
     def show_status(self, live: Live, room_byte: int | None) -> None:
-        """Tell how a camera is, and what is recorded; ``room_byte`` is free on the disk."""
+        """Show the state of a camera and its recording; ``room_byte`` is free on the disk."""
         self.state.setText(live.state_text())
         part, told = live.ring()
         self.ring.setValue(round(100 * part))

@@ -155,7 +155,7 @@ class LiveStreams(QWidget):
     # --- what it shows ------------------------------------------------------------------------
 
     def show_state(self) -> None:
-        """Show who listens and how much was told."""
+        """Show how many programs listen, and how many frames were sent."""
         watch = self._watch()
         for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
@@ -169,7 +169,7 @@ class LiveStreams(QWidget):
 
 
 def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
-    """Where a stream is heard, by how many, and what was told."""
+    """A stream's address, its number of listeners, and the number of frames sent."""
     if problem:
         return f"⚠ {problem}"
     if stream is None:

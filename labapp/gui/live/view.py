@@ -374,14 +374,14 @@ class LiveView(QObject):
             self._rings.setData(pos=dots_px)
 
     def _report_events(self, live: Live) -> None:
-        """Tell what happened, and hand on what is recorded."""
+        """Report events, and emit recordings that have ended."""
         for event in live.events():
             self._report(event, live)
         for take in live.ended_takes():
             self.recorded.emit(take)
 
     def _report(self, event: Event, live: Live) -> None:
-        """Tell of an event; frames that are lost are a problem only where they are recorded."""
+        """Report an event; lost frames are a problem only while they are recorded."""
         recorded = live.running is not None or event.source != live.name
         problem = event.kind == "warning" or (event.kind == "loss" and recorded)
         self.workspace.notified.emit(str(event), problem)

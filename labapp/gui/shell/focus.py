@@ -1,4 +1,4 @@
-"""Where the keys go: from one part of the window to the next, and into a part."""
+"""Keyboard focus: from one part of the window to the next, and into a part."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from PySide6.QtWidgets import QApplication, QWidget
 
 
 def go_to_part(parts: Sequence[QWidget], by: int) -> None:
-    """Give the keys to the next part of a window that takes any, or the one before (-1)."""
+    """Move the focus to the next part of a window that can have it, or the one before (-1)."""
     parts = [part for part in parts if part.isVisibleTo(part.window())]
     focus = QApplication.focusWidget()
     here = [k for k, part in enumerate(parts) if focus is not None and _holds(part, focus)]
@@ -20,7 +20,7 @@ def go_to_part(parts: Sequence[QWidget], by: int) -> None:
 
 
 def give_keys(part: QWidget) -> bool:
-    """Give a part the keys, where it had them last or at its first widget; False if it has none."""
+    """Focus a part where it had the focus last, or its first widget; False if none can have it."""
     chain = [part]
     while (following := chain[-1].nextInFocusChain()) not in (None, part):
         chain.append(following)
@@ -38,7 +38,7 @@ def takes_keys(widget: QWidget, part: QWidget) -> bool:
 
 
 def finish_edit(*parts: QWidget) -> None:
-    """Take the keys from what has them in some parts: a field is finished when it is left."""
+    """Take the focus from within some parts: a field is finished when it loses the focus."""
     focus = QApplication.focusWidget()
     if focus is not None and any(_holds(part, focus) for part in parts):
         focus.clearFocus()

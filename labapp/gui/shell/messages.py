@@ -1,4 +1,4 @@
-"""What the app tells: the status line, which keeps a problem until it is read, and the log."""
+"""Messages: the status line, which keeps a problem until it is read, and the log."""
 
 from __future__ import annotations
 

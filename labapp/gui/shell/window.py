@@ -201,7 +201,7 @@ class MainWindow(QMainWindow):
     # --- what is in view --------------------------------------------------------------------
 
     def say(self, text: str, problem: bool = False) -> None:
-        """Tell the operator something; a problem stays in the status line until it was read."""
+        """Show a message; a problem stays in the status line until it was read."""
         self.log_panel.add(text, problem)
         self.status_line.say(text, problem)
         if problem:

@@ -233,7 +233,7 @@ class ToolWindow(QDialog):
             self.say(f"Saved in {folder}")
 
     def say(self, text: str, problem: bool = False) -> None:
-        """Tell something on the line below."""
+        """Show a message on the line below."""
         self.message.setText(f"{PROBLEM} {text}" if problem else text)
 
     def _repeat_message(self, text: str, problem: bool) -> None:

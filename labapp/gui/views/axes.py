@@ -1,4 +1,4 @@
-"""Plots whose numbers are in the unit that the axis' label tells: no SI prefix scales them."""
+"""Plots whose numbers are in the unit of the axis' label: no SI prefix scales them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def plain_axes() -> dict[str, PlainAxis]:
 
 
 def make_plot(x_label: str, y_label: str = "", equal: bool = True) -> pg.PlotWidget:
-    """Make a plot that leaves the keys, and the right button, to what it stands in.
+    """Make a plot that leaves keys and the right button to its parent.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is drawn rather than written: a role and words for screen readers, a frame with the keys."""
+"""Drawn widgets: a role and a description for screen readers, and a focus frame."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ class Drawn(QWidget):
             self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
 
     def describe(self, words: str) -> None:
-        """Say what is to be seen now; the keys are said after it."""
+        """Set the description for screen readers; the keys follow it."""
         told = (words.strip().rstrip("."), self._keys)
         self.setAccessibleDescription(". ".join(part for part in told if part))
 
     def paintEvent(self, _event: QPaintEvent) -> None:
-        """Frame it while it has the keys; what lies on it leaves a px at the edge."""
+        """Draw the focus frame; what lies on the widget leaves a px at the edge."""
         if self.hasFocus():
             with QPainter(self) as painter:
                 self.paint_frame(painter)
 
     def paint_frame(self, painter: QPainter) -> None:
-        """Draw the frame that tells where the keys go."""
+        """Draw the focus frame."""
         painter.setPen(self.palette().color(QPalette.ColorRole.Highlight))
         painter.drawRect(self.rect().adjusted(0, 0, -1, -1))
 
@@ -52,7 +52,7 @@ class Plotted(Drawn):
 
 
 def _accessible(_class_name: str, thing: QObject) -> QAccessibleInterface | None:
-    """Qt tells nothing of a widget that it does not know: not even that it is a picture."""
+    """Qt has no accessible role for a widget that it does not know."""
     return QAccessibleWidget(thing, thing.ROLE) if isinstance(thing, Drawn) else None
 
 

@@ -72,7 +72,7 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
         return float(self.pos().x()), float(self.pos().y())
 
     def set_place(self, u: float, v: float) -> None:
-        """Put it somewhere else; tells nobody. A hand that has it keeps it."""
+        """Move it without a signal; ignored while it is being dragged."""
         if self.moving:
             return
         blocked = self.blockSignals(True)

@@ -209,7 +209,7 @@ class PictureView(Drawn):
         self.box.translateBy(x=right * seen.width(), y=down * seen.height())
 
     def _stop_fitting(self) -> None:
-        """Leave what is seen to the hand."""
+        """Stop fitting: the operator has zoomed or moved."""
         self._fits = False
 
     def _refit(self) -> None:
@@ -218,7 +218,7 @@ class PictureView(Drawn):
 
     @property
     def px_per_point(self) -> float:
-        """Picture px that one point of the screen covers: distances for the hand."""
+        """Picture px that one point of the screen covers."""
         return float(abs(self.box.viewPixelSize()[0]))
 
     def auto_contrast(self) -> None:
@@ -317,13 +317,13 @@ class PictureView(Drawn):
             super().keyPressEvent(event)
 
     def keyReleaseEvent(self, event: QKeyEvent) -> None:
-        """Tell the tool."""
+        """Notify the tool."""
         if not event.isAutoRepeat():
             self.tool.release()
         super().keyReleaseEvent(event)
 
     def focusOutEvent(self, event: QFocusEvent) -> None:
-        """Tell the tool: the key may be released elsewhere."""
+        """Notify the tool: the key may be released elsewhere."""
         self.tool.release()
         super().focusOutEvent(event)
 

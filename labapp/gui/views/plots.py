@@ -374,7 +374,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             self.cross.setValue(x)
 
     def _show_points(self) -> None:
-        """Draw points and bars of what is in view, as far as they can be told apart."""
+        """Draw points and bars in view, as far as they can be distinguished."""
         curve = self._curve
         if curve is None or not len(curve.key):
             self.points.clear()

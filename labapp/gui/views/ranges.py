@@ -54,7 +54,7 @@ class RangeField(Field):
         return self.least.value() or 0.0, self.most.value() or 0.0
 
     def set_value(self, ends: tuple[float, float]) -> None:
-        """Show another range; tells nobody."""
+        """Show another range; emits no signal."""
         self.least.set_value(ends[0])
         self.most.set_value(ends[1])
         self._judge()

@@ -103,5 +103,5 @@ def steer(view: View3d, held: SixAxes, seconds: float) -> None:
 
 
 def _beyond(value: float) -> float:
-    """What an axis tells beyond the dead zone."""
+    """Value of an axis beyond the dead zone."""
     return math.copysign(max(0.0, abs(value) - DEAD) / (1 - DEAD), value)

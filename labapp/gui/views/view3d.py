@@ -131,7 +131,7 @@ class View3d(Drawn):
         self._refresh()
 
     def set_words(self, words: str) -> None:
-        """Say why there is no scene, or what it tells."""
+        """Set the text that is shown without a scene, and its description with one."""
         self._words = words
         self.describe(words)
         self.update()
@@ -156,7 +156,7 @@ class View3d(Drawn):
         )
 
     def set_camera(self, camera: Camera) -> None:
-        """Look from where another view does; tells nobody."""
+        """Take over another view's camera; emits no signal."""
         if self._drawing is None:
             self._wanted = camera
         elif camera != self.camera:

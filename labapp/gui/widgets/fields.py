@@ -104,7 +104,7 @@ class Field(QWidget):
         self._show_problem()
 
     def _enter(self, value: object) -> None:
-        """Tell of an edit."""
+        """Emit an edit."""
         self.refuse("")
         self.edited.emit(value)
 
@@ -177,7 +177,7 @@ class NumberField(Field):
         return self._value
 
     def set_value(self, value: float | None) -> None:
-        """Show another value; tells nobody."""
+        """Show another value; emits no signal."""
         if self._pause.isActive():
             return
         typing = self._box.text() != self._shown(self._value) and self._box.line.isModified()
@@ -318,7 +318,7 @@ class TextField(Field):
         return edit.text() if isinstance(edit, QLineEdit) else edit.toPlainText()
 
     def set_value(self, value: str) -> None:
-        """Show other words; tells nobody, and leaves alone what is being typed."""
+        """Show another text; emits no signal, and leaves alone what is being typed."""
         edit = self._edit
         modified = edit if isinstance(edit, QLineEdit) else edit.document()
         typing = modified.isModified() and self.value() != self._emitted
@@ -400,7 +400,7 @@ class ChoiceField(Field):
         return str(self._combo.currentData() or "")
 
     def set_value(self, key: str) -> None:
-        """Choose by key; tells nobody."""
+        """Choose by key; emits no signal."""
         self._combo.setCurrentIndex(self._combo.findData(key))
         if self.value() != self._emitted:
             self.refuse("")

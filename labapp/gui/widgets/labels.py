@@ -105,7 +105,7 @@ class Message(QLabel):
             self._update_tip()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Tell all of it where not all is shown."""
+        """Update the tooltip, which has the whole text where it does not fit."""
         super().resizeEvent(event)
         self._update_tip()
 

@@ -106,7 +106,7 @@ class Scrubber(QAbstractSlider):
         self.valueChanged.connect(self.moved)  # by a screen reader
 
     def sizeHint(self) -> QSize:
-        """As wide as there is room, and high enough for the shapes to be told apart."""
+        """As wide as there is room, and high enough to distinguish the shapes."""
         return QSize(400, self.fontMetrics().height() * 2 + RAIL_PX)
 
     def set_kinds(self, kinds: npt.NDArray[np.int64]) -> None:
@@ -259,7 +259,7 @@ class Scrubber(QAbstractSlider):
             event.ignore()
 
     def event(self, event: QEvent) -> bool:
-        """Tell of the frame under the pointer."""
+        """Show a tooltip for the frame under the pointer."""
         if isinstance(event, QHelpEvent) and len(self._kinds):
             position = self.position_at(event.pos().x())
             QToolTip.showText(event.globalPos(), self.position_text(position), self)

@@ -175,7 +175,7 @@ def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) ->
 def test_an_import_that_is_cancelled_leaves_the_session_as_it_was(
     page: CapturePage, stack: Path, qtbot: QtBot, monkeypatch
 ) -> None:
-    page.choose(stack)
+    page.take(stack)
     qtbot.waitUntil(lambda: page.preview is not None)
     begun, go_on = threading.Event(), threading.Event()
     progress = page.workspace.tasks.start.__globals__["Control"].progress
@@ -200,7 +200,7 @@ def test_what_cannot_be_opened_is_said(page: CapturePage, tmp_path: Path, qtbot:
     said: list[tuple[str, bool]] = []
     page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
     (tmp_path / "notes.txt").write_text("no video")
-    page.choose(tmp_path / "notes.txt")
+    page.take(tmp_path / "notes.txt")
     qtbot.waitUntil(lambda: bool(said))
     assert said[0][1]
     assert "notes.txt" in said[0][0]
@@ -208,7 +208,7 @@ def test_what_cannot_be_opened_is_said(page: CapturePage, tmp_path: Path, qtbot:
 
 
 def test_not_this_one_goes_back(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
-    page.choose(stack)
+    page.take(stack)
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
     page.cancel_choice()
     assert page.preview is None

@@ -130,10 +130,6 @@ class CapturePage(Page):
             self._rest.stop()
             self._seen = None
 
-    def take(self, path: Path) -> None:
-        """Look at a recording, to import it."""
-        self.choose(path)
-
     # --- live ---------------------------------------------------------------------------------
 
     @property
@@ -281,7 +277,7 @@ class CapturePage(Page):
             self, "Choose a recording", str(self._folder()), f"{recordings()};;{EVERYTHING}"
         )
         if name:
-            self.choose(Path(name))
+            self.take(Path(name))
 
     def choose_folder(self) -> None:
         """Ask for a recording that is a folder of images."""
@@ -289,12 +285,12 @@ class CapturePage(Page):
             self, "Choose a folder of images", str(self._folder())
         )
         if name:
-            self.choose(Path(name))
+            self.take(Path(name))
 
     def _folder(self) -> Path:
         return self._last_folder if self._last_folder.name else self.workspace.folder
 
-    def choose(self, path: Path) -> None:
+    def take(self, path: Path) -> None:
         """Look at a recording, to import it."""
         self._last_folder = path.parent
         self.refused.setText("")
@@ -465,7 +461,7 @@ class CapturePage(Page):
         self.panel_layout.addWidget(self.foot_switch)
         # Below the other buttons: it comes when a recording ends.
         self.kept = KeptRecordings(
-            self.choose, lambda path: self._import_next(path, ":", None, False)
+            self.take, lambda path: self._import_next(path, ":", None, False)
         )
         self.panel_layout.addWidget(self.kept)
         self.told_group, layout = headed("What was read")

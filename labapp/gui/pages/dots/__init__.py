@@ -1,4 +1,4 @@
-"""Step 5: the dots of a frame, their rows, and the hand that puts them right."""
+"""Step 5: the dots of a frame, their rows, and how they are corrected by hand."""
 
 from labapp.gui.pages.dots.view import DotsPage
 

@@ -130,7 +130,7 @@ class Editor:
     # --- edits --------------------------------------------------------------------------------
 
     def add(self, image: Image, u: float, v: float, settings: Settings) -> bool:
-        """Add the dot that is pointed at, numbered by its neighbours if they tell its place."""
+        """Add the dot at the pointer, numbered by its neighbours if they determine its place."""
 
         def edit(correction: Correction) -> Correction:
             added = core.add_dot(correction, image, u, v, settings.dots.band_pass)
@@ -167,7 +167,7 @@ class Editor:
         return self._edit(label, lambda c: core.assign(c, chosen, row, column))
 
     def number(self) -> bool:
-        """Give the chosen dots the row and the column that their neighbours tell."""
+        """Give the chosen dots the row and column that follow from their neighbours."""
         chosen = self.selection
         label = f"number {_count(chosen)}"
         return self._edit(label, lambda c: picking.numbered_by_neighbours(c, _some(chosen)))

@@ -247,7 +247,7 @@ class _RowList(ReadTable):
         return [self._numbers[k] for k in lines if k < len(self._numbers)]
 
     def choose(self, rows: Sequence[int]) -> None:
-        """Choose the lines of rows; tells nobody."""
+        """Select the lines of rows; emits no signal."""
         if sorted(self.chosen()) == sorted(rows):
             return
         with QSignalBlocker(self):

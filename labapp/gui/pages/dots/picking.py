@@ -113,7 +113,7 @@ def site_px(correction: Correction, site: Site) -> FloatArray | None:
 
 
 def numbered_by_neighbours(correction: Correction, dots: IntArray) -> Correction:
-    """Give dots the row and the column that the dots round them tell.
+    """Give dots the row and column that follow from the dots around them.
 
     Raises
     ------

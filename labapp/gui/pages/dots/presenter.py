@@ -84,7 +84,7 @@ class DotsState:
 
 @dataclass(frozen=True)
 class Figures:
-    """What tells whether an edit made the fit better; lengths in mm, NaN where there are none.
+    """Figures that show whether an edit improved the fit; lengths in mm, NaN where there are none.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The dots page: the frame, its dots and rows, and the keys and buttons that put them right."""
+"""The dots page: the frame, its dots and rows, and the keys and buttons that correct them."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class DotsPage(Page):
         )
 
     def draw(self) -> None:
-        """Draw the marks where the hand has them."""
+        """Draw the marks, a drag under way included."""
         computed = presenter.NO_PLACES if self.seen is None else self.seen.computed_px
         editor = self.editor
         self.overlay.show(editor.correction, editor.dots_px, editor.selection, computed)

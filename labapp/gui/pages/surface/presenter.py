@@ -135,7 +135,7 @@ class SurfaceState:
 
 
 def shown(session: Session, frame: int) -> SurfaceState:
-    """What to tell of a frame by the scheme that the settings choose.
+    """What to show of a frame by the scheme of the settings.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def _noted(note: str, sigma: float) -> str:
 
 
 def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
-    """ARE … MRE-I, and what else the scheme tells; empty without measures."""
+    """ARE … MRE-I, and the scheme's own ARE where it has one; empty without measures."""
     if measures is None:
         return ()
     return tuple(
