@@ -7,14 +7,12 @@ right height and place has them: enough to begin with.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
 from labapp.core.matching.ray_growth import UNLABELLED, Scene
-from labapp.core.values import FloatArray, IntArray, median
+from labapp.core.values import FloatArray, IntArray
 
 _ASPECTS = (0.9, 1.1, 1.35)
 """Length over width that are tried."""
@@ -34,17 +32,11 @@ LEAST = 10
 LIT_MARKER, DARK = 5.0, 0.5
 """What a dot at the marker's absent ray, and a ray without a dot, take off the rays with one."""
 
+MARKED = 0.3
+"""The marker is lit by a dot within this fraction of the usual way to the next predicted one."""
+
 ALIKE = 0.7
 """Two caps are one hypothesis where such a share of the rays that find a dot find the same."""
-
-
-@dataclass(frozen=True)
-class _Cap:
-    """A paraboloid over an ellipse: semi-axes and middle, X and Y, and height, mm."""
-
-    axes: FloatArray
-    middle: FloatArray
-    height: float
 
 
 def search_caps(scene: Scene, most: int = 8) -> list[IntArray]:
@@ -62,57 +54,30 @@ def search_caps(scene: Scene, most: int = 8) -> list[IntArray]:
     list of IntArray
         Index of the dot of each ray or `UNLABELLED`, shape (rows, columns); the best first.
     """
-    judged = [found for cap in _caps(scene) if (found := _judged(scene, cap)) is not None]
-    judged.sort(key=lambda one: -one[0])
+    from labapp.core.surface import kernels
+
+    rig = scene.rig
+    bench = rig.laser.position_mm, rig.imaging_plane.pose_mm, scene.plane_mm, scene.absent.ravel()
+    settings = np.array([LEAST, GATE, DARK, MARKED, LIT_MARKER])
+    score, found = kernels.score_caps(_caps(scene), scene.rays.reshape(-1, 3), *bench, settings)
     best: list[IntArray] = []
-    for _, labels in judged:
-        if not any(_alike(labels, other) for other in best):
+    for k in np.argsort(-score, kind="stable"):
+        labels = found[k].reshape(scene.absent.shape)
+        if np.isfinite(score[k]) and not any(_alike(labels, other) for other in best):
             best.append(labels)
             if len(best) == most:
                 break
     return best
 
 
-def _caps(scene: Scene) -> Iterator[_Cap]:
-    """Those to be tried: each as large as there are dots for."""
+def _caps(scene: Scene) -> FloatArray:
+    """Caps to be tried, each as large as there are dots for: see `kernels.score_caps`."""
     area = len(scene.plane_mm) * scene.spacing_mm.prod()
+    caps = []
     for aspect, height, x, y in product(_ASPECTS, _HEIGHTS, _ASIDE, _ALONG):
-        axes = np.sqrt(area / np.pi * np.array([1 / aspect, aspect]))
-        yield _Cap(axes, np.array([x, y]), 2 * height * float(axes[0]))
-
-
-def _judged(scene: Scene, cap: _Cap) -> tuple[float, IntArray] | None:
-    """How well the dots lie where the cap has them, and the labels of those that do."""
-    from labapp.core.images.dot_kernels import two_nearest
-    from labapp.core.surface import kernels
-
-    down = np.array([0.0, 0.0, cap.height])  # the quadric has its top at 0
-    rays, plane = scene.rays.reshape(-1, 3), scene.rig.imaging_plane.pose_mm
-    plane = np.vstack([plane[:1] - down, plane[1:]])
-    laser = scene.rig.laser.position_mm - down
-    curvature = -2 * cap.height / cap.axes**2
-    quadric = np.array([[0.0, 0.0, curvature[0], 0.0, curvature[1]]])
-    points, dots = (
-        part[0] for part in kernels.meet_quadrics(cap.middle, quadric, rays, laser, plane)
-    )
-    from_middle = np.sum(((points[:, :2] - cap.middle) / cap.axes) ** 2, axis=-1)
-    there = (from_middle < 1) & np.isfinite(dots).all(axis=-1)
-    own = np.flatnonzero(there & ~scene.absent.ravel())
-    if len(own) < LEAST:
-        return None
-    predicted, captured = dots[own], scene.plane_mm
-    spacing = two_nearest(predicted, predicted)[0][:, 1]
-    away, dot = (part[:, 0] for part in two_nearest(predicted, captured))
-    mutual = two_nearest(captured, predicted)[1][dot, 0] == np.arange(len(own))
-    near = mutual & (away < GATE * spacing)
-    score = float(np.sum(1 - away[near] / spacing[near]) - DARK * np.sum(~near))
-    marker = scene.absent.ravel() & there
-    if marker.any():
-        off = two_nearest(dots[marker], captured)[0][:, 0]
-        score -= LIT_MARKER * float(np.mean(off < 0.3 * median(spacing)))
-    labels = np.full(scene.absent.size, UNLABELLED, np.int64)
-    labels[own[near]] = dot[near]
-    return score, labels.reshape(scene.absent.shape)
+        across, along = np.sqrt(area / np.pi * np.array([1 / aspect, aspect]))
+        caps.append((x, y, across, along, 2 * height * across))
+    return np.array(caps)
 
 
 def _alike(one: IntArray, other: IntArray) -> bool:

@@ -11,7 +11,6 @@ whose rays round a hole fall on dots.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -38,7 +37,7 @@ from labapp.core.matching.hypothesis import (
     turned,
 )
 from labapp.core.matching.quadric_search import search_quadrics
-from labapp.core.matching.ray_growth import LEAST_LABELS, SOFT, UNLABELLED, Scene, try_fit
+from labapp.core.matching.ray_growth import LEAST_LABELS, QUICK, SOFT, UNLABELLED, Scene, try_fit
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
 from labapp.core.surface.pool_fit import FitSettings
@@ -146,9 +145,6 @@ def _by_placement(
 
 MOST_PLACES = 8
 """So many places of the marker in the grid are followed, of those that fit it best."""
-
-QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
-"""Of the surface by which many places are sorted: the right one is not far from the first."""
 
 
 def _placed(

@@ -21,12 +21,13 @@ from labapp.core.matching.hypothesis import (
     contested,
     grow_and_score,
     moved,
+    rough_costs,
     turned,
     weigh,
     without_false_ends,
     without_false_rim,
 )
-from labapp.core.matching.ray_growth import UNLABELLED, Scene, try_fit
+from labapp.core.matching.ray_growth import QUICK, UNLABELLED, Scene, try_fit
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import CannotMeasure, IntArray, median
 
@@ -236,18 +237,43 @@ def _with_neighbours(
         best = better
 
 
+FAR_OFF = 4.0
+"""Labels whose quick surface leaves so many times the residual of the best's are no rivals: those
+that came near, of 700 beside 160 pools with a dip, left less than 2.5 times as much."""
+
+FAR_WORSE = 30.0
+"""With rough surfaces, labels that cost more than the best by so much, and by `INFLATED` besides
+where the marker counts, do not come near it with settled ones."""
+
+
 def _rivals(
     scene: Scene, best: Hypothesis, labelled: Iterable[IntArray], knots: FitSettings
 ) -> list[Hypothesis]:
-    """Weigh other labels beside a hypothesis, as far as a surface goes through them as well."""
+    """Weigh other labels beside a hypothesis, as far as they may come near it.
+
+    A surface has to go through their dots as well; with wide knots they have to explain nearly as
+    much with a rough surface. (With fine ones there is a dip, of which that leaves too much.)
+    """
     most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
-    return [
-        hypothesis
-        for labels in labelled
-        if (pool := try_fit(scene, labels, near=best.pool)) is not None
-        and pool.residual_rms_mm < most_mm
-        and (hypothesis := _judged(scene, labels, knots, pool)) is not None
-    ]
+    quick = try_fit(scene, best.labels, QUICK, best.pool)
+    rough = try_fit(scene, best.labels, near=best.pool)
+    far_mm = np.inf if quick is None else FAR_OFF * quick.residual_rms_mm
+    own = None if rough is None or knots is FINE else rough_costs(scene, best.labels, rough)
+    rivals = []
+    for labels in labelled:
+        sketch = try_fit(scene, labels, QUICK, best.pool)
+        if sketch is None or sketch.residual_rms_mm > far_mm:
+            continue
+        pool = try_fit(scene, labels, near=best.pool)
+        if pool is None or pool.residual_rms_mm >= most_mm:
+            continue
+        if own is not None:
+            unlit, cost = rough_costs(scene, labels, pool)
+            if unlit > own[0] + FAR_WORSE and cost > own[1] + FAR_WORSE + INFLATED:
+                continue
+        hypothesis = _judged(scene, labels, knots, pool)
+        rivals += [] if hypothesis is None else [hypothesis]
+    return rivals
 
 
 def _judged(

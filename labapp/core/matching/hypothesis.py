@@ -168,15 +168,32 @@ def weigh(
         pool = scene.fit(labels, _witness(scene, labels, pool), settings, pool)
     except CannotMeasure:
         return None
+    unseen, stray, marker, cost = _misfit(scene, labels, pool)
+    witness = _witness(scene, labels, pool)
+    cost += _boundary_cost(pool.level)
+    return Hypothesis(labels, pool, witness, unseen, stray, marker, cost)
+
+
+def rough_costs(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[float, float]:
+    """What `weigh` would call unlit cost and cost of labels, with a surface as it is.
+
+    The rays near the boundary have no say in it: that needs no further fit.
+    """
+    _, _, marker, cost = _misfit(scene, labels, pool)
+    return cost, cost + LIT_MARKER * (marker == "lit")
+
+
+def _misfit(
+    scene: Scene, labels: IntArray, pool: FittedPool
+) -> tuple[Prediction, IntArray, Marker | None, float]:
+    """Rays without a dot, dots without a ray, the marker, and χ² with `STRAY` and `MISSED`."""
     lit = labels != UNLABELLED
     unseen, stray = _unexplained(scene, labels, pool)
     marker = _marker(scene, lit, pool)
     variance = scene.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
     surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY)
     cost = float(surprise.sum()) + STRAY * len(stray) + MISSED * len(unseen.at)
-    cost += _boundary_cost(pool.level)
-    witness = _witness(scene, labels, pool)
-    return Hypothesis(labels, pool, witness, unseen, stray, marker, cost)
+    return unseen, stray, marker, cost
 
 
 def _boundary_cost(level: Level) -> float:

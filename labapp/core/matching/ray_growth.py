@@ -61,6 +61,8 @@ LEAST_LABELS = 6
 _FINE = FitSettings(rounds=5, jerk=0.05, floor_mm=0.03, settled_mm=2e-3)
 _WIDE = replace(_FINE, knot_mm=1.2, jerk=0.036)
 SOFT, _WIDE_SOFT = replace(_FINE, jerk=0.12), replace(_WIDE, jerk=0.12)
+# Of the surface by which many labellings are sorted: the right one is not far from the first.
+QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
 
 FEW_LABELS = 25
 """A whole grid labels more dots than this, a quadric round a hole fewer."""

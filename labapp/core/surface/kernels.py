@@ -327,6 +327,37 @@ def accumulate_normal_matrix(
                 normal[row + column] += along_x * by_x[other] + along_y * by_y[other]
 
 
+@_inner
+def _inverse_band(lower: FloatArray, start: int) -> FloatArray:
+    """Band of the inverse of LLᵀ from row ``start`` on, both triangles, shape (p, p).
+
+    Entries farther from the diagonal than the band of L, and rows before ``start``, are not set.
+    Takahashi's recurrence (Erisman and Tinney 1975, On computing certain elements of the inverse
+    of a sparse matrix), from the last row to the first.
+    """
+    width, count = lower.shape[0] - 1, lower.shape[1]
+    inverse, column = np.empty((count, count)), np.empty(width)
+    for j in range(count - 1, start - 1, -1):
+        after = min(width, count - 1 - j)
+        column[:] = 0.0
+        for k in range(0, after - 3, 4):  # four at a time: the column is read and written once
+            a, b = lower[k + 1, j] / lower[0, j], lower[k + 2, j] / lower[0, j]
+            c, d = lower[k + 3, j] / lower[0, j], lower[k + 4, j] / lower[0, j]
+            rows = inverse[j + 1 + k : j + 5 + k, j + 1 :]
+            for i in range(after):
+                column[i] -= a * rows[0, i] + b * rows[1, i] + c * rows[2, i] + d * rows[3, i]
+        for k in range(after - after % 4, after):
+            factor, row = lower[k + 1, j] / lower[0, j], inverse[j + 1 + k, j + 1 :]
+            for i in range(after):
+                column[i] -= factor * row[i]
+        own = 1.0 / (lower[0, j] * lower[0, j])
+        for k in range(after):
+            inverse[j, j + 1 + k] = inverse[j + 1 + k, j] = column[k]
+            own -= lower[k + 1, j] / lower[0, j] * column[k]
+        inverse[j, j] = own
+    return inverse
+
+
 @_compiled(_f2, _f2, _f1, _f2, _f2, _f2)
 def covariance_of_dots(
     grid: FloatArray,
@@ -339,46 +370,41 @@ def covariance_of_dots(
     """Covariance of the dots that a fitted surface makes of rays, shape (n, 2, 2), mm².
 
     With L the factor of the normal matrix, shape (width + 1, p), and R what each coefficient moves
-    either coordinate of a dot by, (L⁻¹R)ᵀ L⁻¹R. Points are where the rays meet the surface, shape
+    either coordinate of a dot by, Rᵀ (LLᵀ)⁻¹ R. Points are where the rays meet the surface, shape
     (n, 3), dots are in the UCS, shape (n, 3), axes those of the imaging plane.
     """
-    width, count, pairs = lower.shape[0] - 1, lower.shape[1], len(points)
-    work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
+    pairs, work, many = len(points), np.empty((4, 4)), int(grid[1, 3]) + 3
     first = np.empty(pairs, np.int64)
     for k in range(pairs):
         first_x = _along(grid[0], points[k, 0], work[0], work[1])
         first[k] = first_x * many + _along(grid[1], points[k, 1], work[2], work[3])
-    order = np.argsort(first)
-    right = np.zeros((count, 2 * pairs))
-    for n in range(pairs):
-        point, dot = points[order[n]], dots[order[n]]
-        (a, b), (c, d) = _slopes_of_dot(laser, axes, point, dot)
+    made = np.zeros((pairs, 2, 2))
+    if pairs == 0:
+        return made
+    # The splines of a cell are all within the band.
+    inverse = _inverse_band(lower, first.min())
+    by_u, by_v = np.empty(16), np.empty(16)
+    for k in range(pairs):
+        (a, b), (c, d) = _slopes_of_dot(laser, axes, points[k], dots[k])
         area = a * d - b * c
-        _along(grid[0], point[0], work[0], work[1])
-        _along(grid[1], point[1], work[2], work[3])
+        _along(grid[0], points[k, 0], work[0], work[1])
+        _along(grid[1], points[k, 1], work[2], work[3])
         for own in range(16):
             by_x = work[1, own // 4] * work[2, own % 4]
             by_y = work[0, own // 4] * work[3, own % 4]
-            at = first[order[n]] + own // 4 * many + own % 4
-            right[at, 2 * n] = (d * by_x - b * by_y) / area
-            right[at, 2 * n + 1] = (a * by_y - c * by_x) / area
-    made, begun = np.zeros((pairs, 2, 2)), 0
-    start = first[order[0]] if pairs else count
-    for i in range(start, count):
-        while begun < pairs and first[order[begun]] <= i:
-            begun += 1
-        row = right[i]
-        for j in range(max(start, i - width), i):
-            factor, before = lower[i - j, j], right[j]
-            for k in range(2 * begun):
-                row[k] -= factor * before[k]
-        for n in range(begun):
-            a, b = row[2 * n] / lower[0, i], row[2 * n + 1] / lower[0, i]
-            row[2 * n], row[2 * n + 1] = a, b
-            made[order[n], 0, 0] += a * a
-            made[order[n], 0, 1] += a * b
-            made[order[n], 1, 1] += b * b
-    made[:, 1, 0] = made[:, 0, 1]
+            by_u[own] = (d * by_x - b * by_y) / area
+            by_v[own] = (a * by_y - c * by_x) / area
+        for own in range(16):
+            row = inverse[first[k] + own // 4 * many + own % 4]
+            along_u, along_v = 0.0, 0.0
+            for other in range(16):
+                entry = row[first[k] + other // 4 * many + other % 4]
+                along_u += entry * by_u[other]
+                along_v += entry * by_v[other]
+            made[k, 0, 0] += by_u[own] * along_u
+            made[k, 0, 1] += by_u[own] * along_v
+            made[k, 1, 1] += by_v[own] * along_v
+        made[k, 1, 0] = made[k, 0, 1]
     return made
 
 
@@ -647,6 +673,108 @@ def hits(
                 off[p, i, j] = np.sqrt(least) / max(gate * spacing, 1e-9)
                 hit[p, i, j] = off[p, i, j] < 1.0 and not absent[i, j]
     return hit, dot, off
+
+
+@_compiled(_f2, _f2, _f1, _f2, _f2, types.Array(types.boolean, 1, "A", readonly=True), _f1)
+def score_caps(
+    caps: FloatArray,
+    rays: FloatArray,
+    laser: FloatArray,
+    plane: FloatArray,
+    places: FloatArray,
+    absent: BoolArray,
+    settings: FloatArray,
+) -> tuple[FloatArray, IntArray]:
+    """Say how well some places on the plane lie where caps put the dots of rays.
+
+    Parameters
+    ----------
+    caps
+        Paraboloids over ellipses: middle X and Y, semi-axes along them, height, shape (m, 5), mm.
+    rays, laser, plane
+        See `meet_quadrics`.
+    places, absent
+        Shape (d, 2), mm; which rays make no dot, shape (n,).
+    settings
+        Least rays; the gate, a share of the way to the next predicted dot; what a ray without its
+        place takes off; share of the way within which an absent ray has a place, and what that
+        takes off (`cap_search`).
+
+    Returns
+    -------
+    score, labels
+        The higher the better, −inf for too few rays, shape (m,); and index of the place that is
+        each ray's, −1 where none is, shape (m, n).
+    """
+    least, gate, dark, lit_gate, lit = settings
+    count, many = len(rays), len(places)
+    score, labels = np.full(len(caps), -np.inf), np.full((len(caps), count), -1)
+    dots, dot, ray_of = np.empty((count, 2)), np.empty(count, np.int64), np.empty(many, np.int64)
+    own, marked = np.empty(count, np.int64), np.empty(count, np.int64)
+    spacing, away, back = np.empty(count), np.empty(count), np.empty(many)
+    quadric, point = np.zeros(5), np.empty(3)
+    for c in range(len(caps)):
+        x_mm, y_mm, along_x, along_y, height = caps[c]
+        quadric[2], quadric[4] = -2.0 * height / along_x**2, -2.0 * height / along_y**2
+        found, marks = 0, 0
+        for k in range(count):
+            ray = rays[k]
+            for axis in range(3):
+                point[axis] = laser[axis] + (height - laser[2]) / ray[2] * ray[axis]
+            for _ in range(3):
+                z, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
+                descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
+                step = (point[2] - height - z) / max(descent, 0.05)
+                for axis in range(3):
+                    point[axis] += min(max(step, -1.0), 1.0) * ray[axis]
+            across, along = (point[0] - x_mm) / along_x, (point[1] - y_mm) / along_y
+            if not across * across + along * along < 1.0:
+                continue
+            _, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
+            u, v = _dot(ray, point, slope_x, slope_y, plane)
+            if not (np.isfinite(u) and np.isfinite(v)):
+                continue
+            dots[k, 0], dots[k, 1] = u, v
+            if absent[k]:
+                marked[marks] = k
+                marks += 1
+            else:
+                own[found] = k
+                found += 1
+        if found < least:
+            continue
+        back[:], spacing[:found] = np.inf, np.inf
+        for a in range(found):
+            u, v = dots[own[a], 0], dots[own[a], 1]
+            for b in range(a):
+                x, y = u - dots[own[b], 0], v - dots[own[b], 1]
+                square = x * x + y * y
+                spacing[a], spacing[b] = min(spacing[a], square), min(spacing[b], square)
+            away[a] = np.inf
+            for m in range(many):
+                x, y = u - places[m, 0], v - places[m, 1]
+                square = x * x + y * y
+                if square < away[a]:
+                    away[a], dot[a] = square, m
+                if square < back[m]:
+                    back[m], ray_of[m] = square, a
+        spacing[:found] = np.sqrt(spacing[:found])
+        total = 0.0
+        for a in range(found):
+            off = np.sqrt(away[a])
+            if ray_of[dot[a]] == a and off < gate * spacing[a]:
+                total += 1.0 - off / spacing[a]
+                labels[c, own[a]] = dot[a]
+            else:
+                total -= dark
+        usual, shown = np.median(spacing[:found]), 0
+        for k in marked[:marks]:
+            nearest = np.inf
+            for m in range(many):
+                nearest = min(nearest, np.hypot(dots[k, 0] - places[m, 0], dots[k, 1] - places[m, 1]))
+            shown += nearest < lit_gate * usual
+        score[c] = total - lit * shown / max(marks, 1)
+    return score, labels
 
 
 @_inner
