@@ -21,6 +21,7 @@ from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, ways
 from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.decision import (
+    FAR_OFF,
     MISFIT_MM,
     MISFIT_TIMES,
     MatchSettings,
@@ -159,8 +160,8 @@ def _placed(
         from_grid(lattice, site, pattern.marker, orientation, shape)
         for site, orientation in product(sites, orientations)
     ]
-    if len(labelled) > 2 * MOST_PLACES:
-        labelled = [labels for _, labels in _fitting(scene, labelled, QUICK)][: 2 * MOST_PLACES]
+    quick = _fitting(scene, labelled, QUICK)[: 2 * MOST_PLACES]
+    labelled = [labels for off_mm, labels in quick if off_mm <= FAR_OFF * quick[0][0]]
     rough = _fitting(scene, labelled, SOFT)[:MOST_PLACES]
     most_mm = max(MISFIT_MM, MISFIT_TIMES * rough[0][0]) if rough else 0.0
     scored = (grow_and_score(scene, labels) for off_mm, labels in rough if off_mm < most_mm)

@@ -12,8 +12,8 @@ from labapp.core.values import FloatArray
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
 
-EPS = 1e-17
-"""One and so much is one."""
+EPS = 1e-12
+"""One and so much is taken for one: a thousand such factors change no level."""
 
 FACTORS = 1000
 """So many factors of at most 2 have a product that is a number still."""
