@@ -13,6 +13,7 @@ from labapp.core.schemes import ers, fit
 from labapp.core.surface.measures import Measures, measure, reflection_errors, size_of
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.rim import find_rim
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import exact_match, trace
@@ -133,7 +134,8 @@ def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely() -> N
         change = dtbtrs(pool.factor, half, uplo="L", trans="T")[0]
         change += rng.normal(0.0, pool.level.sigma_mm) - pool.level_at @ change
         surface = SplineSurface(pool.surface.basis, pool.surface.coefficients + change)
-        boundary = fit.contour(surface, made.boundary.center_mm, pool.level)
+        center = made.boundary.center_mm
+        boundary, _ = find_rim(surface.basis, surface.coefficients, pool.level, center)
         sizes.append(size_of(surface, boundary)[0])
     np.testing.assert_allclose(np.std(sizes, axis=0)[:3], made.size_sigma[:3], rtol=0.2)
     np.testing.assert_allclose(np.std(sizes, axis=0)[4:], made.size_sigma[4:], rtol=0.2)

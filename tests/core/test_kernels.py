@@ -434,7 +434,7 @@ def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
     center, rear = np.array([0.1, -0.4]), Rear(drop_mm, -1.0, -4.5)
     radius, climb, over = kernels.follow_rim(
         BASIS.grid, surface().coefficients, np.array([drop_mm, -1.0, -4.5]), center, way,
-        np.full(48, 3.0), 20, 1e-10,
+        np.full(48, 3.0), np.full(48, 0.3), 1e-10,
     )  # fmt: skip
     place = center + radius[:, None] * way
     height, gradient = surface().height_and_gradient(*place.T)
@@ -442,7 +442,8 @@ def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
     assert inside.sum() > 40
     np.testing.assert_allclose((height - rear.height(place[:, 1]))[inside], 0.0, atol=1e-9)
     np.testing.assert_allclose(over[inside], 0.0, atol=1e-9)
-    gradient[:, 1] -= rear.slope(place[:, 1])
+    below = np.maximum(-1.0 - place[:, 1], 0.0)
+    gradient[:, 1] -= 2 * drop_mm * below / 3.5**2
     np.testing.assert_allclose(climb[inside], gradient[inside], atol=1e-6)
 
 
@@ -555,3 +556,44 @@ def test_what_cannot_be_kept_on_disk_is_compiled_all_the_same(tmp_path: Path) ->
         env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "file")},
     )  # fmt: skip
     assert (told.returncode, told.stdout) == (0, "2\n"), told.stderr
+
+
+@pytest.mark.parametrize("height_mm", [0.3, -0.5])
+def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: float) -> None:
+    rng = np.random.default_rng(7)
+    rays = ray_directions(RIG.laser, RIG.pattern).reshape(-1, 3)
+    absent = np.zeros(len(rays), bool)
+    absent[len(rays) // 2] = True
+    middle, axes = np.array([0.2, -0.3]), np.array([2.6, 3.1])
+    cap = np.array([*middle, *axes, height_mm])
+    # The same by NumPy and a tree: the quadric's top is at 0, so the bench is moved down.
+    down = np.array([0.0, 0.0, height_mm])
+    plane = np.vstack([PLANE.pose_mm[:1] - down, PLANE.pose_mm[1:]])
+    quadric = np.array(
+        [[0.0, 0.0, -2 * height_mm / axes[0] ** 2, 0.0, -2 * height_mm / axes[1] ** 2]]
+    )
+    points, dots = (
+        part[0] for part in kernels.meet_quadrics(middle, quadric, rays, LASER - down, plane)
+    )
+    there = (((points[:, :2] - middle) / axes) ** 2).sum(axis=1) < 1
+    there &= np.isfinite(dots).all(axis=1)
+    own = np.flatnonzero(there & ~absent)
+    shown = rng.permutation(own)[: len(own) // 2]
+    places = np.vstack([dots[shown] + rng.normal(0.0, 0.1, (len(shown), 2)), dots[absent]])
+    spacing = cKDTree(dots[own]).query(dots[own], k=2)[0][:, 1]
+    away, dot = cKDTree(places).query(dots[own])
+    mutual = cKDTree(dots[own]).query(places)[1][dot] == np.arange(len(own))
+    near = mutual & (away < 0.45 * spacing)
+    wanted = np.sum(1 - away[near] / spacing[near]) - 0.5 * np.sum(~near) - 5.0
+    labels = np.full(len(rays), -1)
+    labels[own[near]] = dot[near]
+
+    settings = np.array([10, 0.45, 0.5, 0.3, 5.0])
+    far = cap + [9.0, 0.0, 0.0, 0.0, 0.0]
+    caps = np.array([cap, far])
+    score, made = kernels.score_caps(caps, rays, LASER, PLANE.pose_mm, places, absent, settings)
+    assert len(own) > 30
+    assert 0 < near.sum() < len(own)
+    np.testing.assert_allclose(score, [wanted, -np.inf], rtol=1e-9)
+    np.testing.assert_array_equal(made[0], labels)
+    assert (made[1] == -1).all()

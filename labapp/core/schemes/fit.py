@@ -6,7 +6,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.surface.rim import contour
+from labapp.core.surface.rim import find_rim
 from labapp.core.surface.sizes import sizes_of
 from labapp.core.values import CannotMeasure
 
@@ -42,10 +42,8 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         raise CannotMeasure("no-surface", "the surface does not settle")
     x, y = pool.points_mm[:, 0], pool.points_mm[:, 1]
     center = (pool.points_mm[:, :2].min(axis=0) + pool.points_mm[:, :2].max(axis=0)) / 2
-    boundary = contour(pool.surface, center, pool.level)
-    surface, level, outline = pool.surface, pool.level, boundary.points_mm
-    climb = surface.gradient(*outline[:, :2].T)
-    climb[:, 1] -= level.rear.slope(outline[:, 1])
+    surface, level = pool.surface, pool.level
+    boundary, climb = find_rim(surface.basis, surface.coefficients, level, center)
     sizes = sizes_of(surface.basis, surface.coefficients, level, boundary, climb)
     return Reconstruction(
         scheme="fit",

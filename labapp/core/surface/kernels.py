@@ -456,7 +456,10 @@ def advance(
 # --- the boundary -------------------------------------------------------------------------------
 
 
-@_compiled(_f2, _f1, _f1, _f1, _f2, _f1, _i, _f)
+RIM_STEPS = 20
+
+
+@_compiled(_f2, _f1, _f1, _f1, _f2, _f1, _f1, _f)
 def follow_rim(
     grid: FloatArray,
     coefficients: FloatArray,
@@ -464,17 +467,18 @@ def follow_rim(
     center: FloatArray,
     way: FloatArray,
     radius: FloatArray,
-    steps: int,
+    longest: FloatArray,
     last: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Newton steps along directions to where a surface meets its rim: `rim.follow_rim`.
+    """Newton steps along m directions to where a surface meets its rim (`rim`).
 
-    The rear is its depth and where it starts and ends. Gives radii, gradients of the height over
-    the rim and that height, where each was before its last step.
+    The rear is its depth and where it starts and ends; no step along a direction is longer than
+    its ``longest``, shape (m,), and none follows one in which all are below ``last``. Gives radii,
+    gradients of the height over the rim and that height, where each was before its last step.
     """
     count, work = len(radius), np.empty((4, 4))
     made, climb, over = radius.copy(), np.empty((count, 2)), np.empty(count)
-    for _ in range(steps):
+    for _ in range(RIM_STEPS):
         most = 0.0
         for k in range(count):
             x, y = center[0] + made[k] * way[k, 0], center[1] + made[k] * way[k, 1]
@@ -485,7 +489,7 @@ def follow_rim(
             climb[k, 1] = slope_y - 2.0 * rear[0] * part / (rear[1] - rear[2])
             outward = climb[k, 0] * way[k, 0] + climb[k, 1] * way[k, 1]
             change = -over[k] / outward if abs(outward) > 1e-6 else 0.0
-            made[k] += min(max(change, -0.3), 0.3)
+            made[k] += min(max(change, -longest[k]), longest[k])
             most = max(most, abs(change))
         if most < last:
             break
@@ -675,6 +679,66 @@ def hits(
     return hit, dot, off
 
 
+@_inner
+def _cap_dots(
+    cap: FloatArray, rays: FloatArray, bench: tuple[FloatArray, FloatArray], dots: FloatArray
+) -> BoolArray:
+    """Put the dots that a cap makes of rays into ``dots``, (n, 2); which rays meet it, (n,)."""
+    x_mm, y_mm, along_x, along_y, height = cap
+    laser, plane = bench
+    quadric, point, there = np.zeros(5), np.empty(3), np.zeros(len(rays), np.bool_)
+    quadric[2], quadric[4] = -2.0 * height / along_x**2, -2.0 * height / along_y**2
+    for k in range(len(rays)):
+        ray = rays[k]
+        for axis in range(3):
+            point[axis] = laser[axis] + (height - laser[2]) / ray[2] * ray[axis]
+        for _ in range(3):
+            z, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
+            descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
+            step = (point[2] - height - z) / max(descent, 0.05)
+            for axis in range(3):
+                point[axis] += min(max(step, -1.0), 1.0) * ray[axis]
+        across, along = (point[0] - x_mm) / along_x, (point[1] - y_mm) / along_y
+        if across * across + along * along < 1.0:
+            _, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
+            dots[k, 0], dots[k, 1] = _dot(ray, point, slope_x, slope_y, plane)
+            there[k] = np.isfinite(dots[k, 0]) and np.isfinite(dots[k, 1])
+    return there
+
+
+@_inner
+def _nearest_pairs(
+    dots: FloatArray,
+    own: IntArray,
+    places: FloatArray,
+    dot: IntArray,
+    spacing: FloatArray,
+    away: FloatArray,
+) -> BoolArray:
+    """Nearest place of each own dot, how far it and the next own dot are; and which are mutual."""
+    back, ray_of = np.full(len(places), np.inf), np.empty(len(places), np.int64)
+    spacing[: len(own)] = np.inf
+    for a in range(len(own)):
+        u, v = dots[own[a]]
+        for b in range(a):
+            x, y = u - dots[own[b], 0], v - dots[own[b], 1]
+            square = x * x + y * y
+            spacing[a], spacing[b] = min(spacing[a], square), min(spacing[b], square)
+        away[a] = np.inf
+        for m in range(len(places)):
+            x, y = u - places[m, 0], v - places[m, 1]
+            square = x * x + y * y
+            if square < away[a]:
+                away[a], dot[a] = square, m
+            if square < back[m]:
+                back[m], ray_of[m] = square, a
+    mutual = np.empty(len(own), np.bool_)
+    for a in range(len(own)):
+        spacing[a], away[a] = np.sqrt(spacing[a]), np.sqrt(away[a])
+        mutual[a] = ray_of[dot[a]] == a
+    return mutual
+
+
 @_compiled(_f2, _f2, _f1, _f2, _f2, types.Array(types.boolean, 1, "A", readonly=True), _f1)
 def score_caps(
     caps: FloatArray,
@@ -707,73 +771,34 @@ def score_caps(
         each ray's, −1 where none is, shape (m, n).
     """
     least, gate, dark, lit_gate, lit = settings
-    count, many = len(rays), len(places)
+    count, bench = len(rays), (laser, plane)
     score, labels = np.full(len(caps), -np.inf), np.full((len(caps), count), -1)
-    dots, dot, ray_of = np.empty((count, 2)), np.empty(count, np.int64), np.empty(many, np.int64)
-    own, marked = np.empty(count, np.int64), np.empty(count, np.int64)
-    spacing, away, back = np.empty(count), np.empty(count), np.empty(many)
-    quadric, point = np.zeros(5), np.empty(3)
+    dots, dot, spacing, away = (
+        np.empty((count, 2)),
+        np.empty(count, np.int64),
+        np.empty(count),
+        np.empty(count),
+    )
     for c in range(len(caps)):
-        x_mm, y_mm, along_x, along_y, height = caps[c]
-        quadric[2], quadric[4] = -2.0 * height / along_x**2, -2.0 * height / along_y**2
-        found, marks = 0, 0
-        for k in range(count):
-            ray = rays[k]
-            for axis in range(3):
-                point[axis] = laser[axis] + (height - laser[2]) / ray[2] * ray[axis]
-            for _ in range(3):
-                z, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
-                descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
-                step = (point[2] - height - z) / max(descent, 0.05)
-                for axis in range(3):
-                    point[axis] += min(max(step, -1.0), 1.0) * ray[axis]
-            across, along = (point[0] - x_mm) / along_x, (point[1] - y_mm) / along_y
-            if not across * across + along * along < 1.0:
-                continue
-            _, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
-            u, v = _dot(ray, point, slope_x, slope_y, plane)
-            if not (np.isfinite(u) and np.isfinite(v)):
-                continue
-            dots[k, 0], dots[k, 1] = u, v
-            if absent[k]:
-                marked[marks] = k
-                marks += 1
-            else:
-                own[found] = k
-                found += 1
-        if found < least:
+        there = _cap_dots(caps[c], rays, bench, dots)
+        own, marked = np.flatnonzero(there & ~absent), np.flatnonzero(there & absent)
+        if len(own) < least:
             continue
-        back[:], spacing[:found] = np.inf, np.inf
-        for a in range(found):
-            u, v = dots[own[a], 0], dots[own[a], 1]
-            for b in range(a):
-                x, y = u - dots[own[b], 0], v - dots[own[b], 1]
-                square = x * x + y * y
-                spacing[a], spacing[b] = min(spacing[a], square), min(spacing[b], square)
-            away[a] = np.inf
-            for m in range(many):
-                x, y = u - places[m, 0], v - places[m, 1]
-                square = x * x + y * y
-                if square < away[a]:
-                    away[a], dot[a] = square, m
-                if square < back[m]:
-                    back[m], ray_of[m] = square, a
-        spacing[:found] = np.sqrt(spacing[:found])
+        mutual = _nearest_pairs(dots, own, places, dot, spacing, away)
         total = 0.0
-        for a in range(found):
-            off = np.sqrt(away[a])
-            if ray_of[dot[a]] == a and off < gate * spacing[a]:
-                total += 1.0 - off / spacing[a]
+        for a in range(len(own)):
+            if mutual[a] and away[a] < gate * spacing[a]:
+                total += 1.0 - away[a] / spacing[a]
                 labels[c, own[a]] = dot[a]
             else:
                 total -= dark
-        usual, shown = np.median(spacing[:found]), 0
-        for k in marked[:marks]:
+        usual, shown = np.median(spacing[: len(own)]), 0
+        for k in marked:
             nearest = np.inf
-            for m in range(many):
-                nearest = min(nearest, np.hypot(dots[k, 0] - places[m, 0], dots[k, 1] - places[m, 1]))
+            for m in range(len(places)):
+                nearest = min(nearest, _apart(dots[k], places[m]))
             shown += nearest < lit_gate * usual
-        score[c] = total - lit * shown / max(marks, 1)
+        score[c] = total - lit * shown / max(len(marked), 1)
     return score, labels
 
 

@@ -77,16 +77,10 @@ class Rear:
         """Its three numbers, as compiled functions have it, shape (3,)."""
         return np.array([self.drop_mm, self.start_mm, self.end_mm])
 
-    def _part(self, y_mm: FloatArray) -> FloatArray:
-        return np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
-
     def height(self, y_mm: FloatArray) -> FloatArray:
         """Height of the boundary at y, of the shape of ``y_mm``, mm."""
-        return -self.drop_mm * self._part(y_mm) ** 2
-
-    def slope(self, y_mm: FloatArray) -> FloatArray:
-        """Its derivative by y."""
-        return 2 * self.drop_mm * self._part(y_mm) / (self.start_mm - self.end_mm)
+        share = np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
+        return -self.drop_mm * share**2
 
 
 @dataclass(frozen=True)
@@ -351,7 +345,7 @@ def place_level(
     # Only a pool that stands above the work piece is seen to sink at its rear.
     seen = sign > 0 and bool(np.any(near & (witness < 0) & (y < end)))
     drops = (_DROPS if seen else _DROPS[:1]) if drop_mm is None else np.array([drop_mm])
-    over = np.array([height[near] - Rear(drop, start, end).height(y[near]) for drop in drops])
+    over = height[near] - drops[:, None] * Rear(1.0, start, end).height(y[near])
     side = sign * witness[near] / rise[near]
     nats = level_kernels.level_negative_log_likelihood(over, side, first, step, count, _BLURS)
     asked = _BLUR_COST, _SUNK, drops, first, step
