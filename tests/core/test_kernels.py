@@ -589,7 +589,7 @@ def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: 
     labels[own[near]] = dot[near]
 
     settings = np.array([10, 0.45, 0.5, 0.3, 5.0])
-    far = cap + [9.0, 0.0, 0.0, 0.0, 0.0]
+    far = cap + np.array([9.0, 0.0, 0.0, 0.0, 0.0])
     caps = np.array([cap, far])
     score, made = kernels.score_caps(caps, rays, LASER, PLANE.pose_mm, places, absent, settings)
     assert len(own) > 30
