@@ -121,7 +121,9 @@ def _one_thread() -> AbstractContextManager[object]:
 
 @functools.cache
 def _threads() -> ThreadpoolController:
-    """Made once: it searches all loaded libraries. Those that measure are loaded by then."""
+    """Control of the BLAS libraries that are loaded; made once, as that takes milliseconds."""
+    import scipy.linalg  # noqa: F401 - it has a BLAS of its own, which is else loaded later
+
     return ThreadpoolController()
 
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, replace
@@ -249,3 +253,37 @@ def test_one_frame_at_a_time_is_measured_here(plain: Any) -> None:
 
     for result in plain()(numbers()):
         assert asked[-1] == result.frame
+
+
+THREADS = """
+    import labapp.run.measurers as measurers
+    import numpy as np
+    from labapp.config.setup import read_setup
+    from labapp.core.pipeline import Measurement, Settings
+    from labapp.media import Frame
+    from threadpoolctl import ThreadpoolController
+
+    def measure(*_):
+        import scipy.linalg
+        libraries = ThreadpoolController().select(user_api="blas").info()
+        print({library["num_threads"] for library in libraries})
+        return Measurement("no-dots", "it is dark", "fit")
+
+    measurers.measure = measure
+    setup = read_setup("sample_sessions/gtaw/setup.toml")
+    frame = Frame(0, None, np.zeros((2, 2), np.uint8))
+    list(measurers.ColdMeasurer(lambda _: frame, setup, Settings())([0]))
+"""
+
+
+def test_matrices_are_multiplied_in_one_thread_from_the_first_frame_on() -> None:
+    """Those of SciPy, too, which nothing may have loaded before."""
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(THREADS)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "PYTHONPATH": ".", "OPENBLAS_NUM_THREADS": "2"},
+    )
+    assert (done.returncode, done.stdout) == (0, "{1}\n"), done.stderr
