@@ -7,8 +7,13 @@ import pytest
 
 from labapp.core.matching.hypothesis import Hypothesis, contested, moved, weigh
 from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.schemes import fit
+from labapp.core.schemes.fit import FitSettings
+from labapp.core.sequence.warm_fit import SequenceGeometry, intersect_and_reflect
+from labapp.core.sequence.warm_match import classify_rays
+from labapp.core.surface.measures import measure
 from labapp.core.values import IntArray
-from tests.benchmarks.dips import answer, draw
+from tests.benchmarks.dips import answer, draw, matched
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots
 
 SHIFTED = 37
@@ -116,3 +121,31 @@ def test_labels_next_to_a_dot_without_a_ray_are_in_doubt() -> None:
         scene.frame_shape,
     )
     assert contested(crowded, weighed(crowded, labels)).tolist() == [dot]
+
+
+OUT_OF_VIEW = 41110
+"""A pool whose row beside the last one that is seen has its dots just beyond the imaging plane."""
+
+
+def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
+    """Called dark, its rays had the surface 27 µm too low, six times what was said to be sure."""
+    pool, seen = draw(OUT_OF_VIEW)
+    scene, labels = scene_of(seen)
+    found = weighed(scene, labels)
+    row = slice(8, 12)
+    assert (found.witness[12, row] == 0).all()
+    assert (found.witness[10, [3, 16]] == -1).all()  # dark, and far within the view
+    match = matched(seen)
+    size = measure(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
+    assert abs(size.height_mm - pool.size.height_mm) < 2 * size.height_sigma_mm
+
+    basis, settings = found.pool.surface.basis, FitSettings()
+    geometry = SequenceGeometry.of(BENCH_RIG, basis, settings)
+    coefficients = found.pool.surface.coefficients
+    followed = intersect_and_reflect(geometry, coefficients, geometry.landing_mm, 4)
+    own = labels[tuple(geometry.at.T)]
+    classes = classify_rays(geometry, scene, followed, found.pool.factor, own)
+    witness = np.zeros_like(labels)
+    witness[tuple(geometry.at.T)] = classes.witness
+    np.testing.assert_array_equal(witness[12, row], 0)
+    np.testing.assert_array_equal(witness[10, [3, 16]], -1)

@@ -20,10 +20,13 @@ from labapp.core.matching.ray_growth import (
     amid,
     as_likely_false,
     grow_labels,
+    lines_of,
     neighbours_of,
     predict,
+    surely_in_view,
     surprises,
     try_fit,
+    widened,
 )
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, Level
@@ -388,6 +391,11 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     merged = around.spacing_mm < scene.resolution_mm
     seen = scene.in_view(around.plane_mm) & ~around.blocked(scene) & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
+    rim = around.part(seen & widened(lit, 1)[tuple(around.at.T)])
+    unseen = ~surely_in_view(
+        scene, rim.plane_mm, lambda some: rim.part(some).covariance_mm2(pool, scene.rig)
+    )
+    witness[lines_of(rim.at[unseen], lit.shape)] = 0
     witness[amid(lit) | scene.absent | scene.hidden] = 0
     witness[lit] = 1
     # A dot that no ray was given may be the dot of a ray that seems dark.

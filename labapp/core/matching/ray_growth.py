@@ -6,6 +6,7 @@ bow, fan out or cross; a dot that two predictions could claim is given to neithe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -47,6 +48,13 @@ def as_likely_false(false_per_mm2: float) -> float:
 
 
 AS_LIKELY_FALSE = as_likely_false(FALSE_PER_MM2)
+
+SURE, LEAST_LINE = 2.5, 3
+"""A row of rays beside the last lit one may have left the view where so many of its dots are
+predicted in view by less than so many σ: that they are not seen does not make them dark."""
+
+NEAR_EDGE_MM = 8.0
+"""Only so near the edge of the view it is worked out how uncertain predictions are."""
 
 MODEL_MM = 0.06
 """How far the right surface's dots may be off for no fault of theirs, mm."""
@@ -182,21 +190,24 @@ class Scene:
     def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | CannotMeasure]:
         return {}
 
-    def in_view(self, plane_mm: FloatArray) -> BoolArray:
+    def in_view(self, plane_mm: FloatArray, margin_mm: FloatArray | float = 0.0) -> BoolArray:
         """Whether places on the plane, shape (…, 2), are on it and in the frame, with a rim.
 
         The plane reaches as far as its size says, and as far as dots are seen on it: O′ need not
-        be its very corner.
+        be its very corner. Places are as far inside as a margin along either axis, of their shape.
         """
         rim_mm, rim_px = 0.5, 4.0
         plane = self.rig.imaging_plane
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + rim_mm
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - rim_mm
-        image = self.calibration.to_image(plane_mm)
         limit = np.array(self.frame_shape[::-1]) - 1 - rim_px
-        on_plane = (plane_mm > low) & (plane_mm < high)
-        in_frame = (image > rim_px) & (image < limit)
-        return np.asarray((on_plane & in_frame).all(axis=-1))
+        seen = np.ones(np.shape(plane_mm)[:-1], bool)
+        for way in ((1, 1), (1, -1), (-1, 1), (-1, -1)) if np.any(margin_mm) else ((0, 0),):
+            corner = plane_mm + np.array(way) * margin_mm
+            image = self.calibration.to_image(corner)
+            seen &= ((corner > low) & (corner < high)).all(axis=-1)
+            seen &= ((image > rim_px) & (image < limit)).all(axis=-1)
+        return seen
 
 
 @dataclass(frozen=True)
@@ -347,6 +358,29 @@ def predict(scene: Scene, pool: FittedPool, where: BoolArray) -> Prediction:
     if len(plane) > 1:
         spacing = dot_kernels.two_nearest(plane, plane)[0][:, 1]
     return Prediction(at, points, slopes, plane, spacing)
+
+
+def surely_in_view(
+    scene: Scene, plane_mm: FloatArray, covariance_of: Callable[[BoolArray], FloatArray]
+) -> BoolArray:
+    """Whether dots predicted at places, shape (m, 2), mm, are in view whatever σ they have.
+
+    Their covariance, mm², is asked for of some of them, by a mask of shape (m,).
+    """
+    seen = scene.in_view(plane_mm)
+    doubtful = seen & ~scene.in_view(plane_mm, NEAR_EDGE_MM)
+    if doubtful.any():
+        variance = covariance_of(doubtful)[:, [0, 1], [0, 1]]
+        seen[doubtful] = scene.in_view(plane_mm[doubtful], SURE * np.sqrt(variance))
+    return seen
+
+
+def lines_of(at: IntArray, shape: tuple[int, ...]) -> BoolArray:
+    """Rays, shape (m, 2), of which `LEAST_LINE` are in a row or a column, as a mask of a shape."""
+    mask = np.zeros(shape, bool)
+    mask[tuple(at.T)] = True
+    rows, columns = mask.sum(axis=1, keepdims=True), mask.sum(axis=0, keepdims=True)
+    return np.asarray(mask & ((rows >= LEAST_LINE) | (columns >= LEAST_LINE)))
 
 
 def amid(lit: BoolArray) -> BoolArray:

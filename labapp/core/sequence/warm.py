@@ -184,30 +184,30 @@ def follow(
     passed("match")
     pool, labels, lower = _fitted(geometry, scene, pool, labels)
     passed("fit")
-    heard = classify_rays(geometry, scene, pool, labels)
-    level, open_mm = _level(track, pool, heard.witness)
+    classes = classify_rays(geometry, scene, pool, lower, labels)
+    level, open_mm = _level(track, pool, classes.witness)
     outside = beyond(geometry, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
         pool, lower = _settled(geometry, _shifted(pool, level), _slopes(geometry, scene, labels))
-        heard = classify_rays(geometry, scene, pool, labels)
-        level, open_mm = _level(track, pool, heard.witness)
+        classes = classify_rays(geometry, scene, pool, lower, labels)
+        level, open_mm = _level(track, pool, classes.witness)
     pool = intersect_and_reflect(geometry, pool.coefficients + level.shift_mm, pool.points_mm, 1)
     passed("level")
     ray = np.flatnonzero(labels != UNLABELLED)
     dot = labels[ray]
     residual = pool.plane_mm[ray] - scene.plane_mm[dot]
     limits = settings.match
-    if heard.stray > limits.stray[0] + limits.stray[1] * len(dots):
-        raise TrackLost(f"{heard.stray} dots have no ray")
-    if heard.missed > limits.missed[0] + limits.missed[1] * len(ray):
-        raise TrackLost(f"{heard.missed} rays amid the others have no dot")
+    if classes.stray > limits.stray[0] + limits.stray[1] * len(dots):
+        raise TrackLost(f"{classes.stray} dots have no ray")
+    if classes.missed > limits.missed[0] + limits.missed[1] * len(ray):
+        raise TrackLost(f"{classes.missed} rays amid the others have no dot")
     if not rms(residual) < WORSE * track.residual_mm:
         raise TrackLost("the surface no longer has the dots")
     unseen = 0 if _datum_seen(geometry, scene, pool, labels, off) else track.unseen + 1
     if unseen > HELD:
         raise TrackLost("the dots beside the absent one have not been seen for long")
-    match = _match(track, scene, heard.witness, ray, dot, rms(residual))
+    match = _match(track, scene, classes.witness, ray, dot, rms(residual))
     track = _with_uncertainty(track, pool, ray, lower)
     reconstruction, size = _sized(track, pool, level, lower, match, residual, ray)
     after = replace(

@@ -22,6 +22,8 @@ from labapp.core.matching.ray_growth import (
     UNLABELLED,
     Scene,
     amid,
+    lines_of,
+    surely_in_view,
 )
 from labapp.core.sequence.warm_fit import SequenceGeometry, WarmPool, evaluate_at_landing_points
 from labapp.core.surface import kernels
@@ -164,11 +166,7 @@ def _surprise(
     dot: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
     """What `match_kernels.surprises` says of rays making dots, shapes (rays, dots)."""
-    dots_mm = geometry.rig.imaging_plane.to_universal(pool.plane_mm[ray])
-    laser, axes = geometry.laser_mm, geometry.plane[1:3]
-    spread = kernels.covariance_of_dots(
-        geometry.basis.grid, lower, laser, axes, pool.points_mm[ray], dots_mm
-    )
+    spread = _covariance_of_dots(geometry, pool, lower, ray)
     made = match_kernels.surprises(
         scene.plane_mm[dot],
         scene.covariance_mm2[dot],
@@ -176,6 +174,17 @@ def _surprise(
         CAUTION**2 * spread + MODEL_MM**2 * np.eye(2),
     )
     return made[0].T, made[1].T
+
+
+def _covariance_of_dots(
+    geometry: SequenceGeometry, pool: WarmPool, lower: FloatArray, ray: IntArray
+) -> FloatArray:
+    """Covariance of some rays' dots, as far as the surface is uncertain, shape (n, 2, 2), mm²."""
+    dots_mm = geometry.rig.imaging_plane.to_universal(pool.plane_mm[ray])
+    laser, axes = geometry.laser_mm, geometry.plane[1:3]
+    return kernels.covariance_of_dots(
+        geometry.basis.grid, lower, laser, axes, pool.points_mm[ray], dots_mm
+    )
 
 
 @dataclass(frozen=True)
@@ -196,9 +205,9 @@ class RayClasses:
 
 
 def classify_rays(
-    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, labels: IntArray
+    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, lower: FloatArray, labels: IntArray
 ) -> RayClasses:
-    """Ask every ray, as `hypothesis` does."""
+    """Classify every ray, as `hypothesis` does; ``lower`` is the factor of the pool's fit."""
     lit = labels != UNLABELLED
     known = np.isfinite(pool.plane_mm[:, 0])
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
@@ -211,6 +220,15 @@ def classify_rays(
     among = amid(on_pattern(geometry, lit).view(bool))[tuple(geometry.at.T)]
     missed = int(np.sum(among & ~geometry.absent & ~lit & seen))
     witness = np.where(seen & ~among & ~geometry.absent, -1, 0)
+    rim = np.flatnonzero((witness < 0) & around(geometry, lit, 1))
+    unseen = ~surely_in_view(
+        scene,
+        pool.plane_mm[rim],
+        lambda some: _covariance_of_dots(geometry, pool, lower, rim[some]),
+    )
+    pattern = geometry.rig.pattern
+    hidden_lines = lines_of(geometry.at[rim[unseen]], (pattern.rows, pattern.columns))
+    witness[hidden_lines[tuple(geometry.at.T)]] = 0
     witness[lit] = 1
     stray = unlabelled(len(scene.plane_mm), labels)
     if len(stray):
