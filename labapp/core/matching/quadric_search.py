@@ -66,30 +66,31 @@ def search_quadrics(scene: Scene, most: int = 8) -> list[QuadricGuess]:
         return []  # without rays all round it, a hole cannot be told
     window = _Window(scene, marker)
     found: dict[bytes, QuadricGuess] = {}
-    for hole, half_width in _holes(scene, window.tree):
-        for guess in window.judged(window.fitted(_quadrics(window, hole, half_width))):
-            key = guess.labels.tobytes()
-            if key not in found or found[key].hits < guess.hits:
-                found[key] = guess
+    quadrics = [_quadrics(window, *hole) for hole in _holes(scene, window.tree)]
+    for guess in window.judged(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
+        key = guess.labels.tobytes()
+        if key not in found or found[key].hits < guess.hits:
+            found[key] = guess
     return sorted(found.values(), key=lambda guess: -guess.hits)[:most]
 
 
 def _holes(scene: Scene, tree: scipy.spatial.cKDTree) -> Iterator[tuple[FloatArray, float]]:
     """Empty places between two dots, IPCS, and half the dots' distance along X′, mm."""
     dots = scene.plane_mm
-    for p, near in enumerate(tree.query(dots, k=min(10, len(dots)))[1]):
-        for q in near[1:]:
-            step = dots[q] - dots[p]
-            if step[0] <= 0 or abs(step[1]) > 0.6 * step[0]:
-                continue
-            # Where one dot is missing between two, the next one on lies half as far off.
-            beyond = tree.query([dots[p] - step / 2, dots[q] + step / 2])[0]
-            if beyond.min() > 0.42 * np.linalg.norm(step):
-                continue
-            for lift in _LIFTS * np.linalg.norm(step):
-                hole = (dots[p] + dots[q]) / 2 + [0.0, lift]
-                if tree.query(hole)[0] > 0.3 * np.linalg.norm(step):
-                    yield hole, step[0] / 2
+    near = tree.query(dots, k=min(10, len(dots)))[1][:, 1:]
+    one, other = dots[np.repeat(np.arange(len(dots)), near.shape[1])], dots[near.ravel()]
+    step = other - one
+    beside = (step[:, 0] > 0) & (np.abs(step[:, 1]) <= 0.6 * step[:, 0])
+    one, other, step = one[beside], other[beside], step[beside]
+    length = np.linalg.norm(step, axis=-1)
+    # Where one dot is missing between two, the next one on lies half as far off.
+    beyond = tree.query(np.stack([one - step / 2, other + step / 2]))[0].min(axis=0)
+    regular = beyond <= 0.42 * length
+    one, other, step, length = one[regular], other[regular], step[regular], length[regular]
+    lifts = length[:, None, None] * _LIFTS[:, None] * [0.0, 1.0]
+    holes = ((one + other) / 2)[:, None] + lifts
+    for k, lift in np.argwhere(tree.query(holes)[0] > 0.3 * length[:, None]):
+        yield holes[k, lift], step[k, 0] / 2
 
 
 def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArray:
@@ -115,9 +116,10 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
     quadrics[:, :2] = slope
     quadrics[:, 2] = np.repeat(across, len(_RATIOS))
     quadrics[:, 4] = np.outer(across, _RATIOS).ravel()
-    patterns = window.met(quadrics, window.rays.reshape(-1, 3))[1]
-    patterns = patterns.reshape(-1, *window.rays.shape[:2], 2)
-    hit = window.hits(patterns, LOOSE)[0][(slice(None), *window.core)]
+    rays = window.rays[window.near]
+    patterns = window.met(quadrics, rays.reshape(-1, 3))[1].reshape(-1, *rays.shape[:2], 2)
+    hit = window.hits(patterns, LOOSE, window.absent[window.near])[0]
+    hit = hit[(slice(None), *window.core_of_near)]
     return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= 5])
 
 
@@ -139,6 +141,9 @@ class _Window:
         self.absent = scene.absent[self.part]
         self.middle = (reach, reach)
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
+        rim = max(reach - 2, 0)  # the core, and where there is one a ring round it
+        self.near = slice(rim, 2 * reach + 1 - rim), slice(rim, 2 * reach + 1 - rim)
+        self.core_of_near = tuple(slice(reach - 1 - rim, reach + 2 - rim) for _ in range(2))
 
     def met(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where rays, shape (n, 3), meet quadrics, shape (m, 5), and their dots.
@@ -150,7 +155,9 @@ class _Window:
         laser = self.scene.rig.laser.position_mm
         return kernels.meet_quadrics(self.landing_mm[:2], quadrics, rays, laser, self.plane)
 
-    def hits(self, pattern: FloatArray, gate: float) -> tuple[BoolArray, IntArray, FloatArray]:
+    def hits(
+        self, pattern: FloatArray, gate: float, absent: BoolArray
+    ) -> tuple[BoolArray, IntArray, FloatArray]:
         """Which predicted dots, shape (m, rows, columns, 2), fall on a dot, on which, how far off.
 
         The last is in units of the gate: a share of the way to the next predicted dot in the row
@@ -158,7 +165,7 @@ class _Window:
         """
         from labapp.core.surface import kernels
 
-        return kernels.hits(pattern, self.scene.plane_mm, self.absent, gate)
+        return kernels.hits(pattern, self.scene.plane_mm, absent, gate)
 
     def fitted(self, quadrics: FloatArray) -> FloatArray:
         """Fit quadrics to the dots that their rays next to the reference fall near."""
@@ -173,19 +180,19 @@ class _Window:
         """Hold quadrics against the dots; yield those that explain the dots round the hole."""
         patterns = self.met(quadrics, self.rays.reshape(-1, 3))[1]
         patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
-        for pattern, *found in zip(patterns, *self.hits(patterns, TIGHT), strict=True):
-            if found[0][self.core].sum() >= 6:
-                yield self._guess(pattern, *found)
+        hit, dot, off = self.hits(patterns, TIGHT, self.absent)
+        core = (slice(None), *self.core)
+        explains = np.flatnonzero(hit[core].sum(axis=(1, 2)) >= 6)
+        seen = self.scene.in_view(np.nan_to_num(patterns[core][explains], nan=1e6))
+        # A ray next to the hole that should show its dot and does not speaks against the quadric.
+        silent = seen & ~self.absent[self.core] & ~hit[core][explains]
+        for k, count in zip(explains, silent.sum(axis=(1, 2)).tolist(), strict=True):
+            yield self._guess(hit[k], dot[k], off[k], count)
 
-    def _guess(
-        self, pattern: FloatArray, hit: BoolArray, dot: IntArray, off: FloatArray
-    ) -> QuadricGuess:
+    def _guess(self, hit: BoolArray, dot: IntArray, off: FloatArray, silent: int) -> QuadricGuess:
         own = np.where(hit, dot, UNLABELLED)
         chosen, count = np.unique(own[hit], return_counts=True)
         own[np.isin(own, chosen[count > 1])] = UNLABELLED
-        # A ray next to the hole that should show its dot and does not speaks against the quadric.
-        seen = self.scene.in_view(np.nan_to_num(pattern, nan=1e6)) & ~self.absent
-        silent = np.sum((seen & ~hit)[self.core])
         nearness = 1 - np.mean(off[hit])
         # Farther out the pool is no quadric, and the next row's dots may be hit instead.
         core = (self.core[0], slice(self.core[1].start - 1, self.core[1].stop + 1))
