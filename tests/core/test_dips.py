@@ -133,9 +133,9 @@ def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     scene, labels = scene_of(seen)
     found = weighed(scene, labels)
     row = slice(8, 12)
-    assert (found.witness[12, row] == 0).all()
-    assert (found.witness[10, [3, 16]] == -1).all()  # dark, and far within the view
     match = matched(seen)
+    assert (match.witness[12, row] == 0).all()
+    assert (match.witness[10, [3, 16]] == -1).all()  # dark, and far within the view
     size = measure(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
     assert abs(size.height_mm - pool.size.height_mm) < 2 * size.height_sigma_mm
 

@@ -19,7 +19,7 @@ from labapp.core.surface.surface import intersect
 from labapp.core.values import CannotMeasure
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg, spherical_cap
-from labapp.studies.error_analysis import followed
+from labapp.studies.error_analysis import trace_once
 
 RIG = Rig(
     Laser(31.14, 31.48),
@@ -71,7 +71,7 @@ def test_a_denser_pattern_leaves_less_error():
         each = []
         for cap in caps:
             # As the text does, also where a ray would meet a deep hollow again.
-            match = exact_match(followed(cap, rig), rig)
+            match = exact_match(trace_once(cap, rig), rig)
             measures = measure(ers.reconstruct(match, rig, CIRCLE), match, rig)
             depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
             each.append(abs(depth / abs(cap.peak_mm) - 1))

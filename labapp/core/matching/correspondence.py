@@ -32,6 +32,7 @@ from labapp.core.matching.decision import (
 )
 from labapp.core.matching.hypothesis import (
     Hypothesis,
+    certain_witness,
     from_grid,
     grow_and_score,
     joined,
@@ -229,6 +230,6 @@ def as_match(
         reflected=numbers,
         plane_mm=scene.plane_mm[dot],
         plane_covariance_mm2=scene.covariance_mm2[dot],
-        witness=best.witness,
+        witness=certain_witness(scene, best),
         trials=tuple(sorted(trials, key=lambda trial: trial.residual_mm)),
     )

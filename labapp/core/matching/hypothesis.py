@@ -391,11 +391,6 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
     merged = around.spacing_mm < scene.resolution_mm
     seen = scene.in_view(around.plane_mm) & ~around.blocked(scene) & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
-    rim = around.part(seen & widened(lit, 1)[tuple(around.at.T)])
-    unseen = ~surely_in_view(
-        scene, rim.plane_mm, lambda some: rim.part(some).covariance_mm2(pool, scene.rig)
-    )
-    witness[lines_of(rim.at[unseen], lit.shape)] = 0
     witness[amid(lit) | scene.absent | scene.hidden] = 0
     witness[lit] = 1
     # A dot that no ray was given may be the dot of a ray that seems dark.
@@ -406,3 +401,17 @@ def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
         doubt = doubt[witness[doubt[:, 0], doubt[:, 1]] < 0]
         witness[doubt[:, 0], doubt[:, 1]] = 0
     return witness
+
+
+def certain_witness(scene: Scene, hypothesis: Hypothesis) -> IntArray:
+    """The witness of a hypothesis without rows that are dark but may have left the view.
+
+    Beside the last row that is seen the fit goes on as smoothly as it can, while a pool's edge
+    grows steep: the dots of the next row may lie farther out than they are predicted.
+    """
+    pool, dark = hypothesis.pool, hypothesis.witness < 0
+    rim = predict(scene, pool, dark & widened(hypothesis.labels != UNLABELLED, 1))
+    unsure = ~surely_in_view(
+        scene, rim.plane_mm, lambda some: rim.part(some).covariance_mm2(pool, scene.rig)
+    )
+    return np.where(lines_of(rim.at[unsure], dark.shape), 0, hypothesis.witness)
