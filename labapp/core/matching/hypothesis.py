@@ -20,10 +20,9 @@ from labapp.core.matching.ray_growth import (
     amid,
     as_likely_false,
     grow_labels,
-    lines_of,
+    lines_out_of_view,
     neighbours_of,
     predict,
-    surely_in_view,
     surprises,
     try_fit,
     widened,
@@ -411,7 +410,10 @@ def certain_witness(scene: Scene, hypothesis: Hypothesis) -> IntArray:
     """
     pool, dark = hypothesis.pool, hypothesis.witness < 0
     rim = predict(scene, pool, dark & widened(hypothesis.labels != UNLABELLED, 1))
-    unsure = ~surely_in_view(
-        scene, rim.plane_mm, lambda some: rim.part(some).covariance_mm2(pool, scene.rig)
+    lost = lines_out_of_view(
+        scene,
+        rim.at,
+        rim.plane_mm,
+        lambda some: rim.part(some).covariance_mm2(pool, scene.rig),
     )
-    return np.where(lines_of(rim.at[unsure], dark.shape), 0, hypothesis.witness)
+    return np.where(lost, 0, hypothesis.witness)

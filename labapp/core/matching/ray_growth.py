@@ -201,13 +201,12 @@ class Scene:
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + rim_mm
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - rim_mm
         limit = np.array(self.frame_shape[::-1]) - 1 - rim_px
-        seen = np.ones(np.shape(plane_mm)[:-1], bool)
-        for way in ((1, 1), (1, -1), (-1, 1), (-1, -1)) if np.any(margin_mm) else ((0, 0),):
-            corner = plane_mm + np.array(way) * margin_mm
-            image = self.calibration.to_image(corner)
-            seen &= ((corner > low) & (corner < high)).all(axis=-1)
-            seen &= ((image > rim_px) & (image < limit)).all(axis=-1)
-        return seen
+        ways = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]] if np.any(margin_mm) else [[0, 0]])
+        corners = np.stack([plane_mm + way * margin_mm for way in ways])
+        image = self.calibration.to_image(corners)
+        on_plane = (corners > low) & (corners < high)
+        in_frame = (image > rim_px) & (image < limit)
+        return np.asarray((on_plane & in_frame).all(axis=(0, -1)))
 
 
 @dataclass(frozen=True)
@@ -360,22 +359,33 @@ def predict(scene: Scene, pool: FittedPool, where: BoolArray) -> Prediction:
     return Prediction(at, points, slopes, plane, spacing)
 
 
-def surely_in_view(
-    scene: Scene, plane_mm: FloatArray, covariance_of: Callable[[BoolArray], FloatArray]
+def lines_out_of_view(
+    scene: Scene,
+    at: IntArray,
+    plane_mm: FloatArray,
+    covariance_of: Callable[[BoolArray], FloatArray],
 ) -> BoolArray:
-    """Whether dots predicted at places, shape (m, 2), mm, are in view whatever σ they have.
+    """Rays of rows or columns that may have left the view, a mask of shape (rows, columns).
 
-    Their covariance, mm², is asked for of some of them, by a mask of shape (m,).
+    Parameters
+    ----------
+    scene
+        The dots and the rig.
+    at, plane_mm
+        Dark rays beside the lit ones, as in `Prediction`, shapes (m, 2), mm.
+    covariance_of
+        Covariance of the dots of some of them, by a mask of shape (m,), shape (…, 2, 2), mm².
     """
-    seen = scene.in_view(plane_mm)
-    doubtful = seen & ~scene.in_view(plane_mm, NEAR_EDGE_MM)
-    if doubtful.any():
-        variance = covariance_of(doubtful)[:, [0, 1], [0, 1]]
-        seen[doubtful] = scene.in_view(plane_mm[doubtful], SURE * np.sqrt(variance))
-    return seen
+    unsure = ~scene.in_view(plane_mm, NEAR_EDGE_MM)
+    lines = _lines_of(at[unsure], scene.absent.shape)
+    if lines.any():
+        variance = covariance_of(unsure)[:, [0, 1], [0, 1]]
+        unsure[unsure] = ~scene.in_view(plane_mm[unsure], SURE * np.sqrt(variance))
+        lines = _lines_of(at[unsure], scene.absent.shape)
+    return lines
 
 
-def lines_of(at: IntArray, shape: tuple[int, ...]) -> BoolArray:
+def _lines_of(at: IntArray, shape: tuple[int, ...]) -> BoolArray:
     """Rays, shape (m, 2), of which `LEAST_LINE` are in a row or a column, as a mask of a shape."""
     mask = np.zeros(shape, bool)
     mask[tuple(at.T)] = True

@@ -22,8 +22,7 @@ from labapp.core.matching.ray_growth import (
     UNLABELLED,
     Scene,
     amid,
-    lines_of,
-    surely_in_view,
+    lines_out_of_view,
 )
 from labapp.core.sequence.warm_fit import SequenceGeometry, WarmPool, evaluate_at_landing_points
 from labapp.core.surface import kernels
@@ -221,14 +220,13 @@ def classify_rays(
     missed = int(np.sum(among & ~geometry.absent & ~lit & seen))
     witness = np.where(seen & ~among & ~geometry.absent, -1, 0)
     rim = np.flatnonzero((witness < 0) & around(geometry, lit, 1))
-    unseen = ~surely_in_view(
+    lost = lines_out_of_view(
         scene,
+        geometry.at[rim],
         pool.plane_mm[rim],
         lambda some: _covariance_of_dots(geometry, pool, lower, rim[some]),
     )
-    pattern = geometry.rig.pattern
-    hidden_lines = lines_of(geometry.at[rim[unseen]], (pattern.rows, pattern.columns))
-    witness[hidden_lines[tuple(geometry.at.T)]] = 0
+    witness[lost[tuple(geometry.at.T)]] = 0
     witness[lit] = 1
     stray = unlabelled(len(scene.plane_mm), labels)
     if len(stray):
