@@ -115,7 +115,7 @@ class LiveChain:
         if found is None:
             if time.monotonic() < self._measured_s + SOUGHT_S:
                 return None
-            found = self._chain.measure(frame.image)
+            found = self._chain.search(frame.image)
         surface = None
         if found.status == "ok":
             self._measured_s, surface = time.monotonic(), found.reconstruction
@@ -124,14 +124,14 @@ class LiveChain:
             time_s=frame.time_s,
             arrived_s=frame.arrived_s,
             measurement=without_surface(found),
-            track_lost=self._chain.broke,
+            track_lost=self._chain.track_lost,
             quality=self._quality(frame, found),
             scene=scene_of(surface) if drawn and surface is not None else None,
         )
 
     def _quality(self, frame: CameraFrame, found: Measurement) -> Quality:
         """Quality of the frame, or of one just before: that takes half as long as measuring."""
-        now_s, is_followed = time.monotonic(), self._chain.broke is None
+        now_s, is_followed = time.monotonic(), self._chain.track_lost is None
         if self._judged is not None and is_followed and now_s < self._judged[0] + JUDGED_S:
             return self._judged[1]
         quality = judge_quality(frame.image, found, self._bit_depth, self._rays)

@@ -187,7 +187,7 @@ class WarmMeasurer:
             else:
                 with _one_thread():
                     found = chain.measure(frame.image)
-                yield FrameResult(number, frame.time_s, found, chain.broke)
+                yield FrameResult(number, frame.time_s, found, chain.track_lost)
 
 
 @dataclass(frozen=True)

@@ -50,17 +50,17 @@ class Run:
 
     chain: WarmChain
     measurements: tuple[Measurement, ...]
-    broke: tuple[str | None, ...]
+    track_lost: tuple[str | None, ...]
 
 
 @cache
 def warmed() -> Run:
     chain = WarmChain(RIG, CALIBRATION, Settings())
-    measurements, broke = [], []
+    measurements, track_lost = [], []
     for frame in frames()[:WARMED]:
         measurements.append(chain.measure(frame.image))
-        broke.append(chain.broke)
-    return Run(chain, tuple(measurements), tuple(broke))
+        track_lost.append(chain.track_lost)
+    return Run(chain, tuple(measurements), tuple(track_lost))
 
 
 def chain() -> WarmChain:
@@ -96,8 +96,8 @@ def without_dots(image: FloatArray, places: FloatArray) -> FloatArray:
 
 def test_every_frame_after_the_first_is_followed() -> None:
     run = warmed()
-    assert run.broke[0] is not None
-    assert [reason for reason in run.broke[1:] if reason] == []
+    assert run.track_lost[0] is not None
+    assert [reason for reason in run.track_lost[1:] if reason] == []
     for result, frame in zip(run.measurements, frames(), strict=False):
         assert result.status == "ok"
         assert wrong_rays(result, frame) == 0
@@ -166,7 +166,7 @@ def test_missing_and_false_dots_are_told_apart_from_the_others() -> None:
     image = without_dots(frame.image, gone)
     image = with_dots(image, gone[:1] + np.array([6.0, 14.0]))
     result = follower.measure(image)
-    assert follower.broke is None
+    assert follower.track_lost is None
     assert wrong_rays(result, frame) == 0
     assert result.match is not None
     rays = {tuple(ray) for ray in result.match.ray.tolist()}
@@ -179,8 +179,8 @@ def test_a_dot_where_the_absent_one_should_be_dark_breaks_the_track() -> None:
     frame, follower = frames()[WARMED], chain()
     hole = frame.dot_px[9, 8:11:2].mean(axis=0)
     result = follower.measure(with_dots(frame.image, hole[None]))
-    assert follower.broke is not None
-    assert "absent" in follower.broke
+    assert follower.track_lost is not None
+    assert "absent" in follower.track_lost
     assert wrong_rays(result, frame) == 0
 
 
@@ -189,7 +189,7 @@ def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() ->
     frame, follower = frames()[WARMED], chain()
     step = round(float(np.nanmedian(np.diff(frame.dot_px[9, 5:14, 0]))))
     result = follower.measure(np.roll(frame.image, step, axis=1))
-    assert follower.broke is not None
+    assert follower.track_lost is not None
     assert wrong_rays(result, frame, shift_px=step) == 0
 
 
@@ -233,8 +233,8 @@ def test_a_pool_elsewhere_with_as_many_rays_begins_a_track_of_its_own() -> None:
         assert result.status == "ok"
         assert wrong_rays(result, frame) == 0
         if number == 1:
-            assert follower.broke is not None
-    assert follower.broke is None
+            assert follower.track_lost is not None
+    assert follower.track_lost is None
 
 
 def test_a_pool_that_jumps_is_measured_anew() -> None:
@@ -255,10 +255,10 @@ def test_a_frame_that_is_not_followed_is_left_out_and_the_next_one_is_followed()
     follower = chain()
     dark = np.full_like(frames()[0].image, 20)
     assert follower.follow(dark) is None
-    assert follower.broke is not None
+    assert follower.track_lost is not None
     found = follower.follow(frames()[WARMED].image)
     assert found is not None
-    assert follower.broke is None
+    assert follower.track_lost is None
     assert wrong_rays(found, frames()[WARMED]) == 0
 
 
@@ -266,10 +266,10 @@ def test_the_track_goes_on_after_a_frame_without_dots() -> None:
     follower = chain()
     dark = np.full_like(frames()[0].image, 18)
     assert follower.measure(dark).status == "no-dots"
-    assert follower.broke is not None
+    assert follower.track_lost is not None
     frame = frames()[WARMED + 1]
     result = follower.measure(frame.image)
-    assert follower.broke is None
+    assert follower.track_lost is None
     assert wrong_rays(result, frame) == 0
 
 
@@ -278,5 +278,5 @@ def test_another_scheme_is_measured_by_the_cold_chain() -> None:
     follower = WarmChain(RIG, CALIBRATION, Settings(scheme="ers"))
     for frame in frames()[:2]:
         result = follower.measure(frame.image)
-        assert follower.broke is not None
+        assert follower.track_lost is not None
         assert result.scheme == "ers"

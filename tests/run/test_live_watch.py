@@ -319,14 +319,14 @@ class Chain:
         self.now_s, self.is_lost = 100.0, True
         self.searched: list[float] = []
         self.judged: list[float] = []
-        self.broke: str | None = None
+        self.track_lost: str | None = None
         self.found = Measurement("ok", "", "fit", Dots(*np.ones((7, 2))), measures=MEASURES)
 
     def follow(self, _: np.ndarray) -> Measurement | None:
-        self.broke = "it jumped" if self.is_lost else None
+        self.track_lost = "it jumped" if self.is_lost else None
         return None if self.is_lost else self.found
 
-    def measure(self, _: np.ndarray) -> Measurement:
+    def search(self, _: np.ndarray) -> Measurement:
         self.searched.append(self.now_s)
         return self.found
 

@@ -95,7 +95,7 @@ class WarmChain:
 
     Attributes
     ----------
-    broke
+    track_lost
         Why the last frame was measured by the cold chain; None where it was followed.
     """
 
@@ -108,7 +108,7 @@ class WarmChain:
     ) -> None:
         self.rig, self.calibration, self.settings = rig, calibration, settings
         self._passed = passed
-        self.broke: str | None = None
+        self.track_lost: str | None = None
         self._track: Track | None = None
 
     def follow(self, image: Image) -> Measurement | None:
@@ -122,17 +122,22 @@ class WarmChain:
             measurement, self._track = follow(
                 image, self._track, self.calibration, self.settings, self._passed
             )
-            self.broke = None
+            self.track_lost = None
             return measurement
         except (TrackLost, CannotMeasure, np.linalg.LinAlgError) as reason:
-            self.broke = str(reason)
+            self.track_lost = str(reason)
             return None
 
     def measure(self, image: Image) -> Measurement:
-        """Measure the next frame; see `pipeline.measure`."""
-        found = self.follow(image)
-        if found is not None:
-            return found
+        """Measure the next frame from those before, or else by itself (`search`)."""
+        return self.follow(image) or self.search(image)
+
+    def search(self, image: Image) -> Measurement:
+        """Measure the next frame as if it were the first (`pipeline.measure`).
+
+        Where that succeeds, those after it may be followed from it.
+        """
+        self.track_lost = self.track_lost or "it was measured by itself"
         settings = _with_size(self.settings, image)
         measurement = measure(image, self.rig, self.calibration, settings)
         if measurement.status == "ok":
