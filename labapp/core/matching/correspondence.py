@@ -41,7 +41,7 @@ from labapp.core.matching.hypothesis import (
 from labapp.core.matching.quadric_search import search_quadrics
 from labapp.core.matching.ray_growth import LEAST_LABELS, QUICK, SOFT, UNLABELLED, Scene, try_fit
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
-from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
+from labapp.core.rows.lattice import Lattice, Site, empty_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, IntArray
 
@@ -118,14 +118,16 @@ def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
 
     They index dots that the picture alone leaves in doubt, and none that the rays do not.
     """
-    way = ways(match.orientation)
-    k, t = (
-        np.array(rig.pattern.marker or rig.pattern.reference) * way
-        + (match.reflected - match.ray * way)[0]
-    )
-    sites = (tuple(map(int, site)) for site in match.reflected)
-    grid = {(k, t): int(dot) for (k, t), dot in zip(sites, match.dot, strict=True)}
-    return lattice_of_sites(grid, count, reference=(int(k), int(t)))
+    way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.reference
+    k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
+    row, column = np.zeros((2, count), np.int64)
+    row[match.dot], column[match.dot] = match.reflected.T
+    # Rows that lack two or more neighbouring dots between others are blocked.
+    sites = match.reflected[np.lexsort(match.reflected.T[::-1])]
+    step = np.diff(sites, axis=0)
+    blocked = np.unique(sites[1:, 0][(step[:, 0] == 0) & (step[:, 1] > 2)])
+    site = (int(k), int(t))
+    return Lattice(row, column, site, (site,), frozenset(blocked.tolist()))
 
 
 def _by_grid(
@@ -219,17 +221,31 @@ def as_match(
             trials.append(Trial(orientation, np.inf if other is None else other.residual_rms_mm))
     at = np.argwhere(best.labels != UNLABELLED)
     dot = best.labels[at[:, 0], at[:, 1]]
+    trials.sort(key=lambda trial: trial.residual_mm)
+    return match_of(scene, at, dot, own, certain_witness(scene, best), trials, reference)
+
+
+def match_of(
+    scene: Scene,
+    at: IntArray,
+    dot: IntArray,
+    orientation: Orientation,
+    witness: IntArray,
+    trials: Iterable[Trial],
+    reference: Site | None = None,
+) -> Match:
+    """Build the match of rays, rows and columns counted from 0, shape (n, 2), with dots, (n,)."""
     pattern = scene.rig.pattern
-    numbers = (at + 1 - (pattern.marker or pattern.reference)) * ways(own)
+    numbers = (at + 1 - (pattern.marker or pattern.reference)) * ways(orientation)
     least = numbers.min(axis=0)
     numbers += 1 - least if reference is None else np.maximum(reference, 1 - least)
     return Match(
-        orientation=own,
+        orientation=orientation,
         dot=dot,
         ray=at + 1,
         reflected=numbers,
         plane_mm=scene.plane_mm[dot],
         plane_covariance_mm2=scene.covariance_mm2[dot],
-        witness=certain_witness(scene, best),
-        trials=tuple(sorted(trials, key=lambda trial: trial.residual_mm)),
+        witness=witness,
+        trials=tuple(trials),
     )

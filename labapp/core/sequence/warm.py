@@ -22,10 +22,10 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.band_pass import quick_dots
 from labapp.core.images.dot_size import estimate_size
 from labapp.core.images.dots import Image
-from labapp.core.match import Match, Trial, ways
+from labapp.core.match import Match, Trial
+from labapp.core.matching.correspondence import indexed_lattice, match_of
 from labapp.core.matching.ray_growth import UNLABELLED, Scene
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.rows.lattice import Lattice
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.track import MEMORY, Track, TrackLost, begin, found_again, rms
 from labapp.core.sequence.warm_fit import (
@@ -227,7 +227,7 @@ def follow(
         unseen=unseen,
         count=track.count + 1,
     )
-    lattice = _lattice(match, geometry.rig, len(dots))
+    lattice = indexed_lattice(match, geometry.rig, len(dots))
     told = Measurement("ok", "", "fit", dots, lattice, match, reconstruction, size)
     passed("measures")
     return told, after
@@ -328,35 +328,12 @@ def _match(
     dot: IntArray,
     residual_mm: float,
 ) -> Match:
-    geometry, first = track.geometry, track.match
-    marker = np.array(geometry.rig.pattern.marker)
-    numbers = (geometry.at[ray] + 1 - marker) * ways(first.orientation)
-    said = np.zeros((geometry.rig.pattern.rows, geometry.rig.pattern.columns), np.int64)
-    said[tuple(geometry.at.T)] = witness
-    others = tuple(t for t in first.trials if t.orientation != first.orientation)
-    return Match(
-        orientation=first.orientation,
-        dot=dot,
-        ray=geometry.at[ray] + 1,
-        reflected=numbers + 1 - numbers.min(axis=0),
-        plane_mm=scene.plane_mm[dot],
-        plane_covariance_mm2=scene.covariance_mm2[dot],
-        witness=said,
-        trials=(Trial(first.orientation, residual_mm), *others),
-    )
-
-
-def _lattice(match: Match, rig: Rig, count: int) -> Lattice:
-    """Rows and columns of all dots (`correspondence.indexed_lattice`)."""
-    way = ways(match.orientation)
-    k, t = np.array(rig.pattern.marker) * way + (match.reflected - match.ray * way)[0]
-    row, column = np.zeros((2, count), np.int64)
-    row[match.dot], column[match.dot] = match.reflected.T
-    at = np.lexsort(match.reflected.T[::-1])
-    step = np.diff(match.reflected[at], axis=0)
-    gaps = match.reflected[at][1:, 0][(step[:, 0] == 0) & (step[:, 1] > 2)]
-    site = (int(k), int(t))
-    return Lattice(row, column, site, (site,), frozenset(np.unique(gaps).tolist()))
+    geometry, orientation = track.geometry, track.match.orientation
+    every = np.zeros(scene.absent.shape, np.int64)
+    every[tuple(geometry.at.T)] = witness
+    others = (t for t in track.match.trials if t.orientation != orientation)
+    trials = (Trial(orientation, residual_mm), *others)
+    return match_of(scene, geometry.at[ray], dot, orientation, every, trials)
 
 
 def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatArray) -> Track:
