@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from labapp.cli.shared import frames_text
-from labapp.errors import InputError
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
@@ -61,7 +60,9 @@ def _facts(session: Session) -> dict[str, Any]:
         if recording is None
         else {name: value for name, value in asdict(recording).items() if name != "index"}
         | {"missing": None if missing is None else str(missing)},
-        "setup_lacks": setup_problems(session),
+        "setup_lacks": [
+            f"{p.field}: {p.value}; expected {p.expected}" for p in session.setup_problems
+        ],
         "laser_calibration": None
         if laser is None
         else {
@@ -88,15 +89,6 @@ def _facts(session: Session) -> dict[str, Any]:
             "redoable": sum(change.undone for change in session.history),
         },
     }
-
-
-def setup_problems(session: Session) -> list[str]:
-    """What the set-up lacks, `key: value; expected …` each; empty if it is complete."""
-    try:
-        _ = session.setup
-    except InputError as error:
-        return [f"{p.field}: {p.value}; expected {p.expected}" for p in error.problems]
-    return []
 
 
 def _differences(value: Any, usual: Any, within: str = "") -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from labapp.cli.correct import InOrder, correct
-from labapp.cli.info import info, setup_problems
+from labapp.cli.info import info
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
     FRAMES_HELP,
@@ -190,7 +190,7 @@ def import_recording(
         typer.echo(f"time base  {time_base}")
         typer.echo(f"seeking    {exact}")
         typer.echo(f"kept       {'in the session itself' if embed else f'as {found.path}'}")
-        if setup_problems(session):
+        if session.setup_problems:
             typer.echo(f"The set-up is not complete:\n  {command('setup', file)} SETUP.toml")
         typer.echo(f"Measure it:\n  {command('measure', file)}")
 

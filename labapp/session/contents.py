@@ -81,6 +81,15 @@ class SessionContents:
         return parse_setup(self.setup_text, self.path)
 
     @property
+    def setup_problems(self) -> tuple[InputError, ...]:
+        """What is missing or wrong in the set-up; empty if it is complete."""
+        try:
+            _ = self.setup
+        except InputError as error:
+            return error.problems
+        return ()
+
+    @property
     def laser_calibration(self) -> LaserReadings | None:
         """The laser calibration in use, and what it was found from; None before one."""
         found: LaserReadings | None = self._documents.get("laser-calibration")

@@ -85,17 +85,8 @@ def why_not_measurable(session: Session) -> str:
         return "Import a recording first"
     if gone := recording_gone(session):
         return gone
-    to_do = setup_to_do(setup_problems(session))
+    to_do = setup_to_do(session.setup_problems)
     return f"The set-up is not complete. {to_do}" if to_do else ""
-
-
-def setup_problems(session: Session) -> tuple[InputError, ...]:
-    """What is missing or wrong in the set-up; empty if it is complete."""
-    try:
-        _ = session.setup
-    except InputError as error:
-        return error.problems
-    return ()
 
 
 def calibrations_in_use(session: Session) -> tuple[bool, bool]:
@@ -160,7 +151,7 @@ class Facts:
 
 
 def _facts(session: Session, seen: Overview | None) -> Facts:
-    problems = setup_problems(session)
+    problems = session.setup_problems
     if session.recording is None:
         return Facts(session, problems)
     seen = seen or session.overview()

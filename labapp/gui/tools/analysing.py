@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 
-from labapp.gui.shell.steps import setup_problems
 from labapp.session.session import Session
 from labapp.studies import SCHEMES
 
@@ -44,7 +43,7 @@ USUAL_MM = (6.0, 7.0, 0.3)
 
 def has_setup(session: Session | None) -> bool:
     """Whether a session has a set-up that is complete."""
-    return session is not None and not setup_problems(session)
+    return session is not None and not session.setup_problems
 
 
 def expected_mm(session: Session | None) -> tuple[float, float, float]:

@@ -11,7 +11,6 @@ from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.rig import Rig
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
-from labapp.gui.shell.steps import setup_problems
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.positioning import (
@@ -265,7 +264,7 @@ def shown(session: Session) -> SetupState:
     values = {key: _number(sections, key) for key in keys}
     problems: dict[str, str] = {}
     others = []
-    for problem in setup_problems(session):
+    for problem in session.setup_problems:
         words = "missing"
         if problem.value != words:
             words = f"{problem.value}; expected {problem.expected}"
