@@ -66,6 +66,15 @@ class MatchSettings:
         """Those to be tried."""
         return ORIENTATIONS if self.correspondence == "auto" else (self.correspondence,)
 
+    def most_strays(self, hypothesis: Hypothesis) -> float:
+        """Return how many dots without a ray are put up with, wherever they lie."""
+        return self.stray[0] + self.stray[1] * (hypothesis.count + hypothesis.stray)
+
+    def leaves_much(self, hypothesis: Hypothesis) -> bool:
+        """Whether more is left unexplained than is put up with wherever it lies."""
+        most_missed = self.missed[0] + self.missed[1] * hypothesis.count
+        return hypothesis.stray > self.most_strays(hypothesis) or hypothesis.missed > most_missed
+
 
 def explains(scene: Scene, hypothesis: Hypothesis) -> bool:
     """Hardly a dot is left over, few are missing and lie apart, and none is where the marker is."""
@@ -110,7 +119,7 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     doubtful: list[int] = contested(scene, best).tolist()
     others = (turned(scene, best.labels, own, way) for way in settings.orientations if way != own)
     for other in [*found, *neighbours, *_rivals(scene, best, others, knots)]:
-        if _stands_against(scene, best, other, knots, settings.margin):
+        if _stands_against(scene, best, other, knots, settings):
             continue
         differing, shared = _differing(best, other)
         if len(differing) <= 0.2 * shared:
@@ -155,16 +164,14 @@ def _cheapest(
 
 def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings) -> None:
     """Raise `CannotMeasure` where too much is left unexplained, or it may be a row."""
-    strays = settings.stray[0] + settings.stray[1] * len(scene.plane_mm)
-    missed = settings.missed[0] + settings.missed[1] * best.count
     # Missed rays side by side are a hole or a row: then so many dots without a ray may be theirs.
     scattered = (
         best.marker == "dark"
         and _missed_lie_apart(best)
-        and (best.stray <= strays or _strays_lie_apart(scene, best))
+        and (best.stray <= settings.most_strays(best) or _strays_lie_apart(scene, best))
         and best.stray + best.missed <= SCATTERED * best.count
     )
-    if not scattered and (best.stray > strays or best.missed > missed):
+    if not scattered and settings.leaves_much(best):
         raise CannotMeasure(
             "no-match",
             f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
@@ -187,26 +194,27 @@ INFLATED = 40.0
 
 
 def _stands_against(
-    scene: Scene, best: Hypothesis, other: Hypothesis, knots: FitSettings, margin: float
+    scene: Scene, best: Hypothesis, other: Hypothesis, knots: FitSettings, settings: MatchSettings
 ) -> bool:
-    """Whether the best costs less by a margin; with fine knots, less by either, by one twice that.
+    """Whether the best costs less by a margin; with fine knots, less by either, by one clearly.
 
     A false dot may lie at the marker: what costs less but for that is a rival.
     """
     if other.unlit_cost < best.unlit_cost:
         return False
-    if other.cost >= best.cost + margin:
+    if other.cost >= best.cost + settings.margin:
         return True
     if knots is not FINE:
         return False
     ahead = []
-    for settings in (FINE, FOLLOWING):
-        own, rival = (weigh(scene, h.labels, settings, near=h.pool) for h in (best, other))
+    for each in (FINE, FOLLOWING):
+        own, rival = (weigh(scene, h.labels, each, near=h.pool) for h in (best, other))
         if own is None or rival is None:
             return False
         ahead.append(rival.cost - own.cost)
-    # Where the set-up is off, wrong rows were ahead by more than one margin.
-    return min(ahead) >= 0 and max(ahead) >= 2 * margin
+    # With the set-up off and many false dots, wrong rows were ahead by more than one margin.
+    clearly = (2 if settings.leaves_much(best) else 1) * settings.margin
+    return min(ahead) >= 0 and max(ahead) >= clearly
 
 
 def _beyond_doubt(scene: Scene, best: Hypothesis, margin: float) -> bool:
