@@ -32,6 +32,7 @@ from labapp.cli.shared import (
     TERMINATED,
     Algorithm,
     SchemeName,
+    SigmaParts,
     choose_frames,
     measure_frames,
     note,
@@ -206,6 +207,7 @@ def reconstruct(
         Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
     ] = "all",
     *,
+    sigma_parts: SigmaParts = False,
     warm: Annotated[
         bool,
         typer.Option(
@@ -240,7 +242,13 @@ def reconstruct(
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
         streams = _stream_sinks(at_end, places, anywhere)
-        summary = _run(source, setup, out, settings, frames, surfaces == "all", warm, streams)
+        summary = _run(
+            *(source, setup, out, settings, frames),
+            surfaces=surfaces == "all",
+            sigma_parts=sigma_parts,
+            warm=warm,
+            streams=streams,
+        )
     if not summary.statuses["ok"]:
         raise typer.Exit(NOTHING)
 
@@ -270,7 +278,9 @@ def _run(
     out: Path,
     settings: Settings,
     frames: str,
+    *,
     surfaces: bool,
+    sigma_parts: bool,
     warm: bool,
     streams: Sequence[Sink],
 ) -> Summary:
@@ -289,13 +299,13 @@ def _run(
             note(progress.console, f"warning: {warning}")
         selected = select_frames(frames, len(source))
         origin = provenance(source, source_path, setup_path, setup, settings, selected, warm)
-        results = ResultsWriter(out, setup.calibration, origin, surfaces)
+        results = ResultsWriter(out, setup.calibration, origin, surfaces, sigma_parts)
         show = shown(progress, source.name, len(selected))
         try:
             with results, ExitStack() as at_end:
                 measurer: Measurer = ColdMeasurer(source.frame, setup, settings)
                 if warm:
-                    given = (source_path, source.index, setup, settings, surfaces)
+                    given = (source_path, source.index, setup, settings, surfaces, sigma_parts)
                     pools = at_end.enter_context(stretch_pools(len(selected)))
                     measurer = RecordingMeasurer(*given, pools)
                 for _ in run(selected, measurer, [results.write, summary.add, *streams, show]):

@@ -22,6 +22,7 @@ from labapp.cli.shared import (
     Algorithm,
     ResultsName,
     SchemeName,
+    SigmaParts,
     choose_frames,
     command,
     finite,
@@ -299,6 +300,7 @@ def export(
     frames: Frames = None,
     scheme: WhoseResults = None,
     tables: Tables = True,
+    sigma_parts: SigmaParts = False,
     surfaces: Annotated[str, _some(SURFACE_FORMATS, unit=" (mm)")] = "csv,stl",
     solid: Annotated[
         bool, typer.Option("--solid", help="Each surface as a watertight body, too.")
@@ -325,6 +327,7 @@ def export(
         raise InputError("export", "choice", "nothing", "tables, surfaces, HDF5, pictures, report")
     choice = ExportChoice(
         tables=frozenset(TABLES if tables else ()),
+        sigma_parts=sigma_parts,
         surfaces=_words(surfaces),
         solid=solid,
         hdf5=hdf5,

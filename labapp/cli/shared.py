@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 from rich.console import Console
@@ -49,6 +49,11 @@ RECORDING_HELP = (
     "a Photron .mraw or its header."
 )
 FRAMES_HELP = "Frames A to before B, counted from 0, every STEP-th; parts may be left out."
+
+SigmaParts = Annotated[
+    bool,
+    typer.Option("--sigma-parts", help="The parts of each ±, too, in measures.csv: noise, level."),
+]
 
 
 def progress_bar() -> Progress:

@@ -87,6 +87,8 @@ class ExportChoice:
         Frames of the film a second; None: as fast as they were recorded (`film.film_times`).
     together
         How to write everything into one file: some of `RUN_FORMATS`.
+    sigma_parts
+        Whether `measures.csv` has the parts of standard uncertainties, too.
 
     Raises
     ------
@@ -104,6 +106,7 @@ class ExportChoice:
     size_px: tuple[int, int] = PICTURE_PX
     film_rate_hz: float | None = None
     together: frozenset[str] = frozenset()
+    sigma_parts: bool = False
 
     def __post_init__(self) -> None:
         allowed: dict[str, Collection[str]] = {
@@ -306,7 +309,7 @@ def _write_results(
     """Write everything but a film, frame by frame; returns the summary and the common extent."""
     summary, extent = Summary(), Extent()
     for name in choice.tables:
-        files.add(f"{name}.csv", csv_header(name).encode())
+        files.add(f"{name}.csv", csv_header(name, choice.sigma_parts).encode())
     with ExitStack() as stack:
         process, about = None, _about(provenance)
         together = [
@@ -322,7 +325,7 @@ def _write_results(
                 refuse_too_large(reconstruction, choice.spacing_mm)
             tables = frame_tables(result, calibration)
             for name in choice.tables:
-                rows = csv_rows(name, tables[name])
+                rows = csv_rows(name, tables[name], choice.sigma_parts)
                 files.extend(f"{name}.csv", rows, len(tables[name]["frame"]))
             surfaces = surface_files(
                 frame, reconstruction, choice.surfaces, choice.spacing_mm, as_solid=choice.solid

@@ -85,6 +85,8 @@ class ResultsWriter:
         What `run.json` is to say of the source, the setup and the options.
     surfaces
         Whether to write the surface files.
+    sigma_parts
+        Whether `measures.csv` has the parts of standard uncertainties, too.
 
     Raises
     ------
@@ -98,11 +100,13 @@ class ResultsWriter:
         calibration: ImageCalibration,
         provenance: Mapping[str, object],
         surfaces: bool = True,
+        sigma_parts: bool = False,
     ) -> None:
         self.folder = folder
         self.frames = 0
         self._calibration = calibration
         self.surfaces = surfaces
+        self._sigma_parts = sigma_parts
         self._run = {
             "program": "labapp",
             "version": VERSION,
@@ -120,7 +124,7 @@ class ResultsWriter:
             self._write_run()
             for name in TABLES:
                 self._files[name] = io.FileIO(folder / f"{name}.csv", "a")
-                _append(self._files[name], csv_header(name))
+                _append(self._files[name], csv_header(name, sigma_parts))
         except OSError as error:
             self._close_files()
             raise self._unwritable(error) from error
@@ -141,7 +145,7 @@ class ResultsWriter:
                 result.frame, result.measurement.reconstruction, formats, SPACING_MM
             ).items()
         }
-        rows = result.rows or table_rows(result, self._calibration)
+        rows = result.rows or table_rows(result, self._calibration, self._sigma_parts)
         try:
             for path, content in surfaces.items():
                 write_atomically(path, content)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
@@ -58,20 +59,19 @@ class Summary:
         total = f"{count} frame{'s' * (count != 1)}, {self.statuses['ok']} with a surface"
         without = [f"{n} {status}" for status, n in self.statuses.items() if status != "ok"]
         lines = [f"{total} ({', '.join(without)})" if without else total]
+        known = series_of([each for _, _, each in self.frames if each is not None])
         for label, name in MEANS.items():
-            values = self._finite(name)
+            values = self.series(name)
+            values = values[np.isfinite(values)]
+            if not len(values):
+                continue
+            sigma = sigma_of_mean(name, known)
+            words = [f"± {sigma:.4f}"] if np.isfinite(sigma) else []
+            words += ["mm"]
             if len(values) > 1:
-                spread = f"± {np.std(values):.4f} mm (mean, standard deviation)"
-                lines.append(f"{label:7}{np.mean(values):z8.4f} {spread}")
-            elif len(values):
-                sigma = self._finite(name.replace("_mm", "_sigma_mm"))
-                spread = f"± {sigma[0]:.4f} " if len(sigma) else ""
-                lines.append(f"{label:7}{values[0]:z8.4f} {spread}mm")
+                words += [f"(mean; standard deviation {np.std(values):.4f} mm)"]
+            lines.append(f"{label:7}{np.mean(values):z8.4f} {' '.join(words)}")
         return "\n".join(lines)
-
-    def _finite(self, name: str) -> FloatArray:
-        values = self.series(name)
-        return np.asarray(values[np.isfinite(values)])
 
 
 def format_ranges(frames: Iterable[int], to: str = "–", most: int = 12) -> str:

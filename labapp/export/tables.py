@@ -9,7 +9,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
-from labapp.core.surface.measures import Measures
+from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
@@ -44,11 +44,14 @@ class Column:
         What it holds, in a few words.
     digits
         Decimals in CSV; 0 for whole numbers, None for text.
+    is_part
+        Whether it is a part of a standard uncertainty: in CSV files where these are asked for.
     """
 
     name: str
     description: str
     digits: int | None = MM_DIGITS
+    is_part: bool = False
 
     @property
     def unit(self) -> str:
@@ -56,6 +59,10 @@ class Column:
         end = self.name.rpartition("_")[2]
         return end if end in UNITS else NO_UNIT
 
+
+WITH_SIGMA = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
+PARTS = ("noise", "level")
+"""What has a standard uncertainty, and the parts of that, which are independent."""
 
 FRAME = Column("frame", "number of the frame in its recording, from 0", 0)
 
@@ -125,11 +132,22 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("own_are_mm", "irs, ers: average reflection error of the scheme's own points"),
         Column("sigma_of", "what is in the standard uncertainties, where there are any", None),
         Column("reason", "why there is no surface, in a sentence", None),
+        *(
+            Column(sigma_name(size, part), f"part of {sigma_name(size)}: {part}", is_part=True)
+            for part in PARTS
+            for size in WITH_SIGMA
+        ),
     ),
 }
 """The tables and their columns, in the order in which a frame is written to them."""
 
-SIZES = [column.name for column in TABLES["measures"][7:-2]]
+_MEASURED = {field.name for field in fields(Measures)}
+SIZES = [c.name for c in TABLES["measures"] if c.name in _MEASURED and not c.is_part]
+
+
+def columns_of(name: str, sigma_parts: bool = False) -> list[Column]:
+    """Columns of a table's CSV file, with or without the parts of standard uncertainties."""
+    return [column for column in TABLES[name] if sigma_parts or not column.is_part]
 
 
 def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Table]:
@@ -171,14 +189,24 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
         *(getattr(measurement.measures, name, math.nan) for name in SIZES),
         sigma_of(measurement),
         measurement.reason,
+        *_sigma_parts(measurement.measures),
     ]
     return [np.array([cell], object if isinstance(cell, str) else None) for cell in row]
 
 
 def sigma_of(measurement: Measurement) -> str:
     """Contributions to the standard uncertainties of a frame; empty where it has none."""
-    sigma = (getattr(measurement.measures, name, math.nan) for name in SIZES if "_sigma_" in name)
+    sigma = (getattr(measurement.measures, sigma_name(size), math.nan) for size in WITH_SIGMA)
     return SIGMA_OF if any(map(math.isfinite, sigma)) else ""
+
+
+def _sigma_parts(measures: Measures | None) -> list[float]:
+    """Noise and level, the two parts of each size's standard uncertainty."""
+    total, level = (
+        np.array([getattr(measures, sigma_name(size, part), math.nan) for size in WITH_SIGMA])
+        for part in ("", "level")
+    )
+    return [*np.sqrt(np.maximum(total**2 - level**2, 0.0)).tolist(), *level.tolist()]
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:
@@ -221,39 +249,42 @@ def _boundary(reconstruction: Reconstruction) -> list[npt.NDArray[Any]]:
     return [reconstruction.boundary.theta_deg, *reconstruction.boundary.points_mm.T]
 
 
-def table_rows(result: FrameResult, calibration: ImageCalibration) -> dict[str, str]:
+def table_rows(
+    result: FrameResult, calibration: ImageCalibration, sigma_parts: bool = False
+) -> dict[str, str]:
     """A frame's rows of every table, as CSV text (`frame_tables`)."""
     tables = frame_tables(result, calibration)
-    return {name: csv_rows(name, table) for name, table in tables.items()}
+    return {name: csv_rows(name, table, sigma_parts) for name, table in tables.items()}
 
 
-def csv_header(name: str) -> str:
+def csv_header(name: str, sigma_parts: bool = False) -> str:
     """Header line of a table's CSV file."""
-    return as_csv([[column.name for column in TABLES[name]]])
+    return as_csv([[column.name for column in columns_of(name, sigma_parts)]])
 
 
-def csv_rows(name: str, table: Table) -> str:
+def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
     """CSV text of a table's rows, without header, rounded to the decimals of `TABLES`."""
-    text = _numeric_rows(name, table)
+    columns = columns_of(name, sigma_parts)
+    text = _numeric_rows(columns, table)
     if text is not None:
         return text
     cells = [
         table[column.name].tolist()
         if column.digits is None
         else [number(value, column.digits) for value in table[column.name].tolist()]
-        for column in TABLES[name]
+        for column in columns
     ]
     return as_csv(zip(*cells, strict=True))
 
 
-def _numeric_rows(name: str, table: Table) -> str | None:
+def _numeric_rows(columns: Sequence[Column], table: Table) -> str | None:
     """The same by compiled loops; None unless all is numbers, but for one word in the last column.
 
     None also where the rounding of a number to its decimals is too near to a tie.
     """
     from labapp.export.fixed_point import format_fixed  # loads numba
 
-    columns, end = TABLES[name], "\n"
+    end = "\n"
     if columns[-1].digits is None:
         words = set(table[columns[-1].name].tolist())
         if len(words) != 1:

@@ -205,6 +205,8 @@ class RecordingMeasurer:
     whole
         Whether results have dots, rays and surface, too: to pass them from process to process takes
         a twentieth of the time that it took to measure them.
+    sigma_parts
+        Whether rows have the parts of standard uncertainties, too.
     pools
         Where to measure (`stretch_pools`); none: here.
 
@@ -219,6 +221,7 @@ class RecordingMeasurer:
     setup: Setup
     settings: Settings
     whole: bool = False
+    sigma_parts: bool = False
     pools: Sequence[Executor] = ()
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
@@ -232,7 +235,7 @@ class RecordingMeasurer:
                 yield replace(
                     result,
                     measurement=found if self.whole else without_surface(found),
-                    rows=table_rows(result, self.setup.calibration),
+                    rows=table_rows(result, self.setup.calibration, self.sigma_parts),
                 )
 
     def _in_processes(self, frames: Sequence[int]) -> Generator[FrameResult]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
+from labapp.core.sequence.mean import sigma_of_mean
 from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
 from labapp.session.measured import Overview
 
@@ -87,6 +90,8 @@ class Trend:
         Which stand out (`doubtful_frames`), no longer stand, were corrected by hand, shape (n,).
     counts
         Which go into the statistics and the spectrum, shape (n,).
+    measures
+        All measures of these frames by their names, each of shape (n,).
     """
 
     quantity: Quantity
@@ -100,6 +105,7 @@ class Trend:
     stale: BoolArray
     corrected: BoolArray
     counts: BoolArray
+    measures: Mapping[str, FloatArray]
 
     def __post_init__(self) -> None:
         freeze(self)
@@ -116,6 +122,9 @@ class Spread:
     mean, deviation, lowest, highest
         In the measure's unit; the deviation is the root of the mean square, divided by n as in the
         text. NaN without a frame.
+    mean_sigma
+        Standard uncertainty of the mean, noise and level only (`sigma_of_mean`); NaN where the
+        measure has none.
     """
 
     count: int
@@ -123,6 +132,7 @@ class Spread:
     deviation: float
     lowest: float
     highest: float
+    mean_sigma: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -200,6 +210,7 @@ def trend(
         stale=seen.stale[has],
         corrected=seen.corrected[has],
         counts=counts[has],
+        measures={name: values[has] for name, values in seen.measures.items()},
     )
 
 
@@ -228,7 +239,7 @@ def doubtful_frames(seen: Overview) -> BoolArray:
 
 
 def spread(course: Trend) -> Spread:
-    """Mean, standard deviation and range of the frames that count (Eq. 7-2 … 7-4)."""
+    """Mean, its ±, standard deviation and range of the frames that count (Eq. 7-2 … 7-4)."""
     value = course.value[course.counts]
     if not len(value):
         return Spread(0, *(4 * (float("nan"),)))
@@ -238,6 +249,9 @@ def spread(course: Trend) -> Spread:
         float(value.std()),
         float(value.min()),
         float(value.max()),
+        sigma_of_mean(
+            course.quantity.key, {k: v[course.counts] for k, v in course.measures.items()}
+        ),
     )
 
 

@@ -9,8 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement
+from labapp.core.surface.measures import Measures, sigma_name
 from labapp.export.fixed_point import format_fixed
-from labapp.export.tables import TABLES, Table, csv_rows, number
+from labapp.export.frame_result import FrameResult
+from labapp.export.tables import TABLES, WITH_SIGMA, Table, csv_header, csv_rows, number, table_rows
 
 NUMBERS = st.one_of(
     st.floats(-1e7, 1e7),
@@ -62,3 +66,26 @@ def test_a_number_of_many_digits_is_written_the_slow_way() -> None:
     values = np.array([2e-7, 3e12, 1.5])
     table: Table = {column.name: values for column in TABLES["boundary"]}
     assert csv_rows("boundary", table) == cell_by_cell("boundary", table)
+
+
+def test_parts_of_an_uncertainty_are_written_where_they_are_asked_for() -> None:
+    measures = Measures(
+        *[1.0] * 14,
+        *[0.05] * 6,
+        **{sigma_name(size, "level"): 0.04 for size in WITH_SIGMA},
+    )
+    found = Measurement("ok", "", "fit", measures=measures)
+    made = FrameResult(0, 0.0, found)
+    rows = [
+        table_rows(made, ImageCalibration(np.eye(3)), parts)["measures"] for parts in (False, True)
+    ]
+    heads = [csv_header("measures", parts) for parts in (False, True)]
+    plain, whole = (
+        dict(zip(head.strip().split(","), row.strip("\n").split(","), strict=True))
+        for head, row in zip(heads, rows, strict=True)
+    )
+    assert plain.items() <= whole.items()
+    more = {name: float(whole[name]) for name in whole.keys() - plain.keys()}
+    assert len(more) == 12
+    for name, value in more.items():
+        assert value == (0.04 if "_level_" in name else 0.03), name

@@ -53,7 +53,7 @@ def test_a_frame_without_dots_is_shown_as_it_is(unmeasured: Measurement) -> None
 def test_the_summary_counts_and_averages(summary: Summary) -> None:
     first, width, *_ = summary.text().splitlines()
     assert first == "3 frames, 2 with a surface (1 ambiguous-rows)"
-    assert width == "width    1.2500 ± 0.0000 mm (mean, standard deviation)"
+    assert width == "width    1.2500 ± 1.2500 mm (mean; standard deviation 0.0000 mm)"
     np.testing.assert_array_equal(summary.series("width_mm"), [np.nan, 1.25, 1.25])
 
 

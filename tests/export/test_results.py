@@ -111,8 +111,9 @@ def test_points_carry_residual_and_sigma(written: Path) -> None:
 def test_what_is_in_sigma_is_said_beside_the_tables(written: Path) -> None:
     assert json.loads((written / "run.json").read_text("utf-8"))["sigma_of"] == SIGMA_OF
     sigmas = [c for name in TABLES for c in TABLES[name] if "_sigma_" in f"_{c.name}_" and c.digits]
-    assert len(sigmas) == 7
-    assert all(SIGMA_OF in column.description for column in sigmas)
+    assert len(sigmas) == 7 + 12
+    for column in sigmas:  # the total says what is in it, a part of which total it is one
+        assert ("part of" if column.is_part else SIGMA_OF) in column.description
 
 
 @pytest.mark.parametrize("scheme", ["fit", "ers", "irs"])

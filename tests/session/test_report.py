@@ -133,6 +133,7 @@ def test_statistics_are_those_of_eq_7_2_and_leave_out_what_is_stale(
     assert rows["width (mm)"] == [
         "3",
         "7.5000",
+        data.UNKNOWN,
         f"{np.sqrt(np.sum((widths - 7.5) ** 2) / 3):.4f}",
         "6.0000",
         "9.5000",

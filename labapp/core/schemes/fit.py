@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
@@ -54,4 +56,5 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         residual_mm=pool.residual_mm,
         sigma_mm=pool.sigma_of(surface.basis.matrix(x, y)),
         size_sigma=pool.sigma_of(sizes.gradient),
+        size_sigma_level=np.abs(sizes.by_level) * level.sigma_mm,
     )

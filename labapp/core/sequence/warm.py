@@ -375,9 +375,10 @@ def _sized(
         points_mm=points,
         residual_mm=residual,
         sigma_mm=np.hypot(track.free_mm[ray], level.sigma_mm),
+        size_sigma=sigma_of(lower, sizes.gradient, level_at, level.sigma_mm),
+        size_sigma_level=np.abs(sizes.by_level) * level.sigma_mm,
     )
-    sigma = sigma_of(lower, sizes.gradient, level_at, level.sigma_mm)
     # As `measures.reflection_scale` has it; where the rays land is known.
     scale = np.ptp(geometry.landing_mm[ray, :2], axis=0) / np.ptp(match.plane_mm, axis=0)
     errors = scaled_errors(made, scale)
-    return made, measures.measures_of(errors, sizes.size, sizes.peak_mm, center, sigma)
+    return made, measures.measures_of(errors, sizes.size, sizes.peak_mm, center, made)

@@ -77,6 +77,8 @@ class Measures:
         Standard uncertainties, noise and level only; NaN where the scheme gives none.
     area_sigma_mm2, volume_sigma_mm3
         The same of area and volume.
+    width_sigma_level_mm … volume_sigma_level_mm3
+        The level's part of these six; NaN also in results of versions that did not keep it.
     own_are_mm
         See `Reconstruction`; NaN where the scheme gives none.
     scale_x, scale_z
@@ -107,6 +109,18 @@ class Measures:
     own_are_mm: float = math.nan
     scale_x: float = math.nan
     scale_z: float = math.nan
+    width_sigma_level_mm: float = math.nan
+    length_sigma_level_mm: float = math.nan
+    height_sigma_level_mm: float = math.nan
+    depth_sigma_level_mm: float = math.nan
+    area_sigma_level_mm2: float = math.nan
+    volume_sigma_level_mm3: float = math.nan
+
+
+def sigma_name(name: str, part: str = "") -> str:
+    """Name of a size's standard uncertainty, or of a part of it: ``width_sigma_level_mm``."""
+    size, _, unit = name.rpartition("_")
+    return "_".join(filter(None, (size, "sigma", part, unit)))
 
 
 def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
@@ -114,7 +128,7 @@ def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
     errors = reflection_errors(reconstruction, match, rig)
     boundary = reconstruction.boundary
     size, peak = size_of(reconstruction.whole, boundary)
-    made = measures_of(errors, size, peak, boundary.center_mm, reconstruction.size_sigma)
+    made = measures_of(errors, size, peak, boundary.center_mm, reconstruction)
     return replace(made, own_are_mm=reconstruction.own_are_mm)
 
 
@@ -123,9 +137,10 @@ def measures_of(
     size: FloatArray,
     peak_mm: FloatArray,
     center_mm: FloatArray,
-    sigma: FloatArray,
+    reconstruction: Reconstruction,
 ) -> Measures:
-    """Write down errors, what `size_of` gave, the centre, and the σ of each size, shape (6,)."""
+    """Write down errors, what `size_of` gave, the centre, and what the sizes are uncertain by."""
+    sigma, by_level = reconstruction.size_sigma, reconstruction.size_sigma_level
     return Measures(
         are_mm=errors.are_mm,
         mre_mm=errors.mre_mm,
@@ -149,6 +164,12 @@ def measures_of(
         volume_sigma_mm3=float(sigma[5]),
         scale_x=float(errors.scale[0]),
         scale_z=float(errors.scale[1]),
+        width_sigma_level_mm=float(by_level[0]),
+        length_sigma_level_mm=float(by_level[1]),
+        height_sigma_level_mm=float(by_level[2]),
+        depth_sigma_level_mm=float(by_level[3]),
+        area_sigma_level_mm2=float(by_level[4]),
+        volume_sigma_level_mm3=float(by_level[5]),
     )
 
 

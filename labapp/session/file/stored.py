@@ -160,6 +160,7 @@ STORED = {
             "residual_mm": "n 2",
             "sigma_mm": "n",
             "size_sigma": "6",
+            "size_sigma_level": "6",
         },
     ),
     "Measures": Stored(Measures),

@@ -14,7 +14,8 @@ import numpy as np
 from labapp.config.setup import Setup
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.surface.measures import Measures
+from labapp.core.sequence.mean import series_of, sigma_of_mean
+from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.summary import format_ranges
@@ -264,24 +265,20 @@ def _outcome(line: FrameLine) -> tuple[str, str]:
 
 
 def statistics_cells(lines: Sequence[FrameLine]) -> Cells:
-    """Mean, standard deviation (root of the variances of Eq. 7-2 … 7-4), extremes, range, ±."""
+    """Mean and its ±, standard deviation (Eq. 7-2 … 7-4), extremes, range, ± of a frame."""
     rows = []
+    series = series_of([line.measures for line in lines if line.counts and line.measures])
     for name, (label, digits) in STATISTICS.items():
         found = values(lines, name)
         if not len(found):
             continue
-        figures: list[float] = [found.mean(), found.std(), found.min(), found.max(), np.ptp(found)]
+        figures: list[float] = [found.mean(), sigma_of_mean(name, series), found.std()]
+        figures += [found.min(), found.max(), np.ptp(found)]
         sigma = values(lines, sigma_name(name))
         figures.append(np.median(sigma) if len(sigma) else math.nan)
         rows.append([label, str(len(found)), *(number(float(f), digits) for f in figures)])
-    head = ["quantity", "frames", "mean", "std. dev.", "least", "largest", "range", "±"]
+    head = ["quantity", "frames", "mean", "±", "std. dev.", "least", "largest", "range", "± each"]
     return [head, *rows]
-
-
-def sigma_name(name: str) -> str:
-    """Name of a measure's standard uncertainty."""
-    size, _, unit = name.rpartition("_")
-    return f"{size}_sigma_{unit}"
 
 
 def frame_cells(lines: Sequence[FrameLine]) -> Cells:

@@ -9,6 +9,7 @@ import numpy as np
 
 from labapp.config.setup import parse_setup
 from labapp.core.pipeline import Measurement
+from labapp.core.surface.measures import sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.session.report import data, figures
@@ -47,10 +48,11 @@ def add_results(story: Story, report: ReportData) -> None:
         story.table(
             f"Sizes over the {len(counted)} frames that count. Standard deviation: root of the "
             "variance of Eq. 7-2 … 7-4 (divided by the number of frames). ±: standard uncertainty "
-            f"of a single frame ({SIGMA_OF}), their median; – where the scheme gives none.",
+            f"of the mean, and the median of each frame's ({SIGMA_OF}): levels of frames whose "
+            "outline is the same err together. – where the scheme gives none.",
             data.statistics_cells(lines),
-            "lrrrrrrr",
-            (0.19, 0.09, *[0.12] * 6),
+            "lrrrrrrrr",
+            (0.19, 0.09, *[0.103] * 7),
         )
         _trends(story, lines)
     elif any(line.status for line in lines):
@@ -80,9 +82,7 @@ def _trends(story: Story, lines: list[FrameLine]) -> None:
     )
     peak = "depth_mm" if concave else "height_mm"
     series = [
-        figures.Series(
-            data.STATISTICS[name][0], _each(lines, name), _each(lines, data.sigma_name(name))
-        )
+        figures.Series(data.STATISTICS[name][0], _each(lines, name), _each(lines, sigma_name(name)))
         for name in ("width_mm", "length_mm", peak, "volume_mm3", "are_mm")
     ]
     states = [line.state for line in lines]

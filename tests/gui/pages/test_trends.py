@@ -35,9 +35,11 @@ def test_the_course_of_the_sample(gtaw: Path) -> None:
     assert [curve.name for curve in shown.curves] == ["Width", "Length", "Height", "ARE"]
     assert shown.axis.unit == "s"
     assert all(len(curve.key) == 30 for curve in shown.curves)
-    mean, span = shown.rows[4:6]
+    mean, span, sure = shown.rows[6:9]
     assert mean.texts == ("Height", "0.293", "0.019", "mm")  # §7.3: 0.294 ± 0.019
     assert span.texts[1] == "0.256 … 0.323"
+    assert sure.value is not None
+    assert 0.0 < sure.value < 0.019
     assert shown.words == "30 of 30 frames count"
     assert shown.spectrum == ()
     assert shown.signals_words.startswith("None.")

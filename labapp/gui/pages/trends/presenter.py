@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
+from labapp.text import SIGMA_OF
 
 MARKS = (
     Mark("●", "measured"),
@@ -58,7 +60,7 @@ class TrendsState:
     places
         Where every frame is on the axis, by its number.
     rows
-        Mean ± standard deviation and range, two rows a measure.
+        Mean ± standard deviation, range, and ± of the mean where it has one: rows of a measure.
     words
         How many frames count, and why others do not.
     spectrum, spectrum_axis
@@ -136,10 +138,16 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
     ends = [f"{end:.{len(place)}f}" for end in (found.lowest, found.highest)]
     frames = f"{found.count} frame{'s' * (found.count != 1)}"
     note = f"Mean and standard deviation (divided by n, Eq. 7-2 … 7-4) of {frames}"
+    sure = f"± of the mean, {SIGMA_OF}: levels of frames whose outline is the same err together"
     unknown = None if not found.count else " … ".join(ends).replace("-", "−")
     return (
         ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
         ResultRow("range", unknown, unit=quantity.unit, note=f"Least and greatest of {frames}"),
+        *(
+            [ResultRow("± of the mean", found.mean_sigma, unit=quantity.unit, note=sure)]
+            if math.isfinite(found.mean_sigma)
+            else []
+        ),
     )
 
 
