@@ -9,8 +9,8 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots, Image
 from labapp.core.match import Match
-from labapp.core.matching.corrected_rows import confirmed_lattice, match_corrected
-from labapp.core.matching.correspondence import indexed_lattice, match_rays
+from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
+from labapp.core.matching.correspondence import lattice_of_match, match_rays
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
@@ -113,12 +113,12 @@ def measure(
                 match = match_rays(dots, lattice, *bench)
             except CannotMeasure as answer:
                 raise (doubt if doubt and answer.status == "no-match" else answer) from None
-            lattice = indexed_lattice(match, rig, len(dots))
+            lattice = lattice_of_match(match, rig, len(dots))
         else:
             dots, given = correction.dots, correction.lattice
             result = replace(result, dots=dots, lattice=given)
             match = match_corrected(dots, given, *bench)
-            lattice = confirmed_lattice(match, rig, given)
+            lattice = lattice_of_corrected(match, rig, given)
         result = replace(result, match=match, lattice=lattice)
         reconstruction = reconstruct(match, rig, settings)
         size = measures.measure(reconstruction, match, rig)

@@ -13,8 +13,8 @@ from labapp.core.geometry.rig import DotPattern, Laser, Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
 from labapp.core.matching import correspondence
-from labapp.core.matching.corrected_rows import confirmed_lattice, match_corrected
-from labapp.core.matching.correspondence import indexed_lattice, match_rays
+from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
+from labapp.core.matching.correspondence import lattice_of_match, match_rays
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.correction import (
     Correction,
@@ -206,7 +206,7 @@ def test_rays_that_are_said_to_have_stayed_away_did(answers: list[Answer]) -> No
 @pytest.mark.slow
 def test_indexed_dots_are_those_with_a_ray(answers: list[Answer]) -> None:
     for answer, match in answered(answers):
-        lattice = indexed_lattice(match, answer.rig, len(answer.seen.dots))
+        lattice = lattice_of_match(match, answer.rig, len(answer.seen.dots))
         expected = np.zeros((len(answer.seen.dots), 2), int)
         expected[match.dot] = match.reflected
         np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), expected)
@@ -443,7 +443,7 @@ def test_rows_given_by_hand_are_binding_and_keep_their_numbers(
     assert match.orientation == orientation
     assert sorted(match.dot.tolist()) == list(range(len(seen.ray)))
     np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
-    after = confirmed_lattice(match, BENCH_RIG, correction.lattice)
+    after = lattice_of_corrected(match, BENCH_RIG, correction.lattice)
     np.testing.assert_array_equal(after.row, correction.lattice.row)
     np.testing.assert_array_equal(after.column, correction.lattice.column)
     assert after.reference == correction.lattice.reference
@@ -473,7 +473,7 @@ def test_rows_without_a_reference_are_matched_as_a_block() -> None:
     match = corrected(correction)
     np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
     assert len(match.dot) == len(seen.ray)
-    assert confirmed_lattice(match, BENCH_RIG, correction.lattice).reference == reference
+    assert lattice_of_corrected(match, BENCH_RIG, correction.lattice).reference == reference
 
 
 def test_without_any_rows_the_optics_decide() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.matching.hypothesis import Hypothesis, contested, moved, weigh
-from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.matching.hypothesis import Hypothesis, contested, evaluate, shifted_labels
+from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
 from labapp.core.sequence.warm_fit import SequenceGeometry, intersect_and_reflect
@@ -23,16 +23,16 @@ CROSSED = (7004, 7008, 7148)
 """Pools in whose dip rows cross: growth swaps some dots of two rows."""
 
 
-def scene_of(seen: SeenDots) -> tuple[Scene, IntArray]:
-    """The scene, and the true labels."""
+def observation_of(seen: SeenDots) -> tuple[Observation, IntArray]:
+    """The observation, and the true labels."""
     labels = np.full((BENCH_RIG.pattern.rows, BENCH_RIG.pattern.columns), UNLABELLED, np.int64)
     dot = np.flatnonzero(seen.ray[:, 0] > 0)
     labels[seen.ray[dot, 0] - 1, seen.ray[dot, 1] - 1] = dot
-    return Scene.of(seen.dots, BENCH_RIG, BENCH_VIEW, FRAME_SHAPE), labels
+    return Observation.of(seen.dots, BENCH_RIG, BENCH_VIEW, FRAME_SHAPE), labels
 
 
-def weighed(scene: Scene, labels: IntArray) -> Hypothesis:
-    hypothesis = weigh(scene, labels)
+def weighed(observed: Observation, labels: IntArray) -> Hypothesis:
+    hypothesis = evaluate(observed, labels)
     assert hypothesis is not None
     return hypothesis
 
@@ -87,38 +87,38 @@ def test_many_rays_without_a_dot_are_put_up_with_where_they_lie_apart(
 
 
 def test_the_true_rows_cost_less_than_those_that_put_a_dot_on_the_absent_ray() -> None:
-    scene, labels = scene_of(draw(SHIFTED)[1])
-    true = weighed(scene, labels)
-    shifted = [weighed(scene, other) for other in moved(scene, labels)]
-    assert (true.marker, true.stray, true.missed) == ("dark", 0, 0)
+    observed, labels = observation_of(draw(SHIFTED)[1])
+    true = weighed(observed, labels)
+    shifted = [weighed(observed, other) for other in shifted_labels(observed, labels)]
+    assert (true.marker, true.stray_count, true.missed_count) == ("dark", 0, 0)
     assert {other.marker for other in shifted} == {"lit"}
     assert true.cost < min(other.cost for other in shifted) - 50
 
 
 def test_a_marker_that_is_not_amid_labelled_rays_is_unknown() -> None:
-    scene, labels = scene_of(draw(SHIFTED)[1])
+    observed, labels = observation_of(draw(SHIFTED)[1])
     assert BENCH_RIG.pattern.marker is not None
     apart = labels.copy()
     apart[: BENCH_RIG.pattern.marker[0]] = UNLABELLED
     apart[:, : BENCH_RIG.pattern.marker[1]] = UNLABELLED
-    assert weighed(scene, apart).marker == "unknown"
+    assert weighed(observed, apart).marker == "unknown"
 
 
 def test_labels_next_to_a_dot_without_a_ray_are_in_doubt() -> None:
     _, seen = draw(SHIFTED)
-    scene, labels = scene_of(seen)
-    assert len(contested(scene, weighed(scene, labels))) == 0
+    observed, labels = observation_of(seen)
+    assert len(contested(observed, weighed(observed, labels))) == 0
     # A false dot beside a true one may be the right one.
     dot = int(labels[labels != UNLABELLED][20])
-    nearest = np.sort(np.linalg.norm(scene.plane_mm - scene.plane_mm[dot], axis=-1))[1]
-    beside = scene.plane_mm[dot] + [0.2 * nearest, 0.0]
-    crowded = Scene(
-        np.vstack([scene.plane_mm, beside]),
-        np.concatenate([scene.covariance_mm2, scene.covariance_mm2[dot][None]]),
+    nearest = np.sort(np.linalg.norm(observed.plane_mm - observed.plane_mm[dot], axis=-1))[1]
+    beside = observed.plane_mm[dot] + [0.2 * nearest, 0.0]
+    crowded = Observation(
+        np.vstack([observed.plane_mm, beside]),
+        np.concatenate([observed.covariance_mm2, observed.covariance_mm2[dot][None]]),
         1e-3,
-        scene.rig,
-        scene.calibration,
-        scene.frame_shape,
+        observed.rig,
+        observed.calibration,
+        observed.frame_shape,
     )
     assert contested(crowded, weighed(crowded, labels)).tolist() == [dot]
 
@@ -130,8 +130,8 @@ OUT_OF_VIEW = 41110
 def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     """Called dark, its rays had the surface 27 µm too low, six times what was said to be sure."""
     pool, seen = draw(OUT_OF_VIEW)
-    scene, labels = scene_of(seen)
-    found = weighed(scene, labels)
+    observed, labels = observation_of(seen)
+    found = weighed(observed, labels)
     row = slice(8, 12)
     match = matched(seen)
     assert (match.witness[12, row] == 0).all()
@@ -144,7 +144,7 @@ def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     coefficients = found.pool.surface.coefficients
     followed = intersect_and_reflect(geometry, coefficients, geometry.landing_mm, 4)
     own = labels[tuple(geometry.at.T)]
-    classes = classify_rays(geometry, scene, followed, found.pool.factor, own)
+    classes = classify_rays(geometry, observed, followed, found.pool.factor, own)
     witness = np.zeros_like(labels)
     witness[tuple(geometry.at.T)] = classes.witness
     np.testing.assert_array_equal(witness[12, row], 0)

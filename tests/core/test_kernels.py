@@ -151,12 +151,12 @@ def test_surprises_are_those_of_the_normal_distribution() -> None:
     places, predicted = rng.normal(0.0, 1.0, (9, 2)), rng.normal(0.0, 1.0, (5, 2))
     half = rng.normal(0.0, 0.5, (9, 2, 2)), rng.normal(0.0, 0.5, (5, 2, 2))
     covariance, uncertain = (one @ one.swapaxes(1, 2) for one in half)
-    distance, surprise = match_kernels.surprises(places, covariance, predicted, uncertain)
+    distance, deviance = match_kernels.pair_deviances(places, covariance, predicted, uncertain)
     for n in range(9):
         for m in range(5):
             law = multivariate_normal(predicted[m], covariance[n] + uncertain[m])
             np.testing.assert_allclose(
-                surprise[n, m], -2 * law.logpdf(places[n]) - 2 * np.log(2 * np.pi), rtol=1e-9
+                deviance[n, m], -2 * law.logpdf(places[n]) - 2 * np.log(2 * np.pi), rtol=1e-9
             )
             whole = -2 * law.logpdf(places[n]) + 2 * law.logpdf(predicted[m])
             np.testing.assert_allclose(distance[n, m], whole, rtol=1e-9)

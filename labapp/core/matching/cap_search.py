@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import FloatArray, IntArray
 
 _ASPECTS = (0.9, 1.1, 1.35)
@@ -26,25 +26,26 @@ _ASIDE, _ALONG = np.linspace(-0.6, 0.6, 5), np.linspace(-1.2, 1.2, 9)
 GATE = 0.45
 """A ray finds its dot within this fraction of the way to the next predicted one."""
 
-LEAST = 10
+LEAST_RAYS = 10
 """Fewer rays than this make no cap."""
 
-LIT_MARKER, DARK = 5.0, 0.5
-"""What a dot at the marker's absent ray, and a ray without a dot, take off the rays with one."""
+LIT_MARKER_PENALTY, DARK_PENALTY = 5.0, 0.5
+"""What a dot at the marker's absent ray, and a ray without a dot, take off a score of about 1 for
+each ray with a dot."""
 
-MARKED = 0.3
+LIT_GATE = 0.3
 """The marker is lit by a dot within this fraction of the usual way to the next predicted one."""
 
 ALIKE = 0.7
 """Two caps are one hypothesis where such a share of the rays that find a dot find the same."""
 
 
-def search_caps(scene: Scene, most: int = 8) -> list[IntArray]:
+def search_caps(observed: Observation, most: int = 8) -> list[IntArray]:
     """Find the caps whose rays fall on the dots best.
 
     Parameters
     ----------
-    scene
+    observed
         The dots and the rig.
     most
         How many to return at most, no two much alike.
@@ -56,13 +57,20 @@ def search_caps(scene: Scene, most: int = 8) -> list[IntArray]:
     """
     from labapp.core.surface import kernels
 
-    rig = scene.rig
-    bench = rig.laser.position_mm, rig.imaging_plane.pose_mm, scene.plane_mm, scene.absent.ravel()
-    settings = np.array([LEAST, GATE, DARK, MARKED, LIT_MARKER])
-    score, found = kernels.score_caps(_caps(scene), scene.rays.reshape(-1, 3), *bench, settings)
+    rig = observed.rig
+    bench = (
+        rig.laser.position_mm,
+        rig.imaging_plane.pose_mm,
+        observed.plane_mm,
+        observed.absent.ravel(),
+    )
+    settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_MARKER_PENALTY])
+    score, found = kernels.score_caps(
+        _caps(observed), observed.rays.reshape(-1, 3), *bench, settings
+    )
     best: list[IntArray] = []
     for k in np.argsort(-score, kind="stable"):
-        labels = found[k].reshape(scene.absent.shape)
+        labels = found[k].reshape(observed.absent.shape)
         if np.isfinite(score[k]) and not any(_alike(labels, other) for other in best):
             best.append(labels)
             if len(best) == most:
@@ -70,9 +78,9 @@ def search_caps(scene: Scene, most: int = 8) -> list[IntArray]:
     return best
 
 
-def _caps(scene: Scene) -> FloatArray:
+def _caps(observed: Observation) -> FloatArray:
     """Caps to be tried, each as large as there are dots for: see `kernels.score_caps`."""
-    area = len(scene.plane_mm) * scene.spacing_mm.prod()
+    area = len(observed.plane_mm) * observed.spacing_mm.prod()
     caps = []
     for aspect, height, x, y in product(_ASPECTS, _HEIGHTS, _ASIDE, _ALONG):
         across, along = np.sqrt(area / np.pi * np.array([1 / aspect, aspect]))

@@ -15,25 +15,26 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, ways
-from labapp.core.matching.correspondence import as_match, indexed_lattice, match_rays
+from labapp.core.matching.correspondence import lattice_of_match, match_of_hypothesis, match_rays
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.matching.hypothesis import (
-    STANDING_OUT,
+    WIDE_KNOTS,
     Hypothesis,
-    from_grid,
-    grow_and_score,
-    weigh,
+    evaluate,
+    grow_and_evaluate,
+    labels_from_lattice,
 )
-from labapp.core.matching.ray_growth import LEAST_LABELS, UNLABELLED, Scene
+from labapp.core.matching.observation import LEAST_LABELS, UNLABELLED, Observation
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.values import CannotMeasure, IntArray
 
 AGREED = 0.8
-"""Such a share of the dots must agree in where the reference is."""
+"""Such a share of the dots must agree on where the reference is."""
 
-OFF, FEW_OFF = 0.25, 0.04
-"""A dot given a row and a column is off where the surface's is farther than this share of the way
-to the next dot; a larger share of such dots, or more than two, and the correction does not fit."""
+OFF_SPACINGS, FEW_OFF = 0.25, 0.04
+"""A dot given a row and a column is off where it is farther from the surface's than this share of
+the way to the next dot. Where a larger share of the dots than the second is off, and more than two,
+the correction does not fit."""
 
 
 def match_corrected(
@@ -44,7 +45,7 @@ def match_corrected(
     frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> Match:
-    """Find the ray of every dot where the operator has put the rows right: what he set is binding.
+    """Find the ray of every dot of a frame that the operator has corrected: what he set is binding.
 
     With a reference, every dot that has a row and a column gets the ray that these give; without
     one, the rows and columns are matched as a block, by `match_rays`. Of the other dots the
@@ -79,8 +80,8 @@ def match_corrected(
             "too-few-dots",
             f"{count} dots have a row and a column, telling rays needs {LEAST_LABELS}",
         )
-    scene = Scene.of(dots, rig, calibration, frame_shape)
-    tried = (_bound(scene, lattice, reference, orientation) for orientation in orientations)
+    observed = Observation.of(dots, rig, calibration, frame_shape)
+    tried = (_bound(observed, lattice, reference, orientation) for orientation in orientations)
     bound = [b for b in tried if b is not None]
     if not bound:
         raise CannotMeasure(
@@ -96,18 +97,18 @@ def match_corrected(
                 "ambiguous-orientation",
                 f"{best.orientation} and {other.orientation} explain the dots alike",
             )
-    # Which rays came back is told by the surface that is fitted to frames without a correction.
-    told = weigh(best.scene, best.hypothesis.labels)
-    final = best.hypothesis if told is None else replace(best.hypothesis, witness=told.witness)
-    return as_match(best.scene, final, best.orientation, reference)
+    # Which rays came back follows from the fit that frames without a correction get.
+    usual = evaluate(best.observed, best.hypothesis.labels)
+    final = best.hypothesis if usual is None else replace(best.hypothesis, witness=usual.witness)
+    return match_of_hypothesis(best.observed, final, best.orientation, reference)
 
 
-def confirmed_lattice(match: Match, rig: Rig, given: Lattice) -> Lattice:
-    """Rows and columns as their rays have them, and the blocked rows that the operator marked.
+def lattice_of_corrected(match: Match, rig: Rig, given: Lattice) -> Lattice:
+    """Rows and columns by their rays (`lattice_of_match`), with the operator's blocked rows.
 
     Numbers are those of ``given`` unless the rays have dots below or left of its first.
     """
-    lattice = indexed_lattice(match, rig, len(given.row))
+    lattice = lattice_of_match(match, rig, len(given.row))
     sited = np.flatnonzero((given.row > 0) & (given.column > 0))
     up = int(lattice.row[sited[0]] - given.row[sited[0]]) if len(sited) else 0
     return replace(lattice, blocked_rows=frozenset(k + up for k in given.blocked_rows))
@@ -115,13 +116,13 @@ def confirmed_lattice(match: Match, rig: Rig, given: Lattice) -> Lattice:
 
 @dataclass(frozen=True)
 class _Bound:
-    """What follows from the operator's sites, one way round.
+    """What follows from the operator's sites with one orientation.
 
     ``contested`` are dots with a site whose rays the surface would give to others, or them to
     other rays; then no dot without a site has a ray.
     """
 
-    scene: Scene
+    observed: Observation
     orientation: Orientation
     hypothesis: Hypothesis
     contested: IntArray
@@ -136,25 +137,25 @@ def _whole_sites(lattice: Lattice) -> Lattice:
 
 
 def _bound(
-    scene: Scene, given: Lattice, reference: Site, orientation: Orientation
+    observed: Observation, given: Lattice, reference: Site, orientation: Orientation
 ) -> _Bound | None:
     """Label dots as sites say, and others as the surface does; None if no surface has them."""
-    pattern, way, rows = scene.rig.pattern, ways(orientation), _whole_sites(given)
+    pattern, way, rows = observed.rig.pattern, ways(orientation), _whole_sites(given)
     marker = pattern.marker or pattern.reference
     hidden = (marker[0] + (k - reference[0]) * int(way[0]) for k in given.blocked_rows)
-    scene = replace(scene, hidden_rows=frozenset(hidden))
+    observed = replace(observed, hidden_rows=frozenset(hidden))
     shape = (pattern.rows, pattern.columns)
-    labels = from_grid(rows, reference, marker, orientation, shape)
-    labels = np.where(scene.absent, UNLABELLED, labels)
+    labels = labels_from_lattice(rows, reference, marker, orientation, shape)
+    labels = np.where(observed.absent, UNLABELLED, labels)
     lit = labels != UNLABELLED
     if lit.sum() < (rows.row > 0).sum():  # a site beyond the pattern, or where no ray is
         return None
-    hypothesis = weigh(scene, labels, STANDING_OUT)
+    hypothesis = evaluate(observed, labels, WIDE_KNOTS)
     if hypothesis is None:
         return None
-    wider = grow_and_score(scene, labels)
+    wider = grow_and_evaluate(observed, labels)
     if wider is None:
-        return _Bound(scene, orientation, hypothesis, np.zeros(0, np.int64))
+        return _Bound(observed, orientation, hypothesis, np.zeros(0, np.int64))
     taken = (wider.labels != labels) & (wider.labels != UNLABELLED)
     contested = labels[lit & (taken | (np.isin(labels, wider.labels[taken])))]
     if len(contested) == 0:
@@ -165,10 +166,10 @@ def _bound(
         more = ~against.any(axis=-1)
         labels = labels.copy()
         labels[ray[more, 0] - 1, ray[more, 1] - 1] = dot[more]
-        further = weigh(scene, labels, STANDING_OUT)
+        further = evaluate(observed, labels, WIDE_KNOTS)
         if further is not None and further.cost < hypothesis.cost:
             hypothesis = further
-    return _Bound(scene, orientation, hypothesis, contested)
+    return _Bound(observed, orientation, hypothesis, contested)
 
 
 def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
@@ -187,10 +188,10 @@ def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
 
 def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
     """Refuse sites that the surface cannot reconcile, and name the row that is worst."""
-    scene, labels = bound.scene, bound.hypothesis.labels
+    observed, labels = bound.observed, bound.hypothesis.labels
     dot = labels[labels != UNLABELLED]
-    next_mm = scipy.spatial.cKDTree(scene.plane_mm).query(scene.plane_mm, k=2)[0][dot, 1]
-    off = np.linalg.norm(bound.hypothesis.pool.residual_mm, axis=-1) > OFF * next_mm
+    next_mm = scipy.spatial.cKDTree(observed.plane_mm).query(observed.plane_mm, k=2)[0][dot, 1]
+    off = np.linalg.norm(bound.hypothesis.pool.residual_mm, axis=-1) > OFF_SPACINGS * next_mm
     wrong, sited = dot[off & (rows.row[dot] > 0)], int((rows.row > 0).sum())
     if len(wrong) > max(2, FEW_OFF * sited):
         raise CannotMeasure(
@@ -198,9 +199,9 @@ def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
             f"the correction does not fit: {len(wrong)} of {sited} dots given a row and a column "
             f"are far from where any surface has them, most in row {_most(rows.row[wrong])}",
         )
-    stray = bound.hypothesis.stray
-    if stray > settings.stray[0] + settings.stray[1] * len(scene.plane_mm):
-        reason = f"the correction leaves {stray} of {len(scene.plane_mm)} dots without a ray"
+    stray = bound.hypothesis.stray_count
+    if stray > settings.stray[0] + settings.stray[1] * len(observed.plane_mm):
+        reason = f"the correction leaves {stray} of {len(observed.plane_mm)} dots without a ray"
         if len(bound.contested):
             row = _most(rows.row[bound.contested])
             reason += f", as the surface would have dots elsewhere that are given row {row}"

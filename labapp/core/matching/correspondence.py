@@ -1,11 +1,15 @@
 """Lattice → Match: which ray made which dot, and how sure (§4.2.2, §5.2.3, §7.1).
 
-The absent centre dot gives the rays of a whole grid at once, for each orientation. Every such
-hypothesis is followed by what the surface itself says: fit it to the dots labelled so far,
-predict where every ray's dot should be, label the dots that one ray alone can have made, and fit
-again until nothing changes. That finds the dots the grid left in doubt and drops the ones it got
-wrong. Where rows bow too much for a grid to grow, hypotheses come from the optics instead: quadrics
-whose rays round a hole fall on dots.
+`match_rays` goes three steps:
+
+1. First labels. The absent centre dot gives the rays of a whole grid at once, for each orientation.
+   Where rows bow too much for a grid to grow, labels come from the optics instead: quadrics whose
+   rays round a hole fall on dots (`quadric_search`), or caps as large as the pool (`cap_search`).
+2. Labels grow (`label_growth`) and are evaluated (`hypothesis`): fit the surface to the dots
+   labelled so far, predict where every ray's dot should be, label the dots that one ray alone can
+   have made, and fit again until nothing changes. That finds the dots the grid left in doubt and
+   drops the ones it got wrong. Swapped, jumped and left out rows are repaired (`repair`).
+3. Of the hypotheses the cheapest is taken, if no other comes near it (`decision`).
 """
 
 from __future__ import annotations
@@ -21,9 +25,9 @@ from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, ways
 from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.decision import (
-    FAR_OFF,
     MISFIT_MM,
     MISFIT_TIMES,
+    QUICK_MISFIT_TIMES,
     MatchSettings,
     any_explains,
     decide,
@@ -33,17 +37,27 @@ from labapp.core.matching.decision import (
 from labapp.core.matching.hypothesis import (
     Hypothesis,
     certain_witness,
-    from_grid,
-    grow_and_score,
-    joined,
-    turned,
+    extended_over_grid,
+    grow_and_evaluate,
+    labels_from_lattice,
+    reoriented_labels,
+)
+from labapp.core.matching.observation import (
+    LEAST_LABELS,
+    QUICK,
+    SOFT,
+    UNLABELLED,
+    Observation,
+    try_fit,
 )
 from labapp.core.matching.quadric_search import search_quadrics
-from labapp.core.matching.ray_growth import LEAST_LABELS, QUICK, SOFT, UNLABELLED, Scene, try_fit
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.rows.lattice import Lattice, Site, empty_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, IntArray
+
+MOST_SITES = 8
+"""So many sites of the marker in the grid lead to a hypothesis, of those that fit best."""
 
 
 def match_rays(
@@ -54,7 +68,7 @@ def match_rays(
     frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> Match:
-    """Find the ray of every dot.
+    """Find the ray of every dot that one ray alone can have made.
 
     Parameters
     ----------
@@ -70,53 +84,53 @@ def match_rays(
     Raises
     ------
     CannotMeasure
-        ``too-few-dots``; ``no-reference`` if no hole can be the absent centre dot,
-        ``ambiguous-rows`` if several can; ``ambiguous-orientation``; ``no-match`` if no surface
-        explains the dots.
+        ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if no hole can be
+        the absent centre dot, ``ambiguous-rows`` if several can; ``ambiguous-orientation``;
+        ``no-match`` if no surface explains the dots.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
             "too-few-dots", f"{len(dots)} dots were found, telling rays needs {LEAST_LABELS}"
         )
-    scene = Scene.of(dots, rig, calibration, frame_shape)
+    observed = Observation.of(dots, rig, calibration, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
-    for way in (_by_grid, _by_placement, _by_optics):
-        found = with_repaired(scene, found + way(scene, lattice, orientations))
-        if any_explains(scene, found):
+    for first_labels in (_by_grid, _by_empty_sites, _by_quadrics):
+        found = with_repaired(observed, found + first_labels(observed, lattice, orientations))
+        if any_explains(observed, found):
             break
-    # Where nothing explains most dots, what is found is not mended, but caps are followed at once.
-    hopeless = bool(found) and not any(nearly_explains(scene, each) for each in found)
+    # Where nothing explains most dots, what is found is not decided on, but caps are tried at once.
+    hopeless = bool(found) and not any(nearly_explains(observed, each) for each in found)
     try:
-        best = None if hopeless else _answer(scene, found, lattice, settings)
+        best = None if hopeless else _decide_among(observed, found, lattice, settings)
     except CannotMeasure as reason:
         if reason.status != "no-match":
             raise
         best = None
     if best is None:
-        best = _answer(scene, found + _by_caps(scene), lattice, settings)
-    return as_match(scene, best, best.orientation(scene))
+        best = _decide_among(observed, found + _by_caps(observed), lattice, settings)
+    return match_of_hypothesis(observed, best, best.orientation(observed))
 
 
-def _answer(
-    scene: Scene, found: list[Hypothesis], lattice: Lattice | None, settings: MatchSettings
+def _decide_among(
+    observed: Observation, found: list[Hypothesis], lattice: Lattice | None, settings: MatchSettings
 ) -> Hypothesis:
-    """Settle on one of the hypotheses, or what one leads to; `CannotMeasure` as `match_rays`."""
-    found = with_rows_beyond(scene, found)
-    # Followed to its end, a hypothesis may have come round to a correspondence not asked for.
+    """Decide on one of the hypotheses, or on what one leads to; `CannotMeasure` as `match_rays`."""
+    found = with_rows_beyond(observed, found)
+    # Labels may have grown into an orientation that is not asked for.
     asked = settings.orientations
-    found = [hypothesis for hypothesis in found if hypothesis.orientation(scene) in asked]
+    found = [hypothesis for hypothesis in found if hypothesis.orientation(observed) in asked]
     if not found:
-        if scene.rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
+        if observed.rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
         raise CannotMeasure("no-match", "no surface explains the reflected dots")
-    return decide(scene, found, settings)
+    return decide(observed, found, settings)
 
 
-def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
-    """Rows and columns of ``count`` dots as their rays have them.
+def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
+    """Rows and columns of ``count`` dots by their rays, which replace those found in the picture.
 
-    They index dots that the picture alone leaves in doubt, and none that the rays do not.
+    They index dots that the picture alone leaves in doubt, and no dot without a ray.
     """
     way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.reference
     k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
@@ -131,102 +145,111 @@ def indexed_lattice(match: Match, rig: Rig, count: int) -> Lattice:
 
 
 def _by_grid(
-    scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+    observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Follow the grid with the marker at each site that could be it, each way round."""
-    return [] if lattice is None else _placed(scene, lattice, lattice.candidates, orientations)
+    """Hypotheses from the grid with the marker at each site that could be it, each orientation."""
+    return [] if lattice is None else _by_sites(observed, lattice, lattice.candidates, orientations)
 
 
-def _by_placement(
-    scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+def _by_empty_sites(
+    observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Follow the grid with the marker at each empty site, also at its rim, each way round.
+    """Hypotheses from the grid with the marker at each empty site, also beside it.
 
     False dots, missing ones or the torch may leave the marker without three lit neighbours.
     """
-    return [] if lattice is None else _placed(scene, lattice, empty_sites(lattice), orientations)
+    return (
+        [] if lattice is None else _by_sites(observed, lattice, empty_sites(lattice), orientations)
+    )
 
 
-MOST_PLACES = 8
-"""So many places of the marker in the grid are followed, of those that fit it best."""
-
-
-def _placed(
-    scene: Scene, lattice: Lattice, sites: Iterable[Site], orientations: tuple[Orientation, ...]
+def _by_sites(
+    observed: Observation,
+    lattice: Lattice,
+    sites: Iterable[Site],
+    orientations: tuple[Orientation, ...],
 ) -> list[Hypothesis]:
-    """Follow the grid with the marker at some of its sites, each way round."""
-    pattern = scene.rig.pattern
+    """Hypotheses from the grid with the marker at some of its sites, each orientation.
+
+    Few grow: those whose surface fits best, first a quick one, then that with which labels grow.
+    """
+    pattern = observed.rig.pattern
     if pattern.marker is None:
         return []
     shape = (pattern.rows, pattern.columns)
     labelled = [
-        from_grid(lattice, site, pattern.marker, orientation, shape)
+        labels_from_lattice(lattice, site, pattern.marker, orientation, shape)
         for site, orientation in product(sites, orientations)
     ]
-    quick = _fitting(scene, labelled, QUICK)[: 2 * MOST_PLACES]
-    labelled = [labels for off_mm, labels in quick if off_mm <= FAR_OFF * quick[0][0]]
-    rough = _fitting(scene, labelled, SOFT)[:MOST_PLACES]
+    quick = _fitting(observed, labelled, QUICK)[: 2 * MOST_SITES]
+    labelled = [labels for off_mm, labels in quick if off_mm <= QUICK_MISFIT_TIMES * quick[0][0]]
+    rough = _fitting(observed, labelled, SOFT)[:MOST_SITES]
     most_mm = max(MISFIT_MM, MISFIT_TIMES * rough[0][0]) if rough else 0.0
-    scored = (grow_and_score(scene, labels) for off_mm, labels in rough if off_mm < most_mm)
+    scored = (grow_and_evaluate(observed, labels) for off_mm, labels in rough if off_mm < most_mm)
     return [hypothesis for hypothesis in scored if hypothesis is not None]
 
 
 def _fitting(
-    scene: Scene, labelled: list[IntArray], settings: FitSettings
+    observed: Observation, labelled: list[IntArray], settings: FitSettings
 ) -> list[tuple[float, IntArray]]:
-    """Sort labels by the residuals that the surface through them leaves, mm, the least first."""
-    pools = ((try_fit(scene, labels, settings), labels) for labels in labelled)
+    """Labels with the root mean square residual of a surface through them, mm, the least first."""
+    pools = ((try_fit(observed, labels, settings), labels) for labels in labelled)
     found = [(pool.residual_rms_mm, labels) for pool, labels in pools if pool is not None]
     return sorted(found, key=lambda one: one[0])
 
 
-def _by_caps(scene: Scene) -> list[Hypothesis]:
-    """Follow the caps that the dots lie on best, and mend what each leaves unexplained."""
+def _by_caps(observed: Observation) -> list[Hypothesis]:
+    """Hypotheses from the caps that the dots lie on best, each repaired."""
     found: list[Hypothesis] = []
-    for labels in search_caps(scene):
-        hypothesis = grow_and_score(scene, labels)
-        found += with_repaired(scene, [hypothesis]) if hypothesis is not None else []
-        if any_explains(scene, found):
+    for labels in search_caps(observed):
+        hypothesis = grow_and_evaluate(observed, labels)
+        found += with_repaired(observed, [hypothesis]) if hypothesis is not None else []
+        if any_explains(observed, found):
             break
     return found
 
 
-def _by_optics(
-    scene: Scene, lattice: Lattice | None, orientations: tuple[Orientation, ...]
+def _by_quadrics(
+    observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Follow the quadrics that explain the dots round some hole, with the grid's help."""
+    """Hypotheses from the quadrics that explain the dots round some hole, with the grid's help."""
     found = []
-    for guess in search_quadrics(scene):
-        hypothesis = grow_and_score(scene, guess.labels)
+    for guess in search_quadrics(observed):
+        hypothesis = grow_and_evaluate(observed, guess.labels)
         if hypothesis is None:
             continue
         found.append(hypothesis)
         if lattice is not None:
-            labels = joined(hypothesis, lattice, hypothesis.orientation(scene))
-            wider = None if labels is None else grow_and_score(scene, labels)
+            labels = extended_over_grid(hypothesis, lattice, hypothesis.orientation(observed))
+            wider = None if labels is None else grow_and_evaluate(observed, labels)
             found += [wider] if wider is not None else []
-        if explains(scene, hypothesis):
+        if explains(observed, hypothesis):
             break
     return found
 
 
-def as_match(
-    scene: Scene, best: Hypothesis, own: Orientation, reference: Site | None = None
+def match_of_hypothesis(
+    observed: Observation, best: Hypothesis, own: Orientation, reference: Site | None = None
 ) -> Match:
-    """Write a hypothesis down; reflected numbers from 1, or so that the reference has its own."""
+    """The match of a hypothesis with its orientation, ``own``, and how the other ones would fit.
+
+    Reflected rows and columns count from 1, or so that the reference has the given site (k, t).
+    """
     trials = [Trial(own, best.residual_mm)]
     for orientation in ORIENTATIONS:
         if orientation != own:
-            other = try_fit(scene, turned(scene, best.labels, own, orientation))
+            other = try_fit(observed, reoriented_labels(observed, best.labels, own, orientation))
             trials.append(Trial(orientation, np.inf if other is None else other.residual_rms_mm))
     at = np.argwhere(best.labels != UNLABELLED)
     dot = best.labels[at[:, 0], at[:, 1]]
     trials.sort(key=lambda trial: trial.residual_mm)
-    return match_of(scene, at, dot, own, certain_witness(scene, best), trials, reference)
+    return match_of_pairs(
+        observed, at, dot, own, certain_witness(observed, best), trials, reference
+    )
 
 
-def match_of(
-    scene: Scene,
+def match_of_pairs(
+    observed: Observation,
     at: IntArray,
     dot: IntArray,
     orientation: Orientation,
@@ -234,8 +257,22 @@ def match_of(
     trials: Iterable[Trial],
     reference: Site | None = None,
 ) -> Match:
-    """Build the match of rays, rows and columns counted from 0, shape (n, 2), with dots, (n,)."""
-    pattern = scene.rig.pattern
+    """The match of n pairs of ray and dot.
+
+    Parameters
+    ----------
+    observed
+        The dots and the bench.
+    at
+        Row and column of each pair's ray in the pattern's arrays, counted from 0, shape (n, 2).
+    dot
+        Index of its dot, shape (n,).
+    orientation, witness, trials
+        See `Match`.
+    reference
+        Reflected row and column (k, t) of the marker; None: so that rows and columns begin at 1.
+    """
+    pattern = observed.rig.pattern
     numbers = (at + 1 - (pattern.marker or pattern.reference)) * ways(orientation)
     least = numbers.min(axis=0)
     numbers += 1 - least if reference is None else np.maximum(reference, 1 - least)
@@ -244,8 +281,8 @@ def match_of(
         dot=dot,
         ray=at + 1,
         reflected=numbers,
-        plane_mm=scene.plane_mm[dot],
-        plane_covariance_mm2=scene.covariance_mm2[dot],
+        plane_mm=observed.plane_mm[dot],
+        plane_covariance_mm2=observed.covariance_mm2[dot],
         witness=witness,
         trials=tuple(trials),
     )

@@ -1,4 +1,4 @@
-"""Which of the hypotheses about a frame's rays stands, and whether any does."""
+"""Decide which of the hypotheses about a frame's rays stands, or that none does."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import scipy
 
 from labapp.core.match import ORIENTATIONS, Orientation
 from labapp.core.matching.hypothesis import (
-    FINE,
-    FOLLOWING,
-    MISSED,
-    MODEL_MM,
-    STRAY,
+    FINE_KNOTS,
+    KNOT_ERROR_MM,
+    MISSED_COST,
+    STRAY_COST,
+    USUAL_KNOTS,
     Hypothesis,
     contested,
-    grow_and_score,
-    moved,
+    evaluate,
+    grow_and_evaluate,
+    reoriented_labels,
     rough_costs,
-    turned,
-    weigh,
+    shifted_labels,
+    without_doubtful_outermost,
     without_false_ends,
-    without_false_rim,
 )
-from labapp.core.matching.ray_growth import QUICK, UNLABELLED, Scene, try_fit
+from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import CannotMeasure, IntArray, median
 
@@ -35,10 +35,41 @@ MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
 """Labels that leave larger residuals, mm, and so many times those of the best, are not followed:
 with wrong rays they are mostly ten times those with the right ones."""
 
+FEW_LEFT = 0.05
+"""With no larger share of the dots left over, and as few missing, a hypothesis explains a frame: no
+other is looked for."""
 
-MOST_LEFT = 0.5
-"""With a larger share of the dots left over, a hypothesis is not mended but another one looked
+MOST_STRAY = 0.5
+"""With a larger share of the dots left over, a hypothesis is not repaired but another one looked
 for."""
+
+MOST_DIFFERING = 0.2
+"""Where near-equals have other rays for a larger share of the dots, the whole is ambiguous."""
+
+CONTRADICTED_BITS = 0.5
+"""Mean surprise of a ray near the boundary above which the surface is not the pool's: less than 0.3
+even where the set-up is a little off, more than 1 where labels are wrong for that."""
+
+CLOSE_COST = 40.0
+"""A rival whose cost is within this of the cheapest's is looked at closer, in units of χ²: a dip
+under the torch, or dots that labels a row on have not yet found, may add as much to a cost."""
+
+QUICK_MISFIT_TIMES = 4.0
+"""Labels whose quick surface leaves so many times the residual of the best's are no rivals: those
+that came near, of 700 beside 160 pools with a dip, left less than 2.5 times as much."""
+
+FAR_COST = 30.0
+"""With rough surfaces, labels that cost more than the best by so much, and by `CLOSE_COST` besides
+where the marker counts, do not come near it with settled ones."""
+
+PAIR, BESIDE_SPACINGS = 2, 1.5
+"""So many missed rays, or dots without a ray, side by side are no row; dots are where they are
+nearer to one another than so many spacings."""
+
+MOST_SCATTERED, MOST_MISSED_APART = 0.3, 0.12
+"""Where dots without a ray and missed rays lie apart, so many of both, as a share of the dots with
+a ray, are put up with: false dots lie apart, and those that fail at random; dots of a row that was
+left out or jumped do not. With so many missed rays no other hypothesis is looked for."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +79,13 @@ class MatchSettings:
     Parameters
     ----------
     correspondence
-        ``auto`` tries every orientation; otherwise the one to use.
+        ``auto`` tries every orientation; otherwise the one to use. `pipeline.measure` puts
+        `Settings.correspondence` here.
     margin
         Two hypotheses whose costs differ by less, in units of χ², cannot be told apart.
     stray, missed
-        Dots without a ray, and rays without a dot amid the others, that are put up with: a number
-        and a share.
+        How many dots without a ray, and rays without a dot amid the others, are put up with: a
+        number, and a share of the dots (`most_strays`, `leaves_much`) to be added to it.
     """
 
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
@@ -63,51 +95,60 @@ class MatchSettings:
 
     @property
     def orientations(self) -> tuple[Orientation, ...]:
-        """Those to be tried."""
+        """Orientations to be tried."""
         return ORIENTATIONS if self.correspondence == "auto" else (self.correspondence,)
 
     def most_strays(self, hypothesis: Hypothesis) -> float:
         """Return how many dots without a ray are put up with, wherever they lie."""
-        return self.stray[0] + self.stray[1] * (hypothesis.count + hypothesis.stray)
+        return self.stray[0] + self.stray[1] * (hypothesis.label_count + hypothesis.stray_count)
 
     def leaves_much(self, hypothesis: Hypothesis) -> bool:
         """Whether more is left unexplained than is put up with wherever it lies."""
-        most_missed = self.missed[0] + self.missed[1] * hypothesis.count
-        return hypothesis.stray > self.most_strays(hypothesis) or hypothesis.missed > most_missed
+        most_missed = self.missed[0] + self.missed[1] * hypothesis.label_count
+        return (
+            hypothesis.stray_count > self.most_strays(hypothesis)
+            or hypothesis.missed_count > most_missed
+        )
 
 
-def explains(scene: Scene, hypothesis: Hypothesis) -> bool:
-    """Hardly a dot is left over, few are missing and lie apart, and none is where the marker is."""
-    few = max(2, 0.05 * len(scene.plane_mm))
-    most = MISSED_APART * hypothesis.count if _missed_lie_apart(hypothesis) else 0.0
-    missed = hypothesis.missed <= max(few, most)
-    return hypothesis.stray <= few and missed and hypothesis.marker != "lit"
+def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
+    """Whether few dots are left over, few are missing and lie apart, and the marker is not lit."""
+    few = max(2, FEW_LEFT * len(observed.plane_mm))
+    most = MOST_MISSED_APART * hypothesis.label_count if _missed_lie_apart(hypothesis) else 0.0
+    missed = hypothesis.missed_count <= max(few, most)
+    return hypothesis.stray_count <= few and missed and hypothesis.marker != "lit"
 
 
-def nearly_explains(scene: Scene, hypothesis: Hypothesis) -> bool:
-    """Most dots have their ray: what is left may be a row, or a dip."""
-    return hypothesis.stray <= MOST_LEFT * len(scene.plane_mm)
+def nearly_explains(observed: Observation, hypothesis: Hypothesis) -> bool:
+    """Whether most dots have their ray: what is left may be a row, or a dip."""
+    return hypothesis.stray_count <= MOST_STRAY * len(observed.plane_mm)
 
 
-def any_explains(scene: Scene, found: list[Hypothesis]) -> bool:
-    """Whether one of several hypotheses does."""
-    return any(explains(scene, hypothesis) for hypothesis in found)
+def any_explains(observed: Observation, found: list[Hypothesis]) -> bool:
+    """Whether one of several hypotheses `explains` the frame."""
+    return any(explains(observed, hypothesis) for hypothesis in found)
 
 
-def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hypothesis:
+def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettings) -> Hypothesis:
     """Take the cheapest hypothesis, if nothing else comes near it and it leaves little open.
 
-    It is held against the others and against itself up to two rows or columns further on: a
-    hypothesis that was followed from the wrong hole may lead to almost the right place.
+    It is held against the others, against itself up to two rows or columns further on (labels that
+    grew from the wrong hole may come to almost the right place), and against itself with the other
+    orientations. Dots on which near-equals disagree lose their ray.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-match``, ``no-reference``, ``ambiguous-rows`` or ``ambiguous-orientation``.
     """
-    best, found, neighbours, knots = _cheapest(scene, found, settings.margin)
-    best = without_false_rim(scene, without_false_ends(scene, best, knots), knots)
-    if knots is FINE:
-        best = _judged(scene, best.labels, knots, best.pool) or best
-    _refuse_unexplained(scene, best, settings)
-    own = best.orientation(scene)
+    best, found, neighbours, fit = _cheapest(observed, found, settings.margin)
+    best = without_doubtful_outermost(observed, without_false_ends(observed, best, fit), fit)
+    if fit is FINE_KNOTS:
+        best = _evaluate_twice(observed, best.labels, fit, best.pool) or best
+    _refuse_unexplained(observed, best, settings)
+    own = best.orientation(observed)
     if best.marker == "lit":
-        others_explain = any_explains(scene, [h for h in found if h.marker == "dark"])
+        others_explain = any_explains(observed, [h for h in found if h.marker == "dark"])
         raise CannotMeasure(
             "ambiguous-rows" if others_explain else "no-reference",
             "where the best rows have the absent centre dot, there is a dot",
@@ -116,18 +157,22 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
         raise CannotMeasure(
             "no-reference", "the absent centre dot is not amid dots that have their ray"
         )
-    doubtful: list[int] = contested(scene, best).tolist()
-    others = (turned(scene, best.labels, own, way) for way in settings.orientations if way != own)
-    for other in [*found, *neighbours, *_rivals(scene, best, others, knots)]:
-        if _stands_against(scene, best, other, knots, settings):
+    doubtful: list[int] = contested(observed, best).tolist()
+    others = (
+        reoriented_labels(observed, best.labels, own, way)
+        for way in settings.orientations
+        if way != own
+    )
+    for other in [*found, *neighbours, *_rivals(observed, best, others, fit)]:
+        if _stands_against(observed, best, other, fit, settings):
             continue
         differing, shared = _differing(best, other)
-        if len(differing) <= 0.2 * shared:
+        if len(differing) <= MOST_DIFFERING * shared:
             doubtful += differing
-        elif other.orientation(scene) != own:
+        elif other.orientation(observed) != own:
             raise CannotMeasure(
                 "ambiguous-orientation",
-                f"{own} and {other.orientation(scene)} explain the dots alike",
+                f"{own} and {other.orientation(observed)} explain the dots alike",
             )
         else:
             raise CannotMeasure(
@@ -136,46 +181,48 @@ def decide(scene: Scene, found: list[Hypothesis], settings: MatchSettings) -> Hy
     if doubtful:
         certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
         witness = np.where(certain == best.labels, best.witness, 0)
-        best = replace(weigh(scene, certain, knots, near=best.pool) or best, witness=witness)
+        best = replace(evaluate(observed, certain, fit, initial=best.pool) or best, witness=witness)
     return best
 
 
 def _cheapest(
-    scene: Scene, found: list[Hypothesis], margin: float
+    observed: Observation, found: list[Hypothesis], margin: float
 ) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis], FitSettings]:
-    """Return the cheapest hypothesis, those found, its neighbours, and the knots they all have."""
+    """The cheapest hypothesis, those found, its neighbours a row or two on, and the fit of all."""
     best = min(found, key=lambda hypothesis: hypothesis.cost)
-    knots = FOLLOWING
+    fit = USUAL_KNOTS
     neighbours: list[Hypothesis] = []
-    if best.stray or best.missed:
-        neighbours = _rivals(scene, best, moved(scene, best.labels), knots)
-    # What these knots leave of a dip may decide between rivals so near.
-    near = any(rival.cost < best.cost + INFLATED for rival in neighbours)
-    if near or best.residual_mm > MODEL_MM:
-        knots, neighbours = FINE, []
-        found = [h for each in found if (h := _judged(scene, each.labels, knots, each.pool))]
+    if best.stray_count or best.missed_count:
+        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit)
+    # What these knots leave of a dip may decide between rivals so close.
+    near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours)
+    if near or best.residual_mm > KNOT_ERROR_MM:
+        fit, neighbours = FINE_KNOTS, []
+        found = [
+            h for each in found if (h := _evaluate_twice(observed, each.labels, fit, each.pool))
+        ]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
-    if not neighbours and not _beyond_doubt(scene, best, margin):
-        best, neighbours = _with_neighbours(scene, best, knots)
-    if knots is FINE:  # what takes labels away compares costs of these knots alone
-        best = weigh(scene, best.labels, knots, near=best.pool) or best
-    return best, found, neighbours, knots
+    if not neighbours and not _beyond_doubt(observed, best, margin):
+        best, neighbours = _with_neighbours(observed, best, fit)
+    if fit is FINE_KNOTS:  # what takes labels away compares costs of these knots alone
+        best = evaluate(observed, best.labels, fit, initial=best.pool) or best
+    return best, found, neighbours, fit
 
 
-def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings) -> None:
-    """Raise `CannotMeasure` where too much is left unexplained, or it may be a row."""
+def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: MatchSettings) -> None:
+    """Raise ``no-match`` where too much is left unexplained, or what is left may be a row."""
     # Missed rays side by side are a hole or a row: then so many dots without a ray may be theirs.
     scattered = (
         best.marker == "dark"
         and _missed_lie_apart(best)
-        and (best.stray <= settings.most_strays(best) or _strays_lie_apart(scene, best))
-        and best.stray + best.missed <= SCATTERED * best.count
+        and (best.stray_count <= settings.most_strays(best) or _strays_lie_apart(observed, best))
+        and best.stray_count + best.missed_count <= MOST_SCATTERED * best.label_count
     )
     if not scattered and settings.leaves_much(best):
         raise CannotMeasure(
             "no-match",
-            f"the best surface leaves {_counted(best.stray, 'dot')} without a ray and "
-            f"{_counted(best.missed, 'ray')} without a dot amid {best.count} pairs",
+            f"the best surface leaves {_counted(best.stray_count, 'dot')} without a ray and "
+            f"{_counted(best.missed_count, 'ray')} without a dot amid {best.label_count} pairs",
         )
     if best.pool.level.rays and best.pool.level.disagreement > CONTRADICTED_BITS:
         raise CannotMeasure(
@@ -185,30 +232,27 @@ def _refuse_unexplained(scene: Scene, best: Hypothesis, settings: MatchSettings)
         )
 
 
-CONTRADICTED_BITS = 0.5
-"""Mean surprise of a ray near the boundary above which the surface is not the pool's: less than 0.3
-even where the set-up is a little off, more than 1 where labels are wrong for that."""
-
-INFLATED = 40.0
-"""What a dip under the torch, or dots that labels a row on have not yet found, add to a cost."""
-
-
 def _stands_against(
-    scene: Scene, best: Hypothesis, other: Hypothesis, knots: FitSettings, settings: MatchSettings
+    observed: Observation,
+    best: Hypothesis,
+    other: Hypothesis,
+    fit: FitSettings,
+    settings: MatchSettings,
 ) -> bool:
-    """Whether the best costs less by a margin; with fine knots, less by either, by one clearly.
+    """Whether the best stands against another: it costs less, by a margin.
 
-    A false dot may lie at the marker: what costs less but for that is a rival.
+    With fine knots it may cost less with both kinds of knots, and with one of them by the margin. A
+    false dot may lie at the marker: another that costs less but for that is a rival.
     """
-    if other.unlit_cost < best.unlit_cost:
+    if other.cost_without_marker < best.cost_without_marker:
         return False
     if other.cost >= best.cost + settings.margin:
         return True
-    if knots is not FINE:
+    if fit is not FINE_KNOTS:
         return False
     ahead = []
-    for each in (FINE, FOLLOWING):
-        own, rival = (weigh(scene, h.labels, each, near=h.pool) for h in (best, other))
+    for each in (FINE_KNOTS, USUAL_KNOTS):
+        own, rival = (evaluate(observed, h.labels, each, initial=h.pool) for h in (best, other))
         if own is None or rival is None:
             return False
         ahead.append(rival.cost - own.cost)
@@ -217,117 +261,104 @@ def _stands_against(
     return min(ahead) >= 0 and max(ahead) >= clearly
 
 
-def _beyond_doubt(scene: Scene, best: Hypothesis, margin: float) -> bool:
+def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> bool:
     """Whether nothing is left unexplained, so that no shift of the labels can come near.
 
     Any shift puts a dot on the marker's absent ray and leaves the hole to a ray without a dot.
     """
-    if best.stray or best.missed or best.marker != "dark":
+    if best.stray_count or best.missed_count or best.marker != "dark":
         return False
-    fine = weigh(scene, best.labels, FINE, near=best.pool)
-    return fine is not None and fine.cost + margin < STRAY + MISSED
+    fine = evaluate(observed, best.labels, FINE_KNOTS, initial=best.pool)
+    return fine is not None and fine.cost + margin < STRAY_COST + MISSED_COST
 
 
 def _with_neighbours(
-    scene: Scene, best: Hypothesis, knots: FitSettings
+    observed: Observation, best: Hypothesis, fit: FitSettings
 ) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return what a hypothesis leads to if one a row or two on is cheaper; and its neighbours.
+    """The cheapest hypothesis that shifts by a row or two lead to; and its neighbours.
 
-    One that comes near is followed first: moved, it may lack dots at its ends.
+    The labels of one that comes close grow first: shifted, it may lack dots at its ends.
     """
     while True:  # each round is cheaper than the one before
-        neighbours = _rivals(scene, best, moved(scene, best.labels), knots)
-        near = [each.labels for each in neighbours if each.cost < best.cost + INFLATED]
-        grown = [h for labels in near if (h := grow_and_score(scene, labels, knots))]
-        grown = [h for each in grown if (h := _judged(scene, each.labels, knots, each.pool))]
+        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit)
+        near = [each.labels for each in neighbours if each.cost < best.cost + CLOSE_COST]
+        grown = [h for labels in near if (h := grow_and_evaluate(observed, labels, fit))]
+        grown = [
+            h for each in grown if (h := _evaluate_twice(observed, each.labels, fit, each.pool))
+        ]
         better = min(grown, key=lambda h: h.cost, default=best)
         if better.cost >= best.cost:
             return best, neighbours + grown
         best = better
 
 
-FAR_OFF = 4.0
-"""Labels whose quick surface leaves so many times the residual of the best's are no rivals: those
-that came near, of 700 beside 160 pools with a dip, left less than 2.5 times as much."""
-
-FAR_WORSE = 30.0
-"""With rough surfaces, labels that cost more than the best by so much, and by `INFLATED` besides
-where the marker counts, do not come near it with settled ones."""
-
-
 def _rivals(
-    scene: Scene, best: Hypothesis, labelled: Iterable[IntArray], knots: FitSettings
+    observed: Observation, best: Hypothesis, labelled: Iterable[IntArray], fit: FitSettings
 ) -> list[Hypothesis]:
-    """Weigh other labels beside a hypothesis, as far as they may come near it.
+    """Evaluate other labels beside a hypothesis, as far as they may come near it.
 
     A surface has to go through their dots as well; with wide knots they have to explain nearly as
     much with a rough surface. (With fine ones there is a dip, of which that leaves too much.)
     """
     most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
-    quick = try_fit(scene, best.labels, QUICK, best.pool)
-    rough = try_fit(scene, best.labels, near=best.pool)
-    far_mm = np.inf if quick is None else FAR_OFF * quick.residual_rms_mm
-    own = None if rough is None or knots is FINE else rough_costs(scene, best.labels, rough)
+    quick = try_fit(observed, best.labels, QUICK, best.pool)
+    rough = try_fit(observed, best.labels, initial=best.pool)
+    far_mm = np.inf if quick is None else QUICK_MISFIT_TIMES * quick.residual_rms_mm
+    own = None if rough is None or fit is FINE_KNOTS else rough_costs(observed, best.labels, rough)
     rivals = []
     for labels in labelled:
-        sketch = try_fit(scene, labels, QUICK, best.pool)
+        sketch = try_fit(observed, labels, QUICK, best.pool)
         if sketch is None or sketch.residual_rms_mm > far_mm:
             continue
-        pool = try_fit(scene, labels, near=best.pool)
+        pool = try_fit(observed, labels, initial=best.pool)
         if pool is None or pool.residual_rms_mm >= most_mm:
             continue
         if own is not None:
-            unlit, cost = rough_costs(scene, labels, pool)
-            if unlit > own[0] + FAR_WORSE and cost > own[1] + FAR_WORSE + INFLATED:
+            unlit, cost = rough_costs(observed, labels, pool)
+            if unlit > own[0] + FAR_COST and cost > own[1] + FAR_COST + CLOSE_COST:
                 continue
-        hypothesis = _judged(scene, labels, knots, pool)
+        hypothesis = _evaluate_twice(observed, labels, fit, pool)
         rivals += [] if hypothesis is None else [hypothesis]
     return rivals
 
 
-def _judged(
-    scene: Scene, labels: IntArray, knots: FitSettings, near: FittedPool
+def _evaluate_twice(
+    observed: Observation, labels: IntArray, fit: FitSettings, initial: FittedPool
 ) -> Hypothesis | None:
-    """Weigh labels; with fine knots the cost is the mean of that and of the cost with wide ones.
+    """Evaluate labels; with fine knots the cost is the mean of theirs and of the usual knots' cost.
 
-    Wide knots leave much of a dip, fine ones let wrong labels have the rough surface they need: a
-    marker that either has lit is lit.
+    The usual knots leave much of a dip, fine ones let wrong labels have the rough surface they
+    need. A marker that is lit with either is lit.
     """
-    own = weigh(scene, labels, knots, near=near)
-    if own is None or knots is not FINE:
+    own = evaluate(observed, labels, fit, initial=initial)
+    if own is None or fit is not FINE_KNOTS:
         return own
-    wide = weigh(scene, labels, FOLLOWING, near=near)
-    if wide is None:
+    usual = evaluate(observed, labels, USUAL_KNOTS, initial=initial)
+    if usual is None:
         return None
-    marker = "lit" if wide.marker == "lit" else own.marker
-    return replace(own, marker=marker, unlit_cost=(own.unlit_cost + wide.unlit_cost) / 2)
-
-
-PAIR, BESIDE = 2, 1.5
-"""So many missed rays, or dots without a ray, side by side are no row; dots are where they are
-nearer to one another than so many spacings."""
-
-SCATTERED, MISSED_APART = 0.3, 0.12
-"""Where dots without a ray and missed rays lie apart, so many of both, as a share of the dots with
-a ray, are put up with: false dots lie apart, and those that fail at random; dots of a row that was
-left out or jumped do not. With so many missed rays no other hypothesis is looked for."""
+    marker = "lit" if usual.marker == "lit" else own.marker
+    return replace(
+        own,
+        marker=marker,
+        cost_without_marker=(own.cost_without_marker + usual.cost_without_marker) / 2,
+    )
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
-    """Whether the rays without a dot are scattered."""
+    """Whether no more than `PAIR` rays without a dot are side by side."""
     seen = np.zeros(hypothesis.labels.shape, np.uint8)
-    seen[tuple(hypothesis.unseen.at.T)] = 1
+    seen[tuple(hypothesis.missed_rays.at.T)] = 1
     sizes = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
     return bool((sizes <= PAIR).all())
 
 
-def _strays_lie_apart(scene: Scene, hypothesis: Hypothesis) -> bool:
-    """Whether the dots without a ray are scattered."""
-    dots = scene.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
+def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
+    """Whether no more than `PAIR` dots without a ray are side by side."""
+    dots = observed.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
     spacing = median(scipy.spatial.cKDTree(dots).query(dots, k=2)[0][:, 1])
-    strays = scene.plane_mm[hypothesis.strays]
-    beside = scipy.spatial.cKDTree(strays).query_ball_point(
-        strays, BESIDE * spacing, return_length=True
+    stray_dots = observed.plane_mm[hypothesis.stray_dots]
+    beside = scipy.spatial.cKDTree(stray_dots).query_ball_point(
+        stray_dots, BESIDE_SPACINGS * spacing, return_length=True
     )
     return bool((beside <= PAIR).all())
 

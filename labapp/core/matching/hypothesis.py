@@ -1,4 +1,8 @@
-"""One way to label all dots of a frame with rays, and what speaks against it."""
+"""Hypothesis: one way to label all dots of a frame with rays, and its cost.
+
+The cost is in units of χ²: residuals of the dots over their variance, a fixed sum for every dot
+without a ray and every ray without a dot, and what the rays near the boundary have against it.
+"""
 
 from __future__ import annotations
 
@@ -11,54 +15,67 @@ import numpy as np
 import scipy
 
 from labapp.core.match import Orientation, ways
-from labapp.core.matching.ray_growth import (
-    CLEAR,
-    FALSE_PER_MM2,
+from labapp.core.matching.label_growth import grow_labels
+from labapp.core.matching.observation import (
     UNLABELLED,
-    Prediction,
-    Scene,
+    Observation,
     amid,
-    as_likely_false,
-    grow_labels,
-    lines_out_of_view,
+    count_labels,
     neighbours_of,
-    predict,
-    surprises,
     try_fit,
     widened,
+)
+from labapp.core.matching.prediction import (
+    FALSE_DOTS_PER_MM2,
+    RIVAL_MARGIN,
+    Prediction,
+    false_dot_deviance,
+    lines_out_of_view,
+    pair_deviances,
+    predict,
 )
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, Level
 from labapp.core.values import BoolArray, CannotMeasure, IntArray, median
 
-MODEL_MM = 0.045
-"""How far the right surface's dots may be off for no fault of theirs, mm: what the knots of the fit
-leave of a dent."""
+KNOT_ERROR_MM = 0.045
+"""How far dots may be off the right surface, mm, because its knots cannot follow a dent."""
 
-FOLLOWING = FitSettings(settled_mm=1e-3)
-FINE, STANDING_OUT = replace(FOLLOWING, knot_mm=0.5), replace(FOLLOWING, knot_mm=1.0)
-"""Of the surface that a hypothesis is weighed with: fine enough for a dip under the torch; for a
-narrow one, whose residuals would hide what is unexplained; or so wide that a row which somebody
-shifted stands out."""
+USUAL_KNOTS = FitSettings(settled_mm=1e-3)
+FINE_KNOTS, WIDE_KNOTS = replace(USUAL_KNOTS, knot_mm=0.5), replace(USUAL_KNOTS, knot_mm=1.0)
+"""Fits that a hypothesis is evaluated with: their knots are those of the final fit; or fine enough
+for a narrow dip under the torch, whose residuals would hide what is unexplained; or so wide that a
+row which somebody shifted stands out."""
 
-BEYOND, FEW = 0.25, 2
-"""A lit ray is beyond the boundary when it lands so far outside, in spacings of the rays; so many
-of them are put down to false dots."""
+BEYOND_SPACINGS, FEW_BEYOND = 0.25, 2
+"""A lit ray is beyond the boundary when it lands so far outside, in spacings of the rays; up to so
+many of them are put down to false dots."""
 
-STRAY, MISSED, LIT_MARKER = 16.0, 12.0, 60.0
+STRAY_COST, MISSED_COST, LIT_MARKER_COST = 16.0, 12.0, 60.0
 """What a dot without a ray, a ray without its dot amid the others, and a dot where the marker's
-absent ray would make one, cost in units of χ². The last is rarely a false dot: labels a row or a
-column off put one there nearly always."""
+absent ray would make one, cost, in units of χ². The last costs most, as it is rarely a false dot:
+labels a row or a column off put one there nearly always."""
 
-RIM_MM, MOST_BOUNDARY = 0.01, 60.0
+SETUP_ERROR_MM, MOST_BOUNDARY_COST = 0.01, 60.0
 """How far the set-up may be off at the boundary, as height, mm; and the most that rays near the
 boundary may cost a hypothesis, in units of χ²."""
 
 Marker = Literal["dark", "lit", "unknown"]
-"""What shows where the marker's absent ray would make its dot: nothing amid labelled rays, a dot,
-or nothing where nothing need be seen."""
+"""What shows where the marker's absent ray would make its dot: ``lit``, a dot; ``dark``, nothing,
+amid labelled rays; ``unknown``, nothing, but nothing need be seen there."""
 
-CONTESTED = 0.5
+WEAK_NEIGHBOURS, FALSE_MARGIN = 3, 2 * np.log(10)
+"""A label with at most so many labelled neighbours rests on what lies to one side of it. By so much
+more of deviance, ten times in likelihood, its ray must beat a false dot: beyond the last row most
+rays are dark."""
+
+MARKER_SPACINGS = 1 / 3
+"""A dot shows at the marker where it is nearer than this share of the way to the next dot."""
+
+AGREED = 0.8
+"""Such a share of a hypothesis's dots in the grid must agree with it on where its rays are."""
+
+CONTESTED_SPACINGS = 0.5
 """A label is in doubt where a rival is nearer than this, in spacings of the dots."""
 
 
@@ -74,177 +91,184 @@ class Hypothesis:
         The surface.
     witness
         See `Match.witness`.
-    unseen, strays
-        Rays amid the others that have no dot; indices of the dots that have no ray.
+    missed_rays, stray_dots
+        Predictions for the rays amid the others that have no dot; indices of the dots that have no
+        ray, shape (s,).
     marker
         What shows at the marker's absent ray; None if the pattern has no marker.
-    unlit_cost
-        χ² of the dots, what the rays near the boundary have against it, `STRAY` and `MISSED`.
+    cost_without_marker
+        χ² of the dots, `STRAY_COST` and `MISSED_COST` for each that is left over, and the cost of
+        the boundary.
     """
 
     labels: IntArray
     pool: FittedPool
     witness: IntArray
-    unseen: Prediction
-    strays: IntArray
+    missed_rays: Prediction
+    stray_dots: IntArray
     marker: Marker | None
-    unlit_cost: float
+    cost_without_marker: float
 
     @property
     def cost(self) -> float:
-        """The lower the likelier: `unlit_cost`, and `LIT_MARKER` where a dot is at the marker."""
-        return self.unlit_cost + LIT_MARKER * (self.marker == "lit")
+        """The lower the likelier, in units of χ²: a dot at the marker counts, too."""
+        return self.cost_without_marker + LIT_MARKER_COST * (self.marker == "lit")
 
     @property
-    def stray(self) -> int:
+    def stray_count(self) -> int:
         """How many dots have no ray."""
-        return len(self.strays)
+        return len(self.stray_dots)
 
     @property
-    def missed(self) -> int:
+    def missed_count(self) -> int:
         """How many rays amid the others have no dot."""
-        return len(self.unseen.at)
+        return len(self.missed_rays.at)
 
     @property
-    def count(self) -> int:
+    def label_count(self) -> int:
         """How many dots have a ray."""
-        return int(np.sum(self.labels != UNLABELLED))
+        return count_labels(self.labels)
 
     @property
     def residual_mm(self) -> float:
         """Root mean square distance of computed from captured dots, mm."""
         return self.pool.residual_rms_mm
 
-    def orientation(self, scene: Scene) -> Orientation:
+    def orientation(self, observed: Observation) -> Orientation:
         """Say which correspondence the labels amount to."""
         at = np.argwhere(self.labels != UNLABELLED)
         place = np.full((*self.labels.shape, 2), np.nan)
-        place[at[:, 0], at[:, 1]] = scene.plane_mm[self.labels[at[:, 0], at[:, 1]]]
+        place[at[:, 0], at[:, 1]] = observed.plane_mm[self.labels[at[:, 0], at[:, 1]]]
         if np.nansum(np.sign(np.diff(place[..., 1], axis=0))) >= 0:
             return "S/S"
         return "S/I" if np.nansum(np.sign(np.diff(place[..., 0], axis=1))) >= 0 else "I/I"
 
 
-def grow_and_score(
-    scene: Scene, labels: IntArray, settings: FitSettings = FOLLOWING
+def grow_and_evaluate(
+    observed: Observation, labels: IntArray, settings: FitSettings = USUAL_KNOTS
 ) -> Hypothesis | None:
-    """Follow labels to where the surface leads, and weigh what comes of it."""
-    grown = grow_labels(scene, labels)
-    hypothesis = None if grown is None else weigh(scene, grown, settings)
+    """Let labels grow (`grow_labels`) and evaluate what they lead to; None if that is nowhere."""
+    grown = grow_labels(observed, labels)
+    hypothesis = None if grown is None else evaluate(observed, grown, settings)
     if hypothesis is None:
         return None
-    outside = _outside(scene, hypothesis)
+    outside = _outside(observed, hypothesis)
     # Many lit rays beyond the contour are a rear that lies low; one or two are false dots.
-    if not 0 < len(outside) <= FEW:
+    if not 0 < len(outside) <= FEW_BEYOND:
         return hypothesis
     labels = hypothesis.labels.copy()
     labels[outside[:, 0], outside[:, 1]] = UNLABELLED
-    return weigh(scene, labels, settings)
+    return evaluate(observed, labels, settings)
 
 
-def _outside(scene: Scene, hypothesis: Hypothesis) -> IntArray:
+def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """Labelled rays that landed well beyond where all the others put the boundary."""
     at = np.argwhere(hypothesis.labels != UNLABELLED)
-    x, y = scene.landing_mm[at[:, 0], at[:, 1], :2].T
+    x, y = observed.landing_mm[at[:, 0], at[:, 1], :2].T
     surface, level = hypothesis.pool.surface, hypothesis.pool.level
     slope = surface.gradient(x, y)
-    rise = np.linalg.norm(slope * scene.spacing_mm, axis=-1)
+    rise = np.linalg.norm(slope * observed.spacing_mm, axis=-1)
     over = surface.height(x, y) - level.rear.height(y)
-    return np.asarray(at[level.sign * over < -BEYOND * rise])
+    return np.asarray(at[level.sign * over < -BEYOND_SPACINGS * rise])
 
 
-def weigh(
-    scene: Scene,
+def evaluate(
+    observed: Observation,
     labels: IntArray,
-    settings: FitSettings = FOLLOWING,
-    near: FittedPool | None = None,
+    settings: FitSettings = USUAL_KNOTS,
+    initial: FittedPool | None = None,
 ) -> Hypothesis | None:
-    """Fit the surface to labels as they are and count what speaks against them.
+    """Fit the surface to labels as they are and work out their cost; None if no surface has them.
 
-    A surface that is near saves rounds of the fit.
+    The fit begins with the initial one, which saves rounds where it is near.
     """
-    pool = try_fit(scene, labels, near=near)
+    pool = try_fit(observed, labels, initial=initial)
     if pool is None:
         return None
     try:
-        pool = scene.fit(labels, _witness(scene, labels, pool), settings, pool)
+        pool = observed.fit(labels, _witness(observed, labels, pool), settings, pool)
     except CannotMeasure:
         return None
-    unseen, stray, marker, cost = _misfit(scene, labels, pool)
-    witness = _witness(scene, labels, pool)
+    missed_rays, stray, marker, cost = _misfit(observed, labels, pool)
+    witness = _witness(observed, labels, pool)
     cost += _boundary_cost(pool.level)
-    return Hypothesis(labels, pool, witness, unseen, stray, marker, cost)
+    return Hypothesis(labels, pool, witness, missed_rays, stray, marker, cost)
 
 
-def rough_costs(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[float, float]:
-    """What `weigh` would call unlit cost and cost of labels, with a surface as it is.
+def rough_costs(observed: Observation, labels: IntArray, pool: FittedPool) -> tuple[float, float]:
+    """Cost without and with the marker of labels with a surface as it is (`Hypothesis`).
 
-    The rays near the boundary have no say in it: that needs no further fit.
+    What the rays near the boundary cost is not in it: that would need a further fit.
     """
-    _, _, marker, cost = _misfit(scene, labels, pool)
-    return cost, cost + LIT_MARKER * (marker == "lit")
+    _, _, marker, cost = _misfit(observed, labels, pool)
+    return cost, cost + LIT_MARKER_COST * (marker == "lit")
 
 
 def _misfit(
-    scene: Scene, labels: IntArray, pool: FittedPool
+    observed: Observation, labels: IntArray, pool: FittedPool
 ) -> tuple[Prediction, IntArray, Marker | None, float]:
-    """Rays without a dot, dots without a ray, the marker, and χ² with `STRAY` and `MISSED`."""
+    """Missed rays, stray dots, state of the marker, and what the dots and these two cost."""
     lit = labels != UNLABELLED
-    unseen, stray = _unexplained(scene, labels, pool)
-    marker = _marker(scene, lit, pool)
-    variance = scene.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + MODEL_MM**2
-    surprise = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY)
-    cost = float(surprise.sum()) + STRAY * len(stray) + MISSED * len(unseen.at)
-    return unseen, stray, marker, cost
+    missed_rays, stray = _unexplained(observed, labels, pool)
+    marker = _marker_state(observed, lit, pool)
+    variance = observed.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + KNOT_ERROR_MM**2
+    chi2 = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY_COST)
+    cost = float(chi2.sum()) + STRAY_COST * len(stray) + MISSED_COST * len(missed_rays.at)
+    return missed_rays, stray, marker, cost
 
 
 def _boundary_cost(level: Level) -> float:
-    """−2 log likelihood of which rays near the boundary are lit, as far as the set-up is known.
+    """−2 log likelihood of which rays near the boundary are lit, less where the set-up may be off.
 
-    Its errors tilt the surface: of a shallow pool the boundary then says little, and where the
-    rays contradict any level, it may be for the set-up.
+    They tilt the surface: of a shallow pool the boundary then says little, and rays that contradict
+    any level may do so for the set-up alone.
     """
-    share = level.rise_mm**2 / (level.rise_mm**2 + RIM_MM**2)
-    return min(2 * share * level.negative_log_likelihood, MOST_BOUNDARY)
+    share = level.rise_mm**2 / (level.rise_mm**2 + SETUP_ERROR_MM**2)
+    return min(2 * share * level.negative_log_likelihood, MOST_BOUNDARY_COST)
 
 
-def _marker(scene: Scene, lit: BoolArray, pool: FittedPool) -> Marker | None:
-    """Look where the marker's absent ray would make its dot."""
-    site = scene.rig.pattern.marker
+def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Marker | None:
+    """What shows where the marker's absent ray would make its dot; None without a marker."""
+    site = observed.rig.pattern.marker
     if site is None:
         return None
     at = (site[0] - 1, site[1] - 1)
     around = np.zeros_like(lit)
     around[max(at[0] - 1, 0) : at[0] + 2, max(at[1] - 1, 0) : at[1] + 2] = True
-    predicted = predict(scene, pool, around)
+    predicted = predict(observed, pool, around)
     own = (predicted.at == at).all(axis=-1)
     if not own.any():
         return "unknown"
     place, spacing = predicted.plane_mm[own][0], predicted.spacing_mm[own][0]
-    if np.linalg.norm(scene.plane_mm - place, axis=-1).min() < spacing / 3:
+    if np.linalg.norm(observed.plane_mm - place, axis=-1).min() < spacing * MARKER_SPACINGS:
         return "lit"
     return "dark" if amid(lit)[at] else "unknown"
 
 
-def contested(scene: Scene, hypothesis: Hypothesis) -> IntArray:
+def contested(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """Return the labelled dots next to a dot without a ray, or to where a ray lacks its dot.
 
     Either may be the right pair there. Indices of dots.
     """
     labels = hypothesis.labels
     dots = labels[labels != UNLABELLED]
-    rivals = np.concatenate([hypothesis.unseen.plane_mm, scene.plane_mm[hypothesis.strays]])
+    rivals = np.concatenate(
+        [hypothesis.missed_rays.plane_mm, observed.plane_mm[hypothesis.stray_dots]]
+    )
     if len(rivals) == 0 or len(dots) < 2:
         return np.zeros(0, np.int64)
     spacing = median(
-        scipy.spatial.cKDTree(scene.plane_mm[dots]).query(scene.plane_mm[dots], k=2)[0][:, 1]
+        scipy.spatial.cKDTree(observed.plane_mm[dots]).query(observed.plane_mm[dots], k=2)[0][:, 1]
     )
-    near = scipy.spatial.cKDTree(rivals).query(scene.plane_mm[dots])[0] < CONTESTED * spacing
+    near = (
+        scipy.spatial.cKDTree(rivals).query(observed.plane_mm[dots])[0]
+        < CONTESTED_SPACINGS * spacing
+    )
     return np.asarray(dots[near])
 
 
 def without_false_ends(
-    scene: Scene, hypothesis: Hypothesis, settings: FitSettings = FOLLOWING
+    observed: Observation, hypothesis: Hypothesis, settings: FitSettings = USUAL_KNOTS
 ) -> Hypothesis:
     """Take labels away that alone put a dark ray amid the lit ones, as far as that costs less.
 
@@ -252,47 +276,44 @@ def without_false_ends(
     """
     lit = hypothesis.labels != UNLABELLED
     fewer = []
-    for at in {at for ray in hypothesis.unseen.at.tolist() for at in _alone_around(lit, ray)}:
+    for at in {at for ray in hypothesis.missed_rays.at.tolist() for at in _alone_around(lit, ray)}:
         labels = hypothesis.labels.copy()
         labels[at] = UNLABELLED
-        fewer.append(weigh(scene, labels, settings, near=hypothesis.pool))
+        fewer.append(evaluate(observed, labels, settings, initial=hypothesis.pool))
     best = min((h for h in fewer if h), key=lambda h: h.cost, default=hypothesis)
     if best.cost >= hypothesis.cost:
         return hypothesis
-    return without_false_ends(scene, best, settings)
+    return without_false_ends(observed, best, settings)
 
 
-WEAK, LIKELIER = 3, 2 * np.log(10)
-"""A label with so few labelled neighbours rests on what lies to one side of it. Its ray is to be so
-much likelier than a false dot, in units of −2 log likelihood: beyond the last row most are dark."""
-
-
-def without_false_rim(
-    scene: Scene, hypothesis: Hypothesis, settings: FitSettings = FOLLOWING
+def without_doubtful_outermost(
+    observed: Observation, hypothesis: Hypothesis, settings: FitSettings = USUAL_KNOTS
 ) -> Hypothesis:
-    """Take labels at the rim away that a false dot explains as well as their ray.
+    """Take outermost labels away that a false dot explains as well as their ray.
 
     Each weak label is held against the surface through all that are not weak. How many false dots
     there are, those without a ray tell.
     """
     lit = hypothesis.labels != UNLABELLED
-    weak = lit & (neighbours_of(lit) <= WEAK)
+    weak = lit & (neighbours_of(lit) <= WEAK_NEIGHBOURS)
     if not weak.any():
         return hypothesis
     strong = np.where(weak, UNLABELLED, hypothesis.labels)
-    pool = try_fit(scene, strong, settings, hypothesis.pool)
+    pool = try_fit(observed, strong, settings, hypothesis.pool)
     if pool is None:
         return hypothesis
-    rays = predict(scene, pool, weak)
-    surprise = surprises(scene, pool, rays, hypothesis.labels[tuple(rays.at.T)])[1].diagonal()
-    false_per_mm2 = max(FALSE_PER_MM2, (hypothesis.stray + 1) / scene.view_mm2)
-    certain = surprise + CLEAR + LIKELIER < as_likely_false(false_per_mm2)
+    rays = predict(observed, pool, weak)
+    deviance = pair_deviances(observed, pool, rays, hypothesis.labels[tuple(rays.at.T)])[
+        1
+    ].diagonal()
+    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (hypothesis.stray_count + 1) / observed.view_mm2)
+    certain = deviance + RIVAL_MARGIN + FALSE_MARGIN < false_dot_deviance(false_per_mm2)
     kept = strong.copy()
     at = tuple(rays.at[certain].T)
     kept[at] = hypothesis.labels[at]
     if (kept == hypothesis.labels).all():
         return hypothesis
-    return weigh(scene, kept, settings, near=hypothesis.pool) or hypothesis
+    return evaluate(observed, kept, settings, initial=hypothesis.pool) or hypothesis
 
 
 def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
@@ -307,17 +328,22 @@ def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
     return row + column
 
 
-def from_grid(
+def labels_from_lattice(
     lattice: Lattice, hole: Site, ray: Site, orientation: Orientation, shape: tuple[int, int]
 ) -> IntArray:
-    """Label the whole grid with one of its sites taken for an absent ray's."""
+    """Label the whole grid, with the hole (k, t) where the absent ray (i, j) would have its dot.
+
+    Labels have the pattern's shape (rows, columns); dots at sites beyond it get no ray.
+    """
     dot = np.nonzero(lattice.row > 0)[0]
     site = np.stack([lattice.row[dot], lattice.column[dot]], axis=-1)
-    return _labelled(np.array(ray) + (site - hole) * ways(orientation), dot, shape)
+    return _labels_of_pairs(np.array(ray) + (site - hole) * ways(orientation), dot, shape)
 
 
-def joined(hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation) -> IntArray | None:
-    """Labels for the whole grid where the rays found so far agree with it; None if they do not."""
+def extended_over_grid(
+    hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation
+) -> IntArray | None:
+    """Labels of a hypothesis and of the whole grid, where the two agree; None if they do not."""
     labels = hypothesis.labels
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[at[:, 0], at[:, 1]]
@@ -327,93 +353,101 @@ def joined(hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation) -
     if len(offset) == 0:
         return None
     kinds, count = np.unique(offset, axis=0, return_counts=True)
-    if count.max() < 0.8 * len(offset):
+    if count.max() < AGREED * len(offset):
         return None
     on_grid = np.nonzero(site[:, 0] > 0)[0]
     ray = site[on_grid] * ways(orientation) + kinds[np.argmax(count)]
-    grid = _labelled(ray, on_grid, labels.shape)
+    grid = _labels_of_pairs(ray, on_grid, labels.shape)
     others = np.where(np.isin(labels, on_grid), UNLABELLED, labels)
     return np.where(grid != UNLABELLED, grid, others)
 
 
-def moved(scene: Scene, labels: IntArray) -> Iterator[IntArray]:
-    """Yield the same labels up to two rows or columns on: what a single frame tells worst."""
+def shifted_labels(observed: Observation, labels: IntArray) -> Iterator[IntArray]:
+    """Yield the same labels up to two rows or columns on.
+
+    A shift bends the surface a little and leaves the residuals nearly as they were: what a single
+    frame tells worst.
+    """
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[at[:, 0], at[:, 1]]
     for step in (
         way for way in product(range(-2, 3), repeat=2) if 0 < abs(way[0]) + abs(way[1]) < 3
     ):
-        shifted = _labelled(at + 1 + step, dot, labels.shape)
-        shifted[scene.absent] = UNLABELLED
+        shifted = _labels_of_pairs(at + 1 + step, dot, labels.shape)
+        shifted[observed.absent] = UNLABELLED
         yield shifted
 
 
-def turned(scene: Scene, labels: IntArray, before: Orientation, after: Orientation) -> IntArray:
-    """Label the same dots the other way round the absent ray."""
+def reoriented_labels(
+    observed: Observation, labels: IntArray, before: Orientation, after: Orientation
+) -> IntArray:
+    """Label the same dots with another orientation: rays are mirrored about the marker's."""
     at = np.argwhere(labels != UNLABELLED)
-    center = np.array(scene.rig.pattern.marker or scene.rig.pattern.reference)
+    center = np.array(observed.rig.pattern.marker or observed.rig.pattern.reference)
     ray = center + (at + 1 - center) * ways(before) * ways(after)
-    return _labelled(ray, labels[at[:, 0], at[:, 1]], labels.shape)
+    return _labels_of_pairs(ray, labels[at[:, 0], at[:, 1]], labels.shape)
 
 
-def _labelled(ray: IntArray, dot: IntArray, shape: tuple[int, ...]) -> IntArray:
+def _labels_of_pairs(ray: IntArray, dot: IntArray, shape: tuple[int, ...]) -> IntArray:
     there = ((ray >= 1) & (ray <= shape)).all(axis=-1)
     labels = np.full(shape, UNLABELLED, np.int64)
     labels[ray[there, 0] - 1, ray[there, 1] - 1] = dot[there]
     return labels
 
 
-def _unexplained(scene: Scene, labels: IntArray, pool: FittedPool) -> tuple[Prediction, IntArray]:
-    """Find rays that should have a dot and have none, and the indices of dots that have no ray.
+def _unexplained(
+    observed: Observation, labels: IntArray, pool: FittedPool
+) -> tuple[Prediction, IntArray]:
+    """Rays that should have a dot and have none, and indices of dots that have no ray.
 
-    Where the surface lets dots run into each other there is nothing to be told of either.
+    Neither counts where the surface lets dots run into each other.
     """
     lit = labels != UNLABELLED
-    among = predict(scene, pool, amid(lit) & ~scene.absent & ~scene.hidden)
-    merged = among.spacing_mm < scene.resolution_mm
-    silent = ~lit[tuple(among.at.T)] & ~merged & ~among.blocked(scene)
-    unseen = among.part(silent & scene.in_view(among.plane_mm))
-    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
+    among = predict(observed, pool, amid(lit) & ~observed.absent & ~observed.hidden)
+    merged = among.spacing_mm < observed.resolution_mm
+    silent = ~lit[tuple(among.at.T)] & ~merged & ~among.blocked(observed)
+    missed_rays = among.part(silent & observed.in_view(among.plane_mm))
+    stray = np.setdiff1d(np.arange(len(observed.plane_mm)), labels[lit])
     if merged.any() and len(stray):
         off = np.asarray(
-            scipy.spatial.cKDTree(among.plane_mm[merged]).query(scene.plane_mm[stray])[0]
+            scipy.spatial.cKDTree(among.plane_mm[merged]).query(observed.plane_mm[stray])[0]
         )
-        stray = stray[off > scene.resolution_mm]
-    return unseen, stray
+        stray = stray[off > observed.resolution_mm]
+    return missed_rays, stray
 
 
-def _witness(scene: Scene, labels: IntArray, pool: FittedPool) -> IntArray:
-    """Say which rays came back, which did not, and which cannot tell (see `Match.witness`)."""
+def _witness(observed: Observation, labels: IntArray, pool: FittedPool) -> IntArray:
+    """Which rays came back, which did not, and which cannot tell (see `Match.witness`)."""
     lit = labels != UNLABELLED
     witness = np.zeros(lit.shape, np.int64)
-    around = predict(scene, pool, np.ones_like(lit))
-    merged = around.spacing_mm < scene.resolution_mm
-    seen = scene.in_view(around.plane_mm) & ~around.blocked(scene) & ~merged
+    around = predict(observed, pool, np.ones_like(lit))
+    merged = around.spacing_mm < observed.resolution_mm
+    seen = observed.in_view(around.plane_mm) & ~around.blocked(observed) & ~merged
     witness[around.at[seen, 0], around.at[seen, 1]] = -1
-    witness[amid(lit) | scene.absent | scene.hidden] = 0
+    witness[amid(lit) | observed.absent | observed.hidden] = 0
     witness[lit] = 1
     # A dot that no ray was given may be the dot of a ray that seems dark.
-    stray = np.setdiff1d(np.arange(len(scene.plane_mm)), labels[lit])
+    stray = np.setdiff1d(np.arange(len(observed.plane_mm)), labels[lit])
     if len(stray):
-        distance = scipy.spatial.cKDTree(scene.plane_mm[stray]).query(around.plane_mm)[0]
+        distance = scipy.spatial.cKDTree(observed.plane_mm[stray]).query(around.plane_mm)[0]
         doubt = around.at[distance < around.spacing_mm]
         doubt = doubt[witness[doubt[:, 0], doubt[:, 1]] < 0]
         witness[doubt[:, 0], doubt[:, 1]] = 0
     return witness
 
 
-def certain_witness(scene: Scene, hypothesis: Hypothesis) -> IntArray:
+def certain_witness(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """The witness of a hypothesis without rows that are dark but may have left the view.
 
     Beside the last row that is seen the fit goes on as smoothly as it can, while a pool's edge
     grows steep: the dots of the next row may lie farther out than they are predicted.
     """
     pool, dark = hypothesis.pool, hypothesis.witness < 0
-    rim = predict(scene, pool, dark & widened(hypothesis.labels != UNLABELLED, 1))
+    rim = predict(observed, pool, dark & widened(hypothesis.labels != UNLABELLED, 1))
     lost = lines_out_of_view(
-        scene,
+        observed,
         rim.at,
         rim.plane_mm,
-        lambda some: rim.part(some).covariance_mm2(pool, scene.rig),
+        lambda some: rim.part(some).covariance_mm2(pool, observed.rig),
     )
     return np.where(lost, 0, hypothesis.witness)

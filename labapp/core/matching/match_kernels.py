@@ -12,7 +12,7 @@ _f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (2, 3))
 
 
 @compiled(_f2, _f3, _f2, _f3)
-def surprises(
+def pair_deviances(
     places: FloatArray, covariance: FloatArray, predicted: FloatArray, uncertain: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """How far n places are from m predictions, and how unlikely that makes each pair.
@@ -21,11 +21,11 @@ def surprises(
 
     Returns
     -------
-    distance, surprise
+    distance, deviance
         Squared distances in σ², and −2 log likelihoods but for a constant, both of shape (n, m).
     """
     distance = np.empty((len(places), len(predicted)))
-    surprise = np.empty((len(places), len(predicted)))
+    deviance = np.empty((len(places), len(predicted)))
     for n in range(len(places)):
         for m in range(len(predicted)):
             x, y = places[n, 0] - predicted[m, 0], places[n, 1] - predicted[m, 1]
@@ -34,9 +34,9 @@ def surprises(
             yy = covariance[n, 1, 1] + uncertain[m, 1, 1]
             area = xx * yy - xy * xy
             distance[n, m] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
-            surprise[n, m] = area
-    surprise[:] = distance + np.log(surprise)
-    return distance, surprise
+            deviance[n, m] = area
+    deviance[:] = distance + np.log(deviance)
+    return distance, deviance
 
 
 @compiled(_f2)

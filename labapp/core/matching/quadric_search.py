@@ -15,13 +15,13 @@ import numpy as np
 import scipy
 
 from labapp.core.geometry.optics import bisecting_gradient
-from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
-REACH = 3
-"""Rows and columns each way from the reference that a quadric is held against."""
+WINDOW_REACH = 3
+"""Rows and columns each way from the reference whose dots a quadric is held against."""
 
-LOOSE, TIGHT = 0.5, 0.33
+LOOSE_GATE, TIGHT_GATE = 0.5, 0.33
 """A ray finds its dot within this fraction of the spacing of the predicted dots: at first, and
 once the quadric is fitted."""
 
@@ -51,32 +51,34 @@ class QuadricGuess:
     hits: float
 
 
-def search_quadrics(scene: Scene, most: int = 8) -> list[QuadricGuess]:
+def search_quadrics(observed: Observation, most: int = 8) -> list[QuadricGuess]:
     """Find the quadrics that explain the dots round some hole best, the best first.
 
     Parameters
     ----------
-    scene
+    observed
         The dots and the rig.
     most
         How many to return at most; no two with the same labels.
     """
-    marker = scene.rig.pattern.marker
-    if marker is None or min(marker) < 2 or np.any(np.array(marker) >= scene.rays.shape[:2]):
+    marker = observed.rig.pattern.marker
+    if marker is None or min(marker) < 2 or np.any(np.array(marker) >= observed.rays.shape[:2]):
         return []  # without rays all round it, a hole cannot be told
-    window = _Window(scene, marker)
+    window = _Window(observed, marker)
     found: dict[bytes, QuadricGuess] = {}
-    quadrics = [_quadrics(window, *hole) for hole in _holes(scene, window.tree)]
-    for guess in window.judged(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
+    quadrics = [_quadrics(window, *hole) for hole in _holes(observed, window.tree)]
+    for guess in window.scored(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
         key = guess.labels.tobytes()
         if key not in found or found[key].hits < guess.hits:
             found[key] = guess
     return sorted(found.values(), key=lambda guess: -guess.hits)[:most]
 
 
-def _holes(scene: Scene, tree: scipy.spatial.cKDTree) -> Iterator[tuple[FloatArray, float]]:
+def _holes(
+    observed: Observation, tree: scipy.spatial.cKDTree
+) -> Iterator[tuple[FloatArray, float]]:
     """Empty places between two dots, IPCS, and half the dots' distance along X′, mm."""
-    dots = scene.plane_mm
+    dots = observed.plane_mm
     near = tree.query(dots, k=min(10, len(dots)))[1][:, 1:]
     one, other = dots[np.repeat(np.arange(len(dots)), near.shape[1])], dots[near.ravel()]
     step = other - one
@@ -100,8 +102,8 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
     work piece: (g_x, g_y, κ_x, κ_xy, κ_y) of each, shape (m, 5), mm⁻¹. Every curvature along is
     tried, and both signs of the curvature across that put the neighbouring dots where they are.
     """
-    scene = window.scene
-    laser, plane = scene.rig.laser.position_mm, scene.rig.imaging_plane
+    observed = window.observed
+    laser, plane = observed.rig.laser.position_mm, observed.rig.imaging_plane
     slope = bisecting_gradient(
         window.landing_mm - laser, plane.to_universal(hole) - window.landing_mm
     )
@@ -109,7 +111,7 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
     beside = window.rays[middle[0], middle[1] + 1][None]
     # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.
     trial = np.array([[*slope, -0.02, 0.0, -0.02], [*slope, 0.02, 0.0, 0.02]])
-    moved = window.met(trial, beside)[1][:, 0, 0] - hole[0]
+    moved = window.intersect(trial, beside)[1][:, 0, 0] - hole[0]
     across = (np.array([1, -1]) * half_width - moved.mean()) / ((moved[1] - moved[0]) / 0.04)
     across = across[(np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST)]
     quadrics = np.zeros((len(across) * len(_RATIOS), 5))
@@ -117,8 +119,8 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
     quadrics[:, 2] = np.repeat(across, len(_RATIOS))
     quadrics[:, 4] = np.outer(across, _RATIOS).ravel()
     rays = window.rays[window.near]
-    patterns = window.met(quadrics, rays.reshape(-1, 3))[1].reshape(-1, *rays.shape[:2], 2)
-    hit = window.hits(patterns, LOOSE, window.absent[window.near])[0]
+    patterns = window.intersect(quadrics, rays.reshape(-1, 3))[1].reshape(-1, *rays.shape[:2], 2)
+    hit = window.hits(patterns, LOOSE_GATE, window.absent[window.near])[0]
     hit = hit[(slice(None), *window.core_of_near)]
     return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= 5])
 
@@ -126,33 +128,33 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
 class _Window:
     """The rays round the reference, and the dots they may fall on."""
 
-    def __init__(self, scene: Scene, marker: tuple[int, int]) -> None:
+    def __init__(self, observed: Observation, marker: tuple[int, int]) -> None:
         i, j = (n - 1 for n in marker)
-        rows, columns = scene.rays.shape[:2]
-        reach = min(REACH, i, j, rows - 1 - i, columns - 1 - j)
-        self.scene = scene
+        rows, columns = observed.rays.shape[:2]
+        reach = min(WINDOW_REACH, i, j, rows - 1 - i, columns - 1 - j)
+        self.observed = observed
         self.tree, self.plane = (
-            scipy.spatial.cKDTree(scene.plane_mm),
-            scene.rig.imaging_plane.pose_mm,
+            scipy.spatial.cKDTree(observed.plane_mm),
+            observed.rig.imaging_plane.pose_mm,
         )
         self.part = slice(i - reach, i + reach + 1), slice(j - reach, j + reach + 1)
-        self.rays = scene.rays[self.part]
-        self.landing_mm = scene.landing_mm[i, j]
-        self.absent = scene.absent[self.part]
+        self.rays = observed.rays[self.part]
+        self.landing_mm = observed.landing_mm[i, j]
+        self.absent = observed.absent[self.part]
         self.middle = (reach, reach)
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
         rim = max(reach - 2, 0)  # the core, and where there is one a ring round it
         self.near = slice(rim, 2 * reach + 1 - rim), slice(rim, 2 * reach + 1 - rim)
         self.core_of_near = tuple(slice(reach - 1 - rim, reach + 2 - rim) for _ in range(2))
 
-    def met(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where rays, shape (n, 3), meet quadrics, shape (m, 5), and their dots.
+    def intersect(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Reflection points of rays, shape (n, 3), on quadrics, shape (m, 5), and their dots.
 
-        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm.
+        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm (`kernels.meet_quadrics`).
         """
         from labapp.core.surface import kernels
 
-        laser = self.scene.rig.laser.position_mm
+        laser = self.observed.rig.laser.position_mm
         return kernels.meet_quadrics(self.landing_mm[:2], quadrics, rays, laser, self.plane)
 
     def hits(
@@ -165,25 +167,25 @@ class _Window:
         """
         from labapp.core.surface import kernels
 
-        return kernels.hits(pattern, self.scene.plane_mm, absent, gate)
+        return kernels.hits(pattern, self.observed.plane_mm, absent, gate)
 
     def fitted(self, quadrics: FloatArray) -> FloatArray:
         """Fit quadrics to the dots that their rays next to the reference fall near."""
         from labapp.core.surface import kernels
 
-        laser, places = self.scene.rig.laser.position_mm, self.scene.plane_mm
+        laser, places = self.observed.rig.laser.position_mm, self.observed.plane_mm
         center, plane = self.landing_mm[:2], self.plane
         bench = self.rays, laser, plane, places, self.absent
-        return kernels.fit_quadrics(center, quadrics, *bench, LOOSE)
+        return kernels.fit_quadrics(center, quadrics, *bench, LOOSE_GATE)
 
-    def judged(self, quadrics: FloatArray) -> Iterator[QuadricGuess]:
+    def scored(self, quadrics: FloatArray) -> Iterator[QuadricGuess]:
         """Hold quadrics against the dots; yield those that explain the dots round the hole."""
-        patterns = self.met(quadrics, self.rays.reshape(-1, 3))[1]
+        patterns = self.intersect(quadrics, self.rays.reshape(-1, 3))[1]
         patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
-        hit, dot, off = self.hits(patterns, TIGHT, self.absent)
+        hit, dot, off = self.hits(patterns, TIGHT_GATE, self.absent)
         core = (slice(None), *self.core)
         explains = np.flatnonzero(hit[core].sum(axis=(1, 2)) >= 6)
-        seen = self.scene.in_view(np.nan_to_num(patterns[core][explains], nan=1e6))
+        seen = self.observed.in_view(np.nan_to_num(patterns[core][explains], nan=1e6))
         # A ray next to the hole that should show its dot and does not speaks against the quadric.
         silent = seen & ~self.absent[self.core] & ~hit[core][explains]
         for k, count in zip(explains, silent.sum(axis=(1, 2)).tolist(), strict=True):
@@ -198,7 +200,7 @@ class _Window:
         core = (self.core[0], slice(self.core[1].start - 1, self.core[1].stop + 1))
         near = np.full(own.shape, UNLABELLED)
         near[core] = own[core]
-        labels = np.full(self.scene.rays.shape[:2], UNLABELLED, np.int64)
+        labels = np.full(self.observed.rays.shape[:2], UNLABELLED, np.int64)
         labels[self.part] = near
         hits = float(np.sum(own != UNLABELLED) - 3.0 * silent + 4.0 * nearness)
         return QuadricGuess(labels, hits)

@@ -17,7 +17,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.band_pass import Exposure
 from labapp.core.images.dots import Image
 from labapp.core.match import Match
-from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.warm_fit import (
@@ -225,7 +225,7 @@ def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArr
     return gram, right
 
 
-def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
+def found_again(track: Track, observed: Observation) -> tuple[WarmPool, IntArray, float]:
     """A surface that finds the dots again, the rays that gives them, and how far dots are off.
 
     That is the median share of the way to the next dot, from where they were foreseen. Where none
@@ -236,19 +236,19 @@ def found_again(track: Track, scene: Scene) -> tuple[WarmPool, IntArray, float]:
     own, looked_for = filled(geometry, track.lit), around(geometry, track.lit, 2)
     for coefficients in predictions(track):
         pool = intersect_and_reflect(geometry, coefficients, track.pool.points_mm, 1)
-        labels, off = tracked(scene, pool, own, looked_for)
+        labels, off = tracked(observed, pool, own, looked_for)
         if len(off) >= FOUND * count and (half := median(off)) < STEADY:
             return pool, labels, half
     found = 0
     for coefficients in track.past[: -GROWN_FROM - 1 : -1]:
-        pool, labels = _grown(track, scene, coefficients)
+        pool, labels = _grown(track, observed, coefficients)
         found = max(found, int(np.sum(labels != UNLABELLED)))
         if found >= max(FOUND * count, LEAST_DOTS):
             return pool, labels, np.inf
     raise TrackLost(f"{found} of {count} dots were found again")
 
 
-def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, IntArray]:
+def _grown(track: Track, observed: Observation, start: FloatArray) -> tuple[WarmPool, IntArray]:
     """Find the dots again from the absent one outwards, ring by ring.
 
     Dots in the middle move least from frame to frame; how they moved tells how those around do.
@@ -259,11 +259,11 @@ def _grown(track: Track, scene: Scene, start: FloatArray) -> tuple[WarmPool, Int
     looked_for = around(geometry, track.lit, 2)
     labels = np.full(len(ring), UNLABELLED)
     for reach in range(FIRST_RING, int(ring[track.lit].max()) + 2):
-        labels, _ = tracked(scene, pool, track.lit & (ring <= reach), looked_for)
+        labels, _ = tracked(observed, pool, track.lit & (ring <= reach), looked_for)
         ray = np.flatnonzero(labels != UNLABELLED)
         if len(ray) < LEAST_DOTS:
             break
         dot = labels[ray]
-        slopes = Slopes.of(geometry, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+        slopes = Slopes.of(geometry, ray, observed.plane_mm[dot], observed.covariance_mm2[dot])
         pool, _, _ = fit_slopes_to(geometry, pool, slopes, GROWING_ROUNDS, start)
     return pool, labels

@@ -23,8 +23,8 @@ from labapp.core.images.band_pass import quick_dots
 from labapp.core.images.dot_size import estimate_size
 from labapp.core.images.dots import Image
 from labapp.core.match import Match, Trial
-from labapp.core.matching.correspondence import indexed_lattice, match_of
-from labapp.core.matching.ray_growth import UNLABELLED, Scene
+from labapp.core.matching.correspondence import lattice_of_match, match_of_pairs
+from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.track import MEMORY, Track, TrackLost, begin, found_again, rms
@@ -184,24 +184,24 @@ def follow(
         raise TrackLost("the frame has another size than the one before")
     dots = quick_dots(image, track.exposure, settings.dots.band_pass)
     passed("dots")
-    scene = Scene.of(dots, geometry.rig, calibration, (image.shape[0], image.shape[1]))
-    pool, labels, off = found_again(track, scene)
+    observed = Observation.of(dots, geometry.rig, calibration, (image.shape[0], image.shape[1]))
+    pool, labels, off = found_again(track, observed)
     passed("match")
-    pool, labels, lower = _fitted(geometry, scene, pool, labels)
+    pool, labels, lower = _fitted(geometry, observed, pool, labels)
     passed("fit")
-    classes = classify_rays(geometry, scene, pool, lower, labels)
+    classes = classify_rays(geometry, observed, pool, lower, labels)
     level, open_mm = _level(track, pool, classes.witness)
     outside = beyond(geometry, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
-        pool, lower = _settled(geometry, _shifted(pool, level), _slopes(geometry, scene, labels))
-        classes = classify_rays(geometry, scene, pool, lower, labels)
+        pool, lower = _settled(geometry, _shifted(pool, level), _slopes(geometry, observed, labels))
+        classes = classify_rays(geometry, observed, pool, lower, labels)
         level, open_mm = _level(track, pool, classes.witness)
     pool = intersect_and_reflect(geometry, pool.coefficients + level.shift_mm, pool.points_mm, 1)
     passed("level")
     ray = np.flatnonzero(labels != UNLABELLED)
     dot = labels[ray]
-    residual = pool.plane_mm[ray] - scene.plane_mm[dot]
+    residual = pool.plane_mm[ray] - observed.plane_mm[dot]
     limits = settings.match
     if classes.stray > limits.stray[0] + limits.stray[1] * len(dots):
         raise TrackLost(f"{classes.stray} dots have no ray")
@@ -209,10 +209,10 @@ def follow(
         raise TrackLost(f"{classes.missed} rays amid the others have no dot")
     if not rms(residual) < WORSE * track.residual_mm:
         raise TrackLost("the surface no longer has the dots")
-    unseen = 0 if _datum_seen(geometry, scene, pool, labels, off) else track.unseen + 1
+    unseen = 0 if _datum_seen(geometry, observed, pool, labels, off) else track.unseen + 1
     if unseen > HELD:
         raise TrackLost("the dots beside the absent one have not been seen for long")
-    match = _match(track, scene, classes.witness, ray, dot, rms(residual))
+    match = _match(track, observed, classes.witness, ray, dot, rms(residual))
     track = _with_uncertainty(track, pool, ray, lower)
     reconstruction, size = _sized(track, pool, level, lower, match, residual, ray)
     after = replace(
@@ -227,7 +227,7 @@ def follow(
         unseen=unseen,
         count=track.count + 1,
     )
-    lattice = indexed_lattice(match, geometry.rig, len(dots))
+    lattice = lattice_of_match(match, geometry.rig, len(dots))
     told = Measurement("ok", "", "fit", dots, lattice, match, reconstruction, size)
     passed("measures")
     return told, after
@@ -238,17 +238,17 @@ def _shifted(pool: WarmPool, level: Level) -> WarmPool:
 
 
 def _fitted(
-    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, labels: IntArray
+    geometry: SequenceGeometry, observed: Observation, pool: WarmPool, labels: IntArray
 ) -> tuple[WarmPool, IntArray, FloatArray]:
     """Fit the surface, roughly first, and then with the labels that it bears out."""
-    slopes, factor = _slopes(geometry, scene, labels), None
+    slopes, factor = _slopes(geometry, observed, labels), None
     for _ in range(WIDENINGS):
         pool, lower, moved = fit_slopes_to(geometry, pool, slopes, until_mm=ROUGHLY_MM)
         factor = lower if moved < REUSE_MM else None
-        before, labels = labels, widened(geometry, scene, pool, lower, labels)
+        before, labels = labels, widened(geometry, observed, pool, lower, labels)
         if np.array_equal(labels, before):
             break
-        slopes, factor = _slopes(geometry, scene, labels), None
+        slopes, factor = _slopes(geometry, observed, labels), None
         if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
             break
     pool, lower = _settled(geometry, pool, slopes, factor)
@@ -264,12 +264,12 @@ def _settled(
     return pool, lower
 
 
-def _slopes(geometry: SequenceGeometry, scene: Scene, labels: IntArray) -> Slopes:
+def _slopes(geometry: SequenceGeometry, observed: Observation, labels: IntArray) -> Slopes:
     ray = np.flatnonzero(labels != UNLABELLED)
     if len(ray) < LEAST_DOTS:
         raise TrackLost("hardly a dot is left that has a ray")
     dot = labels[ray]
-    return Slopes.of(geometry, ray, scene.plane_mm[dot], scene.covariance_mm2[dot])
+    return Slopes.of(geometry, ray, observed.plane_mm[dot], observed.covariance_mm2[dot])
 
 
 def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, float]:
@@ -292,7 +292,7 @@ def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, floa
 
 
 def _datum_seen(
-    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, labels: IntArray, off: float
+    geometry: SequenceGeometry, observed: Observation, pool: WarmPool, labels: IntArray, off: float
 ) -> bool:
     """Whether all four neighbours of the absent ray are lit.
 
@@ -310,7 +310,7 @@ def _datum_seen(
         float(np.linalg.norm(pool.plane_mm[a] - pool.plane_mm[b])) / 2
         for a, b in beside.reshape(2, 2)
     )
-    if not np.linalg.norm(scene.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
+    if not np.linalg.norm(observed.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
         raise TrackLost("a dot is where the absent one should be dark")
     if lit.sum() < (2 if off < FORESEEN else 4):
         raise TrackLost("the dots beside the absent one are not seen")
@@ -322,18 +322,18 @@ def _datum_seen(
 
 def _match(
     track: Track,
-    scene: Scene,
+    observed: Observation,
     witness: IntArray,
     ray: IntArray,
     dot: IntArray,
     residual_mm: float,
 ) -> Match:
     geometry, orientation = track.geometry, track.match.orientation
-    every = np.zeros(scene.absent.shape, np.int64)
+    every = np.zeros(observed.absent.shape, np.int64)
     every[tuple(geometry.at.T)] = witness
     others = (t for t in track.match.trials if t.orientation != orientation)
     trials = (Trial(orientation, residual_mm), *others)
-    return match_of(scene, geometry.at[ray], dot, orientation, every, trials)
+    return match_of_pairs(observed, geometry.at[ray], dot, orientation, every, trials)
 
 
 def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatArray) -> Track:

@@ -13,15 +13,13 @@ import numpy.typing as npt
 
 from labapp.core.images import dot_kernels
 from labapp.core.matching import match_kernels
-from labapp.core.matching.hypothesis import BEYOND, FEW
-from labapp.core.matching.ray_growth import (
-    CAUTION,
-    CLEAR,
-    MODEL_MM,
-    NEAR,
-    UNLABELLED,
-    Scene,
-    amid,
+from labapp.core.matching.hypothesis import BEYOND_SPACINGS, FEW_BEYOND
+from labapp.core.matching.observation import UNLABELLED, Observation, amid
+from labapp.core.matching.prediction import (
+    GATE_SIGMA2,
+    MODEL_ERROR_MM,
+    RIVAL_MARGIN,
+    SIGMA_INFLATION,
     lines_out_of_view,
 )
 from labapp.core.sequence.warm_fit import SequenceGeometry, WarmPool, evaluate_at_landing_points
@@ -84,13 +82,13 @@ def unlabelled(count: int, labels: IntArray) -> IntArray:
 
 
 def tracked(
-    scene: Scene, pool: WarmPool, lit: BoolArray, looked_for: BoolArray
+    observed: Observation, pool: WarmPool, lit: BoolArray, looked_for: BoolArray
 ) -> tuple[IntArray, FloatArray]:
     """Dots of the rays that were lit before, each by the one prediction that is near.
 
     Parameters
     ----------
-    scene, pool
+    observed, pool
         The frame's dots, and the surface that predicts them.
     lit, looked_for
         Rays that may have dots, and those and their rivals, shape (R,).
@@ -103,15 +101,15 @@ def tracked(
     """
     labels = np.full(len(lit), UNLABELLED, np.int64)
     near = np.flatnonzero(looked_for & np.isfinite(pool.plane_mm[:, 0]))
-    if len(near) < 2 or len(scene.plane_mm) < 2:
+    if len(near) < 2 or len(observed.plane_mm) < 2:
         return labels, np.empty(0)
     plane = pool.plane_mm[near]
     step = dot_kernels.two_nearest(plane, plane)[0][:, 1]
-    off, ray = dot_kernels.two_nearest(scene.plane_mm, plane)
-    other, dot = dot_kernels.two_nearest(plane, scene.plane_mm)
+    off, ray = dot_kernels.two_nearest(observed.plane_mm, plane)
+    other, dot = dot_kernels.two_nearest(plane, observed.plane_mm)
     own, off_own = ray[:, 0], off[:, 0]
     gate = GATE * step[own]
-    sure = (off_own < gate) & (step[own] > scene.resolution_mm) & lit[near[own]]
+    sure = (off_own < gate) & (step[own] > observed.resolution_mm) & lit[near[own]]
     sure &= (dot[own, 0] == np.arange(len(own))) & (off[:, 1] > CLEARLY * off_own)
     sure &= other[own, 1] > gate  # speckle may split a dot in two
     labels[near[own[sure]]] = np.flatnonzero(sure)
@@ -119,58 +117,62 @@ def tracked(
 
 
 def widened(
-    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, lower: FloatArray, labels: IntArray
+    geometry: SequenceGeometry,
+    observed: Observation,
+    pool: WarmPool,
+    lower: FloatArray,
+    labels: IntArray,
 ) -> IntArray:
     """Labels that the fitted surface bears out, and new ones beside them that it makes sure of.
 
     A new label stands where it is likelier by far than any other ray for the dot, and any other
-    dot for the ray (`ray_growth`), with what the prediction is uncertain by.
+    dot for the ray (`label_growth`), with what the prediction is uncertain by.
     """
     lit = labels != UNLABELLED
     looked_for = np.flatnonzero(around(geometry, lit, 2) & np.isfinite(pool.plane_mm[:, 0]))
     next_mm = next_of(pool.plane_mm, looked_for)
     rays = np.flatnonzero(lit)
-    off = np.linalg.norm(pool.plane_mm[rays] - scene.plane_mm[labels[rays]], axis=-1)
+    off = np.linalg.norm(pool.plane_mm[rays] - observed.plane_mm[labels[rays]], axis=-1)
     astray = off > np.maximum(6.0 * median(off), ASTRAY * next_mm[rays])
     labels = labels.copy()
     labels[rays[astray]] = UNLABELLED
-    free = unlabelled(len(scene.plane_mm), labels)
+    free = unlabelled(len(observed.plane_mm), labels)
     if len(free) == 0:
         return labels
     beside = np.flatnonzero(around(geometry, lit, 1) & ~lit & ~geometry.absent)
     if len(beside) == 0:
         return labels
-    apart = apart_mm(pool.plane_mm[looked_for], scene.plane_mm[free])
+    apart = apart_mm(pool.plane_mm[looked_for], observed.plane_mm[free])
     near = looked_for[np.unique(np.argsort(apart, axis=0)[:RIVALS])]
-    apart = apart_mm(pool.plane_mm[near], scene.plane_mm)
+    apart = apart_mm(pool.plane_mm[near], observed.plane_mm)
     dots = np.union1d(free, np.argsort(apart, axis=1)[:, : RIVALS + 1])
-    distance, cost = _surprise(geometry, scene, pool, lower, near, dots)
+    distance, cost = _deviance(geometry, observed, pool, lower, near, dots)
     for dot in np.searchsorted(dots, free).tolist():
         best = int(np.argmin(cost[:, dot]))
         ray = int(near[best])
         rivals = np.delete(cost[:, dot], best), np.delete(cost[best], dot)
-        clear = all(len(r) == 0 or r.min() > cost[best, dot] + CLEAR for r in rivals)
-        known = ray in beside and next_mm[ray] > scene.resolution_mm
-        if clear and known and distance[best, dot] < NEAR:
+        clear = all(len(r) == 0 or r.min() > cost[best, dot] + RIVAL_MARGIN for r in rivals)
+        known = ray in beside and next_mm[ray] > observed.resolution_mm
+        if clear and known and distance[best, dot] < GATE_SIGMA2:
             labels[ray] = dots[dot]
     return labels
 
 
-def _surprise(
+def _deviance(
     geometry: SequenceGeometry,
-    scene: Scene,
+    observed: Observation,
     pool: WarmPool,
     lower: FloatArray,
     ray: IntArray,
     dot: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """What `match_kernels.surprises` says of rays making dots, shapes (rays, dots)."""
+    """What `match_kernels.pair_deviances` says of rays making dots, shapes (rays, dots)."""
     spread = _covariance_of_dots(geometry, pool, lower, ray)
-    made = match_kernels.surprises(
-        scene.plane_mm[dot],
-        scene.covariance_mm2[dot],
+    made = match_kernels.pair_deviances(
+        observed.plane_mm[dot],
+        observed.covariance_mm2[dot],
         pool.plane_mm[ray],
-        CAUTION**2 * spread + MODEL_MM**2 * np.eye(2),
+        SIGMA_INFLATION**2 * spread + MODEL_ERROR_MM**2 * np.eye(2),
     )
     return made[0].T, made[1].T
 
@@ -204,39 +206,43 @@ class RayClasses:
 
 
 def classify_rays(
-    geometry: SequenceGeometry, scene: Scene, pool: WarmPool, lower: FloatArray, labels: IntArray
+    geometry: SequenceGeometry,
+    observed: Observation,
+    pool: WarmPool,
+    lower: FloatArray,
+    labels: IntArray,
 ) -> RayClasses:
     """Classify every ray, as `hypothesis` does; ``lower`` is the factor of the pool's fit."""
     lit = labels != UNLABELLED
     known = np.isfinite(pool.plane_mm[:, 0])
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
-    merged = next_mm < scene.resolution_mm
+    merged = next_mm < observed.resolution_mm
     hidden = kernels.behind_torch(
         pool.points_mm, geometry.rays, pool.slopes, geometry.rig.electrode.height_mm
     )
     seen = known & ~hidden & ~merged
-    seen[seen] = scene.in_view(pool.plane_mm[seen])
+    seen[seen] = observed.in_view(pool.plane_mm[seen])
     among = amid(on_pattern(geometry, lit).view(bool))[tuple(geometry.at.T)]
     missed = int(np.sum(among & ~geometry.absent & ~lit & seen))
     witness = np.where(seen & ~among & ~geometry.absent, -1, 0)
     rim = np.flatnonzero((witness < 0) & around(geometry, lit, 1))
     lost = lines_out_of_view(
-        scene,
+        observed,
         geometry.at[rim],
         pool.plane_mm[rim],
         lambda some: _covariance_of_dots(geometry, pool, lower, rim[some]),
     )
     witness[lost[tuple(geometry.at.T)]] = 0
     witness[lit] = 1
-    stray = unlabelled(len(scene.plane_mm), labels)
+    stray = unlabelled(len(observed.plane_mm), labels)
     if len(stray):
         apart = np.full((len(lit), len(stray)), np.inf)
-        apart[known] = apart_mm(pool.plane_mm[known], scene.plane_mm[stray])
+        apart[known] = apart_mm(pool.plane_mm[known], observed.plane_mm[stray])
         doubt = apart.min(axis=1) < next_mm
         witness[doubt & (witness < 0)] = 0
         run_together = known & merged & among
         if run_together.any():
-            stray = stray[apart[run_together].min(axis=0) > scene.resolution_mm]
+            stray = stray[apart[run_together].min(axis=0) > observed.resolution_mm]
     return RayClasses(witness, len(stray), missed)
 
 
@@ -253,5 +259,5 @@ def beyond(
     over = height[lit] - level.rear.height(geometry.landing_mm[lit, 1])
     rise = np.linalg.norm(slope[lit] * geometry.spacing_mm, axis=-1)
     is_new, inward = ~before[lit], level.sign * over
-    far = ~is_new & (inward < -BEYOND * rise)
-    return np.asarray(lit[(is_new & (inward < 0)) | (far & (far.sum() <= FEW))])
+    far = ~is_new & (inward < -BEYOND_SPACINGS * rise)
+    return np.asarray(lit[(is_new & (inward < 0)) | (far & (far.sum() <= FEW_BEYOND))])

@@ -1,0 +1,247 @@
+"""What matching starts from: the dots of a frame on the imaging plane, and the bench.
+
+An array over the rays of the pattern has the shape (rows, columns): the *labels*, the index of each
+ray's dot, and masks, such as the rays that are *lit* because they have a dot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.rig import Rig
+from labapp.core.images.dots import Dots
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, landing_spacing
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze, median
+
+UNLABELLED = -1
+"""In labels: the ray has no dot."""
+
+LEAST_LABELS = 6
+"""Fewer labelled dots are no start: a quadric has three slopes each way, and the six dots nearest a
+hole give twice that."""
+
+RESOLVED_SIZES = 2.2
+"""Dots nearer to each other than this many of their standard deviations are taken for one: two
+equal Gaussians have a single peak up to 2, and pixels and noise blur them further."""
+
+EDGE_MM, EDGE_PX = 0.5, 4.0
+"""A dot nearer to the edge of the plane or of the frame may be cut off, and is not in view: about
+the radius of a dot."""
+
+# Surfaces that are fitted while dots are being labelled are stiffer than the final one: a wrong
+# label must stand out rather than be bent to. A shallow pool is followed farther by a stiff
+# surface, a steep one only by a soft one.
+STIFF = FitSettings(rounds=5, jerk=0.05, floor_mm=0.03, settled_mm=2e-3)
+SOFT = replace(STIFF, jerk=0.12)
+QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
+"""Of the surface by which many sets of labels are sorted: the right one is not far from the first
+in that order."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The n dots of one frame on the imaging plane, and the bench that they were seen on.
+
+    Parameters
+    ----------
+    plane_mm
+        Dots, IPCS (X′, Z′), shape (n, 2), mm.
+    covariance_mm2
+        Their covariance, shape (n, 2, 2), mm².
+    resolution_mm
+        How near another dot may be before the two run into each other, mm.
+    rig, calibration
+        The bench, and how the camera sees the plane.
+    frame_shape
+        Height and width of the frame, px.
+    hidden_rows
+        Rows i of the pattern whose missing dots the operator says are hidden.
+    """
+
+    plane_mm: FloatArray
+    covariance_mm2: FloatArray
+    resolution_mm: float
+    rig: Rig
+    calibration: ImageCalibration
+    frame_shape: tuple[int, int]
+    hidden_rows: frozenset[int] = frozenset()
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+    @classmethod
+    def of(
+        cls, dots: Dots, rig: Rig, calibration: ImageCalibration, frame_shape: tuple[int, int]
+    ) -> Observation:
+        """Put the dots of a frame, of some height and width, px, on the imaging plane."""
+        from labapp.core.images import dot_kernels
+
+        sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
+        plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, dots.image_px, sigma)
+        resolution = RESOLVED_SIZES * median(dots.size_px * scale)
+        return cls(plane, covariance, resolution, rig, calibration, frame_shape)
+
+    @cached_property
+    def rays(self) -> FloatArray:
+        """Directions of the rays, shape (rows, columns, 3)."""
+        return ray_directions(self.rig.laser, self.rig.pattern)
+
+    @cached_property
+    def landing_mm(self) -> FloatArray:
+        """Where the rays would land on z = 0, shape (rows, columns, 3), mm."""
+        return meet_level(self.rig.laser.position_mm, self.rays)
+
+    @cached_property
+    def spacing_mm(self) -> FloatArray:
+        """Distance between neighbouring landing points along X and along Y, shape (2,), mm."""
+        return landing_spacing(self.landing_mm)
+
+    @cached_property
+    def view_mm2(self) -> float:
+        """Area of the imaging plane that the frame shows, mm²."""
+        height, width = self.frame_shape
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+        seen = self.calibration.to_plane(corners).astype(np.float32)
+        return float(cv2.contourArea(seen))
+
+    @cached_property
+    def absent(self) -> BoolArray:
+        """Rays that the lens does not make, shape (rows, columns)."""
+        mask = np.zeros(self.rays.shape[:2], bool)
+        for i, j in self.rig.pattern.absent_rays:
+            mask[i - 1, j - 1] = True
+        mask.flags.writeable = False
+        return mask
+
+    @cached_property
+    def hidden(self) -> BoolArray:
+        """Rays of `hidden_rows`, shape (rows, columns)."""
+        mask = np.zeros(self.rays.shape[:2], bool)
+        mask[[i - 1 for i in self.hidden_rows if 1 <= i <= len(mask)]] = True
+        mask.flags.writeable = False
+        return mask
+
+    def fit(
+        self,
+        labels: IntArray,
+        witness: IntArray,
+        settings: FitSettings,
+        initial: FittedPool | None = None,
+    ) -> FittedPool:
+        """Fit the surface to labelled dots, kept for the next time it is asked for.
+
+        Hypotheses lead to the same labels again and again.
+
+        Parameters
+        ----------
+        labels
+            Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+        witness
+            See `Match.witness`; 0 everywhere: the level is guessed from the outermost labels.
+        settings
+            See `FitSettings`.
+        initial
+            A fit to begin with, whose surface is near; None: the flat work piece.
+
+        Raises
+        ------
+        CannotMeasure
+            ``no-surface``, as `fit_pool`.
+        """
+        key = labels.tobytes(), witness.tobytes(), settings
+        if key not in self._fitted:
+            at = np.argwhere(labels != UNLABELLED)
+            dot = labels[tuple(at.T)]
+            dots = self.plane_mm[dot], self.covariance_mm2[dot]
+            surface = None if initial is None else initial.surface
+            try:
+                made = fit_pool(at + 1, *dots, witness, self.rig, settings, surface)
+                self._fitted[key] = made
+            except CannotMeasure as reason:
+                self._fitted[key] = reason
+        found = self._fitted[key]
+        if isinstance(found, CannotMeasure):
+            raise found
+        return found
+
+    @cached_property
+    def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | CannotMeasure]:
+        return {}
+
+    def in_view(self, plane_mm: FloatArray, margin_mm: FloatArray | float = 0.0) -> BoolArray:
+        """Whether dots at places on the plane, shape (…, 2), mm, would be seen.
+
+        They are on the plane and in the frame, farther from the edge than `EDGE_MM` and `EDGE_PX`,
+        also where they are off by a margin, of their shape, mm, along either axis. The plane
+        reaches as far as its size says, and as far as dots are seen on it: O′ need not be its very
+        corner.
+        """
+        plane = self.rig.imaging_plane
+        low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
+        high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
+        limit = np.array(self.frame_shape[::-1]) - 1 - EDGE_PX
+        ways = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]] if np.any(margin_mm) else [[0, 0]])
+        corners = np.stack([plane_mm + way * margin_mm for way in ways])
+        image = self.calibration.to_image(corners)
+        on_plane = (corners > low) & (corners < high)
+        in_frame = (image > EDGE_PX) & (image < limit)
+        return np.asarray((on_plane & in_frame).all(axis=(0, -1)))
+
+
+def try_fit(
+    observed: Observation,
+    labels: IntArray,
+    settings: FitSettings = SOFT,
+    initial: FittedPool | None = None,
+) -> FittedPool | None:
+    """Fit the surface to the dots labelled so far, the level guessed from the outermost of them.
+
+    None where there are fewer than `LEAST_LABELS`, or no surface has them (`Observation.fit`).
+    """
+    if count_labels(labels) < LEAST_LABELS:
+        return None
+    try:
+        return observed.fit(labels, np.zeros(labels.shape, np.int64), settings, initial)
+    except CannotMeasure:
+        return None
+
+
+# --- masks over the rays -----------------------------------------------------------------------
+
+
+def count_labels(labels: IntArray) -> int:
+    """How many rays have a dot."""
+    return int(np.sum(labels != UNLABELLED))
+
+
+def amid(lit: BoolArray) -> BoolArray:
+    """Rays between lit ones in their row or in their column, shape (rows, columns)."""
+    between = np.zeros_like(lit)
+    for rays, among in ((lit, between), (lit.T, between.T)):
+        before = np.logical_or.accumulate(rays)
+        after = np.logical_or.accumulate(rays[::-1])[::-1]
+        np.logical_or(among, before & after, out=among)
+    return between
+
+
+def neighbours_of(lit: BoolArray) -> IntArray:
+    """How many of the eight rays round each are lit, shape (rows, columns)."""
+    ones, border = lit.astype(np.int32), cv2.BORDER_CONSTANT
+    return np.asarray(cv2.boxFilter(ones, -1, (3, 3), normalize=False, borderType=border) - ones)
+
+
+def within_rings(labels: IntArray, rings: int) -> BoolArray:
+    """Labelled rays and their neighbours, so many rings of them, a mask, shape (rows, columns)."""
+    return widened(labels != UNLABELLED, rings)
+
+
+def widened(mask: BoolArray, rings: int) -> BoolArray:
+    """A mask over rays, shape (rows, columns), and the neighbours, so many rings of them."""
+    lit = np.ascontiguousarray(mask).view(np.uint8)
+    return cv2.dilate(lit, np.ones((3, 3), np.uint8), iterations=rings).view(bool)

@@ -1,0 +1,171 @@
+"""Where a fitted surface puts the dots of rays, and how likely a dot there is a ray's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.matching.observation import Observation
+from labapp.core.surface.pool_fit import FittedPool
+from labapp.core.values import BoolArray, FloatArray, IntArray
+
+GATE_SIGMA2, RIVAL_MARGIN = 20.0, 6.0
+"""A dot may be a ray's if its squared Mahalanobis distance from the prediction is below the first,
+and is if the deviance of every rival is larger by the second. (A right pair is beyond the gate once
+in 22,000; a margin of 6 makes it 20 times as likely as its rival.)"""
+
+SIGMA_INFLATION = 1.4
+"""By how much the surface's own uncertainty is enlarged while dots are labelled: beyond the last
+labelled row it rests on how smooth pools are expected to be."""
+
+MODEL_ERROR_MM = 0.06
+"""How far the right surface's predictions may be off, mm, for what no spline of it can follow."""
+
+FALSE_DOTS_PER_MM2 = 5e-4
+"""False dots to be expected on the imaging plane: a few in a frame. Where a prediction is vague,
+one of them is as likely a cause of a dot as the ray."""
+
+OUT_OF_VIEW_SIGMA, LEAST_LINE = 2.5, 3
+"""A row of rays beside the last lit one may have left the view where at least so many (the second)
+of its dots are predicted in view by less than so many σ: that they are not seen does not make them
+dark."""
+
+NEAR_EDGE_MM = 8.0
+"""Only so near the edge of the view it is worked out how uncertain predictions are."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where the surface puts the dots of some rays, m of them.
+
+    Parameters
+    ----------
+    at
+        Rows and columns of the rays in the pattern's arrays, counted from 0, shape (m, 2).
+    points_mm, slopes
+        Reflection points, shape (m, 3), mm, and the surface's slopes there, shape (m, 2).
+    plane_mm
+        Dots, IPCS, shape (m, 2), mm.
+    spacing_mm
+        Distance from each to the next predicted dot, shape (m,), mm.
+    """
+
+    at: IntArray
+    points_mm: FloatArray
+    slopes: FloatArray
+    plane_mm: FloatArray
+    spacing_mm: FloatArray
+
+    def part(self, which: BoolArray) -> Prediction:
+        """The same of some of the rays, by a mask of shape (m,)."""
+        return Prediction(
+            self.at[which],
+            self.points_mm[which],
+            self.slopes[which],
+            self.plane_mm[which],
+            self.spacing_mm[which],
+        )
+
+    def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
+        """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
+        from labapp.core.surface import kernels
+
+        laser, axes = rig.laser.position_mm, rig.imaging_plane.pose_mm[1:3]
+        dots = rig.imaging_plane.to_universal(self.plane_mm)
+        grid = pool.surface.basis.grid
+        return kernels.covariance_of_dots(grid, pool.factor, laser, axes, self.points_mm, dots)
+
+    def blocked(self, observed: Observation) -> BoolArray:
+        """Whether the torch may hide the dots, shape (m,) (`kernels.behind_torch`)."""
+        from labapp.core.surface import kernels
+
+        rays, tip = observed.rays[tuple(self.at.T)], observed.rig.electrode.height_mm
+        return kernels.behind_torch(self.points_mm, rays, self.slopes, tip)
+
+
+def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:
+    """Predict the dots of the rays in a mask, shape (rows, columns), that reach the plane."""
+    from labapp.core.images import dot_kernels
+    from labapp.core.surface import kernels
+
+    at = np.argwhere(where)
+    index, surface, pose = tuple(at.T), pool.surface, observed.rig.imaging_plane.pose_mm
+    points, slopes, plane = kernels.meet(
+        surface.basis.grid,
+        surface.coefficients,
+        observed.rays[index],
+        observed.landing_mm[index],
+        4,
+        pose,
+    )
+    sane = np.isfinite(plane[:, 0])
+    at, points, slopes, plane = at[sane], points[sane], slopes[sane], plane[sane]
+    spacing = np.full(len(plane), np.inf)
+    if len(plane) > 1:
+        spacing = dot_kernels.two_nearest(plane, plane)[0][:, 1]
+    return Prediction(at, points, slopes, plane, spacing)
+
+
+def pair_deviances(
+    observed: Observation, pool: FittedPool, predicted: Prediction, dots: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """How far dots, n of them, are from m predictions, and how unlikely that makes each pair.
+
+    Covariances of dot and prediction are added.
+
+    Returns
+    -------
+    distance, deviance
+        Squared Mahalanobis distances, and deviances: −2 log likelihoods but for a constant that is
+        the same for all pairs. Both of shape (n, m).
+    """
+    from labapp.core.matching import match_kernels
+
+    uncertain = SIGMA_INFLATION**2 * predicted.covariance_mm2(
+        pool, observed.rig
+    ) + MODEL_ERROR_MM**2 * np.eye(2)
+    return match_kernels.pair_deviances(
+        observed.plane_mm[dots], observed.covariance_mm2[dots], predicted.plane_mm, uncertain
+    )
+
+
+def false_dot_deviance(per_mm2: float = FALSE_DOTS_PER_MM2) -> float:
+    """Deviance of a false dot, comparable with `pair_deviances`, where there are so many a mm²."""
+    return -2 * float(np.log(2 * np.pi * per_mm2))
+
+
+def lines_out_of_view(
+    observed: Observation,
+    at: IntArray,
+    plane_mm: FloatArray,
+    covariance_of: Callable[[BoolArray], FloatArray],
+) -> BoolArray:
+    """Rays of rows or columns that may have left the view, a mask of shape (rows, columns).
+
+    Parameters
+    ----------
+    observed
+        The dots and the rig.
+    at, plane_mm
+        Dark rays beside the lit ones, as in `Prediction`, shapes (m, 2), mm.
+    covariance_of
+        Covariance of the dots of some of them, by a mask of shape (m,), shape (…, 2, 2), mm².
+    """
+    unsure = ~observed.in_view(plane_mm, NEAR_EDGE_MM)
+    lines = _lines_of(at[unsure], observed.absent.shape)
+    if lines.any():
+        variance = covariance_of(unsure)[:, [0, 1], [0, 1]]
+        unsure[unsure] = ~observed.in_view(plane_mm[unsure], OUT_OF_VIEW_SIGMA * np.sqrt(variance))
+        lines = _lines_of(at[unsure], observed.absent.shape)
+    return lines
+
+
+def _lines_of(at: IntArray, shape: tuple[int, ...]) -> BoolArray:
+    """Rays, shape (m, 2), of which `LEAST_LINE` are in a row or a column, as a mask of a shape."""
+    mask = np.zeros(shape, bool)
+    mask[tuple(at.T)] = True
+    rows, columns = mask.sum(axis=1, keepdims=True), mask.sum(axis=0, keepdims=True)
+    return np.asarray(mask & ((rows >= LEAST_LINE) | (columns >= LEAST_LINE)))
