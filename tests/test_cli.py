@@ -610,6 +610,14 @@ def test_help_tells_units(labapp: Run, command: str) -> None:
         assert "mm" in said or "px" in said
 
 
+@pytest.mark.parametrize("command", ["", "session", "analyze", "calibrate"])
+def test_help_lists_commands_with_whole_sentences(labapp: Run, command: str) -> None:
+    _, said, _ = labapp(*command.split(), "--help")
+    listed = said.partition("Commands:")[2]
+    assert listed
+    assert "..." not in listed
+
+
 def test_every_status_is_explained() -> None:
     root = Path(cli.__file__).parents[1]
     raised = {
@@ -630,9 +638,13 @@ def test_the_version_is_told(labapp: Run) -> None:
 @pytest.mark.parametrize(
     ("start", "heavy"),
     [
-        ("import labapp.cli", {"numpy", "scipy", "cv2", "pyvista", "matplotlib"}),
+        ("import labapp.cli", {"numpy", "scipy", "cv2", "rich", "pyvista", "matplotlib"}),
         (
             "from labapp import Session",
+            {"scipy", "cv2", "av", "numba", "h5py", "matplotlib", "labapp.core.pipeline"},
+        ),
+        (
+            "import labapp.session.frames, labapp.session.measured",
             {"scipy.linalg", "scipy.spatial", "scipy.special", "av", "numba", "h5py", "matplotlib"},
         ),
     ],

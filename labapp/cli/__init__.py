@@ -31,6 +31,7 @@ from labapp.cli.shared import (
     RECORDING_HELP,
     TERMINATED,
     Algorithm,
+    Commands,
     SchemeName,
     SigmaParts,
     choose_frames,
@@ -59,6 +60,8 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # which takes as long to load as all else
+    cls=Commands,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Measure the 3-D surface of a molten weld pool from a reflected laser dot matrix. "
     "Alone, labapp opens the app; labapp FILE opens a session or a recording in it. "
@@ -67,7 +70,9 @@ app = typer.Typer(
     epilog="Exit codes: 0 done; 1 done, but nothing could be measured, or a session is not whole; "
     "2 bad input or output; 3 a fault in labapp; 130 stopped by Ctrl-C; 143 by SIGTERM.",
 )
-calibrate = typer.Typer(no_args_is_help=True, help="Calibrate the laser or the imaging plane.")
+calibrate = typer.Typer(
+    no_args_is_help=True, cls=Commands, help="Calibrate the laser or the imaging plane."
+)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")

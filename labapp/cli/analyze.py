@@ -8,6 +8,7 @@ from typing import Annotated, Literal, TypeVar
 import typer
 
 from labapp.cli.shared import (
+    Commands,
     progress_shown,
     results_folder,
     writable_folder,
@@ -28,6 +29,7 @@ from labapp.studies.analysis import (
 T = TypeVar("T", bound=str)
 
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     help="Reproduce the tables and figures of chapters 4 and 8, and the error budget of a set-up.",
 )

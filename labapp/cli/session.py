@@ -20,6 +20,7 @@ from labapp.cli.shared import (
     NOTHING,
     RECORDING_HELP,
     Algorithm,
+    Commands,
     ResultsName,
     SchemeName,
     SigmaParts,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from labapp.session.session import Session
 
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     help="Keep an experiment in one file: set-up, recording, corrections, results.",
 )

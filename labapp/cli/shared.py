@@ -6,11 +6,10 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+import typer.core
 
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
@@ -19,7 +18,8 @@ from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from rich.progress import TaskID
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
 
     from labapp.core.schemes import irs
     from labapp.export.frame_result import FrameResult
@@ -56,8 +56,28 @@ SigmaParts = Annotated[
 ]
 
 
+class Commands(typer.core.TyperGroup):
+    """Commands whose list in the help has the first sentence of each in full."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list: names and sentences."""
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
+            )
+
+
 def progress_bar() -> Progress:
     """A progress bar on stderr; nothing where stderr is not a terminal."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
     console = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}", markup=False),

@@ -44,7 +44,8 @@ LOAD_AFTER_MS = 300
 """The window is there first; then what it will need is loaded behind it."""
 
 NEEDED_LATER = (
-    "labapp.session.session",
+    "labapp.session.frames",
+    "labapp.run.measurers",
     *(f"labapp.gui.pages.{key}" for key in ("surface", "dots", "trends", "capture", "setup")),
     "pyvistaqt",
 )

@@ -1,27 +1,31 @@
-"""Reading a session: set-up, calibrations, corrections, frames and results."""
+"""Reading a session: set-up, calibrations, corrections, frames and results.
+
+What measures and reads recordings is loaded when a session is opened, not with this module: scripts
+begin soon.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from labapp.config.setup import Setup, parse_setup
-from labapp.core.pipeline import Settings
-from labapp.core.rows.correction import Correction
-from labapp.core.values import IntArray
 from labapp.errors import InputError
-from labapp.media import Frame, GreyImage
-from labapp.run.limits import Limits
-from labapp.session.calibration_pictures import CalibrationPictures
-from labapp.session.documents import Change, Documents
-from labapp.session.file.database import Database
-from labapp.session.frames import Frames, Progress
-from labapp.session.measured import Basis, Overview, Result, Results, scheme_name
-from labapp.session.overviews import Overviews
-from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
-from labapp.session.signals import Signals
+
+if TYPE_CHECKING:
+    from labapp.config.setup import Setup
+    from labapp.core.pipeline import Settings
+    from labapp.core.rows.correction import Correction
+    from labapp.core.values import IntArray
+    from labapp.media import Frame, GreyImage
+    from labapp.run.limits import Limits
+    from labapp.session.documents import Change
+    from labapp.session.file.database import Database
+    from labapp.session.frames import Progress
+    from labapp.session.measured import Basis, Overview, Result
+    from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
+    from labapp.session.signals import Signals
 
 
 class SessionContents:
@@ -36,6 +40,12 @@ class SessionContents:
     """
 
     def __init__(self, database: Database) -> None:
+        from labapp.session.calibration_pictures import CalibrationPictures
+        from labapp.session.documents import Documents
+        from labapp.session.frames import Frames
+        from labapp.session.measured import Results
+        from labapp.session.overviews import Overviews
+
         self.path = database.path
         self.read_only = database.read_only
         self._database = database
@@ -61,6 +71,8 @@ class SessionContents:
     @property
     def record(self) -> Record:
         """The experiment record."""
+        from labapp.session.record import Record
+
         found = self._documents.get("record")
         return Record() if found is None else found
 
@@ -78,6 +90,8 @@ class SessionContents:
         InputError
             If it is incomplete; the error names what is missing.
         """
+        from labapp.config.setup import parse_setup
+
         return parse_setup(self.setup_text, self.path)
 
     @property
@@ -114,6 +128,8 @@ class SessionContents:
     @property
     def settings(self) -> Settings:
         """Scheme and settings that frames are measured with."""
+        from labapp.core.pipeline import Settings
+
         found = self._documents.get("settings")
         return Settings() if found is None else found
 
@@ -131,6 +147,8 @@ class SessionContents:
     @property
     def limits(self) -> Limits:
         """Lower and upper limits of the pool's sizes while it is filmed."""
+        from labapp.run.limits import Limits
+
         found = self._documents.get("limits")
         return Limits() if found is None else found
 
@@ -174,14 +192,14 @@ class SessionContents:
         """
         return self._results.get(
             frame,
-            scheme or scheme_name(self.settings),
+            scheme or self._scheme(),
             self._basis(),
             self._documents.fingerprint("correction", frame),
         )
 
     def overview(self, scheme: str | None = None) -> Overview:
         """Status, correction, staleness and measures of every frame."""
-        return self._overviews.get(scheme or scheme_name(self.settings), self._basis())
+        return self._overviews.get(scheme or self._scheme(), self._basis())
 
     def corrected_frames(self) -> IntArray:
         """Numbers of the frames with a correction by hand, ascending, shape (n,)."""
@@ -215,7 +233,14 @@ class SessionContents:
             *self._results.problems(),
         ]
 
+    def _scheme(self) -> str:
+        from labapp.session.measured import scheme_name
+
+        return scheme_name(self.settings)
+
     def _basis(self) -> Basis | None:
+        from labapp.session.measured import Basis
+
         try:
             return Basis(self.setup, self.settings)
         except InputError:

@@ -14,8 +14,9 @@ from urllib.parse import quote
 
 from labapp.errors import InputError
 from labapp.files import atomic_file
-from labapp.session.documents import NO_FRAME, Key, Kind
+from labapp.session.documents import Key, Kind
 from labapp.session.file.database import SUFFIX, new_session_path
+from labapp.session.file.schema import NO_FRAME
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 

@@ -19,6 +19,7 @@ from labapp.run.limits import Limits
 from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
 from labapp.session.file.database import Database
 from labapp.session.file.read_cache import ReadCache
+from labapp.session.file.schema import NO_FRAME
 from labapp.session.record import LaserReadings, PlanePicture, Record
 from labapp.session.signals import Signals
 
@@ -34,8 +35,6 @@ Kind = Literal[
 ]
 Key = tuple[Kind, int]
 """Kind, and the frame of a correction; `NO_FRAME` for what belongs to no frame."""
-
-NO_FRAME = -1
 
 CLASSES: dict[str, type] = {
     "record": Record,

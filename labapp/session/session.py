@@ -8,35 +8,28 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from labapp.config.setup import parse_setup, updated_setup
-from labapp.core.calibration.laser_calibration import LaserCalibration, calibrate_laser
-from labapp.core.calibration.plane_calibration import (
-    PlaneCalibration,
-    PlaneCalibrationSettings,
-    calibrate_plane,
-)
-from labapp.core.pipeline import Measurement, Settings
-from labapp.core.rows.correction import Correction
-from labapp.media import GreyImage, open_source
-from labapp.run.limits import Limits
-from labapp.run.measurers import ColdMeasurer, WarmMeasurer
-from labapp.run.runner import Measurer, Sink, run
 from labapp.session.contents import SessionContents
-from labapp.session.documents import NO_FRAME, Change, Key
-from labapp.session.file.blobs import fingerprint
-from labapp.session.file.database import Database
-from labapp.session.frames import Progress
-from labapp.session.measured import Basis
-from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
-from labapp.session.signals import Signals
+from labapp.session.file.schema import NO_FRAME
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from labapp.core.calibration.laser_calibration import LaserCalibration
+    from labapp.core.calibration.plane_calibration import PlaneCalibration
+    from labapp.core.pipeline import Measurement, Settings
+    from labapp.core.rows.correction import Correction
     from labapp.export.folder import ExportChoice, ExportedFile
     from labapp.export.frame_result import FrameResult
+    from labapp.media import GreyImage
+    from labapp.run.limits import Limits
+    from labapp.run.runner import Measurer, Sink
+    from labapp.session.documents import Change, Key
+    from labapp.session.frames import Progress
+    from labapp.session.record import Record, Recording
+    from labapp.session.signals import Signals
 
 
 class Session(SessionContents):
@@ -51,6 +44,8 @@ class Session(SessionContents):
         InputError
             If there is a file of that name, or it cannot be written.
         """
+        from labapp.session.file.database import Database
+
         session = cls(Database.create(path))
         if record is not None:
             session.set_record(record)
@@ -67,6 +62,8 @@ class Session(SessionContents):
         InputError
             If it cannot be read, is no session, or is one of a newer labapp.
         """
+        from labapp.session.file.database import Database
+
         return cls(Database.open(path, read_only))
 
     # --- what the operator says; every change can be undone ---------------------------------
@@ -83,6 +80,8 @@ class Session(SessionContents):
         InputError
             If anything in it is unknown, missing or impossible.
         """
+        from labapp.config.setup import parse_setup
+
         parse_setup(text, self.path)
         self._documents.change(label, {("setup", NO_FRAME): text})
 
@@ -96,9 +95,7 @@ class Session(SessionContents):
         InputError
             If a section is not one; whether values are possible is told by `setup`.
         """
-        self._documents.change(
-            label, {("setup", NO_FRAME): updated_setup(self.setup_text, self.path, values)}
-        )
+        self._documents.change(label, {("setup", NO_FRAME): self._updated_setup(values)})
 
     def calibrate_laser(
         self,
@@ -115,15 +112,17 @@ class Session(SessionContents):
         ValueError
             If no laser can have drawn such a cross.
         """
+        from labapp.core.calibration.laser_calibration import calibrate_laser
+        from labapp.session.record import LaserReadings
+
         found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg)
         kept = None if picture is None else self._pictures.add("cross-hair", picture)
         lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
         readings = LaserReadings(*lengths, fan_angle_deg, found, kept)
         laser = {"projection_angle_deg": found.angle_deg, "distance_mm": found.distance_mm}
-        setup = updated_setup(self.setup_text, self.path, {"laser": laser})
         values: dict[Key, Any] = {
             ("laser-calibration", NO_FRAME): readings,
-            ("setup", NO_FRAME): setup,
+            ("setup", NO_FRAME): self._updated_setup({"laser": laser}),
         }
         self._documents.change("laser calibration", values)
         return found
@@ -145,6 +144,12 @@ class Session(SessionContents):
         InputError
             If it cannot be read.
         """
+        from labapp.core.calibration.plane_calibration import (
+            PlaneCalibrationSettings,
+            calibrate_plane,
+        )
+        from labapp.media import open_source
+
         with open_source(picture) as source:
             image = source.frame(0).image
         found = calibrate_plane(image, PlaneCalibrationSettings(unit_mm=unit_mm))
@@ -161,12 +166,13 @@ class Session(SessionContents):
         ValueError
             If its three points lie on one line, or its marks do not give its model.
         """
+        from labapp.session.record import PlanePicture
+
         _ = found.image_calibration  # which refuses such points
         readings = PlanePicture(unit_mm, found, self._pictures.add(name, image))
-        setup = updated_setup(self.setup_text, self.path, {"image_calibration": found.setup_keys})
         values: dict[Key, Any] = {
             ("plane-calibration", NO_FRAME): readings,
-            ("setup", NO_FRAME): setup,
+            ("setup", NO_FRAME): self._updated_setup({"image_calibration": found.setup_keys}),
         }
         self._documents.change("imaging-plane calibration", values)
 
@@ -262,6 +268,11 @@ class Session(SessionContents):
             If the setup is incomplete, or a result cannot be saved; at the end, if frames are no
             longer those that were imported.
         """
+        from labapp.run.measurers import ColdMeasurer, WarmMeasurer
+        from labapp.run.runner import run
+        from labapp.session.file.blobs import fingerprint
+        from labapp.session.measured import Basis
+
         chosen = self.stale_frames() if frames is None else frames
         basis = Basis(self.setup, self.settings)
         self._frames.refuse_missing()
@@ -321,3 +332,9 @@ class Session(SessionContents):
 
         what = choice or ExportChoice()
         return export_session(self, folder, what, frames, scheme, report, progress)
+
+    def _updated_setup(self, values: Mapping[str, Mapping[str, object]]) -> str:
+        """Text of the setup with keys set or deleted; see `update_setup`."""
+        from labapp.config.setup import updated_setup
+
+        return updated_setup(self.setup_text, self.path, values)

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from labapp.errors import InputError
 from labapp.session import documents as module
-from labapp.session.documents import NO_FRAME, Documents
+from labapp.session.documents import Documents
 from labapp.session.file.database import Database
+from labapp.session.file.schema import NO_FRAME
 
 
 @pytest.fixture(scope="module", autouse=True)

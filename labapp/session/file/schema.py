@@ -13,6 +13,9 @@ APPLICATION_ID = 0x4C414250
 VERSION = 2
 """Of the tables below. A change to them adds 1, and a step to `MIGRATIONS`."""
 
+NO_FRAME = -1
+"""In place of a frame's number, for documents that belong to no frame."""
+
 MEASURES = (
     "are_mm mre_mm are_inner_mm mre_inner_mm width_mm length_mm height_mm depth_mm area_mm2 "
     "volume_mm3 center_x_mm center_y_mm peak_x_mm peak_y_mm width_sigma_mm length_sigma_mm "
