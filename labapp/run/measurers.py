@@ -16,9 +16,9 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,8 +39,15 @@ T = TypeVar("T")
 AHEAD = 8
 """So many frames are submitted to a pool beyond the one whose result is awaited."""
 
+VOTERS, WAITS = 3, 5
+"""A frame is judged with two more that have a surface, so that of three that disagree two decide;
+so many wait at most."""
+
 STRETCH = 1000
 """Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
+
+HALFWAY = 500
+"""This frame of a stretch is measured by itself, too: then its rows can be held against others'."""
 
 BATCH = 20
 """Frames that a process returns at a time."""
@@ -79,7 +86,8 @@ class ColdMeasurer:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
-        return _in_order(map(self._begun, frames), AHEAD)
+        measured = _in_order(map(self._begun, frames), AHEAD)
+        return _agreeing(measured, self.setup, self.settings)
 
     def _begun(self, number: int) -> Future[FrameResult]:
         frame = _read(self.read, number, self.settings)
@@ -87,6 +95,49 @@ class ColdMeasurer:
             return _here(lambda: frame)
         submit = _here if self.pool is None else self.pool.submit
         return submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
+
+
+def _agreeing(
+    measured: Generator[FrameResult], setup: Setup, settings: Settings, warm: bool = False
+) -> Generator[FrameResult]:
+    """Results in their order, but for those whose rows are a row off the others' (`RowVote`).
+
+    A frame is judged when two more with a surface are there, or after the next few.
+
+    Parameters
+    ----------
+    measured
+        What was measured, in its order.
+    setup, settings
+        With what.
+    warm
+        Whether frames follow on those before, but for where the track was lost.
+    """
+    from labapp.core.sequence.row_vote import RowVote
+
+    vote = RowVote(setup.rig, settings.fit)
+    waiting: deque[tuple[FrameResult, tuple[int, int] | None]] = deque()
+
+    def is_due() -> bool:
+        voters = sum(at is not None for _, at in waiting)
+        return waiting[0][1] is None or voters >= VOTERS or len(waiting) > WAITS
+
+    def judged() -> FrameResult:
+        result, at = waiting.popleft()
+        if at is None:
+            return result
+        return replace(result, measurement=vote.judged(result.measurement, at))
+
+    with closing(measured):
+        for result in measured:
+            found = result.measurement
+            followed = warm and result.track_lost is None and found.correction is None
+            at = None if found.reconstruction is None else vote.add(found, followed)
+            waiting.append((result, at))
+            while waiting and is_due():
+                yield judged()
+        while waiting:
+            yield judged()
 
 
 def _here(work: Callable[..., T], *given: Any) -> Future[T]:
@@ -173,12 +224,18 @@ class WarmMeasurer:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
+        rest = iter(frames)
+        for first in rest:
+            stretch = self._stretch(chain([first], islice(rest, STRETCH - 1)))
+            yield from _agreeing(stretch, self.setup, self.settings, warm=True)
+
+    def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
         from labapp.core.sequence.warm import WarmChain
 
         given = (self.setup.rig, self.setup.calibration, self.settings)
         for place, number in enumerate(frames):
-            if place % STRETCH == 0:
-                chain = WarmChain(*given)
+            if place in {0, HALFWAY}:
+                warm = WarmChain(*given)
             frame = _read(self.read, number, self.settings)
             if isinstance(frame, FrameResult):
                 yield frame
@@ -186,8 +243,8 @@ class WarmMeasurer:
                 yield _cold(number, frame, self.setup, self.settings, correction)
             else:
                 with _one_thread():
-                    found = chain.measure(frame.image)
-                yield FrameResult(number, frame.time_s, found, chain.track_lost)
+                    found = warm.measure(frame.image)
+                yield FrameResult(number, frame.time_s, found, warm.track_lost)
 
 
 @dataclass(frozen=True)

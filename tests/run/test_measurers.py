@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,7 +22,10 @@ from typer.testing import CliRunner
 from labapp.cli import app
 from labapp.config.scenario import read_scenario
 from labapp.config.setup import read_setup
+from labapp.core import pipeline
 from labapp.core.pipeline import Measurement, Settings, start_correction
+from labapp.core.schemes import fit
+from labapp.core.surface.pool_fit import FitSettings
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
@@ -103,14 +106,14 @@ def test_stretches_are_measured_alike_here_and_by_processes(
 class Slow(Executor):
     """A pool that has done the first of what it was given when it has so much, and no more."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, done: Any) -> None:
         self.given: list[Future[Any]] = []
-        self._most = most
+        self._most, self._done = most, done
 
     def submit(self, *_: Any, **__: Any) -> Future[Any]:
         self.given.append(Future())
         if len(self.given) == self._most:
-            self.given[0].set_result(["the first"])
+            self.given[0].set_result(self._done)
         return self.given[-1]
 
 
@@ -118,7 +121,7 @@ def test_a_sequence_given_up_takes_back_what_it_had_given_out(
     recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(measurers, "BATCH", 2)
-    pool = Slow(5)
+    pool = Slow(5, ["the first"])
     told = replace(recording, pools=[pool])(range(FRAMES))
     assert next(told) == "the first"
     told.close()
@@ -236,9 +239,10 @@ def test_cold_frames_come_in_their_order_wherever_they_are_measured(plain: Any) 
 
 
 def test_a_pool_is_given_some_frames_ahead_which_are_taken_back_at_the_end(plain: Any) -> None:
-    pool = Slow(AHEAD + 1)
+    first = FrameResult(4, None, Measurement("no-dots", "", "fit"))
+    pool = Slow(AHEAD + 1, first)
     results = plain(pool)(range(4, 100))
-    assert next(results) == ["the first"]
+    assert next(results) == first
     results.close()
     assert [one.cancelled() for one in pool.given] == [False, *[True] * AHEAD]
 
@@ -287,3 +291,51 @@ def test_matrices_are_multiplied_in_one_thread_from_the_first_frame_on() -> None
         env={**os.environ, "PYTHONPATH": ".", "OPENBLAS_NUM_THREADS": "2"},
     )
     assert (done.returncode, done.stdout) == (0, "{1}\n"), done.stderr
+
+
+@pytest.fixture
+def slipping(
+    monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer
+) -> Callable[[int], ColdMeasurer]:
+    """A cold measurer of the recording that has the rows of one frame a row off."""
+    rig = recording.setup.rig
+
+    def measurer(slips: int) -> ColdMeasurer:
+        with open_source(recording.path) as source:
+            images = {number: source.frame(number) for number in range(4)}
+
+        def measure(image: np.ndarray, *given: Any) -> Measurement:
+            found = pipeline.measure(image, *given)
+            if image is not images[slips].image:
+                return found
+            assert found.match is not None
+            match = replace(
+                found.match,
+                ray=found.match.ray + np.array([1, 0]),
+                witness=np.roll(found.match.witness, 1, axis=0),
+            )
+            return replace(
+                found, match=match, reconstruction=fit.reconstruct(match, rig, FitSettings())
+            )
+
+        monkeypatch.setattr(measurers, "measure", measure)
+        return ColdMeasurer(images.__getitem__, recording.setup, recording.settings)
+
+    return measurer
+
+
+@pytest.mark.parametrize("slips", [0, 1, 3])
+def test_a_frame_whose_rows_slipped_is_not_answered(
+    slipping: Callable[[int], ColdMeasurer], slips: int
+) -> None:
+    told = list(slipping(slips)(range(4)))
+    assert [each.frame for each in told] == list(range(4))
+    expected = ["ambiguous-rows" if k == slips else "ok" for k in range(4)]
+    assert [each.measurement.status for each in told] == expected
+
+
+def test_two_frames_whose_rows_differ_are_both_not_answered(
+    slipping: Callable[[int], ColdMeasurer],
+) -> None:
+    told = list(slipping(1)(range(2)))
+    assert [each.measurement.status for each in told] == ["ambiguous-rows"] * 2
