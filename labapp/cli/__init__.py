@@ -34,6 +34,7 @@ from labapp.cli.shared import (
     Commands,
     SchemeName,
     SigmaParts,
+    Warm,
     choose_frames,
     measure_frames,
     note,
@@ -213,14 +214,7 @@ def reconstruct(
     ] = "all",
     *,
     sigma_parts: SigmaParts = False,
-    warm: Annotated[
-        bool,
-        typer.Option(
-            "--warm",
-            help="Measure each frame from the one before: a hundred times as fast where frames "
-            "follow on each other quickly. On all cores.",
-        ),
-    ] = False,
+    warm: Warm = False,
     lines: Annotated[
         str | None,
         typer.Option(metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP."),

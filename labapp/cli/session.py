@@ -24,6 +24,7 @@ from labapp.cli.shared import (
     ResultsName,
     SchemeName,
     SigmaParts,
+    Warm,
     choose_frames,
     command,
     finite,
@@ -234,9 +235,7 @@ def measure(
         Literal["auto", "S/S", "S/I", "I/I"] | None,
         typer.Option(help="From now on: order of columns/rows of dots to that of rays."),
     ] = None,
-    warm: Annotated[
-        bool, typer.Option("--warm", help="Measure each frame from the one before, much faster.")
-    ] = False,
+    warm: Warm = False,
 ) -> None:
     """Measure frames: those that are not measured yet or whose measures no longer stand.
 

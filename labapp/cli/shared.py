@@ -50,6 +50,15 @@ RECORDING_HELP = (
 )
 FRAMES_HELP = "Frames A to before B, counted from 0, every STEP-th; parts may be left out."
 
+Warm = Annotated[
+    bool,
+    typer.Option(
+        "--warm",
+        help="Measure each frame from the one before: some ten times as fast where frames follow "
+        "on each other quickly. On all cores.",
+    ),
+]
+
 SigmaParts = Annotated[
     bool,
     typer.Option("--sigma-parts", help="The parts of each ±, too, in measures.csv: noise, level."),
