@@ -121,7 +121,7 @@ def measure(
             lattice = lattice_of_corrected(match, rig, given)
         result = replace(result, match=match, lattice=lattice)
         reconstruction = reconstruct(match, rig, settings)
-        size = measures.measure(reconstruction, match, rig)
+        size = measures.measure_surface(reconstruction, match, rig)
         return replace(result, reconstruction=reconstruction, measures=size)
     except CannotMeasure as answer:
         return replace(result, status=answer.status, reason=answer.reason)

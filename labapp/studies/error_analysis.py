@@ -22,7 +22,7 @@ from labapp.core.geometry.rig import DotPattern, Laser, Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.schemes import ers, irs
-from labapp.core.surface.measures import Measures, measure
+from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace
 from labapp.simulation.parallel import Progress, in_parallel
@@ -91,7 +91,7 @@ def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str)
     """`ERRORS` of one reconstruction, shape (4,); NaN where the scheme finds no surface."""
     try:
         made = reconstruct(match, rig, circle_settings(scheme))
-        measures = measure(made, match, rig)
+        measures = measure_surface(made, match, rig)
     except CannotMeasure:
         return np.full(len(ERRORS), np.nan)
     true = seen.point_mm[tuple(match.ray.T - 1)]

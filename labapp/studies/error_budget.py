@@ -13,7 +13,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings, reconstruct
-from labapp.core.surface.measures import Measures, measure
+from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.studies.parameter_deviation import NOMINAL, OFFSETS, QUANTITIES, AxisPoints, move
 
@@ -72,7 +72,7 @@ def calibration_budget(
 
     def change(match: Match, rig: Rig) -> FloatArray:
         try:
-            size = measure(reconstruct(match, rig, settings), match, rig)
+            size = measure_surface(reconstruct(match, rig, settings), match, rig)
         except CannotMeasure:
             return np.full(len(SIZES), np.nan)
         return np.abs(_sizes(size) - _sizes(base))

@@ -15,7 +15,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.pipeline import measure as measure_frame
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match
@@ -159,7 +159,7 @@ def _sizes(known: KnownPool, scheme: str) -> FloatArray:
         made = reconstruct(known.match, known.rig, circle_settings(scheme))
     except CannotMeasure:
         return np.full(3, np.nan)
-    measures = measure(made, known.match, known.rig)
+    measures = measure_surface(made, known.match, known.rig)
     return np.array([*relative_errors(measures, known.cap), computed_are(measures)])
 
 

@@ -17,7 +17,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import reconstruct
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool
@@ -238,7 +238,7 @@ def moved_errors(task: tuple[KnownPool, FloatArray, str]) -> FloatArray:
     known, offset, scheme = task
     match, rig = move(known.match, known.rig, known.axes, offset)
     try:
-        measures = measure(reconstruct(match, rig, circle_settings(scheme)), match, rig)
+        measures = measure_surface(reconstruct(match, rig, circle_settings(scheme)), match, rig)
     except CannotMeasure:
         return np.full(2, np.nan)
     return np.array(relative_errors(measures, known.cap))

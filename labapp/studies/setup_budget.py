@@ -13,7 +13,7 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, freeze
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.parallel import Progress, in_parallel
@@ -127,7 +127,7 @@ def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, Fl
     changes = np.full(len(QUANTITIES), np.nan)
     try:
         made = reconstruct(match, rig, Settings())
-        error = relative_errors(measure(made, match, rig), pool)[0]
+        error = relative_errors(measure_surface(made, match, rig), pool)[0]
     except CannotMeasure:
         return predicted, float("nan"), changes
     if number < MOVED_POOLS:

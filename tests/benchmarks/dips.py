@@ -25,7 +25,7 @@ from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.lattice import GrowSettings, grow_lattice
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
-from labapp.core.surface.measures import Measures, measure
+from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.simulation.pools import Dent, Pool, egg
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see
@@ -64,7 +64,7 @@ def answer(pool: Pool, seen: SeenDots, rig: Rig = BENCH_RIG) -> Answer:
     shown = int((seen.ray[:, 0] > 0).sum())
     try:
         match = matched(seen, rig)
-        size = measure(fit.reconstruct(match, rig, FitSettings()), match, rig)
+        size = measure_surface(fit.reconstruct(match, rig, FitSettings()), match, rig)
     except CannotMeasure as reason:
         return Answer(reason.status, shown=shown)
     wrong = int((seen.ray[match.dot] != match.ray).any(axis=-1).sum())

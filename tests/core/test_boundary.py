@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.surface.boundary import (
     Boundary,
@@ -56,7 +56,9 @@ def radius_of(boundary):
 def test_edge_points_lie_midway_between_the_last_lit_ray_and_its_outer_neighbour():
     match = match_of(spherical_cap(6.5, 0.4))
     edges = edge_points(match, RIG)
-    landing = meet_level(RIG.laser.position_mm, ray_directions(RIG.laser, RIG.pattern))[..., :2]
+    landing = intersect_level(RIG.laser.position_mm, ray_directions(RIG.laser, RIG.pattern))[
+        ..., :2
+    ]
     row = 10
     lit = match.ray[match.ray[:, 0] == row, 1]
     k = list(np.unique(match.ray[:, 0])).index(row)
@@ -69,7 +71,9 @@ def test_edge_points_lie_midway_between_the_last_lit_ray_and_its_outer_neighbour
 def test_a_pool_wider_than_the_pattern_ends_half_a_step_beyond_it():
     match = match_of(spherical_cap(14.0, 0.4))
     edges = edge_points(match, RIG)
-    landing = meet_level(RIG.laser.position_mm, ray_directions(RIG.laser, RIG.pattern))[..., :2]
+    landing = intersect_level(RIG.laser.position_mm, ray_directions(RIG.laser, RIG.pattern))[
+        ..., :2
+    ]
     whole = [i for i in range(19) if (match.ray[:, 0] == i + 1).sum() == 19]
     assert whole
     step = landing[whole[0], 18] - landing[whole[0], 17]

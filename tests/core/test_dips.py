@@ -11,7 +11,7 @@ from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
 from labapp.core.sequence.warm_fit import SequenceGeometry, intersect_and_reflect
 from labapp.core.sequence.warm_match import classify_rays
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.core.values import IntArray
 from tests.benchmarks.dips import answer, draw, matched
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots
@@ -136,7 +136,7 @@ def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     match = matched(seen)
     assert (match.witness[12, row] == 0).all()
     assert (match.witness[10, [3, 16]] == -1).all()  # dark, and far within the view
-    size = measure(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
+    size = measure_surface(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
     assert abs(size.height_mm - pool.size.height_mm) < 2 * size.height_sigma_mm
 
     basis, settings = found.pool.surface.basis, FitSettings()

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.geometry.optics import meet_plane, reflect, surface_normal
+from labapp.core.geometry.optics import intersect_imaging_plane, reflect, surface_normal
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.schemes import ers
 from labapp.core.schemes.slopes import Paths, parents_from, reflected_rays
 from labapp.core.surface.interpolation import ThinPlateSurface
-from labapp.core.surface.measures import measure, reflection_scale
+from labapp.core.surface.measures import measure_surface, reflection_scale
 from labapp.core.surface.surface import intersect
 from labapp.core.values import CannotMeasure
 from labapp.simulation.forward import exact_match, trace
@@ -56,7 +56,7 @@ def test_the_thumb_tack_of_8_2():
         ImagingPlane.vertical(40.69, 50.8, 0.0, 101.6, 101.6),
     )
     match = match_of(spherical_cap(9.75, 0.91), rig)
-    measures = measure(ers.reconstruct(match, rig, CIRCLE), match, rig)
+    measures = measure_surface(ers.reconstruct(match, rig, CIRCLE), match, rig)
     assert measures.height_mm == pytest.approx(0.91, rel=0.10)
     assert measures.width_mm == pytest.approx(9.75, rel=0.015)
     assert measures.length_mm == pytest.approx(9.75, rel=0.015)
@@ -72,7 +72,7 @@ def test_a_denser_pattern_leaves_less_error():
         for cap in caps:
             # As the text does, also where a ray would meet a deep hollow again.
             match = exact_match(trace_once(cap, rig), rig)
-            measures = measure(ers.reconstruct(match, rig, CIRCLE), match, rig)
+            measures = measure_surface(ers.reconstruct(match, rig, CIRCLE), match, rig)
             depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
             each.append(abs(depth / abs(cap.peak_mm) - 1))
         errors.append(np.mean(each))
@@ -106,7 +106,9 @@ def test_reflection_points_lie_on_their_rays_and_their_own_are_is_that_of_step_4
     points = intersect(surface, RIG.laser.position_mm, direction)
     np.testing.assert_allclose(points, made.points_mm, atol=1e-6)
     gradient = surface.gradient(points[:, 0], points[:, 1])
-    computed = meet_plane(points, reflect(direction, surface_normal(gradient)), RIG.imaging_plane)
+    computed = intersect_imaging_plane(
+        points, reflect(direction, surface_normal(gradient)), RIG.imaging_plane
+    )
     own = np.hypot(*((computed - match.plane_mm) * reflection_scale(match, RIG)).T).mean()
     assert made.own_are_mm == pytest.approx(own, rel=0.05)
 
@@ -183,7 +185,7 @@ def test_caps_that_hardly_move_are_measured_alike():
         depth = []
         for aside in (0.0, 1e-9, -1e-9):
             match = match_of(spherical_cap(diameter, diameter / 10, (aside, 0.7 * aside)))
-            depth.append(measure(ers.reconstruct(match, RIG, CIRCLE), match, RIG).height_mm)
+            depth.append(measure_surface(ers.reconstruct(match, RIG, CIRCLE), match, RIG).height_mm)
         assert np.ptp(depth) < 1e-4
 
 
@@ -223,7 +225,7 @@ def test_odd_sets_of_dots_are_measured_or_refused(seed, share):
             assert error.status in {"too-few-dots", "no-surface", "no-boundary"}  # noqa: PT017 - or an answer
         else:
             assert np.isfinite(made.points_mm).all()
-            assert np.isfinite(measure(made, match, RIG).volume_mm3)
+            assert np.isfinite(measure_surface(made, match, RIG).volume_mm3)
 
 
 def test_too_few_dots_are_refused():
@@ -254,6 +256,6 @@ def test_pools_off_the_axis_either_way_are_centred_either_way():
     centers = []
     for x in (-0.2, 0.2):
         match = match_of(spherical_cap(6.5, 0.4, (x, 0.0)))
-        centers.append(measure(ers.reconstruct(match, RIG, CIRCLE), match, RIG).center_x_mm)
+        centers.append(measure_surface(ers.reconstruct(match, RIG, CIRCLE), match, RIG).center_x_mm)
     assert centers[1] == pytest.approx(0.2, abs=0.25)
     assert centers[0] == pytest.approx(-centers[1])

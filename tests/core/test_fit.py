@@ -10,10 +10,10 @@ from scipy.linalg.lapack import dtbtrs
 
 from labapp.core.match import Match
 from labapp.core.schemes import ers, fit
-from labapp.core.surface.measures import Measures, measure, reflection_errors, size_of
+from labapp.core.surface.boundary_trace import trace_boundary
+from labapp.core.surface.measures import Measures, measure_surface, reflection_errors, surface_sizes
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.surface.rim import find_rim
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import exact_match, trace
@@ -41,7 +41,7 @@ def fitted(
 
 
 def measured(pool: Pool) -> Measures:
-    return measure(*fitted(pool), OPEN_RIG)
+    return measure_surface(*fitted(pool), OPEN_RIG)
 
 
 def extreme(pool: Pool, measures: Measures) -> float:
@@ -60,7 +60,7 @@ def test_the_28_caps_of_8_3_1() -> None:
     depth, width, length, ratio = [], [], [], []
     for cap in caps_8_3_1():
         made, match = fitted(cap)
-        measures = measure(made, match, OPEN_RIG)
+        measures = measure_surface(made, match, OPEN_RIG)
         depth.append(abs(extreme(cap, measures) / abs(cap.peak_mm) - 1))
         width.append(abs(measures.width_mm / cap.footprint.width_mm - 1))
         length.append(abs(measures.length_mm / cap.footprint.width_mm - 1))
@@ -92,7 +92,7 @@ def test_a_dent_and_an_oscillation_are_followed(term: Term, rms_mm: float) -> No
     xy = inside(pool)
     error = made.whole.height(*xy.T) - pool.height(*xy.T)
     assert np.sqrt(np.mean(error**2)) < rms_mm
-    measures = measure(made, match, OPEN_RIG)
+    measures = measure_surface(made, match, OPEN_RIG)
     assert measures.height_mm == pytest.approx(pool.size.height_mm, abs=0.01)
     assert measures.width_mm == pytest.approx(pool.size.width_mm, rel=0.02)
     assert measures.length_mm == pytest.approx(pool.size.length_mm, rel=0.02)
@@ -132,11 +132,11 @@ def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely() -> N
     for _ in range(300):
         half = rng.normal(size=pool.surface.basis.count)
         change = dtbtrs(pool.factor, half, uplo="L", trans="T")[0]
-        change += rng.normal(0.0, pool.level.sigma_mm) - pool.level_at @ change
+        change += rng.normal(0.0, pool.level.sigma_mm) - pool.mean_splines @ change
         surface = SplineSurface(pool.surface.basis, pool.surface.coefficients + change)
         center = made.boundary.center_mm
-        boundary, _ = find_rim(surface.basis, surface.coefficients, pool.level, center)
-        sizes.append(size_of(surface, boundary)[0])
+        boundary, _ = trace_boundary(surface.basis, surface.coefficients, pool.level, center)
+        sizes.append(surface_sizes(surface, boundary)[0])
     np.testing.assert_allclose(np.std(sizes, axis=0)[:3], made.size_sigma[:3], rtol=0.2)
     np.testing.assert_allclose(np.std(sizes, axis=0)[4:], made.size_sigma[4:], rtol=0.2)
     assert made.size_sigma[3] == 0.0  # the lowest point is on the rim, which is at 0
@@ -184,7 +184,7 @@ def test_uncertainties_are_honest() -> None:
         known = np.isfinite(error)
         assert known.mean() > 0.9
         within.append(np.abs(error[known]) < 1.96 * made.sigma_mm[known])
-        measures, true = measure(made, match, OPEN_RIG), pool.size
+        measures, true = measure_surface(made, match, OPEN_RIG), pool.size
         convex = pool.peak_mm > 0
         sigma = measures.height_sigma_mm if convex else measures.depth_sigma_mm
         surprise.append(
@@ -239,6 +239,6 @@ def test_every_size_has_its_uncertainty_where_the_pool_ends_near_what_is_fitted(
         witness=witness,
     )
     made = fit.reconstruct(match, OPEN_RIG, FitSettings())
-    size = measure(made, match, OPEN_RIG)
+    size = measure_surface(made, match, OPEN_RIG)
     assert all(np.isfinite(value) for name, value in vars(size).items() if "_sigma_" in name)
     assert 0 < size.volume_sigma_mm3 < 0.2 * size.volume_mm3

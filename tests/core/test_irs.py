@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.schemes import irs
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import caps_8_3_1, egg, spherical_cap
@@ -53,7 +53,7 @@ def test_depths_of_the_caps(algorithm, median):
     error = []
     for cap in aside(caps_8_3_1(), 1):
         match = match_of(cap)
-        measures = measure(irs.reconstruct(match, RIG, settings), match, RIG)
+        measures = measure_surface(irs.reconstruct(match, RIG, settings), match, RIG)
         depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
         error.append(abs(depth / abs(cap.peak_mm) - 1))
     assert np.median(error) < median
@@ -147,7 +147,7 @@ def test_odd_sets_of_dots_are_measured_or_refused(seed, share, algorithm):
         assert error.status in {"too-few-dots", "no-surface", "no-boundary"}  # noqa: PT017 - or an answer
     else:
         assert np.isfinite(made.points_mm).all()
-        assert np.isfinite(measure(made, match, RIG).volume_mm3)
+        assert np.isfinite(measure_surface(made, match, RIG).volume_mm3)
 
 
 def test_too_few_dots_are_refused():

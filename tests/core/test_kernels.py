@@ -16,8 +16,8 @@ from scipy.stats import multivariate_normal
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.optics import (
     bisecting_gradient,
-    meet_level,
-    meet_plane,
+    intersect_imaging_plane,
+    intersect_level,
     ray_directions,
     reflect,
     surface_normal,
@@ -27,7 +27,7 @@ from labapp.core.images import dot_kernels, dot_size, dots
 from labapp.core.matching import match_kernels
 from labapp.core.sequence.track import recurrence
 from labapp.core.surface import kernels, level_kernels
-from labapp.core.surface.pool_fit import Rear
+from labapp.core.surface.level import Rear
 from labapp.core.surface.solver import normal_factor
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
@@ -52,7 +52,7 @@ def surface() -> SplineSurface:
 def landings() -> tuple[FloatArray, FloatArray]:
     """Rays, and where they land on z = 0, shapes (n, 3)."""
     rays = ray_directions(RIG.laser, RIG.pattern).reshape(-1, 3)
-    return rays, meet_level(LASER, rays)
+    return rays, intersect_level(LASER, rays)
 
 
 def test_splines_and_surfaces_are_those_of_the_basis() -> None:
@@ -74,7 +74,7 @@ def test_splines_and_surfaces_are_those_of_the_basis() -> None:
 
 def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() -> None:
     rays, landing = landings()
-    points, slopes, plane = kernels.meet(
+    points, slopes, plane = kernels.intersect_and_reflect(
         BASIS.grid, surface().coefficients, rays, landing, 6, PLANE.pose_mm
     )
     known = np.isfinite(plane[:, 0])
@@ -84,19 +84,23 @@ def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() ->
     np.testing.assert_allclose(points[known, 2], height, atol=1e-9)
     np.testing.assert_allclose(slopes[known], gradient, atol=1e-6)  # before the last step
     way = reflect(rays[known], surface_normal(slopes[known]))
-    np.testing.assert_allclose(plane[known], meet_plane(points[known], way, PLANE), atol=1e-9)
+    np.testing.assert_allclose(
+        plane[known], intersect_imaging_plane(points[known], way, PLANE), atol=1e-9
+    )
     own = rays[known], landing[known]
-    moved, last = kernels.advance(BASIS.grid, surface().coefficients, *own, 6)
+    moved, last = kernels.newton_along_rays(BASIS.grid, surface().coefficients, *own, 6)
     np.testing.assert_allclose(moved, points[known], atol=1e-12)
     assert 0.0 <= last < 1e-9
-    once, step = kernels.advance(BASIS.grid, surface().coefficients, *own, 1)
+    once, step = kernels.newton_along_rays(BASIS.grid, surface().coefficients, *own, 1)
     np.testing.assert_allclose(step, np.linalg.norm(once - landing[known], axis=-1).max())
 
 
 def test_a_ray_that_runs_away_from_the_plane_has_no_dot() -> None:
     rays, landing = landings()
     steep = SplineSurface(BASIS, surface().coefficients + 8.0 * BASIS_Y)
-    plane = kernels.meet(BASIS.grid, steep.coefficients, rays, landing, 1, PLANE.pose_mm)[2]
+    plane = kernels.intersect_and_reflect(
+        BASIS.grid, steep.coefficients, rays, landing, 1, PLANE.pose_mm
+    )[2]
     assert np.isnan(plane).all()
 
 
@@ -418,8 +422,10 @@ def test_pictures_lower_than_the_filters_are_mirrored_again_and_again(rows: int)
 def test_what_is_not_a_number_is_not_settled() -> None:
     rays, landing = landings()
     nothing = np.full(COUNT, np.nan)
-    assert np.isnan(kernels.advance(BASIS.grid, nothing, rays, landing, 1)[1])
-    assert np.isnan(kernels.meet(BASIS.grid, nothing, rays, landing, 1, PLANE.pose_mm)[2]).all()
+    assert np.isnan(kernels.newton_along_rays(BASIS.grid, nothing, rays, landing, 1)[1])
+    assert np.isnan(
+        kernels.intersect_and_reflect(BASIS.grid, nothing, rays, landing, 1, PLANE.pose_mm)[2]
+    ).all()
 
 
 def test_division_by_zero_is_as_in_numpy() -> None:
@@ -432,7 +438,7 @@ def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
     theta = np.linspace(-np.pi, np.pi, 48, endpoint=False)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     center, rear = np.array([0.1, -0.4]), Rear(drop_mm, -1.0, -4.5)
-    radius, climb, over = kernels.follow_rim(
+    radius, boundary_slope, over = kernels.newton_to_boundary(
         BASIS.grid, surface().coefficients, np.array([drop_mm, -1.0, -4.5]), center, way,
         np.full(48, 3.0), np.full(48, 0.3), 1e-10,
     )  # fmt: skip
@@ -444,14 +450,14 @@ def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
     np.testing.assert_allclose(over[inside], 0.0, atol=1e-9)
     below = np.maximum(-1.0 - place[:, 1], 0.0)
     gradient[:, 1] -= 2 * drop_mm * below / 3.5**2
-    np.testing.assert_allclose(climb[inside], gradient[inside], atol=1e-6)
+    np.testing.assert_allclose(boundary_slope[inside], gradient[inside], atol=1e-6)
 
 
 def test_rays_meet_quadrics() -> None:
     rays = ray_directions(RIG.laser, RIG.pattern)[7:12, 7:12].reshape(-1, 3)
     center = np.array([0.2, -0.3])
     quadrics = np.array([[0.02, -0.03, -0.05, 0.01, -0.04], [0.0, 0.01, 0.03, 0.0, 0.02]])
-    points, plane = kernels.meet_quadrics(center, quadrics, rays, LASER, PLANE.pose_mm)
+    points, plane = kernels.reflect_off_quadrics(center, quadrics, rays, LASER, PLANE.pose_mm)
     for (g_x, g_y, k_x, k_xy, k_y), met, seen in zip(quadrics, points, plane, strict=True):
         x, y = (met[:, :2] - center).T
         z = g_x * x + g_y * y + (k_x * x**2 + 2 * k_xy * x * y + k_y * y**2) / 2
@@ -459,7 +465,7 @@ def test_rays_meet_quadrics() -> None:
         np.testing.assert_allclose(np.cross(met - LASER, rays), 0.0, atol=1e-9)
         slope = np.stack([g_x + k_x * x + k_xy * y, g_y + k_xy * x + k_y * y], axis=-1)
         way = reflect(rays, surface_normal(slope))
-        np.testing.assert_allclose(seen, meet_plane(met, way, PLANE), atol=1e-9)
+        np.testing.assert_allclose(seen, intersect_imaging_plane(met, way, PLANE), atol=1e-9)
 
 
 def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
@@ -469,7 +475,9 @@ def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
     absent = np.zeros((3, 4), bool)
     absent[1, 1] = True
     places = np.array([[0.9, 0.0], [2.0, 3.0], [6.0, 1.1], [4.0, 5.0]])
-    hit, dot, off = (part[0] for part in kernels.hits(pattern[None], places, absent, 0.5))
+    hit, dot, off = (
+        part[0] for part in kernels.match_predicted_dots(pattern[None], places, absent, 0.5)
+    )
     np.testing.assert_allclose(off[0, 0], 0.9)  # of half the 2 mm to the next in its row
     assert hit[0, 0]
     assert not hit[1, 1]  # nobody makes that dot
@@ -487,13 +495,13 @@ def test_quadrics_are_fitted_by_least_squares_of_slopes(lit: list[int]) -> None:
     true = np.array([[0.02, -0.03, -0.05, 0.01, -0.04]])
     near, absent = true + 0.003 * random().normal(size=(1, 5)), np.zeros((5, 5), bool)
     bench = LASER, PLANE.pose_mm
-    places = kernels.meet_quadrics(center, true, rays.reshape(-1, 3), *bench)[1]
+    places = kernels.reflect_off_quadrics(center, true, rays.reshape(-1, 3), *bench)[1]
     places = places.reshape(5, 5, 2)[1:4, 1:4].reshape(-1, 2)[list(lit)]
     fitted = kernels.fit_quadrics(center, near, rays, *bench, places, absent, 0.5)
     if len(lit) < 4:
         np.testing.assert_array_equal(fitted, near)
         return
-    pattern = kernels.meet_quadrics(center, fitted, rays.reshape(-1, 3), *bench)[1][0]
+    pattern = kernels.reflect_off_quadrics(center, fitted, rays.reshape(-1, 3), *bench)[1][0]
     off = np.linalg.norm(places[:, None] - pattern, axis=-1).min(axis=1)
     assert off.max() < 0.02
     if len(lit) > 4:
@@ -533,11 +541,11 @@ def test_levels_are_weighed_by_what_speaks_against_them(depth: int) -> None:
         np.sqrt(share.sum(axis=0) @ (levels - mean) ** 2),
         share[:, [0, -1]].sum(),
     )
-    made = level_kernels.weigh(nats, blur_cost, 1.5, drops, 0.3, 1.0)
+    made = level_kernels.level_posterior(nats, blur_cost, 1.5, drops, 0.3, 1.0)
     np.testing.assert_allclose(made, wanted)
 
 
-def test_doubts_of_what_is_unknown_are_unknown() -> None:
+def test_the_likelihood_of_what_is_unknown_is_unknown() -> None:
     over = np.array([[0.1, np.nan], [0.1, 0.2]])
     made = level_kernels.level_negative_log_likelihood(over, np.ones(2), 0.0, 0.1, 3, np.ones(2))
     assert np.isnan(made[0]).all()
@@ -573,7 +581,7 @@ def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: 
         [[0.0, 0.0, -2 * height_mm / axes[0] ** 2, 0.0, -2 * height_mm / axes[1] ** 2]]
     )
     points, dots = (
-        part[0] for part in kernels.meet_quadrics(middle, quadric, rays, LASER - down, plane)
+        part[0] for part in kernels.reflect_off_quadrics(middle, quadric, rays, LASER - down, plane)
     )
     there = (((points[:, :2] - middle) / axes) ** 2).sum(axis=1) < 1
     there &= np.isfinite(dots).all(axis=1)

@@ -9,7 +9,7 @@ import pytest
 
 from labapp.core.schemes import fit
 from labapp.core.sequence.mean import MOST, series_of, sigma_of_mean
-from labapp.core.surface.measures import Measures, measure
+from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import FloatArray
 from labapp.simulation.pools import Wave, egg
@@ -77,7 +77,7 @@ def test_the_mean_of_a_swinging_pool_is_told_to_be_as_uncertain_as_it_is() -> No
             pool = egg(width, 0.47 * width, 0.6 * width, 0.05 * width, (0.1, -0.2), terms)
             match = matched(see(pool, rng, sigma_px=0.2), BENCH_RIG)
             measured.append(
-                measure(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
+                measure_surface(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
             )
             off.append(measured[-1].height_mm - pool.size.height_mm)
         series = series_of(measured)

@@ -9,12 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.geometry.optics import meet_plane, ray_directions, reflect, surface_normal
+from labapp.core.geometry.optics import (
+    intersect_imaging_plane,
+    ray_directions,
+    reflect,
+    surface_normal,
+)
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.schemes import ers, irs
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.measures import (
-    measure,
+    measure_surface,
     reflection_errors,
     reflection_scale,
     surface_grid,
@@ -63,7 +68,7 @@ def truth(pool: Pool, residual=None):
 def test_a_spherical_cap_has_the_size_of_the_formulas(diameter, share, center):
     height = diameter * share
     reconstruction, match = truth(spherical_cap(diameter, height, center))
-    measures = measure(reconstruction, match, RIG)
+    measures = measure_surface(reconstruction, match, RIG)
     assert measures.width_mm == pytest.approx(diameter, rel=1e-4)
     assert measures.length_mm == pytest.approx(diameter, rel=1e-4)
     assert measures.height_mm == pytest.approx(max(height, 0), abs=1e-5)
@@ -78,7 +83,7 @@ def test_a_spherical_cap_has_the_size_of_the_formulas(diameter, share, center):
 def test_an_egg_off_the_origin_is_measured():
     pool = egg(6.6, 2.8, 4.6, 0.29, (0.2, -0.4))
     reconstruction, match = truth(pool)
-    measures, size = measure(reconstruction, match, RIG), pool.size
+    measures, size = measure_surface(reconstruction, match, RIG), pool.size
     assert measures.width_mm == pytest.approx(size.width_mm, rel=1e-4)
     assert measures.length_mm == pytest.approx(size.length_mm, rel=1e-4)
     assert measures.height_mm == pytest.approx(size.height_mm, rel=1e-4)
@@ -90,9 +95,9 @@ def test_an_egg_off_the_origin_is_measured():
 
 def test_the_uncertainties_of_sizes_are_those_of_the_reconstruction():
     reconstruction, match = truth(spherical_cap(6.0, 0.4))
-    assert np.isnan(measure(reconstruction, match, RIG).height_sigma_mm)
+    assert np.isnan(measure_surface(reconstruction, match, RIG).height_sigma_mm)
     sigma = np.array([0.06, 0.05, 0.04, 0.03, 0.2, 0.1])
-    measures = measure(replace(reconstruction, size_sigma=sigma), match, RIG)
+    measures = measure_surface(replace(reconstruction, size_sigma=sigma), match, RIG)
     names = ("width_sigma_mm", "length_sigma_mm", "height_sigma_mm", "depth_sigma_mm")
     told = [getattr(measures, name) for name in (*names, "area_sigma_mm2", "volume_sigma_mm3")]
     np.testing.assert_array_equal(told, sigma)
@@ -165,7 +170,7 @@ def test_the_mesh_ends_at_the_boundary_and_looks_up():
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     assert (normal[:, 2] > 0).all()
-    measures = measure(reconstruction, match, RIG)
+    measures = measure_surface(reconstruction, match, RIG)
     assert normal[:, 2].sum() / 2 == pytest.approx(measures.area_mm2)
     # A sheet: every edge has two triangles but those of the boundary, which are its points.
     edges = np.sort(np.vstack([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
@@ -180,7 +185,7 @@ def test_the_mesh_ends_at_the_boundary_and_looks_up():
 def test_residuals_and_are_of_the_text_s_schemes_are_those_of_the_surface_they_give(scheme):
     match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.2), RIG), RIG)
     made = scheme.reconstruct(match, RIG)
-    told = measure(made, match, RIG)
+    told = measure_surface(made, match, RIG)
     # Down each ray to the surface in steps of 1 µm, not by the way that the program takes.
     laser = RIG.laser.position_mm
     distance = np.arange(-0.2, 1.2, 0.001)
@@ -196,7 +201,7 @@ def test_residuals_and_are_of_the_text_s_schemes_are_those_of_the_surface_they_g
         k = met[0]
         at = way[k] + over[k] / (over[k] - over[k + 1]) * (way[k + 1] - way[k])
         normal = surface_normal(made.surface.gradient(at[0], at[1]))
-        dots.append(meet_plane(at, reflect(ray, normal), RIG.imaging_plane))
+        dots.append(intersect_imaging_plane(at, reflect(ray, normal), RIG.imaging_plane))
     residual = np.array(dots) - match.plane_mm
     error = np.hypot(*(residual * reflection_scale(match, RIG)).T)
     known = np.isfinite(error)

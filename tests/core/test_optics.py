@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from labapp.core.geometry.optics import (
     bisecting_gradient,
-    meet_level,
-    meet_plane,
+    intersect_imaging_plane,
+    intersect_level,
     ray_directions,
     reflect,
     surface_normal,
@@ -55,7 +55,7 @@ def test_the_beam_axis_goes_through_the_origin_and_neighbours_are_the_angle_apar
     laser = Laser(31.14, 31.48)
     direction = ray_directions(laser, DotPattern())
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1.0)
-    np.testing.assert_allclose(meet_level(laser.position_mm, direction[9, 9]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(intersect_level(laser.position_mm, direction[9, 9]), 0.0, atol=1e-12)
     for neighbour in (direction[9, 10], direction[10, 9]):
         angle = np.degrees(np.arccos(direction[9, 9] @ neighbour))
         assert angle == pytest.approx(0.77, abs=1e-6)
@@ -63,7 +63,7 @@ def test_the_beam_axis_goes_through_the_origin_and_neighbours_are_the_angle_apar
 
 def test_rows_grow_towards_the_head_and_columns_with_x():
     laser = Laser(31.14, 31.48)
-    landing = meet_level(laser.position_mm, ray_directions(laser, DotPattern()))
+    landing = intersect_level(laser.position_mm, ray_directions(laser, DotPattern()))
     assert (np.diff(landing[..., 1], axis=0) > 0).all()
     assert (np.diff(landing[..., 0], axis=1) > 0).all()
 
@@ -72,17 +72,17 @@ def test_a_ray_off_a_flat_mirror_meets_the_plane_where_the_geometry_says():
     # From (0, 0, 0) at 30° elevation towards −Y: after 50 mm it is 50·tan 30° high.
     plane = ImagingPlane.vertical(50.0, s_mm=45.0, h_mm=3.0)
     direction = np.array([0.0, -np.cos(np.radians(30)), np.sin(np.radians(30))])
-    dot = meet_plane(np.zeros(3), direction, plane)
+    dot = intersect_imaging_plane(np.zeros(3), direction, plane)
     np.testing.assert_allclose(dot, [45.0, 50 * np.tan(np.radians(30)) - 3.0])
 
 
 def test_a_ray_that_runs_away_from_the_plane_or_along_it_never_meets_it():
     plane = ImagingPlane.vertical(50.0, s_mm=45.0, h_mm=3.0)
     for direction in ([0.0, 1.0, 1.0], [1.0, 0.0, 1.0]):
-        assert np.isnan(meet_plane(np.zeros(3), np.array(direction), plane)).all()
+        assert np.isnan(intersect_imaging_plane(np.zeros(3), np.array(direction), plane)).all()
 
 
 @given(st.floats(-2.0, 2.0), elevations, sideways)
 def test_a_ray_meets_a_level_at_that_level(level, elevation, side):
-    point = meet_level(np.array([1.0, 20.0, 30.0]), falling(elevation, side), level)
+    point = intersect_level(np.array([1.0, 20.0, 30.0]), falling(elevation, side), level)
     assert point[2] == pytest.approx(level)

@@ -22,7 +22,7 @@ from labapp.core.pipeline import (
 from labapp.core.rows.correction import Correction, add_dot, assign, delete_dots, set_reference
 from labapp.core.rows.detection import DotSettings
 from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice
-from labapp.core.surface.measures import measure as size_of
+from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.media import open_source
 from labapp.simulation.pools import spherical_cap
@@ -169,7 +169,7 @@ def test_the_scheme_is_the_one_that_is_asked_for(
         np.testing.assert_array_equal(getattr(ours.match, name), getattr(other.match, name))
     assert ours.match.trials == other.match.trials
     again = reconstruct(other.match, SETUP.rig, Settings())
-    assert_same(size_of(again, other.match, SETUP.rig), ours.measures)
+    assert_same(measure_surface(again, other.match, SETUP.rig), ours.measures)
 
 
 def test_a_correction_that_changes_nothing_changes_no_figure(

@@ -10,18 +10,12 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from labapp.core.geometry.optics import meet_plane, reflect, surface_normal
+from labapp.core.geometry.optics import intersect_imaging_plane, reflect, surface_normal
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.match import Match
 from labapp.core.schemes import fit
-from labapp.core.surface.pool_fit import (
-    FitSettings,
-    FittedPool,
-    Level,
-    find_level,
-    fit_pool,
-    place_level,
-)
+from labapp.core.surface.level import Level, find_level
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import exact_match, trace
@@ -50,7 +44,8 @@ def rays_landing(spacing: float, seed: int = 0) -> tuple[FloatArray, IntArray]:
 
 
 def level_of(landing: FloatArray, witness: IntArray, spacing: float, sign: int = 1) -> Level:
-    return find_level(dome(sign), landing, witness, np.array([spacing, spacing]))
+    height, slope = dome(sign).height_and_gradient(*landing.T)
+    return find_level(height, slope, landing[:, 1], witness, np.array([spacing, spacing]))
 
 
 def fitted(match: Match, **changes: object) -> FittedPool:
@@ -131,7 +126,7 @@ def test_rays_meet_the_surface_and_give_back_the_dots(match: Match) -> None:
     x, y, z = pool.points_mm.T
     np.testing.assert_allclose(z, pool.surface.height(x, y), atol=1e-6)
     normal = surface_normal(pool.surface.gradient(x, y))
-    dots = meet_plane(pool.points_mm, reflect(rays, normal), OPEN_RIG.imaging_plane)
+    dots = intersect_imaging_plane(pool.points_mm, reflect(rays, normal), OPEN_RIG.imaging_plane)
     np.testing.assert_allclose(pool.residual_mm, dots - match.plane_mm, atol=1e-6)
 
 
@@ -280,6 +275,6 @@ def test_dots_with_the_wrong_rays_make_no_surface(match: Match, seed: int) -> No
 def test_a_single_row_of_rays_that_came_back_has_a_level() -> None:
     height, slope = np.array([0.1, 0.2, 0.1, -0.1, -0.1]), np.full((5, 2), 0.1)
     y, witness = np.array([1.0, 1.0, 1.0, 2.0, 0.0]), np.array([1, 1, 1, -1, -1])
-    level = place_level(height, slope, y, witness, np.array([0.4, 0.8]))
+    level = find_level(height, slope, y, witness, np.array([0.4, 0.8]))
     assert np.isfinite([level.shift_mm, level.sigma_mm]).all()
     assert level.rear.drop_mm == 0.0

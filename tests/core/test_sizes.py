@@ -1,4 +1,4 @@
-"""Sizes of a followed surface, and how they change with it, against `measures.size_of`."""
+"""Sizes of a followed surface, and how they change with it, against `measures.surface_sizes`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.sequence.warm_fit import SequenceGeometry
 from labapp.core.surface import measures
 from labapp.core.surface.boundary import Boundary
-from labapp.core.surface.pool_fit import FitSettings, Level, Rear
-from labapp.core.surface.rim import follow_rim
-from labapp.core.surface.sizes import Sizes, sizes_of
+from labapp.core.surface.boundary_trace import retrace_boundary
+from labapp.core.surface.level import Level, Rear
+from labapp.core.surface.pool_fit import FitSettings
+from labapp.core.surface.sizes import Sizes, sizes_and_gradients
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 
@@ -32,8 +33,8 @@ def coefficients(dent_mm: float) -> FloatArray:
 def measured(made: FloatArray, level: Level) -> tuple[Sizes, Boundary]:
     circle = Boundary.polar(CENTER, np.full(360, 3.0))
     for _ in range(4):
-        circle, climb = follow_rim(BASIS, made, level, CENTER, circle)
-    return sizes_of(BASIS, made, level, circle, climb), circle
+        circle, boundary_slope = retrace_boundary(BASIS, made, level, CENTER, circle)
+    return sizes_and_gradients(BASIS, made, level, circle, boundary_slope), circle
 
 
 @pytest.mark.parametrize(("sign", "drop_mm"), [(1, 0.0), (1, 0.05), (-1, 0.0)])
@@ -42,7 +43,7 @@ def test_sizes_are_those_of_many_samples(sign: int, drop_mm: float, dent_mm: flo
     made = sign * coefficients(dent_mm)
     level = Level(0.0, 0.001, sign, Rear(drop_mm, -1.0, -3.2), 0.0)
     sizes, boundary = measured(made, level)
-    wanted, peak = measures.size_of(SplineSurface(BASIS, made), boundary)
+    wanted, peak = measures.surface_sizes(SplineSurface(BASIS, made), boundary)
     assert (np.abs(sizes.size - wanted) < [1e-9, 1e-9, 1e-5, 1e-5, 1e-9, 2e-4]).all()
     np.testing.assert_allclose(sizes.peak_mm, peak, atol=1e-3)
     assert sizes.holds

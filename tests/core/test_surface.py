@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import DotPattern, Laser
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface, ThinPlateSurface, whole_surface
@@ -27,7 +27,7 @@ def scattered(seed: int = 3, count: int = 80) -> np.ndarray:
 @given(st.floats(-1.5, 1.5))
 def test_rays_meet_a_level_where_the_formula_says(level):
     points = intersect(FlatSurface(level), LASER.position_mm, RAYS)
-    np.testing.assert_allclose(points, meet_level(LASER.position_mm, RAYS, level), atol=1e-8)
+    np.testing.assert_allclose(points, intersect_level(LASER.position_mm, RAYS, level), atol=1e-8)
 
 
 @given(st.floats(5.0, 8.0), st.floats(-0.12, 0.12))
@@ -56,7 +56,7 @@ def test_a_ray_that_starts_outside_the_domain_is_found_inside_it():
     plateau = CloughTocherSurface(np.column_stack([x.ravel(), y.ravel(), np.full(9, 0.8)]))
     target = np.array([0.2, -0.5, 0.8])
     direction = target - LASER.position_mm
-    landing = meet_level(LASER.position_mm, direction)
+    landing = intersect_level(LASER.position_mm, direction)
     assert np.isnan(plateau.height(landing[0], landing[1]))
     np.testing.assert_allclose(
         intersect(plateau, LASER.position_mm, direction[None])[0], target, atol=1e-6

@@ -16,7 +16,7 @@ import pytest
 
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Measurement, Settings, reconstruct
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.errors import InputError
 from labapp.export import results
 from labapp.export.frame_result import FrameResult
@@ -128,7 +128,7 @@ def test_are_is_reckoned_from_the_points(out: Path, writer: Writer, scheme: str)
     match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.35), rig), rig, sigma_mm=0.05, rng=rng)
     match = replace(match, dot=np.zeros(len(match.ray), int))
     made = reconstruct(match, rig, Settings(scheme=scheme))
-    size = measure(made, match, rig)
+    size = measure_surface(made, match, rig)
     with writer(out) as files:
         found = Measurement("ok", "", scheme, dots(1), None, match, made, size)
         files.write(FrameResult(0, 0.0, found))

@@ -68,7 +68,7 @@ def test_two_sequences_in_turn_keep_apart(
     ]
 
 
-def measures_of(told: FrameResult) -> dict[str, float]:
+def assemble_measures(told: FrameResult) -> dict[str, float]:
     assert told.measurement.measures is not None
     return asdict(told.measurement.measures)
 
@@ -88,7 +88,7 @@ def test_stretches_are_measured_alike_here_and_by_processes(
         assert here.rows == there.rows
         assert there.measurement.reconstruction is not None
         assert here.track_lost == there.track_lost
-        np.testing.assert_equal(measures_of(here), measures_of(there))  # NaN is NaN
+        np.testing.assert_equal(assemble_measures(here), assemble_measures(there))  # NaN is NaN
     cold = [one.frame for one in told[0] if one.track_lost is not None]
     assert {0, 5} <= set(cold)
     assert len(cold) <= 4

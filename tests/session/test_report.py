@@ -20,7 +20,7 @@ from labapp.core.match import Trial
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows import correction
 from labapp.core.schemes import ers
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.errors import InputError
 from labapp.export.summary import format_ranges
 from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
@@ -65,7 +65,7 @@ def seen(setup: Setup) -> Measurement:
         dots=as_dots(setup.calibration.to_image(match.plane_mm)),
         match=match,
         reconstruction=found,
-        measures=measure(found, match, setup.rig),
+        measures=measure_surface(found, match, setup.rig),
     )
 
 
@@ -254,7 +254,7 @@ def test_the_budget_is_what_measuring_with_other_values_gives(seen: Measurement,
     moved = replace(setup.rig, laser=replace(setup.rig.laser, distance_mm=31.58))
     assert seen.match is not None
     assert seen.measures is not None
-    size = measure(ers.reconstruct(seen.match, moved, ERS.ers), seen.match, moved)
+    size = measure_surface(ers.reconstruct(seen.match, moved, ERS.ers), seen.match, moved)
     change = [abs(getattr(size, name) - getattr(seen.measures, name)) for name in SIZES]
     np.testing.assert_allclose(found[1].change, change, atol=1e-12)
     assert found[1].change[0] > 0.005
@@ -271,7 +271,7 @@ def test_a_moved_point_of_the_picture_is_another_image_calibration(seen: Measure
     for origin in ((44.2, 590.0), (44.0, 590.2)):
         other = ImageCalibration.from_three_points(origin, *points[1:])
         match = replace(seen.match, plane_mm=other.to_plane(image))
-        size = measure(ers.reconstruct(match, setup.rig, ERS.ers), match, setup.rig)
+        size = measure_surface(ers.reconstruct(match, setup.rig, ERS.ers), match, setup.rig)
         heights.append(size.height_mm - seen.measures.height_mm)
     assert (found.name, found.sigma, found.nominal) == ("image calibration, O′", 0.2, False)
     np.testing.assert_allclose(found.change[2], np.hypot(*heights), rtol=1e-6)

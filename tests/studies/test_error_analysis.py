@@ -9,7 +9,7 @@ import pytest
 
 from labapp.core.geometry.rig import Electrode, ImagingPlane
 from labapp.core.schemes import fit
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.parallel import in_parallel
@@ -156,7 +156,7 @@ def test_the_predicted_error_is_what_the_fit_makes(sign: int) -> None:
             (rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)),
         )
         match = exact_match(trace(pool, BENCH), BENCH, sigma_mm=DOT_SIGMA_MM, rng=rng)
-        size = measure(fit.reconstruct(match, BENCH, FitSettings()), match, BENCH)
+        size = measure_surface(fit.reconstruct(match, BENCH, FitSettings()), match, BENCH)
         found = size.height_mm if sign > 0 else -size.depth_mm
         made.append(found - abs(pool.peak_mm))
         predicted.append(predict_error(pool, BENCH).random_mm)

@@ -57,7 +57,9 @@ def bisecting_gradient(incident: FloatArray, reflected: FloatArray) -> FloatArra
     return np.asarray(-normal[..., :2] / normal[..., 2:])
 
 
-def meet_plane(origin_mm: FloatArray, direction: FloatArray, plane: ImagingPlane) -> FloatArray:
+def intersect_imaging_plane(
+    origin_mm: FloatArray, direction: FloatArray, plane: ImagingPlane
+) -> FloatArray:
     """Where rays meet the imaging plane, as IPCS (X′, Z′), shape (…, 2), mm.
 
     A ray that runs away from the plane or along it gives NaN. The plane is taken as unbounded.
@@ -70,6 +72,6 @@ def meet_plane(origin_mm: FloatArray, direction: FloatArray, plane: ImagingPlane
     return plane.from_universal(origin_mm + distance[..., None] * direction)
 
 
-def meet_level(origin_mm: FloatArray, direction: FloatArray, z_mm: float = 0.0) -> FloatArray:
+def intersect_level(origin_mm: FloatArray, direction: FloatArray, z_mm: float = 0.0) -> FloatArray:
     """Where rays meet the horizontal plane z = z_mm, shape (…, 3), mm."""
     return np.asarray(origin_mm + ((z_mm - origin_mm[..., 2:]) / direction[..., 2:]) * direction)

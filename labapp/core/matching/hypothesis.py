@@ -35,7 +35,8 @@ from labapp.core.matching.prediction import (
     predict,
 )
 from labapp.core.rows.lattice import Lattice, Site
-from labapp.core.surface.pool_fit import FitSettings, FittedPool, Level
+from labapp.core.surface.level import Level
+from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import BoolArray, CannotMeasure, IntArray, median
 
 KNOT_ERROR_MM = 0.045

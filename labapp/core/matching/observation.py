@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, landing_spacing
@@ -95,7 +95,7 @@ class Observation:
     @cached_property
     def landing_mm(self) -> FloatArray:
         """Where the rays would land on z = 0, shape (rows, columns, 3), mm."""
-        return meet_level(self.rig.laser.position_mm, self.rays)
+        return intersect_level(self.rig.laser.position_mm, self.rays)
 
     @cached_property
     def spacing_mm(self) -> FloatArray:

@@ -93,7 +93,7 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
 
     at = np.argwhere(where)
     index, surface, pose = tuple(at.T), pool.surface, observed.rig.imaging_plane.pose_mm
-    points, slopes, plane = kernels.meet(
+    points, slopes, plane = kernels.intersect_and_reflect(
         surface.basis.grid,
         surface.coefficients,
         observed.rays[index],

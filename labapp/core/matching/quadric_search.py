@@ -150,12 +150,12 @@ class _Window:
     def intersect(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Reflection points of rays, shape (n, 3), on quadrics, shape (m, 5), and their dots.
 
-        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm (`kernels.meet_quadrics`).
+        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm (`kernels.reflect_off_quadrics`).
         """
         from labapp.core.surface import kernels
 
         laser = self.observed.rig.laser.position_mm
-        return kernels.meet_quadrics(self.landing_mm[:2], quadrics, rays, laser, self.plane)
+        return kernels.reflect_off_quadrics(self.landing_mm[:2], quadrics, rays, laser, self.plane)
 
     def hits(
         self, pattern: FloatArray, gate: float, absent: BoolArray
@@ -167,7 +167,7 @@ class _Window:
         """
         from labapp.core.surface import kernels
 
-        return kernels.hits(pattern, self.observed.plane_mm, absent, gate)
+        return kernels.match_predicted_dots(pattern, self.observed.plane_mm, absent, gate)
 
     def fitted(self, quadrics: FloatArray) -> FloatArray:
         """Fit quadrics to the dots that their rays next to the reference fall near."""

@@ -6,10 +6,10 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
+from labapp.core.surface.boundary_trace import trace_boundary
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.surface.rim import find_rim
-from labapp.core.surface.sizes import sizes_of
+from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.values import CannotMeasure
 
 LEAST_DOTS = 9
@@ -45,8 +45,10 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
     x, y = pool.points_mm[:, 0], pool.points_mm[:, 1]
     center = (pool.points_mm[:, :2].min(axis=0) + pool.points_mm[:, :2].max(axis=0)) / 2
     surface, level = pool.surface, pool.level
-    boundary, climb = find_rim(surface.basis, surface.coefficients, level, center)
-    sizes = sizes_of(surface.basis, surface.coefficients, level, boundary, climb)
+    boundary, boundary_slope = trace_boundary(surface.basis, surface.coefficients, level, center)
+    sizes = sizes_and_gradients(
+        surface.basis, surface.coefficients, level, boundary, boundary_slope
+    )
     return Reconstruction(
         scheme="fit",
         surface=surface,

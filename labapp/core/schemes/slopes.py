@@ -21,7 +21,7 @@ import numpy as np
 
 from labapp.core.geometry.optics import (
     bisecting_gradient,
-    meet_plane,
+    intersect_imaging_plane,
     ray_directions,
     reflect,
     surface_normal,
@@ -46,7 +46,7 @@ PATIENCE = 10
 """They also end when the ARE has not become less for this many loops.
 
 Where the slope changes its sign, Eq. 6-1 rises a little too far from either side, so that the
-edge points of the edge-points algorithm climb from loop to loop and never settle.
+edge points of the edge-points algorithm boundary_slope from loop to loop and never settle.
 """
 
 
@@ -97,7 +97,7 @@ class ReflectedRays:
 
     def reflected(self, point_mm: FloatArray, gradient: FloatArray) -> FloatArray:
         """Dots that points of that gradient would make, IPCS, shape (n, 2), mm (step 4)."""
-        return meet_plane(
+        return intersect_imaging_plane(
             point_mm, reflect(self.direction, surface_normal(gradient)), self.imaging_plane
         )
 

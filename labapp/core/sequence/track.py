@@ -29,7 +29,7 @@ from labapp.core.sequence.warm_fit import (
 )
 from labapp.core.sequence.warm_match import around, filled, tracked
 from labapp.core.surface.boundary import Boundary
-from labapp.core.surface.pool_fit import Level, find_level
+from labapp.core.surface.level import Level, find_level
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
@@ -122,9 +122,9 @@ def begin(
     witness = match.witness[tuple(geometry.at.T)]
     witnesses = witness != 0
     surface = SplineSurface(geometry.basis, pool.coefficients)
-    level = find_level(
-        surface, geometry.landing_mm[witnesses, :2], witness[witnesses], geometry.spacing_mm
-    )
+    x, y = geometry.landing_mm[witnesses, :2].T
+    height, slope = surface.height_and_gradient(x, y)
+    level = find_level(height, slope, y, witness[witnesses], geometry.spacing_mm)
     if former is None:
         past, before = np.empty((0, len(pool.coefficients))), np.empty((0, *pool.slopes.shape))
     else:

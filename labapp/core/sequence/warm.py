@@ -38,12 +38,12 @@ from labapp.core.sequence.warm_fit import (
 )
 from labapp.core.sequence.warm_match import beyond, classify_rays, widened
 from labapp.core.surface import kernels, measures
+from labapp.core.surface.boundary_trace import retrace_boundary
+from labapp.core.surface.level import Level, find_level
 from labapp.core.surface.measures import scaled_errors
-from labapp.core.surface.pool_fit import Level, place_level
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.surface.rim import follow_rim
-from labapp.core.surface.sizes import sizes_of
-from labapp.core.surface.solver import REUSE_MM, sigma_of
+from labapp.core.surface.sizes import sizes_and_gradients
+from labapp.core.surface.solver import REUSE_MM, propagate_sigma
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
@@ -61,7 +61,7 @@ SINKS_EVERY = 16
 """Every so many frames it is asked anew whether the rear sinks."""
 
 WINDOW = 0.4
-"""How far from the last frame's level it is looked for first (`place_level`)."""
+"""How far from the last frame's level it is looked for first (`find_level`)."""
 
 POINTS_EVERY = 8
 """Every so many frames the uncertainty of the reflection points is worked out anew."""
@@ -286,7 +286,7 @@ def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, floa
     drop = None if free else before.rear.drop_mm
     y, about = geometry.landing_mm[witnesses, 1], (0.0, before.sign)
     at_witnesses = height[witnesses], slope[witnesses], y, witness[witnesses]
-    level = place_level(*at_witnesses, geometry.spacing_mm, drop, about, WINDOW)
+    level = find_level(*at_witnesses, geometry.spacing_mm, drop, about, WINDOW)
     open_mm = level.sigma_mm if free else track.open_mm
     return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
 
@@ -344,7 +344,7 @@ def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatA
     at_points = np.zeros((len(ray), len(pool.coefficients)))
     np.put_along_axis(at_points, splines, values[0], axis=1)
     free = track.free_mm.copy()
-    free[ray] = sigma_of(lower, at_points, at_points.mean(axis=0), 0.0)
+    free[ray] = propagate_sigma(lower, at_points, at_points.mean(axis=0), 0.0)
     return replace(track, free_mm=free)
 
 
@@ -361,8 +361,10 @@ def _sized(
     geometry, coefficients = track.geometry, pool.coefficients
     points = pool.points_mm[ray]
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-    boundary, climb = follow_rim(geometry.basis, coefficients, level, center, track.boundary)
-    sizes = sizes_of(geometry.basis, coefficients, level, boundary, climb)
+    boundary, boundary_slope = retrace_boundary(
+        geometry.basis, coefficients, level, center, track.boundary
+    )
+    sizes = sizes_and_gradients(geometry.basis, coefficients, level, boundary, boundary_slope)
     if not sizes.holds:
         raise TrackLost("the surface comes down to the work piece within its boundary")
     share = np.full(len(ray), 1 / len(ray))
@@ -375,10 +377,10 @@ def _sized(
         points_mm=points,
         residual_mm=residual,
         sigma_mm=np.hypot(track.free_mm[ray], level.sigma_mm),
-        size_sigma=sigma_of(lower, sizes.gradient, level_at, level.sigma_mm),
+        size_sigma=propagate_sigma(lower, sizes.gradient, level_at, level.sigma_mm),
         size_sigma_level=np.abs(sizes.by_level) * level.sigma_mm,
     )
     # As `measures.reflection_scale` has it; where the rays land is known.
     scale = np.ptp(geometry.landing_mm[ray, :2], axis=0) / np.ptp(match.plane_mm, axis=0)
     errors = scaled_errors(made, scale)
-    return made, measures.measures_of(errors, sizes.size, sizes.peak_mm, center, made)
+    return made, measures.assemble_measures(errors, sizes.size, sizes.peak_mm, center, made)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.surface import kernels
 from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
@@ -73,7 +73,7 @@ class SequenceGeometry:
     def of(cls, rig: Rig, basis: SplineBasis, settings: FitSettings) -> SequenceGeometry:
         """Lay it out for a rig and the basis of a cold fit."""
         rays = ray_directions(rig.laser, rig.pattern)
-        landing = meet_level(rig.laser.position_mm, rays)
+        landing = intersect_level(rig.laser.position_mm, rays)
         spacing = landing_spacing(landing)
         at = np.argwhere(basis.contains(landing[..., 0], landing[..., 1]))
         rays, landing = rays[at[:, 0], at[:, 1]], landing[at[:, 0], at[:, 1]]
@@ -132,7 +132,8 @@ def intersect_and_reflect(
     """Meet every ray with a surface, from points nearby, shape (R, 3)."""
     grid, rays = geometry.basis.grid, geometry.rays
     return WarmPool(
-        coefficients, *kernels.meet(grid, coefficients, rays, points_mm, steps, geometry.plane)
+        coefficients,
+        *kernels.intersect_and_reflect(grid, coefficients, rays, points_mm, steps, geometry.plane),
     )
 
 
@@ -197,8 +198,8 @@ def fit_slopes_to(
     )
     coefficients, points, moved = pool.coefficients, pool.points_mm[slopes.ray], 0.0
     for _ in range(rounds):
-        coefficients = equations.improve(coefficients, points, moved, rest)
-        points, moved = kernels.advance(grid, coefficients, rays, points, 1)
+        coefficients = equations.step(coefficients, points, moved, rest)
+        points, moved = kernels.newton_along_rays(grid, coefficients, rays, points, 1)
         if moved < until_mm:
             break
     every = pool.points_mm.copy()

@@ -24,7 +24,7 @@ from labapp.core.matching.prediction import (
 )
 from labapp.core.sequence.warm_fit import SequenceGeometry, WarmPool, evaluate_at_landing_points
 from labapp.core.surface import kernels
-from labapp.core.surface.pool_fit import Level
+from labapp.core.surface.level import Level
 from labapp.core.values import BoolArray, FloatArray, IntArray, median
 
 GATE, CLEARLY = 0.35, 2.0

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
@@ -153,7 +153,7 @@ def _landings(rig: Rig) -> FloatArray:
     """(X, Y) of ray (i, j) on z = 0 at ``[i, j]``, with one more ray round the pattern."""
     pattern = rig.pattern
     wider = replace(pattern, rows=pattern.rows + 2, columns=pattern.columns + 2, absent=None)
-    return meet_level(rig.laser.position_mm, ray_directions(rig.laser, wider))[..., :2]
+    return intersect_level(rig.laser.position_mm, ray_directions(rig.laser, wider))[..., :2]
 
 
 def circle(edges: EdgePoints) -> Boundary:

@@ -1,12 +1,18 @@
-"""Inner loops of the fit, compiled for the processor (docs/adr/0018).
+"""Loops over rays and splines, compiled for the processor (docs/adr/0018).
 
-A frame has a hundred dots: NumPy's overhead per call would take longer than the sums. Here
-are only loops over rays and splines; what they mean is told where they are called. Those that call
-each other are in one file because a compiled function is kept on disk as long as its own file does
-not change, whatever became of those it calls.
+A frame has a hundred dots: NumPy's overhead per call would take longer than the sums. Those that
+call each other are in one file because a compiled function is kept on disk as long as its own file
+does not change, whatever became of those it calls. Arrays may be read-only, and of any layout.
 
-Arrays may be read-only, and of any layout but for pictures. Places of splines are a grid's: for
-each of its two axes low, high, step and number of cells, shape (2, 4) (`SplineBasis.grid`).
+Five arguments mean the same everywhere, all in the UCS and mm:
+
+* ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
+  (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
+* ``rays``: unit directions from the laser, shape (n, 3); ``points``: where they meet the surface.
+* ``plane``: O′, the directions of O′X′ and O′Z′, and the normal of the imaging plane, shape (4, 3)
+  (`ImagingPlane.pose_mm`); ``axes``: the two directions alone, shape (2, 3).
+* ``work``: memory to write on, which holds values and slopes of the four splines along x, then
+  those along y, shape (4, 4).
 """
 
 from __future__ import annotations
@@ -23,12 +29,35 @@ _f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 
 _mask = types.Array(types.boolean, 2, "A", readonly=True)
 
 
+LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
+"""A Newton step along a ray is no longer, and a ray comes no slower nearer to the surface, mm a mm:
+where one grazes the surface a step would throw it off the pool."""
+
+LONGEST_QUADRIC_STEP_MM = 1.0
+"""The same for quadrics, which go on beyond the pool."""
+
+QUADRIC_STEPS = 3
+"""Newton steps from the plane z = 0, or that of the cap's top, to a quadric."""
+
+TIP_MARGIN_MM = 0.3
+"""A ray that passes less than this below the electrode's tip may be hidden."""
+
+DOT_STEP_MM = 1e-3
+"""Step of the finite differences by the place of a dot."""
+
+MOST_BOUNDARY_STEPS = 20
+"""Newton steps along a direction, if the boundary does not settle before."""
+
+
 # --- splines ------------------------------------------------------------------------------------
 
 
 @_inner
-def _along(axis: FloatArray, place: float, value: FloatArray, slope: FloatArray) -> int:
-    """Values and slopes of the four cubic splines at a place held to an axis; the first one."""
+def _cubic_splines(axis: FloatArray, place: float, value: FloatArray, slope: FloatArray) -> int:
+    """Values and slopes of the four cubic splines at a place; returns the number of the first one.
+
+    The axis is a row of ``grid``; a place beyond its ends is moved to them.
+    """
     low, high, step = axis[0], axis[1], axis[2]
     at = (min(max(place, low), high) - low) / step
     first = min(int(at), int(axis[3]) - 1) if at > 0.0 else 0
@@ -46,12 +75,12 @@ def _along(axis: FloatArray, place: float, value: FloatArray, slope: FloatArray)
 
 
 @_inner
-def _at(
+def _height_and_slopes(
     grid: FloatArray, coefficients: FloatArray, x: float, y: float, work: FloatArray
 ) -> tuple[float, float, float]:
-    """Height and slopes of a surface; what the splines are there stays in ``work``, (4, 4)."""
-    first_x = _along(grid[0], x, work[0], work[1])
-    first_y = _along(grid[1], y, work[2], work[3])
+    """Height and slopes of a surface; values and slopes of the splines there stay in ``work``."""
+    first_x = _cubic_splines(grid[0], x, work[0], work[1])
+    first_y = _cubic_splines(grid[1], y, work[2], work[3])
     many = int(grid[1, 3]) + 3
     z, slope_x, slope_y = 0.0, 0.0, 0.0
     for a in range(4):
@@ -70,14 +99,14 @@ def _at(
 def splines_at(grid: FloatArray, place: FloatArray) -> tuple[IntArray, FloatArray]:
     """Splines that are not zero at places, shape (n, 2), held to the rectangle.
 
-    Gives their numbers, shape (n, 16); value and derivatives by x and by y, shape (3, n, 16).
+    Returns their numbers, shape (n, 16); value and derivatives by x and by y, shape (3, n, 16).
     """
     count, many = len(place), int(grid[1, 3]) + 3
     splines, values = np.empty((count, 16), np.int64), np.empty((3, count, 16))
     work = np.empty((4, 4))
     for k in range(count):
-        first_x = _along(grid[0], place[k, 0], work[0], work[1])
-        first_y = _along(grid[1], place[k, 1], work[2], work[3])
+        first_x = _cubic_splines(grid[0], place[k, 0], work[0], work[1])
+        first_y = _cubic_splines(grid[1], place[k, 1], work[2], work[3])
         for a in range(4):
             for b in range(4):
                 splines[k, 4 * a + b] = (first_x + a) * many + first_y + b
@@ -89,25 +118,25 @@ def splines_at(grid: FloatArray, place: FloatArray) -> tuple[IntArray, FloatArra
 
 @_compiled(_f2, _f1, _f2)
 def surface_at(grid: FloatArray, coefficients: FloatArray, place: FloatArray) -> FloatArray:
-    """Height and slopes of a surface at places, shapes (n, 2) and (3, n)."""
-    made, work = np.empty((3, len(place))), np.empty((4, 4))
+    """Height, mm, and slopes by x and by y of a surface at places, shape (n, 2): shape (3, n)."""
+    out, work = np.empty((3, len(place))), np.empty((4, 4))
     for k in range(len(place)):
-        z, slope_x, slope_y = _at(grid, coefficients, place[k, 0], place[k, 1], work)
-        made[0, k], made[1, k], made[2, k] = z, slope_x, slope_y
-    return made
+        z, slope_x, slope_y = _height_and_slopes(grid, coefficients, place[k, 0], place[k, 1], work)
+        out[0, k], out[1, k], out[2, k] = z, slope_x, slope_y
+    return out
 
 
 @_inner
-def _add(
-    grid: FloatArray, x: float, y: float, share: float, work: FloatArray, made: FloatArray
+def _accumulate_splines(
+    grid: FloatArray, x: float, y: float, share: float, work: FloatArray, out: FloatArray
 ) -> None:
-    """Add a share of what every spline is at a place."""
+    """Add to ``out`` the value of every spline at a place, times a share."""
     many = int(grid[1, 3]) + 3
-    first_x = _along(grid[0], x, work[0], work[1])
-    first_y = _along(grid[1], y, work[2], work[3])
+    first_x = _cubic_splines(grid[0], x, work[0], work[1])
+    first_y = _cubic_splines(grid[1], y, work[2], work[3])
     for a in range(4):
         for b in range(4):
-            made[(first_x + a) * many + first_y + b] += share * work[0, a] * work[2, b]
+            out[(first_x + a) * many + first_y + b] += share * work[0, a] * work[2, b]
 
 
 @_compiled(_f2, _i, _f2, _f1)
@@ -115,33 +144,37 @@ def gradient_of_sum(
     grid: FloatArray, count: int, place: FloatArray, share: FloatArray
 ) -> FloatArray:
     """Derivative of Σ share · height at places by so many coefficients, shape (p,)."""
-    made, work = np.zeros(count), np.empty((4, 4))
+    out, work = np.zeros(count), np.empty((4, 4))
     for k in range(len(place)):
-        _add(grid, place[k, 0], place[k, 1], share[k], work, made)
-    return made
+        _accumulate_splines(grid, place[k, 0], place[k, 1], share[k], work, out)
+    return out
 
 
 # --- rays ---------------------------------------------------------------------------------------
 
 
 @_inner
-def _meet(
+def _newton_step(
     grid: FloatArray, coefficients: FloatArray, ray: FloatArray, point: FloatArray, work: FloatArray
 ) -> tuple[float, float, float]:
-    """Move a point along its ray by a bounded Newton step (`meet_surface`); step and slopes."""
-    z, slope_x, slope_y = _at(grid, coefficients, point[0], point[1], work)
+    """Move a point along its ray to a surface by a bounded Newton step; returns step and slopes.
+
+    The step, mm, and the slopes are those from before the move.
+    """
+    z, slope_x, slope_y = _height_and_slopes(grid, coefficients, point[0], point[1], work)
     descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
-    step = min(max((point[2] - z) / max(descent, 0.05), -0.5), 0.5)
+    step = (point[2] - z) / max(descent, LEAST_DESCENT)
+    step = min(max(step, -LONGEST_STEP_MM), LONGEST_STEP_MM)
     for axis in range(3):
         point[axis] += step * ray[axis]
     return step, slope_x, slope_y
 
 
 @_inner
-def _dot(
+def _reflected_dot(
     ray: FloatArray, point: FloatArray, slope_x: float, slope_y: float, plane: FloatArray
 ) -> tuple[float, float]:
-    """Dot that a ray makes, reflected at a point of a surface of some slopes; NaN if none."""
+    """Dot (X′, Z′) of a ray reflected at a point where a surface has some slopes; NaN if none."""
     # Twice the ray's part along the normal (−f_x, −f_y, 1) is taken off (Eq. 4-4).
     twice = 2.0 * (ray[2] - slope_x * ray[0] - slope_y * ray[1])
     twice /= slope_x * slope_x + slope_y * slope_y + 1.0
@@ -162,7 +195,7 @@ def _dot(
 
 
 @_compiled(_f2, _f1, _f2, _f2, _i, _f2)
-def meet(
+def intersect_and_reflect(
     grid: FloatArray,
     coefficients: FloatArray,
     rays: FloatArray,
@@ -170,9 +203,22 @@ def meet(
     steps: int,
     plane: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Meet rays with a surface and reflect them to a plane: see `warm_fit.intersect_and_reflect`.
+    """Intersect rays with a surface, from points nearby, and reflect them to the imaging plane.
 
-    The plane is its origin, its axes along X′ and Z′ and its normal, shape (4, 3).
+    Parameters
+    ----------
+    grid, coefficients, rays, plane
+        See the module.
+    points
+        Where Newton's method begins, shape (n, 3).
+    steps
+        Newton steps.
+
+    Returns
+    -------
+    met, slopes, dots
+        Reflection points, shape (n, 3), mm; slopes of the surface there, shape (n, 2); dots, IPCS,
+        shape (n, 2), mm, NaN for rays that leave the rectangle or never meet the plane.
     """
     count = len(rays)
     met, slopes, dots = points.copy(), np.empty((count, 2)), np.empty((count, 2))
@@ -181,16 +227,16 @@ def meet(
         ray, point = rays[k], met[k]
         slope_x, slope_y = 0.0, 0.0
         for _ in range(steps):
-            _, slope_x, slope_y = _meet(grid, coefficients, ray, point, work)
+            _, slope_x, slope_y = _newton_step(grid, coefficients, ray, point, work)
         slopes[k, 0], slopes[k, 1] = slope_x, slope_y
         dots[k, 0] = dots[k, 1] = np.nan
         if grid[0, 0] <= point[0] <= grid[0, 1] and grid[1, 0] <= point[1] <= grid[1, 1]:
-            dots[k, 0], dots[k, 1] = _dot(ray, point, slope_x, slope_y, plane)
+            dots[k, 0], dots[k, 1] = _reflected_dot(ray, point, slope_x, slope_y, plane)
     return met, slopes, dots
 
 
 @_inner
-def _bisecting(
+def _bisecting_slopes(
     laser: FloatArray, point: FloatArray, dot_x: float, dot_y: float, dot_z: float
 ) -> tuple[float, float]:
     """Slopes that turn the ray from the laser at a point to a dot (`optics.bisecting_gradient`)."""
@@ -203,18 +249,18 @@ def _bisecting(
 
 
 @_inner
-def _slopes_of_dot(
+def _slope_jacobian(
     laser: FloatArray, axes: FloatArray, point: FloatArray, dot: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Rows of ∂(slopes at a point)/∂(its dot along either axis of the plane), mm⁻¹."""
-    step = 1e-3
-    base_x, base_y = _bisecting(laser, point, dot[0], dot[1], dot[2])
+    step = DOT_STEP_MM
+    base_x, base_y = _bisecting_slopes(laser, point, dot[0], dot[1], dot[2])
     by = axes[0]
-    x, y = _bisecting(
+    x, y = _bisecting_slopes(
         laser, point, dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
     )
     by = axes[1]
-    u, v = _bisecting(
+    u, v = _bisecting_slopes(
         laser, point, dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
     )
     return (
@@ -237,26 +283,27 @@ def slope_weights(
     Points and dots are in the UCS, shape (n, 3), mm; the covariance of the dots along the axes of
     the imaging plane has shape (n, 2, 2), mm². ``floor`` is the least uncertainty of a dot, mm.
     """
-    made = np.empty(covariance.shape)
+    out = np.empty(covariance.shape)
     for k in range(len(points)):
-        (a, b), (c, d) = _slopes_of_dot(laser, axes, points[k], dots[k])
+        (a, b), (c, d) = _slope_jacobian(laser, axes, points[k], dots[k])
         xx, xy, yy = covariance[k, 0, 0] + floor**2, covariance[k, 0, 1], covariance[k, 1, 1]
         yy += floor**2
         one = a * a * xx + 2.0 * a * b * xy + b * b * yy
         other = c * c * xx + 2.0 * c * d * xy + d * d * yy
         both = a * c * xx + (a * d + b * c) * xy + b * d * yy
         area = one * other - both * both
-        made[k, 0, 0], made[k, 1, 1] = other / area, one / area
-        made[k, 0, 1] = made[k, 1, 0] = -both / area
-    return made
+        out[k, 0, 0], out[k, 1, 1] = other / area, one / area
+        out[k, 0, 1] = out[k, 1, 0] = -both / area
+    return out
 
 
 @_compiled(_f2, _f2, _f2, _f)
 def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: float) -> BoolArray:
-    """Whether rays pass above the torch's tip, or nearly (§4.2.1), shape (n,).
+    """Whether the torch may hide the dots of rays (§4.2.1): they pass above its tip, or nearly.
 
-    The incident ray for points behind the electrode (y < 0), the reflected one before it. Points
-    and unit directions, shape (n, 3), slopes of the surface there, shape (n, 2); mm.
+    The incident ray does so for points behind the electrode (y < 0), the reflected one for points
+    before it. A mask, shape (n,); slopes of the surface at the points have shape (n, 2), ``tip`` is
+    the height of the electrode's tip, mm.
     """
     hidden = np.empty(len(rays), np.bool_)
     for k in range(len(rays)):
@@ -267,7 +314,7 @@ def behind_torch(points: FloatArray, rays: FloatArray, slopes: FloatArray, tip: 
             y, z = twice * b - y, -twice - z
         y = y if y != 0.0 else 1e-12
         # Both ways lead towards y = 0 and up.
-        hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - 0.3
+        hidden[k] = points[k, 2] - points[k, 1] * z / y > tip - TIP_MARGIN_MM
     return hidden
 
 
@@ -311,8 +358,8 @@ def accumulate_normal_matrix(
     work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
     by_x, by_y = np.empty(16), np.empty(16)
     for k in range(len(points)):
-        first_x = _along(grid[0], points[k, 0], work[0], work[1])
-        first_y = _along(grid[1], points[k, 1], work[2], work[3])
+        first_x = _cubic_splines(grid[0], points[k, 0], work[0], work[1])
+        first_y = _cubic_splines(grid[1], points[k, 1], work[2], work[3])
         for a in range(4):
             for b in range(4):
                 by_x[4 * a + b] = work[1, a] * work[2, b]
@@ -370,25 +417,24 @@ def covariance_of_dots(
     """Covariance of the dots that a fitted surface makes of rays, shape (n, 2, 2), mm².
 
     With L the factor of the normal matrix, shape (width + 1, p), and R what each coefficient moves
-    either coordinate of a dot by, Rᵀ (LLᵀ)⁻¹ R. Points are where the rays meet the surface, shape
-    (n, 3), dots are in the UCS, shape (n, 3), axes those of the imaging plane.
+    either coordinate of a dot by, Rᵀ (LLᵀ)⁻¹ R. Points and dots are in the UCS, shape (n, 3), mm.
     """
     pairs, work, many = len(points), np.empty((4, 4)), int(grid[1, 3]) + 3
     first = np.empty(pairs, np.int64)
     for k in range(pairs):
-        first_x = _along(grid[0], points[k, 0], work[0], work[1])
-        first[k] = first_x * many + _along(grid[1], points[k, 1], work[2], work[3])
-    made = np.zeros((pairs, 2, 2))
+        first_x = _cubic_splines(grid[0], points[k, 0], work[0], work[1])
+        first[k] = first_x * many + _cubic_splines(grid[1], points[k, 1], work[2], work[3])
+    out = np.zeros((pairs, 2, 2))
     if pairs == 0:
-        return made
+        return out
     # The splines of a cell are all within the band.
     inverse = _inverse_band(lower, first.min())
     by_u, by_v = np.empty(16), np.empty(16)
     for k in range(pairs):
-        (a, b), (c, d) = _slopes_of_dot(laser, axes, points[k], dots[k])
+        (a, b), (c, d) = _slope_jacobian(laser, axes, points[k], dots[k])
         area = a * d - b * c
-        _along(grid[0], points[k, 0], work[0], work[1])
-        _along(grid[1], points[k, 1], work[2], work[3])
+        _cubic_splines(grid[0], points[k, 0], work[0], work[1])
+        _cubic_splines(grid[1], points[k, 1], work[2], work[3])
         for own in range(16):
             by_x = work[1, own // 4] * work[2, own % 4]
             by_y = work[0, own // 4] * work[3, own % 4]
@@ -401,11 +447,11 @@ def covariance_of_dots(
                 entry = row[first[k] + other // 4 * many + other % 4]
                 along_u += entry * by_u[other]
                 along_v += entry * by_v[other]
-            made[k, 0, 0] += by_u[own] * along_u
-            made[k, 0, 1] += by_u[own] * along_v
-            made[k, 1, 1] += by_v[own] * along_v
-        made[k, 1, 0] = made[k, 0, 1]
-    return made
+            out[k, 0, 0] += by_u[own] * along_u
+            out[k, 0, 1] += by_u[own] * along_v
+            out[k, 1, 1] += by_v[own] * along_v
+        out[k, 1, 0] = out[k, 0, 1]
+    return out
 
 
 @_compiled(_f2, _f1, _f2, _f3, _f1, _f2)
@@ -417,35 +463,42 @@ def gradient_rhs(
     laser: FloatArray,
     dots: FloatArray,
 ) -> FloatArray:
-    """Right-hand side of the normal equations, shape (p,)."""
-    made, work = np.zeros(len(coefficients)), np.empty((4, 4))
+    """Right-hand side of the normal equations, shape (p,): Σ Jᵀ W (slopes asked for − slopes).
+
+    Asked for at each point are the slopes that turn its ray to its dot, shape (n, 3), UCS; weights
+    are the inverse covariances of these slopes, shape (n, 2, 2).
+    """
+    out, work = np.zeros(len(coefficients)), np.empty((4, 4))
     many = int(grid[1, 3]) + 3
     for k in range(len(points)):
         x, y = points[k, 0], points[k, 1]
-        _, slope_x, slope_y = _at(grid, coefficients, x, y, work)
-        first_x = _along(grid[0], x, work[0], work[1])
-        first_y = _along(grid[1], y, work[2], work[3])
-        asked_x, asked_y = _bisecting(laser, points[k], dots[k, 0], dots[k, 1], dots[k, 2])
+        _, slope_x, slope_y = _height_and_slopes(grid, coefficients, x, y, work)
+        first_x = _cubic_splines(grid[0], x, work[0], work[1])
+        first_y = _cubic_splines(grid[1], y, work[2], work[3])
+        asked_x, asked_y = _bisecting_slopes(laser, points[k], dots[k, 0], dots[k, 1], dots[k, 2])
         off_x, off_y = asked_x - slope_x, asked_y - slope_y
         pull_x = weights[k, 0, 0] * off_x + weights[k, 0, 1] * off_y
         pull_y = weights[k, 1, 0] * off_x + weights[k, 1, 1] * off_y
         for a in range(4):
             for b in range(4):
                 by_x, by_y = work[1, a] * work[2, b], work[0, a] * work[3, b]
-                made[(first_x + a) * many + first_y + b] += pull_x * by_x + pull_y * by_y
-    return made
+                out[(first_x + a) * many + first_y + b] += pull_x * by_x + pull_y * by_y
+    return out
 
 
 @_compiled(_f2, _f1, _f2, _f2, _i)
-def advance(
+def newton_along_rays(
     grid: FloatArray, coefficients: FloatArray, rays: FloatArray, points: FloatArray, steps: int
 ) -> tuple[FloatArray, float]:
-    """Move points along their rays towards the surface; and the longest of the last steps."""
+    """Points moved along their rays to a surface by so many Newton steps, shape (n, 3), mm.
+
+    The second value is the length of the longest last step, mm; NaN where one is.
+    """
     moved, most, work = points.copy(), 0.0, np.empty((4, 4))
     for k in range(len(points)):
         step = 0.0
         for _ in range(steps):
-            step, _, _ = _meet(grid, coefficients, rays[k], moved[k], work)
+            step, _, _ = _newton_step(grid, coefficients, rays[k], moved[k], work)
         if not abs(step) <= most:  # NaN, too
             most = abs(step)
         if np.isnan(most):
@@ -456,11 +509,8 @@ def advance(
 # --- the boundary -------------------------------------------------------------------------------
 
 
-RIM_STEPS = 20
-
-
 @_compiled(_f2, _f1, _f1, _f1, _f2, _f1, _f1, _f)
-def follow_rim(
+def newton_to_boundary(
     grid: FloatArray,
     coefficients: FloatArray,
     rear: FloatArray,
@@ -470,30 +520,46 @@ def follow_rim(
     longest: FloatArray,
     last: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Newton steps along m directions to where a surface meets its rim (`rim`).
+    """Newton steps along m directions to where a surface comes down to its boundary.
 
-    The rear is its depth and where it starts and ends; no step along a direction is longer than
-    its ``longest``, shape (m,), and none follows one in which all are below ``last``. Gives radii,
-    gradients of the height over the rim and that height, where each was before its last step.
+    Parameters
+    ----------
+    grid, coefficients
+        See the module.
+    rear
+        `Rear.as_array`: the height that the boundary has at y.
+    center, way, radius
+        Where directions start, shape (2,), unit vectors along them, shape (m, 2), and how far out
+        the steps begin, shape (m,), mm.
+    longest
+        Longest step along each direction, shape (m,), mm.
+    last
+        The steps end after one in which all are shorter, mm.
+
+    Returns
+    -------
+    radius, boundary_slope, over
+        Radii of the boundary, shape (m,), mm. Where each was before its last step: gradient of the
+        surface's height over the boundary's, shape (m, 2), and that height, shape (m,), mm.
     """
     count, work = len(radius), np.empty((4, 4))
-    made, climb, over = radius.copy(), np.empty((count, 2)), np.empty(count)
-    for _ in range(RIM_STEPS):
+    out, boundary_slope, over = radius.copy(), np.empty((count, 2)), np.empty(count)
+    for _ in range(MOST_BOUNDARY_STEPS):
         most = 0.0
         for k in range(count):
-            x, y = center[0] + made[k] * way[k, 0], center[1] + made[k] * way[k, 1]
-            z, slope_x, slope_y = _at(grid, coefficients, x, y, work)
+            x, y = center[0] + out[k] * way[k, 0], center[1] + out[k] * way[k, 1]
+            z, slope_x, slope_y = _height_and_slopes(grid, coefficients, x, y, work)
             part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
             over[k] = z + rear[0] * part * part
-            climb[k, 0] = slope_x
-            climb[k, 1] = slope_y - 2.0 * rear[0] * part / (rear[1] - rear[2])
-            outward = climb[k, 0] * way[k, 0] + climb[k, 1] * way[k, 1]
+            boundary_slope[k, 0] = slope_x
+            boundary_slope[k, 1] = slope_y - 2.0 * rear[0] * part / (rear[1] - rear[2])
+            outward = boundary_slope[k, 0] * way[k, 0] + boundary_slope[k, 1] * way[k, 1]
             change = -over[k] / outward if abs(outward) > 1e-6 else 0.0
-            made[k] += min(max(change, -longest[k]), longest[k])
+            out[k] += min(max(change, -longest[k]), longest[k])
             most = max(most, abs(change))
         if most < last:
             break
-    return made, climb, over
+    return out, boundary_slope, over
 
 
 # --- sizes --------------------------------------------------------------------------------------
@@ -512,15 +578,15 @@ def spokes(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sample a surface at fractions of the way from a centre to each ``stride``-th boundary point.
 
-    There are m boundary points, a multiple of ``stride``. The rear is its depth and where it starts
-    and ends (`follow_rim`).
+    The outline is the m boundary points, shape (m, 3), m a multiple of ``stride``. The rear is
+    `Rear.as_array`.
 
     Returns
     -------
     samples, over, share
-        Places with their height, shape (n, 3); height over the rim, shape (n,), and what a sample
-        counts in the volume, shape (n,): its weight times its share of the wedges of all boundary
-        points (`measures.wedges`), those between two spokes shared by how near they are.
+        Places with their height, shape (n, 3); height over that of the boundary, shape (n,); what a
+        sample counts in the volume, shape (n,): its weight times its share of the wedges of all
+        boundary points (`measures.wedges`), those between two spokes shared by how near they are.
     """
     count, rings, work = len(outline), len(fraction), np.empty((4, 4))
     wedge = np.empty(count)
@@ -541,7 +607,7 @@ def spokes(
             at = spoke * rings + ring
             x = center[0] + fraction[ring] * (end[0] - center[0])
             y = center[1] + fraction[ring] * (end[1] - center[1])
-            z, _, _ = _at(grid, coefficients, x, y, work)
+            z, _, _ = _height_and_slopes(grid, coefficients, x, y, work)
             part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
             samples[at, 0], samples[at, 1], samples[at, 2] = x, y, z
             over[at] = z + rear[0] * part * part
@@ -556,32 +622,38 @@ def size_gradients(
     samples: FloatArray,
     share: FloatArray,
     outline: FloatArray,
-    climb: FloatArray,
+    boundary_slope: FloatArray,
     center: FloatArray,
 ) -> FloatArray:
     """Derivatives of width, length, area and volume by so many coefficients, shape (4, p).
 
-    Samples and what they count in the volume are those of `spokes`; climb is the gradient of the
-    height over the rim at each boundary point, shape (m, 2).
+    Samples and what they count in the volume are those of `spokes`; ``boundary_slope`` is the
+    gradient of the surface's height over the boundary's at each boundary point, shape (m, 2).
     """
-    made, work = np.zeros((4, count)), np.empty((4, 4))
+    out, work = np.zeros((4, count)), np.empty((4, 4))
     for axis in range(2):
         low, high = 0, 0
         for k in range(len(outline)):
             low = k if outline[k, axis] < outline[low, axis] else low
             high = k if outline[k, axis] > outline[high, axis] else high
         for end, sign in ((high, -1.0), (low, 1.0)):
-            moved = sign / climb[end, axis]
-            _add(grid, outline[end, 0], outline[end, 1], moved, work, made[axis])
+            moved = sign / boundary_slope[end, axis]
+            _accumulate_splines(grid, outline[end, 0], outline[end, 1], moved, work, out[axis])
     for k in range(len(outline)):
         x, y = outline[k, 0] - center[0], outline[k, 1] - center[1]
         # Where the surface rises by dz the boundary moves by −dz over its slope outwards.
-        moved = -2.0 * np.pi / len(outline) * (x * x + y * y) / (climb[k, 0] * x + climb[k, 1] * y)
-        _add(grid, outline[k, 0], outline[k, 1], moved, work, made[2])
-        _add(grid, outline[k, 0], outline[k, 1], moved * outline[k, 2], work, made[3])
+        moved = (
+            -2.0
+            * np.pi
+            / len(outline)
+            * (x * x + y * y)
+            / (boundary_slope[k, 0] * x + boundary_slope[k, 1] * y)
+        )
+        _accumulate_splines(grid, outline[k, 0], outline[k, 1], moved, work, out[2])
+        _accumulate_splines(grid, outline[k, 0], outline[k, 1], moved * outline[k, 2], work, out[3])
     for k in range(len(samples)):
-        _add(grid, samples[k, 0], samples[k, 1], share[k], work, made[3])
-    return made
+        _accumulate_splines(grid, samples[k, 0], samples[k, 1], share[k], work, out[3])
+    return out
 
 
 # --- quadrics -----------------------------------------------------------------------------------
@@ -596,10 +668,10 @@ def _quadric_at(quadric: FloatArray, x: float, y: float) -> tuple[float, float, 
 
 
 @_compiled(_f1, _f2, _f2, _f1, _f2)
-def meet_quadrics(
+def reflect_off_quadrics(
     center: FloatArray, quadrics: FloatArray, rays: FloatArray, laser: FloatArray, plane: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where rays meet quadrics, and the dots that these make of them on a plane.
+    """Intersect rays with quadrics and reflect them to the imaging plane.
 
     Parameters
     ----------
@@ -608,7 +680,7 @@ def meet_quadrics(
     rays, laser
         Shapes (n, 3) and (3,), mm.
     plane
-        Its origin, its axes along X′ and Z′ and its normal, shape (4, 3).
+        See the module.
 
     Returns
     -------
@@ -622,33 +694,53 @@ def meet_quadrics(
             ray, point = rays[k], points[q, k]
             for axis in range(3):
                 point[axis] = laser[axis] - laser[2] / ray[2] * ray[axis]
-            for _ in range(3):
+            for _ in range(QUADRIC_STEPS):
                 z, slope_x, slope_y = _quadric_at(
                     quadrics[q], point[0] - center[0], point[1] - center[1]
                 )
                 descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
-                step = min(max((point[2] - z) / max(descent, 0.05), -1.0), 1.0)
+                step = (point[2] - z) / max(descent, LEAST_DESCENT)
+                step = min(max(step, -LONGEST_QUADRIC_STEP_MM), LONGEST_QUADRIC_STEP_MM)
                 for axis in range(3):
                     point[axis] += step * ray[axis]
             _, slope_x, slope_y = _quadric_at(
                 quadrics[q], point[0] - center[0], point[1] - center[1]
             )
-            dots[q, k, 0], dots[q, k, 1] = _dot(ray, point, slope_x, slope_y, plane)
+            dots[q, k, 0], dots[q, k, 1] = _reflected_dot(ray, point, slope_x, slope_y, plane)
     return points, dots
 
 
 @_inner
-def _apart(one: FloatArray, other: FloatArray) -> float:
+def _distance(one: FloatArray, other: FloatArray) -> float:
     """Distance of two dots; infinite where there is none."""
     distance = np.hypot(one[0] - other[0], one[1] - other[1])
     return distance if np.isfinite(distance) else np.inf
 
 
 @_compiled(_f4, _f2, _mask, _f)
-def hits(
+def match_predicted_dots(
     pattern: FloatArray, places: FloatArray, absent: BoolArray, gate: float
 ) -> tuple[BoolArray, IntArray, FloatArray]:
-    """Which predicted dots fall on which of some places: see `quadric_search._Window.hits`."""
+    """Which predicted dots fall on which of some places.
+
+    Parameters
+    ----------
+    pattern
+        Predicted dots, shape (m, rows, columns, 2), mm; NaN where there is none.
+    places
+        Dots that were found, shape (d, 2), mm.
+    absent
+        Rays that make no dot, shape (rows, columns).
+    gate
+        Share of the way to the next predicted dot in the row or the column within which a place is
+        a predicted dot's.
+
+    Returns
+    -------
+    hit, dot, off
+        Whether a place is within the gate; the nearest place; how far off it is, in units of the
+        gate. Shape (m, rows, columns) each.
+    """
     count, rows, columns = pattern.shape[:3]
     hit = np.zeros((count, rows, columns), np.bool_)
     dot = np.zeros((count, rows, columns), np.int64)
@@ -661,13 +753,13 @@ def hits(
                     continue
                 spacing = np.inf
                 if i > 0:
-                    spacing = min(spacing, _apart(own, pattern[p, i - 1, j]))
+                    spacing = min(spacing, _distance(own, pattern[p, i - 1, j]))
                 if i < rows - 1:
-                    spacing = min(spacing, _apart(own, pattern[p, i + 1, j]))
+                    spacing = min(spacing, _distance(own, pattern[p, i + 1, j]))
                 if j > 0:
-                    spacing = min(spacing, _apart(own, pattern[p, i, j - 1]))
+                    spacing = min(spacing, _distance(own, pattern[p, i, j - 1]))
                 if j < columns - 1:
-                    spacing = min(spacing, _apart(own, pattern[p, i, j + 1]))
+                    spacing = min(spacing, _distance(own, pattern[p, i, j + 1]))
                 least = np.inf
                 for k in range(len(places)):
                     x, y = own[0] - places[k, 0], own[1] - places[k, 1]
@@ -683,7 +775,7 @@ def hits(
 def _cap_dots(
     cap: FloatArray, rays: FloatArray, bench: tuple[FloatArray, FloatArray], dots: FloatArray
 ) -> BoolArray:
-    """Put the dots that a cap makes of rays into ``dots``, (n, 2); which rays meet it, (n,)."""
+    """Put the dots that a cap makes of rays into ``dots``, (n, 2); which rays it meets, (n,)."""
     x_mm, y_mm, along_x, along_y, height = cap
     laser, plane = bench
     quadric, point, there = np.zeros(5), np.empty(3), np.zeros(len(rays), np.bool_)
@@ -692,16 +784,17 @@ def _cap_dots(
         ray = rays[k]
         for axis in range(3):
             point[axis] = laser[axis] + (height - laser[2]) / ray[2] * ray[axis]
-        for _ in range(3):
+        for _ in range(QUADRIC_STEPS):
             z, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
             descent = slope_x * ray[0] + slope_y * ray[1] - ray[2]
-            step = (point[2] - height - z) / max(descent, 0.05)
+            step = (point[2] - height - z) / max(descent, LEAST_DESCENT)
+            step = min(max(step, -LONGEST_QUADRIC_STEP_MM), LONGEST_QUADRIC_STEP_MM)
             for axis in range(3):
-                point[axis] += min(max(step, -1.0), 1.0) * ray[axis]
+                point[axis] += step * ray[axis]
         across, along = (point[0] - x_mm) / along_x, (point[1] - y_mm) / along_y
         if across * across + along * along < 1.0:
             _, slope_x, slope_y = _quadric_at(quadric, point[0] - x_mm, point[1] - y_mm)
-            dots[k, 0], dots[k, 1] = _dot(ray, point, slope_x, slope_y, plane)
+            dots[k, 0], dots[k, 1] = _reflected_dot(ray, point, slope_x, slope_y, plane)
             there[k] = np.isfinite(dots[k, 0]) and np.isfinite(dots[k, 1])
     return there
 
@@ -749,14 +842,14 @@ def score_caps(
     absent: BoolArray,
     settings: FloatArray,
 ) -> tuple[FloatArray, IntArray]:
-    """Say how well some places on the plane lie where caps put the dots of rays.
+    """How well places on the plane fit the dots that caps make of rays, and which is whose.
 
     Parameters
     ----------
     caps
         Paraboloids over ellipses: middle X and Y, semi-axes along them, height, shape (m, 5), mm.
     rays, laser, plane
-        See `meet_quadrics`.
+        See `reflect_off_quadrics`.
     places, absent
         Shape (d, 2), mm; which rays make no dot, shape (n,).
     settings
@@ -796,15 +889,15 @@ def score_caps(
         for k in marked:
             nearest = np.inf
             for m in range(len(places)):
-                nearest = min(nearest, _apart(dots[k], places[m]))
+                nearest = min(nearest, _distance(dots[k], places[m]))
             shown += nearest < lit_gate * usual
         score[c] = total - lit * shown / max(len(marked), 1)
     return score, labels
 
 
 @_inner
-def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve normal equations by elimination; what they leave open is 0."""
+def _solve_small(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve small normal equations by elimination; what they leave open is 0."""
     count, most = len(right), normal.max()
     for k in range(count):
         if not normal[k, k] > 1e-10 * most:
@@ -836,24 +929,26 @@ def fit_quadrics(
     """Fit quadrics, shape (m, 5), to the places that their rays next to the middle one fall near.
 
     Least squares of slopes: every ray that falls on a place asks for the slopes that turn it
-    there (`_bisecting`). One on which fewer than four fall stays as it is.
+    there (`_bisecting_slopes`). One on which fewer than four fall stays as it is.
 
     Parameters
     ----------
     center, laser, plane
-        See `meet_quadrics`.
+        See `reflect_off_quadrics`.
     rays
         Shape (rows, columns, 3), rows and columns odd.
     places, absent, gate
-        See `hits`.
+        See `match_predicted_dots`.
     """
     rows, columns = rays.shape[:2]
-    flat, made = rays.copy().reshape(rows * columns, 3), quadrics.copy()
+    flat, out = rays.copy().reshape(rows * columns, 3), quadrics.copy()
     normal, right, by, dot = np.empty((5, 5)), np.empty(5), np.zeros((2, 5)), np.empty(3)
-    for q in range(len(made)):
+    for q in range(len(out)):
         for _ in range(2):  # they land elsewhere then
-            points, dots = meet_quadrics(center, made[q : q + 1], flat, laser, plane)
-            hit, number, _ = hits(dots.reshape(1, rows, columns, 2), places, absent, gate)
+            points, dots = reflect_off_quadrics(center, out[q : q + 1], flat, laser, plane)
+            hit, number, _ = match_predicted_dots(
+                dots.reshape(1, rows, columns, 2), places, absent, gate
+            )
             normal[:], right[:], count = 0.0, 0.0, 0
             for i in range(rows // 2 - 1, rows // 2 + 2):
                 for j in range(columns // 2 - 1, columns // 2 + 2):
@@ -864,7 +959,7 @@ def fit_quadrics(
                     for axis in range(3):
                         dot[axis] = plane[0, axis] + place[0] * plane[1, axis]
                         dot[axis] += place[1] * plane[2, axis]
-                    asked = _bisecting(laser, point, dot[0], dot[1], dot[2])
+                    asked = _bisecting_slopes(laser, point, dot[0], dot[1], dot[2])
                     x, y = point[0] - center[0], point[1] - center[1]
                     by[0, 0], by[0, 2], by[0, 3] = 1.0, x, y
                     by[1, 1], by[1, 3], by[1, 4] = 1.0, x, y
@@ -875,5 +970,5 @@ def fit_quadrics(
                                 normal[m, n] += by[axis, m] * by[axis, n]
             if count < 4:
                 break
-            made[q] = _solved(normal, right)
-    return made
+            out[q] = _solve_small(normal, right)
+    return out

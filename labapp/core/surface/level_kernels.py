@@ -1,4 +1,4 @@
-"""Inner loops of where z = 0 lies, compiled for the processor (docs/adr/0018)."""
+"""Inner loops of `level`, compiled for the processor (docs/adr/0018)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
 
 EPS = 1e-12
-"""One and so much is taken for one: a thousand such factors change no level."""
+"""1 plus less than this is taken for 1: a thousand such factors change no level."""
 
 FACTORS = 1000
-"""So many factors of at most 2 have a product that is a number still."""
+"""So many factors of at most 2 have a product that does not overflow."""
 
 
 @_inner
@@ -50,20 +50,21 @@ def _multiply(factors: FloatArray, k: int, way: int, factor: float, shrinks: flo
 def level_negative_log_likelihood(
     over: FloatArray, side: FloatArray, first: float, step: float, count: int, blurs: FloatArray
 ) -> FloatArray:
-    """What witnesses have against levels: Σ log(1 + exp(−side · (over + level) / blur)).
+    """−log likelihood of witnesses at levels: Σ log(1 + exp(−side · (over + level) / blur)).
 
     Along the levels the exponential is a geometric progression, away from where it is 1.
 
     Parameters
     ----------
     over
-        Height over the boundary for each of d depths of the rear, shape (d, n), mm.
+        Height of the surface over the boundary where n witnesses land, for each of d drops of the
+        rear, shape (d, n), mm.
     side
-        Of each witness, lit above 0, over its rise, shape (n,), mm⁻¹.
+        +1 or −1 of each witness, lit or dark, over its rise (`find_level`), shape (n,), mm⁻¹.
     first, step, count
-        The levels: the first, mm, the way to the next, above 0, and how many.
+        The levels: the first, mm, the step to the next, above 0, and how many.
     blurs
-        Shape (b,).
+        In spacings of the rays, shape (b,).
 
     Returns
     -------
@@ -105,7 +106,7 @@ def level_negative_log_likelihood(
 
 
 @_compiled(_f3, _f1, _f, _f1, _f, _f)
-def weigh(
+def level_posterior(
     nats: FloatArray,
     blur_cost: FloatArray,
     sunk: float,
@@ -113,24 +114,24 @@ def weigh(
     first: float,
     step: float,
 ) -> tuple[float, float, float, float]:
-    """Weigh levels and depths of the rear (`level_negative_log_likelihood`).
+    """Posterior of the level and of the rear's drop, blurs marginalised.
 
     Parameters
     ----------
     nats
-        Shape (d, b, count).
+        Result of `level_negative_log_likelihood`, shape (d, b, count).
     blur_cost, sunk
-        What blurs, shape (b,), and every depth but the first have against them before, nats.
+        −log of the priors of blurs, shape (b,), and of every drop but the first, nats.
     drops
-        The depths, shape (d,), mm.
+        The drops, shape (d,), mm; the first is none.
     first, step
-        The levels: the first, mm, and the way to the next.
+        The levels: the first, mm, and the step to the next.
 
     Returns
     -------
-    drop, mean, sigma, off
-        Expected depth and level, given that there is a depth or none, whichever is likelier; the
-        standard deviation of the level over both, mm; and the share of the first and last levels.
+    drop, mean, sigma, at_ends
+        Expected drop and level, given that there is a drop or none, whichever is likelier; standard
+        deviation of the level over both, mm; probability of the first and last levels together.
     """
     depths, blurs, count = nats.shape
     least = np.inf

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.geometry.optics import meet_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.boundary import Boundary
@@ -123,23 +123,23 @@ def sigma_name(name: str, part: str = "") -> str:
     return "_".join(filter(None, (size, "sigma", part, unit)))
 
 
-def measure(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
+def measure_surface(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
     """Measure a reconstructed pool."""
     errors = reflection_errors(reconstruction, match, rig)
     boundary = reconstruction.boundary
-    size, peak = size_of(reconstruction.whole, boundary)
-    made = measures_of(errors, size, peak, boundary.center_mm, reconstruction)
+    size, peak = surface_sizes(reconstruction.whole, boundary)
+    made = assemble_measures(errors, size, peak, boundary.center_mm, reconstruction)
     return replace(made, own_are_mm=reconstruction.own_are_mm)
 
 
-def measures_of(
+def assemble_measures(
     errors: ReflectionErrors,
     size: FloatArray,
     peak_mm: FloatArray,
     center_mm: FloatArray,
     reconstruction: Reconstruction,
 ) -> Measures:
-    """Write down errors, what `size_of` gave, the centre, and what the sizes are uncertain by."""
+    """Put errors, the result of `surface_sizes`, the centre and the sizes' σ together."""
     sigma, by_level = reconstruction.size_sigma, reconstruction.size_sigma_level
     return Measures(
         are_mm=errors.are_mm,
@@ -181,7 +181,7 @@ def reflection_scale(match: Match, rig: Rig) -> FloatArray:
     """
     i, j = match.ray.T - 1
     direction = ray_directions(rig.laser, rig.pattern)[i, j]
-    projected = meet_level(rig.laser.position_mm, direction)[:, :2]
+    projected = intersect_level(rig.laser.position_mm, direction)[:, :2]
     return np.asarray(np.ptp(projected, axis=0) / np.ptp(match.plane_mm, axis=0))
 
 
@@ -220,7 +220,7 @@ def _inner(ray: IntArray) -> BoolArray:
     return inner
 
 
-def size_of(surface: Surface, boundary: Boundary) -> tuple[FloatArray, FloatArray]:
+def surface_sizes(surface: Surface, boundary: Boundary) -> tuple[FloatArray, FloatArray]:
     """Width, length, height, depth, area, volume, shape (6,); and the peak's (x, y), shape (2,)."""
     outline = boundary.points_mm
     width, length = np.ptp(outline[:, :2], axis=0)

@@ -1,4 +1,4 @@
-"""Sizes of a fitted surface, and how they change with its coefficients, to first order."""
+"""Sizes of a fitted surface, and their derivatives by its coefficients (for their uncertainty)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ import numpy as np
 
 from labapp.core.surface import measures
 from labapp.core.surface.boundary import Boundary
-from labapp.core.surface.pool_fit import Level
+from labapp.core.surface.level import Level
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import FloatArray
 
 _NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
 FRACTION = (_NODE + 1) / 2
-"""What samples between the centre and the boundary weigh, and where they are, of the way."""
+"""Gauss–Legendre weights of the samples on the way from the centre to a boundary point, and their
+places as fractions of that way."""
 
 STRIDE = 4
-"""Every so many boundary points there is a spoke of samples: the surface is smooth."""
+"""Every fourth boundary point has a spoke of samples: the surface is smooth."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +28,13 @@ class Sizes:
     Parameters
     ----------
     size
-        Shape (6,), mm, mm², mm³.
+        In this order, shape (6,), mm, mm², mm³.
     peak_mm
         Where the surface is farthest from the work piece, shape (2,).
     gradient
         Derivatives by the spline coefficients, shape (6, p).
     holds
-        Whether the surface is on one side of the rim all the way from the centre to it.
+        Whether the surface is on one side of the boundary's height from the centre to it.
     """
 
     size: FloatArray
@@ -47,16 +48,16 @@ class Sizes:
         return np.asarray(self.gradient.sum(axis=1))
 
 
-def sizes_of(
+def sizes_and_gradients(
     basis: SplineBasis,
     coefficients: FloatArray,
     level: Level,
     boundary: Boundary,
-    climb: FloatArray,
+    boundary_slope: FloatArray,
 ) -> Sizes:
-    """Measure a surface within its boundary as `measures.size_of` does, with fewer samples.
+    """Measure a surface within its boundary as `measures.surface_sizes` does, with fewer samples.
 
-    Climb is the gradient of the height over the rim at each of m boundary points, shape (m, 2).
+    ``boundary_slope`` is that of `boundary_trace`, shape (m, 2).
     """
     from labapp.core.surface import kernels
 
@@ -68,18 +69,20 @@ def sizes_of(
         return np.asarray(z.reshape(np.shape(x_mm)))
 
     samples, over, share = kernels.spokes(
-        grid, coefficients, outline, center, FRACTION, WEIGHT, level.rear.numbers, STRIDE
+        grid, coefficients, outline, center, FRACTION, WEIGHT, level.rear.as_array, STRIDE
     )
     extremes, changes = [], np.zeros((2, len(coefficients)))
     for sign, change in zip((1.0, -1.0), changes, strict=True):
         within, extreme = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
-        # On the rim it is where it is, and its height is given; within it may lie between samples.
+        # On the boundary an extreme stays where it is; within it may lie between samples.
         if sign * within[2] >= sign * extreme[2]:
             extreme = measures.refined(height, boundary, within, sign)
             change[:] = kernels.gradient_of_sum(grid, len(change), extreme[None, :2], np.ones(1))
         extremes.append(extreme)
     high, low = extremes
-    by_rim = kernels.size_gradients(grid, len(coefficients), samples, share, outline, climb, center)
+    by_boundary = kernels.size_gradients(
+        grid, len(coefficients), samples, share, outline, boundary_slope, center
+    )
     width, length = np.ptp(outline[:, :2], axis=0)
     area, volume = share.sum(), share @ samples[:, 2]
     above = (level.sign * over > 0).reshape(-1, len(FRACTION))
@@ -88,6 +91,6 @@ def sizes_of(
     return Sizes(
         np.array([width, length, high[2], low[2], area, volume]),
         (high if abs(high[2]) >= abs(low[2]) else low)[:2],
-        np.concatenate([by_rim[:2], changes, by_rim[2:]]),
+        np.concatenate([by_boundary[:2], changes, by_boundary[2:]]),
         bool(above[entered].all() and entered[:, -1].all()),
     )

@@ -18,13 +18,13 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
 
 REUSE_MM = 5e-3
-"""A track uses its factor again where no reflection point has moved by more: that is small beside
-the splines' cells."""
+"""By default a factor is used again where no reflection point has moved by more: that is small
+beside the splines' cells."""
 
 
 @dataclass
 class NormalEquations:
-    """Of n rays that meet a surface of p splines, and the dots they are to make.
+    """Normal equations of n rays that meet a surface of p splines, and their dots.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class NormalEquations:
     dots_mm
         The dots in the UCS, shape (n, 3), mm.
     weights
-        Inverse covariance of the slopes that follow from them, shape (n, 2, 2).
+        Inverse covariance of the slopes that the dots ask for, shape (n, 2, 2).
     factor
         Cholesky factor of the normal matrix (`normal_factor`); None: not known yet.
     reuse_mm
@@ -53,14 +53,17 @@ class NormalEquations:
     factor: FloatArray | None = None
     reuse_mm: float = REUSE_MM
 
-    def improve(
+    def step(
         self,
         coefficients: FloatArray,
         points_mm: FloatArray,
         moved_mm: float,
-        rest: FloatArray | float = 0.0,
+        smooth_about: FloatArray | float = 0.0,
     ) -> FloatArray:
-        """Solve once for the surface with the slopes that the dots ask for, shape (p,), mm.
+        """Coefficients after one step of the fit, shape (p,), mm: one linear least-squares problem.
+
+        The reflection points stay where they are; the slopes there become those that turn the rays
+        to their dots, as far as roughness allows. The mean height of the points stays.
 
         Parameters
         ----------
@@ -70,8 +73,8 @@ class NormalEquations:
             Where the rays meet it, shape (n, 3), mm.
         moved_mm
             How far the farthest of these moved in the last round, mm.
-        rest
-            The roughness is that of the difference to a surface with these coefficients.
+        smooth_about
+            Coefficients of a surface the difference to which is held smooth; 0: the surface itself.
 
         Raises
         ------
@@ -85,7 +88,9 @@ class NormalEquations:
         at = self.basis.grid, coefficients, points_mm, self.weights
         target = kernels.gradient_rhs(*at, self.laser_mm, self.dots_mm)
         width = len(self.stiffness) - 1
-        target -= scipy.linalg.blas.dsbmv(width, 1.0, self.stiffness, coefficients - rest, lower=1)
+        target -= scipy.linalg.blas.dsbmv(
+            width, 1.0, self.stiffness, coefficients - smooth_about, lower=1
+        )
         change = solve(self.factor, target)
         # Slopes leave the level open: the mean height of the points stays.
         change -= kernels.surface_at(self.basis.grid, change, points_mm)[0].mean()
@@ -131,8 +136,8 @@ def normal_factor(
     return np.asarray(lower)
 
 
-def sigma_of(
-    lower: FloatArray, gradients: FloatArray, level_at: FloatArray, sigma_mm: float
+def propagate_sigma(
+    factor: FloatArray, gradients: FloatArray, mean_splines: FloatArray, level_sigma_mm: float
 ) -> FloatArray:
     """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p).
 
@@ -141,20 +146,20 @@ def sigma_of(
 
     Parameters
     ----------
-    lower
-        Factor of the normal matrix (`normal_factor`).
+    factor
+        Cholesky factor of the normal matrix (`normal_factor`).
     gradients
         Derivatives by the spline coefficients.
-    level_at
-        Mean value of each spline over the reflection points, shape (p,): what slopes tell is the
-        surface without its mean there.
-    sigma_mm
-        Uncertainty of the level.
+    mean_splines
+        Mean value of each spline over the reflection points, shape (p,): slopes give the surface
+        but for its mean there.
+    level_sigma_mm
+        Standard uncertainty of the level, mm.
     """
     by_level = gradients.sum(axis=1)
-    free = gradients - by_level[:, None] * level_at
-    half = scipy.linalg.lapack.dtbtrs(lower, np.asfortranarray(free.T), uplo="L")[0]
-    return np.asarray(np.sqrt((half * half).sum(axis=0) + (sigma_mm * by_level) ** 2))
+    free = gradients - by_level[:, None] * mean_splines
+    half = scipy.linalg.lapack.dtbtrs(factor, np.asfortranarray(free.T), uplo="L")[0]
+    return np.asarray(np.sqrt((half * half).sum(axis=0) + (level_sigma_mm * by_level) ** 2))
 
 
 @dataclass(frozen=True)
@@ -168,17 +173,17 @@ class SlopeFit:
     factor
         Cholesky factor of the normal matrix with one spline held, lower band, shape
         (width + 1, splines).
-    level
+    mean_splines
         Mean value of each spline over the points, shape (splines,).
     """
 
     surface: SplineSurface
     factor: FloatArray
-    level: FloatArray
+    mean_splines: FloatArray
 
     def sigma_of(self, gradients: FloatArray) -> FloatArray:
-        """`sigma_of` quantities that the level does not change, shape (m,)."""
-        return sigma_of(self.factor, gradients, self.level, 0.0)
+        """Standard uncertainty of quantities that the level does not change, shape (m,)."""
+        return propagate_sigma(self.factor, gradients, self.mean_splines, 0.0)
 
 
 def fit_slopes(
@@ -212,10 +217,10 @@ def fit_slopes(
     from labapp.core.surface import kernels
 
     splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
-    pull = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
-    target = np.bincount(splines.ravel(), pull.ravel(), basis.count)
+    weighted = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
+    target = np.bincount(splines.ravel(), weighted.ravel(), basis.count)
     factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
     coefficients = solve(factor, target)
-    level = np.bincount(splines.ravel(), value.ravel(), basis.count) / len(points_mm)
-    surface = SplineSurface(basis, coefficients - level @ coefficients)
-    return SlopeFit(surface, factor, level)
+    mean_splines = np.bincount(splines.ravel(), value.ravel(), basis.count) / len(points_mm)
+    surface = SplineSurface(basis, coefficients - mean_splines @ coefficients)
+    return SlopeFit(surface, factor, mean_splines)

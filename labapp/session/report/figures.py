@@ -11,7 +11,12 @@ from matplotlib import rc_context
 from matplotlib.patches import Polygon
 
 from labapp.core.calibration.plane_calibration import PlaneCalibration
-from labapp.core.geometry.optics import meet_level, meet_plane, ray_directions, reflect
+from labapp.core.geometry.optics import (
+    intersect_imaging_plane,
+    intersect_level,
+    ray_directions,
+    reflect,
+)
 from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import surface_mesh
@@ -85,9 +90,9 @@ def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
 def _draw_ray(view: Any, rig: Rig, direction: FloatArray, *, central: bool) -> None:
     """A ray down to the work piece, and from there, as from a flat mirror, to the plane."""
     laser = rig.laser.position_mm
-    foot = meet_level(laser, direction)
+    foot = intersect_level(laser, direction)
     after = reflect(direction, np.array([0.0, 0.0, 1.0]))
-    end = rig.imaging_plane.to_universal(meet_plane(foot, after, rig.imaging_plane))
+    end = rig.imaging_plane.to_universal(intersect_imaging_plane(foot, after, rig.imaging_plane))
     path = np.array([laser, foot, end])
     look = {"color": "#b01030", "lw": 1.1} if central else {"color": "#d98a9a", "lw": 0.6}
     view.plot(path[:, 1], path[:, 2], **look, zorder=2)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.surface.measures import measure
+from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.simulation.forward import exact_match, trace
 from labapp.studies.adviser.bench_limits import BenchLimits, Place
@@ -66,7 +66,7 @@ def simulated_errors(trial: Trial) -> FloatArray:
             believed = rig
             if trial.calibrated:
                 match, believed = move(match, rig, axes, each * sample.deviate[number])
-            measures = measure(reconstruct(match, believed, Settings()), match, believed)
+            measures = measure_surface(reconstruct(match, believed, Settings()), match, believed)
             error = abs(relative_errors(measures, pool)[0] * pool.peak_mm)
         except CannotMeasure:
             error = np.inf

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.geometry.optics import bisecting_gradient, meet_level, ray_directions
+from labapp.core.geometry.optics import bisecting_gradient, intersect_level, ray_directions
 from labapp.core.geometry.rig import Laser, Rig
-from labapp.core.surface.pool_fit import CORRELATED_MM2, REACH, FitSettings, landing_spacing
+from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings, landing_spacing
 from labapp.core.surface.solver import SlopeFit, fit_slopes
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import FloatArray, freeze
@@ -149,9 +149,11 @@ class _Model:
         self.peak_xy = np.array(size.peak_mm if convex else size.bottom_mm)
         self.peak_mm = size.height_mm if convex else size.depth_mm
         self.rim = pool.boundary_mm(RIM_POINTS)[:, :2]
-        ground = meet_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))[..., :2]
+        ground = intersect_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))[
+            ..., :2
+        ]
         self.ground = ground
-        margin = REACH * landing_spacing(ground).max()
+        margin = MARGIN_ROWS * landing_spacing(ground).max()
         corners = np.vstack([self.points[:, :2], self.rim, self.peak_xy])
         self.basis = SplineBasis.over(
             corners.min(axis=0) - margin, corners.max(axis=0) + margin, settings.knot_mm
@@ -235,7 +237,9 @@ def _landing(xy: FloatArray, true: Laser, believed: Laser) -> FloatArray:
     ray = np.column_stack([xy, np.zeros(len(xy))]) - true.position_mm
     p, q = ray @ across / (ray @ forward), ray @ up / (ray @ forward)
     forward, across, up = _axes(believed)
-    return meet_level(believed.position_mm, forward + p[:, None] * across + q[:, None] * up)[:, :2]
+    return intersect_level(believed.position_mm, forward + p[:, None] * across + q[:, None] * up)[
+        :, :2
+    ]
 
 
 def _axes(laser: Laser) -> tuple[FloatArray, FloatArray, FloatArray]:

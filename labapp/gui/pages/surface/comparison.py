@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.pipeline import Measurement, reconstruct
-from labapp.core.surface.measures import Measures, measure
+from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.export.scene import Scene, difference_scene
 from labapp.gui.digits import rounded
@@ -126,7 +126,7 @@ def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
         reason="",
         scheme=chosen.scheme,
         reconstruction=reconstruction,
-        measures=measure(reconstruction, match, rig),
+        measures=measure_surface(reconstruction, match, rig),
     )
 
 

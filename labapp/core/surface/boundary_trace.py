@@ -1,38 +1,51 @@
-"""Where a pool ends: its surface followed to the work piece, or to a rear that lies below it."""
+"""The boundary of a fitted surface: where it comes down to the work piece, or to a lower rear.
+
+It is traced outwards from a centre (`trace_boundary`), or from the boundary of a surface that is
+near (`retrace_boundary`), by Newton steps along each direction.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from labapp.core.surface.boundary import Boundary
-from labapp.core.surface.pool_fit import Level, Rear
+from labapp.core.surface.level import Level, Rear
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import CannotMeasure, FloatArray
 
 LONGEST_MM, LAST_MM = 0.3, 3e-3
-"""How long a Newton step may be where the boundary is near; and after one of how much the next
-would be of some nanometres."""
+"""Longest Newton step where the boundary is near; and the step after which none is taken, as the
+next would be of some nanometres."""
 
-ON_RIM_MM = 1e-3
-"""Before the last step boundary points are on the rim's height to within this, or the boundary is
-looked for anew."""
+ON_BOUNDARY_MM = 1e-3
+"""Before the last step the surface is at the boundary's height to within this at every point, or
+the boundary is looked for anew."""
 
 DIRECTIONS, CELLS = 360, 63
 """Boundary points, and cells on the way out in which the first crossing is looked for."""
 
 
-def find_rim(
+def trace_boundary(
     basis: SplineBasis, coefficients: FloatArray, level: Level, center_mm: FloatArray
 ) -> tuple[Boundary, FloatArray]:
-    """The first place on the way out from the centre where a surface comes down to its rim.
+    """Trace the boundary: first place on the way out where the surface comes down to its height.
 
     That is the work piece, z = 0, or a rear that lies below it.
 
+    Parameters
+    ----------
+    basis, coefficients
+        The surface: splines and their coefficients, shape (p,), mm.
+    level
+        The side of the work piece that the pool is on, and its rear.
+    center_mm
+        Where the ways out begin, shape (2,), mm.
+
     Returns
     -------
-    boundary, climb
-        The boundary of m points, and the gradient there of the surface's height over the rim's,
-        shape (m, 2).
+    boundary, boundary_slope
+        The boundary of m points, one a direction; gradient there of the surface's height over the
+        boundary's, shape (m, 2).
 
     Raises
     ------
@@ -58,38 +71,39 @@ def find_rim(
         )
     cell = limit / CELLS
     radius = reach[np.arange(DIRECTIONS), np.argmax(crossing, axis=1)] + 0.5 * cell
-    rear = level.rear.numbers
-    radius, climb, _ = kernels.follow_rim(
+    rear = level.rear.as_array
+    radius, boundary_slope, _ = kernels.newton_to_boundary(
         basis.grid, coefficients, rear, center_mm, way, radius, cell, LAST_MM
     )
-    return _boundary_of(level.rear, center_mm, np.degrees(theta), way, radius), climb
+    return _boundary_of(level.rear, center_mm, np.degrees(theta), way, radius), boundary_slope
 
 
-def follow_rim(
+def retrace_boundary(
     basis: SplineBasis,
     coefficients: FloatArray,
     level: Level,
     center_mm: FloatArray,
     before: Boundary,
 ) -> tuple[Boundary, FloatArray]:
-    """Move a boundary onto a surface that is near its own; see `find_rim`.
+    """Trace the boundary from that of a surface nearby: `trace_boundary` in less time.
 
-    Where it does not lead there, the boundary is looked for anew.
+    Parameters, return values and errors are the same, and ``before``, the boundary nearby. Where
+    steps from there do not lead to the boundary, it is traced from the centre.
     """
     from labapp.core.surface import kernels
 
     radius = np.linalg.norm(before.points_mm[:, :2] - before.center_mm, axis=-1)
     theta = np.radians(before.theta_deg)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    longest, rear = np.full(len(radius), LONGEST_MM), level.rear.numbers
-    radius, climb, over = kernels.follow_rim(
+    longest, rear = np.full(len(radius), LONGEST_MM), level.rear.as_array
+    radius, boundary_slope, over = kernels.newton_to_boundary(
         basis.grid, coefficients, rear, center_mm, way, radius, longest, LAST_MM
     )
     boundary = _boundary_of(level.rear, center_mm, before.theta_deg, way, radius)
     inside = bool(basis.contains(*boundary.points_mm[:, :2].T).all() and (radius > 0).all())
-    if inside and np.abs(over).max() < ON_RIM_MM:
-        return boundary, climb
-    return find_rim(basis, coefficients, level, center_mm)
+    if inside and np.abs(over).max() < ON_BOUNDARY_MM:
+        return boundary, boundary_slope
+    return trace_boundary(basis, coefficients, level, center_mm)
 
 
 def _boundary_of(

@@ -1,0 +1,193 @@
+"""The level: where z = 0 lies on a surface that slopes give up to a constant.
+
+It comes from the witnesses, the rays of which it is known whether they came back: a lit ray landed
+inside the boundary, a dark one outside. The boundary is on the work piece, but for the pool's rear,
+which may lie below it (§7.2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.values import BoolArray, FloatArray, IntArray, median
+
+STEPS_A_REACH = 120
+"""Steps of the grid of levels over a reach of 1 on either side."""
+
+NEAR_RISES = 3.0
+"""Witnesses whose rays land farther than so many spacings from the boundary do not count."""
+
+SCAN_LEVELS = 300
+"""Levels that are tried where nothing is known of it."""
+
+MOST_AT_ENDS, MOST_AT_FAR_ENDS = 1e-6, 0.02
+"""With more of the level's probability at the ends of its grid, a wider grid is searched: the first
+of a narrow grid (reach below 1), the second of a wide one."""
+
+# Blurs: width of the step from inside to outside, in dot spacings, from a boundary that is known
+# as sharply as the surface is to one that half the neighbouring rays contradict.
+_BLURS = np.geomspace(1 / 200, 1 / 4, 9)
+_BLUR_COST = 1.2 * np.log(_BLURS)  # −log of the prior, blur^−1.2, nats: sharp ones are likelier
+_WIDEST_BLUR = _BLURS[-1:]
+
+# Drops: how deep a rear may lie, mm. One in five lies below the work piece, as deep as any other.
+_DROPS_MM = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
+_SHARE_SUNK = 0.2
+_SUNK_COST = -float(np.log(_SHARE_SUNK / (1 - _SHARE_SUNK) / (len(_DROPS_MM) - 1)))  # nats
+
+
+@dataclass(frozen=True)
+class Rear:
+    """How far the boundary lies below the work piece towards the pool's end (§7.2).
+
+    Parameters
+    ----------
+    drop_mm
+        Depth at the end, mm; 0 for a boundary on the work piece all round.
+    start_mm, end_mm
+        Where the boundary leaves the work piece, and where the pool ends, along Y, mm.
+    """
+
+    drop_mm: float = 0.0
+    start_mm: float = 0.0
+    end_mm: float = -1.0
+
+    @property
+    def as_array(self) -> FloatArray:
+        """Drop, start and end for compiled functions, shape (3,), mm."""
+        return np.array([self.drop_mm, self.start_mm, self.end_mm])
+
+    def height(self, y_mm: FloatArray) -> FloatArray:
+        """Height of the boundary at y, of the shape of ``y_mm``, mm: 0, falling as a parabola."""
+        share = np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
+        return -self.drop_mm * share**2
+
+
+@dataclass(frozen=True)
+class Level:
+    """Where z = 0 lies on a surface that is known up to its level.
+
+    Parameters
+    ----------
+    shift_mm
+        What to add to the surface's height, mm.
+    sigma_mm
+        Its standard uncertainty, mm.
+    sign
+        +1 for a pool that stands above the work piece inside its boundary, −1 for one below.
+    rear
+        Where the boundary lies below the work piece.
+    negative_log_likelihood
+        Of the rays near the boundary, being lit or dark: 0 where every lit one lands inside and
+        every dark one outside, or where no ray is known to be dark.
+    rays, rise_mm
+        How many these are; by how much the surface rises there from one ray to the next, mm.
+    """
+
+    shift_mm: float
+    sigma_mm: float
+    sign: int
+    rear: Rear
+    negative_log_likelihood: float
+    rays: int = 0
+    rise_mm: float = 0.0
+
+    @property
+    def disagreement(self) -> float:
+        """Mean surprise of the rays near the boundary, bits; infinite where there are none."""
+        return self.negative_log_likelihood / np.log(2) / self.rays if self.rays else np.inf
+
+
+def find_level(
+    height: FloatArray,
+    slope: FloatArray,
+    y: FloatArray,
+    witness: IntArray,
+    spacing_mm: FloatArray,
+    drop_mm: float | None = None,
+    about: tuple[float, int] | None = None,
+    reach: float = 1.0,
+) -> Level:
+    """Find the level at which lit rays land inside the boundary and dark ones outside.
+
+    A ray that lands a distance d inside the boundary came back with probability
+    1/(1 + exp(−d/s)). Level, blur s and drop of the rear are weighed on a grid; the level's mean
+    and standard deviation are taken over it.
+
+    Parameters
+    ----------
+    height, slope
+        Of the surface, up to its level, where m witnesses would land on z = 0: shape (m,), mm, and
+        gradients, shape (m, 2).
+    y
+        Where they would land along Y, shape (m,), mm.
+    witness
+        +1 lit, −1 dark, shape (m,).
+    spacing_mm
+        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
+    drop_mm
+        How deep the rear lies, mm; None: found along with the level.
+    about
+        A level that is near, as its shift, mm, and its sign; None: all are tried.
+    reach
+        How far from there the level may be, in rises: heights by which the surface changes from
+        one ray to the next. Where the grid's ends are likely, a wider one is searched.
+    """
+    from labapp.core.surface import level_kernels
+
+    # Height by which the surface changes from one ray to the next, straight across the contour.
+    rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
+    usual = median(rise)
+    rise = np.maximum(rise, usual / 4)
+    shift, sign = about or _scan_levels(height, rise, witness)
+    near = np.abs(height + shift) < NEAR_RISES * rise
+    count = round(STEPS_A_REACH * reach) + 1
+    first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
+    lit = y[witness > 0]
+    start = (lit.max() + lit.min()) / 2
+    end = min(lit.min(), start - 1e-6)  # a single row has no rear
+    # Only a pool that stands above the work piece is seen to sink at its rear.
+    seen = sign > 0 and bool(np.any(near & (witness < 0) & (y < end)))
+    drops = (_DROPS_MM if seen else _DROPS_MM[:1]) if drop_mm is None else np.array([drop_mm])
+    over = height[near] - drops[:, None] * Rear(1.0, start, end).height(y[near])
+    side = sign * witness[near] / rise[near]
+    nats = level_kernels.level_negative_log_likelihood(over, side, first, step, count, _BLURS)
+    costs = _BLUR_COST, _SUNK_COST, drops
+    drop, mean, sigma, at_ends = level_kernels.level_posterior(nats, *costs, first, step)
+    if about is not None and at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
+        about = about if reach < 1.0 else None
+        return find_level(height, slope, y, witness, spacing_mm, drop_mm, about)
+    least, rays = float(nats.min()), int(near.sum())
+    return Level(mean, sigma, sign, Rear(drop, start, end), least, rays, usual)
+
+
+def _scan_levels(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:
+    """Shift, mm, and sign that the witnesses contradict least, with the widest blur."""
+    from labapp.core.surface import level_kernels
+
+    scan, side = np.linspace((-height).min(), (-height).max(), SCAN_LEVELS), witness / rise
+    grid = scan[0], scan[1] - scan[0], len(scan), _WIDEST_BLUR
+    above, below = (
+        level_kernels.level_negative_log_likelihood(height[None], k * side, *grid)[0, 0]
+        for k in (1, -1)
+    )
+    if above.min() <= below.min():
+        return float(scan[np.argmin(above)]), 1
+    return float(scan[np.argmin(below)]), -1
+
+
+def guess_level(height: FloatArray, outer: BoolArray) -> Level:
+    """Guess the level where no dark ray tells where the pool ends: the outer points lie at 0.
+
+    Parameters
+    ----------
+    height
+        Of the surface at reflection points, up to its level, shape (n,), mm.
+    outer
+        Which of them lie far from their middle, shape (n,).
+    """
+    shift = -float(np.mean(height[outer]))
+    sign = 1 if height[~outer].mean() + shift > 0 else -1
+    return Level(shift, float(np.std(height)), sign, Rear(), 0.0)
