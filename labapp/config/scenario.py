@@ -6,7 +6,6 @@ It is a setup file with tables more: [pool], and [torch], [camera], [look], [rec
 from __future__ import annotations
 
 import os
-import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from labapp.bundled import bundled
 from labapp.config.scenario_keys import RECORDINGS, SHAPES, TABLES, TERMS, pool_rules
 from labapp.config.setup import parse_setup
 from labapp.config.setup_keys import SECTIONS
-from labapp.config.toml_keys import check_keys, unknown_key
+from labapp.config.toml_keys import check_keys, parse_toml, read_text, unknown_key
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
@@ -95,7 +94,8 @@ def read_scenario(
         missing or impossible; all that was found is reported together (`InputError.problems`).
     """
     path = Path(path)
-    text, values = _read(path)
+    text = read_text(path, A_SCENARIO)
+    values = parse_toml(text, path, A_SCENARIO)
     bench = {table: keys for table, keys in values.items() if table in SECTIONS}
     setup = tomlkit.dumps(bench)
     problems = _check(path, values)
@@ -114,18 +114,6 @@ def read_scenario(
     recording |= {} if seed is None else {"seed": seed}
     made = _recording(path, {**values, "recording": recording}, rig)
     return Scenario(made, setup, text)
-
-
-def _read(path: Path) -> tuple[str, dict[str, Any]]:
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-        return text, tomllib.loads(text)
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, A_SCENARIO) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "encoding", "not UTF-8", A_SCENARIO) from error
-    except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
-        raise InputError(path, "syntax", error, A_SCENARIO) from error
 
 
 # --- what is wrong ------------------------------------------------------------------------------

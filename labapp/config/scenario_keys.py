@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from labapp.config.toml_keys import Rule, are_numbers, between, is_number
+from labapp.config.toml_keys import Rule, are_numbers, between, is_number, within
 
 LARGEST_POOL_MM = 100.0
 """Lengths of a pool are below this."""
@@ -13,15 +13,6 @@ RECORDINGS = {"avi": "recording.avi", "tif": "recording.tif", "png": "recording"
 """Format → the recording's name: a video, a TIFF stack, a folder of PNG files."""
 
 BITS = (8, 12, 16)
-
-
-def _number(low: float, high: float, unit: str, required: bool = False) -> Rule:
-    """A number from ``low`` to ``high``."""
-    return Rule(
-        f"a number from {low:g} to {high:g}{f' ({unit})' if unit else ''}",
-        lambda value: is_number(value) and low <= value <= high,
-        required,
-    )
 
 
 def _whole(low: int, high: int, required: bool = False) -> Rule:
@@ -59,7 +50,7 @@ def _is_mode(value: object) -> bool:
 
 _LENGTH = between(0, LARGEST_POOL_MM, "mm")
 _HEIGHT = between(-LARGEST_POOL_MM / 2, LARGEST_POOL_MM / 2, "mm; below 0 for a concave pool")
-_ANGLE = _number(-360, 360, "degrees")
+_ANGLE = within(-360, 360, "degrees")
 
 _EVERY_CAP = {
     "height_mm": _HEIGHT,
@@ -69,7 +60,7 @@ _EVERY_CAP = {
         lambda value: is_number(value) and 0 <= value < 1,
         required=False,
     ),
-    "wander_percent": _number(0, 20, "% of its size, standard deviation over time"),
+    "wander_percent": within(0, 20, "% of its size, standard deviation over time"),
 }
 
 SHAPES: dict[str, dict[str, Rule]] = {
@@ -92,15 +83,15 @@ SHAPE = _one_of(*SHAPES, required=True)
 
 TERMS: dict[str, dict[str, Rule]] = {
     "dent": {
-        "depth_mm": _number(-10, 10, "mm", required=True),
+        "depth_mm": within(-10, 10, "mm", required=True),
         "radius_mm": _LENGTH,
         "offset_mm": _places(2, "[x, y] from the pool's centre, two numbers (mm)"),
     },
-    "low_rear": {"drop_mm": _number(0, 10, "mm", required=True)},
+    "low_rear": {"drop_mm": within(0, 10, "mm", required=True)},
     "wave": {
         "mode": Rule("[m, n], whole numbers: m from 0 and n from 1, both up to 8", _is_mode),
-        "amplitude_mm": _number(0, 10, "mm", required=True),
-        "frequency_hz": _number(0, 1e5, "Hz", required=True),
+        "amplitude_mm": within(0, 10, "mm", required=True),
+        "frequency_hz": within(0, 1e5, "Hz", required=True),
         "kind": _one_of("standing", "travelling"),
         "turned_deg": _ANGLE,
         "phase_deg": _ANGLE,
@@ -111,38 +102,38 @@ TERMS: dict[str, dict[str, Rule]] = {
 TABLES: dict[str, dict[str, Rule]] = {
     "torch": {
         "tip_mm": _places(3, "[x, y, z], three numbers (mm)", required=True),
-        "tip_radius_mm": _number(0, 50, "mm"),
-        "radius_mm": _number(0, 50, "mm"),
-        "half_angle_deg": _number(0, 89, "degrees"),
+        "tip_radius_mm": within(0, 50, "mm"),
+        "radius_mm": within(0, 50, "mm"),
+        "half_angle_deg": within(0, 89, "degrees"),
     },
     "camera": {
         "width_px": _whole(64, 8192),
         "height_px": _whole(64, 8192),
-        "focal_px": _number(10, 1e6, "px"),
-        **{name: _number(-10, 10, "") for name in ("k1", "k2", "p1", "p2", "k3")},
+        "focal_px": within(10, 1e6, "px"),
+        **{name: within(-10, 10, "") for name in ("k1", "k2", "p1", "p2", "k3")},
     },
     "look": {
-        "dot_peak": _number(0, 1000, "grey levels"),
-        "unevenness": _number(0, 3, ""),
-        "beam_fraction": _number(0, 1, "of the angle between beams"),
+        "dot_peak": within(0, 1000, "grey levels"),
+        "unevenness": within(0, 3, ""),
+        "beam_fraction": within(0, 1, "of the angle between beams"),
         "dot_floor_mm": between(0, 10, "mm", required=False),
         "dot_ceiling_mm": between(0, 10, "mm", required=False),
-        "speckle": _number(0, 1, "contrast"),
-        "blur_px": _number(0, 50, "px"),
-        "background": _number(0, 255, "grey levels"),
-        "glow": _number(0, 255, "grey levels"),
-        "read_noise": _number(0, 100, "grey levels"),
-        "photon_noise": _number(0, 10, "grey levels² a grey level"),
+        "speckle": within(0, 1, "contrast"),
+        "blur_px": within(0, 50, "px"),
+        "background": within(0, 255, "grey levels"),
+        "glow": within(0, 255, "grey levels"),
+        "read_noise": within(0, 100, "grey levels"),
+        "photon_noise": within(0, 10, "grey levels² a grey level"),
         "hot_pixels": _whole(0, 100_000),
         "false_dots": _whole(0, 10_000),
-        "missing": _number(0, 1, "probability"),
+        "missing": within(0, 1, "probability"),
         "full_scale": between(0, 255.5, "grey levels", required=False),
         "bits": Rule("8, 12 or 16", lambda v: type(v) is int and v in BITS, False),
     },
     "recording": {
         "frames": _whole(1, 1_000_000, required=True),
         "frame_rate_hz": between(0, 1e6, "Hz"),
-        "exposure_ms": _number(0, 1e5, "ms"),
+        "exposure_ms": within(0, 1e5, "ms"),
         "seed": _whole(0, 2**31 - 1, required=True),
         "format": _one_of(*RECORDINGS),
     },

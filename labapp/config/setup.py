@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ import tomlkit
 from tomlkit.items import Table
 
 from labapp.config.setup_keys import SECTIONS, rules_for
-from labapp.config.toml_keys import check_keys, shown, unknown_key
+from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.errors import InputError
@@ -56,17 +55,14 @@ def read_setup(path: str | os.PathLike[str]) -> Setup:
         was found is reported together (`InputError.problems`).
     """
     path = Path(path)
-    return parse_setup(_text(path), path)
+    return parse_setup(read_text(path, A_SETUP), path)
 
 
 @functools.lru_cache(maxsize=64)
 def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
     """Check a setup that was read from ``path``; see `read_setup`."""
     path = Path(path)
-    try:
-        values = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
-        raise InputError(path, "syntax", error, A_SETUP) from error
+    values = parse_toml(text, path, A_SETUP)
     problems = [
         *(unknown_key(path, key, SECTIONS) for key in values if key not in SECTIONS),
         *(
@@ -103,7 +99,7 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
         If there is a file that is not TOML, or it cannot be written.
     """
     path = Path(path)
-    text = updated_setup(_text(path) if path.exists() else "", path, values)
+    text = updated_setup(read_text(path, A_SETUP) if path.exists() else "", path, values)
     try:
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(13, "write-protected")
@@ -145,13 +141,11 @@ def pattern_values(pattern: DotPattern) -> dict[str, object]:
     return values if pattern.kind == DotPattern.kind else values | {"kind": pattern.kind}
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, A_SETUP) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "encoding", "not UTF-8", A_SETUP) from error
+def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
+    """Pattern of the keys of a setup file; inverse of `pattern_values`."""
+    absent = keys.get("absent")
+    rays = None if absent is None else frozenset((i, j) for i, j in absent)
+    return DotPattern(**{**keys, "absent": rays})
 
 
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
@@ -221,13 +215,9 @@ def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
 
 
 def _rig(values: dict[str, Any]) -> Rig:
-    pattern = dict(values["pattern"])
-    absent = pattern.pop("absent", None)
     return Rig(
         Laser(**values["laser"]),
-        DotPattern(
-            **pattern, absent=None if absent is None else frozenset((i, j) for i, j in absent)
-        ),
+        dot_pattern(values["pattern"]),
         Electrode(**values["electrode"]),
         _imaging_plane(**values["imaging_plane"]),
     )

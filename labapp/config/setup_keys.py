@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number
+from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number, within
 from labapp.core.geometry.patterns import PATTERNS
 
 _LENGTH = between(0, LARGEST_MM, "mm")
@@ -69,10 +69,7 @@ SECTIONS = {
         ),
     },
     "electrode": {
-        "height_mm": Rule(
-            f"a number from 0 to {LARGEST_MM:g} (mm)",
-            lambda value: is_number(value) and 0 <= value <= LARGEST_MM,
-        ),
+        "height_mm": within(0, LARGEST_MM, "mm", required=True),
     },
     "imaging_plane": {
         "distance_mm": _LENGTH,

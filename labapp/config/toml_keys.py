@@ -1,13 +1,14 @@
-"""Validation of TOML files: rules for keys, and the problems of a table."""
+"""Reading and validation of TOML files: rules for keys, and the problems of a table."""
 
 from __future__ import annotations
 
 import difflib
 import json
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 from labapp.errors import InputError
 
@@ -16,6 +17,36 @@ LARGEST_MM = 10_000.0
 
 LARGEST = 1e9
 """Numbers of any kind above this are no measurement."""
+
+
+def read_text(path: Path, wanted: str) -> str:
+    """Text of a file, UTF-8; ``wanted`` is what it should be, for the error.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is no text.
+    """
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(path, "file", error.strerror, wanted) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "encoding", "not UTF-8", wanted) from error
+
+
+def parse_toml(text: str, path: Path, wanted: str) -> dict[str, Any]:
+    """Tables of a file that was read from ``path``.
+
+    Raises
+    ------
+    InputError
+        If it is not TOML.
+    """
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
+        raise InputError(path, "syntax", error, wanted) from error
 
 
 @dataclass(frozen=True)
@@ -52,6 +83,15 @@ def between(low: float, high: float, unit: str, required: bool = True) -> Rule:
     return Rule(
         f"a number above {low:g} and below {high:g} ({unit})",
         lambda value: is_number(value) and low < value < high,
+        required,
+    )
+
+
+def within(low: float, high: float, unit: str, required: bool = False) -> Rule:
+    """A number from ``low`` to ``high``."""
+    return Rule(
+        f"a number from {low:g} to {high:g}{f' ({unit})' if unit else ''}",
+        lambda value: is_number(value) and low <= value <= high,
         required,
     )
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from labapp.config.setup import dot_pattern
 from labapp.config.setup_keys import SECTIONS
-from labapp.config.toml_keys import Rule, are_numbers, check_keys, is_number, unknown_key
-from labapp.core.geometry.rig import DotPattern
+from labapp.config.toml_keys import (
+    Rule,
+    are_numbers,
+    check_keys,
+    parse_toml,
+    read_text,
+    unknown_key,
+    within,
+)
 from labapp.errors import InputError
 from labapp.studies.adviser.bench_limits import BenchLimits
 from labapp.studies.adviser.expected_pools import ExpectedPools
@@ -40,20 +47,12 @@ def _range(low: float, high: float, unit: str, required: bool = False) -> Rule:
     return Rule(expected, accepts, required)
 
 
-def _number(low: float, high: float, unit: str) -> Rule:
-    return Rule(
-        f"a number from {low:g} to {high:g} ({unit})",
-        lambda value: is_number(value) and low <= value <= high,
-        required=False,
-    )
-
-
 POOLS = {
     "kind": Rule('"convex" or "concave"', lambda v: v in ("convex", "concave"), False),
     "width_mm": _range(1, 50, "mm", True),
     "length_mm": _range(1, 50, "mm", True),
     "height_mm": _range(0.01, 10, "mm; above 0 for concave pools, too", True),
-    "shift_mm": _number(0, 5, "mm"),
+    "shift_mm": within(0, 5, "mm"),
 }
 BENCH = {
     "projection_angle_deg": _range(5, 80, "degrees"),
@@ -61,22 +60,22 @@ BENCH = {
     "plane_distance_mm": _range(10, 1000, "mm"),
     "s_mm": _range(-500, 500, "mm"),
     "h_mm": _range(-500, 500, "mm"),
-    "width_mm": _number(10, 1000, "mm"),
-    "height_mm": _number(10, 1000, "mm"),
-    "edge_mm": _number(0, 50, "mm"),
-    "electrode_height_mm": _number(0, 50, "mm"),
+    "width_mm": within(10, 1000, "mm"),
+    "height_mm": within(10, 1000, "mm"),
+    "edge_mm": within(0, 50, "mm"),
+    "electrode_height_mm": within(0, 50, "mm"),
 }
 CAMERA = {
-    "px_per_mm": _number(0.5, 200, "px/mm"),
-    "spacing_px": _number(0, 100, "px"),
-    "dot_sigma_px": _number(0.01, 10, "px"),
+    "px_per_mm": within(0.5, 200, "px/mm"),
+    "spacing_px": within(0, 100, "px"),
+    "dot_sigma_px": within(0.01, 10, "px"),
 }
 TABLES: dict[str, dict[str, Rule]] = {
     "pools": POOLS,
     "bench": BENCH,
     "pattern": SECTIONS["pattern"],
     "camera": CAMERA,
-    "calibration": {name: _number(0, 10, "standard uncertainty") for name in CALIBRATION},
+    "calibration": {name: within(0, 10, "standard uncertainty") for name in CALIBRATION},
 }
 """All tables and keys; only the pools are required."""
 
@@ -91,12 +90,7 @@ def read_request(path: Path) -> dict[str, Any]:
     InputError
         If the file cannot be read, or is no TOML.
     """
-    try:
-        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, A_REQUEST) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(path, "syntax", error, A_REQUEST) from error
+    return parse_toml(read_text(path, A_REQUEST), path, A_REQUEST)
 
 
 def parse_request(
@@ -151,8 +145,6 @@ def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:
     edge = bench.pop("edge_mm", 1.0)
     for key, value in bench.items():
         given[RANGES.get(key, key)] = _span(value)
-    pattern = dict(tables["pattern"])
-    absent = pattern.pop("absent", None)
     sigma = [
         float(tables["calibration"].get(name, usual))
         for name, usual in zip(CALIBRATION, NOMINAL, strict=True)
@@ -162,9 +154,7 @@ def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:
         plate_mm=plate,
         edge_mm=edge,
         electrode_mm=electrode,
-        pattern=DotPattern(
-            **pattern, absent=None if absent is None else frozenset((i, j) for i, j in absent)
-        ),
+        pattern=dot_pattern(tables["pattern"]),
         sigma=tuple(sigma),
         **tables["camera"],
     )
