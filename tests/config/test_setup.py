@@ -203,7 +203,7 @@ def test_what_is_no_setup_file_is_refused(tmp_path: Path, path: Path) -> None:
 
 @given(st.text())
 def test_no_text_gets_another_error_than_ours(text: str) -> None:
-    with mock.patch("labapp.config.setup._text", return_value=text), pytest.raises(InputError):
+    with mock.patch("labapp.config.setup.read_text", return_value=text), pytest.raises(InputError):
         read_setup("setup.toml")
 
 
@@ -227,8 +227,8 @@ def test_no_value_gets_another_error_than_ours(section: str, key: str, value: ob
     values = tomllib.loads(SETUP)
     values[section][key] = value
     with (
-        mock.patch("labapp.config.setup._text", return_value=SETUP),
-        mock.patch("labapp.config.setup.tomllib.loads", return_value=values),
+        mock.patch("labapp.config.setup.read_text", return_value=SETUP),
+        mock.patch("labapp.config.toml_keys.tomllib.loads", return_value=values),
     ):
         try:
             setup = read_setup("setup.toml")

@@ -160,7 +160,7 @@ def _bits(number: int, report: bytes) -> frozenset[int]:
     return frozenset(number * 8 * LONGEST + place for place in places)
 
 
-class FootSwitch:
+class FootSwitch(HidReader):
     """A foot switch in use, whenever it is plugged in.
 
     Parameters
@@ -187,31 +187,14 @@ class FootSwitch:
         self._on_action = on_action
         self._known = Pedals(pedals.keyboard)
         self._down_s: dict[int, float] = {}
-        self._reader = HidReader(
-            lambda info: info.key == pedals.device,
-            pedals.name,
-            self._on_report,
-            on_event,
-            find,
-            opener,
-        )
+        super().__init__(pedals.name, on_event, find, opener)
 
-    @property
-    def connected(self) -> bool:
-        """Whether it is plugged in and can be read."""
-        return self._reader.connected
+    def matches(self, info: HidInfo) -> bool:
+        """Whether it is this foot switch."""
+        return info.key == self.pedals.device
 
-    def stop(self) -> None:
-        """Stop. Twice does no harm."""
-        self._reader.stop()
-
-    def __enter__(self) -> FootSwitch:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def _on_report(self, number: int, report: bytes) -> None:
+    def on_report(self, number: int, report: bytes) -> None:
+        """Do the actions of the pedals that were pressed."""
         now_s, before = time.monotonic(), self._known.down
         new = self._known.pressed(number, report)
         first = [p for p in sorted(new) if now_s - self._down_s.get(p, -math.inf) >= BOUNCE_S]

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from labapp.bundled import bundled
 from labapp.errors import InputError
@@ -221,17 +221,14 @@ def has_numbers(descriptor: Iterable[int]) -> bool:
 
 
 class HidReader:
-    """Reader thread of a device, which reconnects after unplugging.
+    """Reader thread of a device, which reconnects after unplugging; base of devices in use.
+
+    It begins at once: a subclass is ready before it calls ``__init__``.
 
     Parameters
     ----------
-    matches
-        Selects the device.
     name
-        Its name in events.
-    on_report
-        Called with every report, (report ID or 0, bytes), in the reader's thread; with (−1, b"")
-        when the device is gone: what was pressed is released.
+        Name of the device in events.
     on_event
         Called with every event.
     find, opener
@@ -242,18 +239,15 @@ class HidReader:
 
     def __init__(
         self,
-        matches: Callable[[HidInfo], bool],
         name: str,
-        on_report: Callable[[int, bytes], None],
         on_event: OnEvent = ignore_event,
         find: Find = find_hid,
         opener: Open = open_hid,
         retry_s: float | None = None,
     ) -> None:
         self.connected = False
-        self._matches, self._name = matches, name
+        self._name, self._on_event = name, on_event
         self._retry_s = retry_s
-        self._on_report, self._on_event = on_report, on_event
         self._find, self._opener = find, opener
         self._reported = ""
         self._gone_s = time.monotonic()
@@ -261,13 +255,29 @@ class HidReader:
         self._thread = threading.Thread(target=self._run, name=f"reader of {name}", daemon=True)
         self._thread.start()
 
+    def matches(self, info: HidInfo) -> bool:
+        """Whether this is the device."""
+        raise NotImplementedError
+
+    def on_report(self, number: int, report: bytes) -> None:
+        """Take a report, in the reader's thread.
+
+        Parameters
+        ----------
+        number
+            Report ID, or 0; −1 when the device is gone: what was pressed is released.
+        report
+            Its bytes, without the ID.
+        """
+        raise NotImplementedError
+
     def stop(self) -> None:
         """Stop reading. Twice does no harm."""
         self._ending.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
 
-    def __enter__(self) -> HidReader:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -297,7 +307,7 @@ class HidReader:
             self._reported = words
 
     def _read_on(self) -> None:
-        info = next(filter(self._matches, self._find()), None)
+        info = next(filter(self.matches, self._find()), None)
         if info is None:
             raise HidError(AWAY)
         device = self._opener(info)
@@ -316,7 +326,7 @@ class HidReader:
     def _deliver(self, number: int, report: bytes) -> None:
         """Call `on_report`; an error in it is an event and ends no reading."""
         try:
-            self._on_report(number, report)
+            self.on_report(number, report)
         except Exception as error:
             if not isinstance(error, InputError):
                 logging.getLogger("labapp").exception("%s, report %s", self._name, report.hex())

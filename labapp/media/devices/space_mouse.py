@@ -6,8 +6,17 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from labapp.media.devices.hid import AWAY, MISSING, Find, HidReader, Open, find_hid, open_hid
-from labapp.media.events import Event, OnEvent, ignore_event
+from labapp.media.devices.hid import (
+    AWAY,
+    MISSING,
+    Find,
+    HidInfo,
+    HidReader,
+    Open,
+    find_hid,
+    open_hid,
+)
+from labapp.media.events import Kind, OnEvent, ignore_event
 
 RETRY_S = 2.0
 """Pause between looks for one: most benches have none."""
@@ -62,7 +71,7 @@ class SixAxes:
         return SixAxes(*move, *turn, buttons)
 
 
-class SpaceMouse:
+class SpaceMouse(HidReader):
     """Reader thread of the connected controller, if there is one.
 
     Parameters
@@ -84,34 +93,22 @@ class SpaceMouse:
     ) -> None:
         self._on_move, self._on_event = on_move, on_event
         self._held = SixAxes()
-        self._reader = HidReader(
-            lambda info: info.is_3d,
-            "3-D controller",
-            self._on_report,
-            self._emit,
-            find,
-            opener,
-            RETRY_S,
-        )
+        super().__init__("3-D controller", on_event, find, opener, RETRY_S)
 
-    @property
-    def connected(self) -> bool:
-        """Whether one is plugged in and can be read."""
-        return self._reader.connected
+    def matches(self, info: HidInfo) -> bool:
+        """Whether it is a 3-D controller."""
+        return info.is_3d
 
-    def stop(self) -> None:
-        """Stop reading. Twice does no harm."""
-        self._reader.stop()
-
-    def _emit(self, event: Event) -> None:
-        if event.words not in (AWAY, MISSING):
-            self._on_event(event)
-
-    def _on_report(self, number: int, report: bytes) -> None:
+    def on_report(self, number: int, report: bytes) -> None:
+        """Tell of a change."""
         held = self._held.after(number, report)
         if held != self._held:
             self._held = held
             self._on_move(held)
+
+    def _emit(self, kind: Kind, words: str) -> None:
+        if words not in (AWAY, MISSING):
+            super()._emit(kind, words)
 
 
 def _axes(report: bytes) -> tuple[float, float, float]:
