@@ -63,7 +63,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # which takes as long to load as all else
     cls=Commands,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "max_content_width": 1000,  # the terminal's
+    },
     help="Measure the 3-D surface of a molten weld pool from a reflected laser dot matrix. "
     "Alone, labapp opens the app; labapp FILE opens a session or a recording in it. "
     "Lengths are in mm, angles in degrees, places in an image in px (u right, v down, the "
