@@ -104,9 +104,21 @@ def surface(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
         Largest distance between rings of vertices, mm.
     """
     vertices, triangles = surface_mesh(reconstruction, spacing_mm)
-    triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
+    used, triangles = known_part(triangles, vertices[:, 2])
+    return Mesh(vertices[used], triangles)
+
+
+def known_part(triangles: IntArray, value: FloatArray) -> tuple[IntArray, IntArray]:
+    """Part of a mesh of n vertices whose corners all have a value, shape (n,); NaN: unknown.
+
+    Returns
+    -------
+    used, triangles
+        Indices of its vertices, shape (m,), and its triangles by their places among these.
+    """
+    triangles = triangles[np.isfinite(value[triangles]).all(axis=1)]
     used, corner = np.unique(triangles, return_inverse=True)
-    return Mesh(vertices[used], corner.reshape(triangles.shape))
+    return used, corner.reshape(triangles.shape)
 
 
 def solid(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:

@@ -9,7 +9,6 @@ import os
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -164,12 +163,7 @@ class ResultsWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """Record in `run.json` how the run ended."""
         state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         self._run |= {

@@ -13,7 +13,7 @@ from labapp.core.surface.measures import surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, freeze
 from labapp.export.heights import difference_at, sigma_at
-from labapp.export.meshes import drawn_spacing
+from labapp.export.meshes import drawn_spacing, known_part
 
 EXAGGERATION = 3.0
 """Height over width by default: pools are flat."""
@@ -105,7 +105,9 @@ def scene_of(
     limits
         Ends of the colour scale, mm; None: those of this surface.
     """
-    vertices, triangles = _known(*_mesh(reconstruction))
+    vertices, triangles = _mesh(reconstruction)
+    used, triangles = known_part(triangles, vertices[:, 2])
+    vertices = vertices[used]
     values, label = vertices[:, 2], HEIGHT
     if colour == "sigma":
         sigma = sigma_at(reconstruction, vertices[:, 0], vertices[:, 1])
@@ -129,13 +131,12 @@ def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
     # Slightly within, so that the rim of one of two equal boundaries is not lost to rounding.
     x, y = (one.boundary.center_mm + (vertices[:, :2] - one.boundary.center_mm) * (1 - 1e-9)).T
     difference = difference_at(one, other, x, y)
-    triangles = triangles[np.isfinite(difference[triangles]).all(axis=1)]
-    used, corners = np.unique(triangles, return_inverse=True)
+    used, triangles = known_part(triangles, difference)
     values = difference[used]
     reach = float(np.abs(values).max(initial=1e-6))
     return Scene(
         vertices[used],
-        corners.reshape(-1, 3),
+        triangles,
         values,
         "difference (mm)",
         (-reach, reach),
@@ -173,15 +174,6 @@ def _mesh(reconstruction: Reconstruction) -> tuple[FloatArray, IntArray]:
     )
     spacing_mm = drawn_spacing(reconstruction, SPACING_MM)
     return surface_mesh(replace(reconstruction, boundary=thinned), spacing_mm)
-
-
-def _known(vertices: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
-    """Mesh without vertices of unknown height (NaN)."""
-    if np.isfinite(vertices).all():
-        return vertices, triangles
-    triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
-    used, corners = np.unique(triangles, return_inverse=True)
-    return vertices[used], corners.reshape(-1, 3)
 
 
 def _closed(line: FloatArray) -> FloatArray:

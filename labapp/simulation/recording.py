@@ -6,6 +6,7 @@ import csv
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -181,8 +182,8 @@ class Recording:
         _write_png(folder / "calibration.png", self.calibration_picture())
         (folder / "setup.toml").write_text(setup, encoding="utf-8")
         with (
-            _Table(folder / "truth.csv", self.truth_columns) as truth,
-            _Table(folder / "dots_truth.csv", self.dot_columns) as dots,
+            _table(folder / "truth.csv", self.truth_columns) as truth,
+            _table(folder / "dots_truth.csv", self.dot_columns) as dots,
         ):
             done = 0
 
@@ -193,8 +194,8 @@ class Recording:
             def images() -> Iterator[Picture]:
                 nonlocal done
                 for one in self._frames(workers, report):
-                    truth.write([one.truth])
-                    dots.write(one.dots)
+                    truth.writerow(one.truth)
+                    dots.writerows(one.dots)
                     yield one.image
                     done += 1
                     report()
@@ -353,19 +354,10 @@ def _write_png(path: Path, image: npt.NDArray[np.uint8 | np.uint16]) -> None:
         raise OSError(f"cannot write {path}")
 
 
-class _Table:
-    """A CSV file that is written row by row; cells of other columns than its own are left out."""
-
-    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
-        self._file = path.open("w", encoding="utf-8", newline="")
-        self._rows = csv.DictWriter(self._file, columns, extrasaction="ignore", lineterminator="\n")
-        self._rows.writeheader()
-
-    def __enter__(self) -> _Table:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def write(self, rows: Iterable[Mapping[str, str]]) -> None:
-        self._rows.writerows(rows)
+@contextmanager
+def _table(path: Path, columns: tuple[str, ...]) -> Iterator[csv.DictWriter[str]]:
+    """Write a CSV file row by row; cells of other columns than its own are left out."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
+        rows.writeheader()
+        yield rows

@@ -273,14 +273,8 @@ def _load(
                 )
             if needed > MOST_HELD:
                 raise InputError(path, entry.filename, f"{needed} bytes, compressed", NOT_HELD)
-            content = np.empty(needed, np.uint8)
-            done = 0
-            # To the end, where the checksum is looked at.
-            while part := file.read(READ_BYTES):
-                start, done = done, done + len(part)
-                if done > needed:
-                    break
-                content[start:done] = np.frombuffer(part, np.uint8)
+            content = file.read(needed)
+            done = len(content) + len(file.read(1))  # to the end, where the checksum is looked at
     except InputError:
         raise
     except Exception as error:
