@@ -16,9 +16,10 @@ import pytest
 
 import labapp as package
 from labapp.core import pipeline
+from labapp.core.images.find_dots import find_dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows.correction import Correction
-from labapp.core.rows.detection import find_dots, find_lattice
+from labapp.core.rows.find_lattice import find_lattice
 from labapp.core.surface.measures import Measures
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError

@@ -278,7 +278,7 @@ def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
 
 def _carried_on(session: Session, frame: int, correction: Correction) -> dict[int, Correction]:
     """Corrections of the frames after it, as far as it fits; says up to where."""
-    from labapp.core.rows.detection import find_dots
+    from labapp.core.images.find_dots import find_dots
     from labapp.core.rows.tracking import carry_on
     from labapp.core.values import CannotMeasure
 

@@ -1,4 +1,4 @@
-"""Matched pairs of ray and dot: what matching finds and every scheme begins with (§4.2.2)."""
+"""Match: the matched pairs of ray and dot, which `matching` finds and every scheme begins with."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ ORIENTATIONS: tuple[Orientation, ...] = ("S/S", "S/I", "I/I")
 
 
 def ways(orientation: Orientation) -> IntArray:
-    """+1 or −1: whether reflected rows, and columns, grow with the rays'; shape (2,)."""
+    """Whether reflected rows grow with the rays', and columns: +1 or −1 each, shape (2,)."""
     by_column, by_row = orientation.split("/")
     return np.array([1 if by_row == "S" else -1, 1 if by_column == "S" else -1])
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One orientation that was tried on the matched dots.
+    """How well the matched dots fit with one orientation.
 
     Parameters
     ----------

@@ -1,4 +1,13 @@
-"""Frame → Measurement: the seven steps of the measurement, in order, and nothing else."""
+"""Frame → Measurement: the steps of the measurement, in order, and nothing else.
+
+1. `find_dots`: the reflected dots of the frame (§5.2.1).
+2. `find_lattice`: their rows and columns in the picture, as far as they can be told (§5.2.2).
+3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
+4. `reconstruct`: the pool's surface and boundary, by the scheme that is chosen (ch. 6, 7).
+5. `measure_surface`: its size and the reflection errors (Eq. 6-3 … 6-8).
+
+Of a frame that the operator has corrected, his dots and rows take the place of steps 1 and 2.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +17,13 @@ from typing import Any, Literal
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots, Image
+from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.match import Match
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.rows.correction import Correction
-from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.schemes import SCHEMES, ers, irs
 from labapp.core.surface import measures
@@ -31,11 +41,13 @@ class Settings:
     scheme
         One of `SCHEMES`.
     algorithm
-        Of IRS: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``.
+        Of IRS: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``. It goes before that of ``irs``.
     correspondence
-        ``auto``, or the one to use.
-    dots, lattice, match, fit, ers, irs
-        Settings of the single steps.
+        ``auto``, or the orientation to use (`match.Orientation`). It goes before that of ``match``.
+    dots, lattice, match
+        Settings of steps 1 to 3.
+    fit, ers, irs
+        Settings of the schemes; only those of ``scheme`` count.
     """
 
     scheme: str = "fit"
@@ -51,7 +63,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one frame gave, as far as it went.
+    """The results of the steps for one frame, as far as they went.
 
     Parameters
     ----------
@@ -62,9 +74,10 @@ class Measurement:
     scheme
         Which scheme was asked for.
     dots, lattice, match, reconstruction, measures
-        The steps' results; None from the step on that could not be done.
+        Results of steps 1 to 5; None from the step on that could not be done. The lattice may be
+        None before that, too: rays can be told without.
     correction
-        What the operator put right; None if dots and rows are as they were found.
+        The operator's dots and rows; None if they are as they were found.
     """
 
     status: str
@@ -96,23 +109,23 @@ def measure(
     settings
         See `Settings`.
     correction
-        The frame's dots and rows as the operator left them; they are measured in place of what
-        would be found, and of the image only the shape counts.
+        The frame's dots and rows as the operator has them; they are measured in place of what would
+        be found, and of the image only the shape counts.
     """
     result = Measurement("ok", "", settings.scheme, correction=correction)
     height, width = image.shape
-    chosen = replace(settings.match, correspondence=settings.correspondence)
-    bench = (rig, calibration, (height, width), chosen)
+    match_settings = replace(settings.match, correspondence=settings.correspondence)
+    bench = (rig, calibration, (height, width), match_settings)
     try:
         if correction is None:
             dots = find_dots(image, settings.dots)
             result = replace(result, dots=dots)
-            lattice, doubt = _lattice(dots, (height, width), settings.lattice)
+            lattice, no_lattice = _lattice_or_why(dots, (height, width), settings.lattice)
             result = replace(result, lattice=lattice)
             try:
                 match = match_rays(dots, lattice, *bench)
-            except CannotMeasure as answer:
-                raise (doubt if doubt and answer.status == "no-match" else answer) from None
+            except CannotMeasure as why:
+                raise (no_lattice if no_lattice and why.status == "no-match" else why) from None
             lattice = lattice_of_match(match, rig, len(dots))
         else:
             dots, given = correction.dots, correction.lattice
@@ -123,14 +136,14 @@ def measure(
         reconstruction = reconstruct(match, rig, settings)
         size = measures.measure_surface(reconstruction, match, rig)
         return replace(result, reconstruction=reconstruction, measures=size)
-    except CannotMeasure as answer:
-        return replace(result, status=answer.status, reason=answer.reason)
+    except CannotMeasure as why:
+        return replace(result, status=why.status, reason=why.reason)
 
 
 def start_correction(measurement: Measurement) -> Correction:
-    """Return the correction that a frame was measured with, or one of what was found in it.
+    """The correction that a frame was measured with, or one that begins with what was found.
 
-    A reference is taken over only where the frame was matched: a hole that stands out among the
+    The latter has a reference only where the frame was matched: a hole that stands out among the
     rows is no more than a candidate until the rays agree.
     """
     if measurement.correction is not None:
@@ -156,11 +169,11 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
     return scheme.reconstruct(match, rig, own)
 
 
-def _lattice(
+def _lattice_or_why(
     dots: Dots, frame_shape: tuple[int, int], settings: LatticeSettings
 ) -> tuple[Lattice | None, CannotMeasure | None]:
     """Rows and columns, or why there are none: the optics may still tell the rays."""
     try:
         return find_lattice(dots, frame_shape, settings), None
-    except CannotMeasure as answer:
-        return None, answer
+    except CannotMeasure as why:
+        return None, why

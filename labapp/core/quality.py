@@ -14,8 +14,9 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.exposure import Exposure, judge_exposure
+from labapp.core.images.find_dots import find_dots
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.rows.detection import find_dots, find_lattice
+from labapp.core.rows.find_lattice import find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.surface.measures import Measures
 from labapp.core.values import CannotMeasure

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from labapp.core.images.dots import BandPassSettings, Dots
-from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.images.find_dots import DotSettings, find_dots
+from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError

@@ -20,7 +20,7 @@ import platformdirs
 import typer
 from scipy.spatial import cKDTree
 
-from labapp.core.images.band_pass import Exposure, band_pass_dots, quick_dots
+from labapp.core.images.band_pass import DetectorTuning, band_pass_dots, quick_dots
 from labapp.core.images.dots import Dots, Image
 from labapp.core.pipeline import Settings
 from labapp.core.values import FloatArray
@@ -106,15 +106,15 @@ def compare_detectors(video: Video, count: int) -> list[Detected | tuple[str, st
     with open_source(video.path) as source:
         images = [source.frame(number).image for number in frames]
     settings = Settings().dots.band_pass
-    exposure = Exposure.of(images[0], settings)
+    tuning = DetectorTuning.of(images[0], settings)
 
     def quick(image: Image) -> FloatArray:
-        dots: Dots = quick_dots(image, exposure, settings)
+        dots: Dots = quick_dots(image, tuning, settings)
         return dots.image_px
 
     true = [video.dots[number][0] for number in frames]
     made: list[Detected | tuple[str, str]] = [_detected("labapp, warm", quick, images, true)]
-    for name, detector in detectors(exposure.size_px):
+    for name, detector in detectors(tuning.size_px):
         if isinstance(detector, str):
             made.append((name, detector))
         else:

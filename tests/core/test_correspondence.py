@@ -25,7 +25,8 @@ from labapp.core.rows.correction import (
     set_reference,
     shift_row,
 )
-from labapp.core.rows.lattice import GrowSettings, Lattice, Site, grow_lattice
+from labapp.core.rows.lattice import Lattice, Site
+from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.values import BoolArray, CannotMeasure
 from labapp.simulation.forward import Reflections, seen_orientation, trace
 from labapp.simulation.pools import Dent, Pool, Wave, egg, ellipsoidal_cap, spherical_cap

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from labapp.core.images.band_pass import band_pass_dots
+from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.images.threshold_dots import block_threshold_dots, wavelet_dots
-from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
-from labapp.core.rows.lattice import grow_lattice
+from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
+from labapp.core.rows.lattice_growth import grow_lattice
 from labapp.core.rows.row_search import mask_rows, search_rows
 from labapp.core.values import CannotMeasure, FloatArray
 from tests.scenes import as_dots

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from labapp.core.images.exposure import ADVICE, Exposure, judge_exposure
-from labapp.core.rows.detection import DotSettings, find_dots
+from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.values import CannotMeasure
 
 SPACING_PX, SIZE_PX = 14.0, 2.0

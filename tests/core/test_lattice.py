@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice, joined
+from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice, merge_grids
 from labapp.core.rows.lattice_kernels import BORDER, grow
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.pools import egg, ellipsoidal_cap, spherical_cap
@@ -77,11 +78,11 @@ def test_tiles_with_gaps_between_them_are_one_grid(seed: int) -> None:
 def test_grids_that_contradict_each_other_are_not_joined() -> None:
     left, right = (np.arange(64).reshape(8, 8) + first for first in (0, 100))
     right[:, :2] = left[:, -2:]
-    whole = joined([left, right.T])
+    whole = merge_grids([left, right.T])
     assert whole.shape == (8, 14)
     np.testing.assert_array_equal(whole[:, 6:], right)
     right[4:, 0] = left[3:7, -2]  # slipped by a row
-    np.testing.assert_array_equal(joined([left, right.T]), left)
+    np.testing.assert_array_equal(merge_grids([left, right.T]), left)
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -12,6 +12,7 @@ import pytest
 
 from labapp.config.setup import read_setup
 from labapp.core.images.dots import Dots
+from labapp.core.images.find_dots import DotSettings
 from labapp.core.pipeline import (
     Measurement,
     Settings,
@@ -20,8 +21,8 @@ from labapp.core.pipeline import (
     start_correction,
 )
 from labapp.core.rows.correction import Correction, add_dot, assign, delete_dots, set_reference
-from labapp.core.rows.detection import DotSettings
-from labapp.core.rows.lattice import GrowSettings, Lattice, grow_lattice
+from labapp.core.rows.lattice import Lattice
+from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.media import open_source

@@ -1,4 +1,4 @@
-"""Dots of a frame like the one before, whose exposure is known, are those of the whole search."""
+"""Dots of a frame like the one before, whose tuning is known, are those of the whole search."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core.images.band_pass import Exposure, band_pass_dots, quick_dots
+from labapp.core.images.band_pass import DetectorTuning, band_pass_dots, quick_dots
 from labapp.core.images.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
 
@@ -36,10 +36,10 @@ def places(rng: np.random.Generator) -> FloatArray:
 def test_the_dots_of_the_next_frame_are_those_of_the_default_detector(seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, true = frame(places(rng), rng), places(rng)
-    exposure = Exposure.of(first, BandPassSettings())
+    tuning = DetectorTuning.of(first, BandPassSettings())
     after = frame(true, rng, hot=6)
-    quick = quick_dots(after, exposure, BandPassSettings())
-    slow = band_pass_dots(after, BandPassSettings(size_px=exposure.size_px))
+    quick = quick_dots(after, tuning, BandPassSettings())
+    slow = band_pass_dots(after, BandPassSettings(size_px=tuning.size_px))
     assert len(quick) == len(slow) >= len(true) - 1  # a hot pixel may hit a dot
     away, own = cKDTree(quick.image_px).query(slow.image_px)
     assert np.quantile(away / slow.u_sigma_px, 0.95) < 1.0
@@ -54,11 +54,11 @@ def test_light_is_the_same_round_the_dots_alone_and_over_the_whole_picture(
 ) -> None:
     rng = np.random.default_rng(5)
     image = frame(places(rng), rng)
-    exposure = Exposure.of(image, BandPassSettings())
+    tuning = DetectorTuning.of(image, BandPassSettings())
     made = []
     for much in (np.inf, 0.0):
-        monkeypatch.setattr("labapp.core.images.band_pass.MUCH", much)
-        made.append(quick_dots(image, exposure, BandPassSettings()))
+        monkeypatch.setattr("labapp.core.images.band_pass.MOST_SURROUNDINGS", much)
+        made.append(quick_dots(image, tuning, BandPassSettings()))
     np.testing.assert_allclose(made[0].image_px, made[1].image_px, atol=1e-4)
     np.testing.assert_allclose(made[0].size_px, made[1].size_px, atol=1e-3)
 
@@ -67,36 +67,36 @@ def test_a_frame_with_its_own_exposure_has_the_same_dots() -> None:
     rng = np.random.default_rng(9)
     image = frame(places(rng), rng, hot=6)
     cold = band_pass_dots(image, BandPassSettings())
-    quick = quick_dots(image, Exposure.of(image, BandPassSettings()), BandPassSettings())
+    quick = quick_dots(image, DetectorTuning.of(image, BandPassSettings()), BandPassSettings())
     for one, other in zip(vars(cold).values(), vars(quick).values(), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_a_frame_without_dots_has_none() -> None:
     rng = np.random.default_rng(5)
-    exposure = Exposure.of(frame(places(rng), rng), BandPassSettings())
+    tuning = DetectorTuning.of(frame(places(rng), rng), BandPassSettings())
     for dark in (frame(np.zeros((0, 2)), rng, hot=4), np.zeros(SHAPE, np.uint8)):
         with pytest.raises(CannotMeasure) as answer:
-            quick_dots(dark, exposure, BandPassSettings())
+            quick_dots(dark, tuning, BandPassSettings())
         assert answer.value.status == "no-dots"
 
 
 def test_a_frame_of_another_size_is_refused() -> None:
-    exposure = Exposure.of(np.zeros((40, 60), np.uint8), BandPassSettings(size_px=1.8))
+    tuning = DetectorTuning.of(np.zeros((40, 60), np.uint8), BandPassSettings(size_px=1.8))
     for kind in (np.uint8, np.uint16):
-        with pytest.raises(ValueError, match="exposure of"):
-            quick_dots(np.zeros((60, 40), kind), exposure, BandPassSettings(size_px=1.8))
+        with pytest.raises(ValueError, match="tuning of"):
+            quick_dots(np.zeros((60, 40), kind), tuning, BandPassSettings(size_px=1.8))
 
 
 @pytest.mark.slow
 def test_threads_that_share_an_exposure_do_not_share_their_dots() -> None:
     rng = np.random.default_rng(11)
     frames = [frame(places(rng), rng) for _ in range(6)]
-    exposure, settings = Exposure.of(frames[0], BandPassSettings()), BandPassSettings()
-    alone = [quick_dots(image, exposure, settings).image_px for image in frames]
+    tuning, settings = DetectorTuning.of(frames[0], BandPassSettings()), BandPassSettings()
+    alone = [quick_dots(image, tuning, settings).image_px for image in frames]
     with ThreadPoolExecutor(3) as pool:
         told = list(
-            pool.map(lambda k: quick_dots(frames[k % 6], exposure, settings).image_px, range(120))
+            pool.map(lambda k: quick_dots(frames[k % 6], tuning, settings).image_px, range(120))
         )
     for k, found in enumerate(told):
         np.testing.assert_array_equal(found, alone[k % 6])
@@ -104,6 +104,6 @@ def test_threads_that_share_an_exposure_do_not_share_their_dots() -> None:
 
 @pytest.mark.parametrize("shape", [(16, 16), (24, 600)])
 def test_a_blank_picture_smaller_than_a_dot_is_wide_has_no_dots(shape: tuple[int, int]) -> None:
-    exposure = Exposure(4.0, np.ones(shape, np.float32), np.ones(shape, np.float32))
+    tuning = DetectorTuning(4.0, np.ones(shape, np.float32), np.ones(shape, np.float32))
     with pytest.raises(CannotMeasure, match="no-dots"):
-        quick_dots(np.full(shape, 7, np.uint8), exposure, BandPassSettings())
+        quick_dots(np.full(shape, 7, np.uint8), tuning, BandPassSettings())

@@ -1,8 +1,8 @@
 """The default detector: a band-pass at the dots' own size, which the frame itself tells.
 
-One search serves the first frame and the frames that follow: what they share, size and noise, is an
-`Exposure`. Wide Gaussians are taken of a smaller picture, and what concerns few pixels is worked
-out for these alone.
+One search serves the first frame and the frames that follow, with the `DetectorTuning` of the
+first: dot size and noise. Wide Gaussians are taken of a smaller picture, and what concerns few
+pixels is worked out for these alone.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from labapp.core.images.dot_size import (
 from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
 
-HOT = 1.6
+HOT_RATIO = 1.6
 """What a cluster of hot pixels answers to a band of a third of the dots' size, over its answer to
 theirs."""
 
-REMAINS = 0.5
+REMAINS_SHARE = 0.5
 """A dot with mended pixels is at least this fraction of the typical dot; remains of hot pixels are
 fainter."""
 
-FAINT = 3.0
-"""A peak that is pointed at stands this many noise σ above the background: half of what one that
-nobody points at must."""
+FAINT_SIGMA = 3.0
+"""A peak that the operator points at stands this many noise σ above the background: half of what
+any other must (`BandPassSettings.threshold`)."""
 
 ROUND_PX2 = 0.25
 """Variance, px² of the smaller picture, that making a picture smaller and large again adds."""
@@ -49,12 +49,12 @@ ROUND_PX2 = 0.25
 LEAST_PX2 = 0.8
 """A blur of less, px² of the smaller picture, is not taken of it."""
 
-WHOLE = 1.4
-"""Centroids are taken over so much more of a dot than it is found by: over more of its grains of
-speckle, which move it the less."""
+CENTROID_WIDENING = 1.4
+"""Centroids are taken over windows wider by this than a dot is found by: over more of its grains of
+speckle, which then move it less."""
 
-MUCH = 0.3
-"""Where the dots' surroundings are a larger share of the picture, the whole of it is blurred."""
+MOST_SURROUNDINGS = 0.3
+"""Where the dots' surroundings are a larger share of the picture, all of it is blurred at once."""
 
 PEAK_GAIN = 1 / 1.64 - 1 / 3.56
 """What a Gaussian dot of the band's own size keeps of its height: 1/(1 + 0.8²) − 1/(1 + 1.6²)."""
@@ -64,8 +64,10 @@ WIDTH_KEPT = 0.8
 
 
 @dataclass(frozen=True)
-class Exposure:
-    """What frames of one recording share as long as light and camera stay as they are.
+class DetectorTuning:
+    """What the detector is set to by a frame: dot size and noise, good for the frames after it.
+
+    It holds as long as light and camera stay as they are.
 
     Parameters
     ----------
@@ -85,9 +87,9 @@ class Exposure:
         freeze(self)
 
     @classmethod
-    def of(cls, frame: Image, settings: BandPassSettings) -> Exposure:
-        """Take it from a frame, shape (height, width), any real type."""
-        return _exposed(as_picture(frame), settings)[0]
+    def of(cls, frame: Image, settings: BandPassSettings) -> DetectorTuning:
+        """The tuning for a frame, shape (height, width), any real type, and those like it."""
+        return _tuned(as_picture(frame), settings)[0]
 
 
 def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
@@ -108,32 +110,32 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
     picture = as_picture(np.asarray(frame))
     if picture.ndim != 2 or min(picture.shape) < 8 or not float(np.ptp(picture)) > 0:
         raise CannotMeasure("no-dots", "the frame is blank or too small to hold a dot")
-    return _found(*_exposed(picture, settings), settings)
+    return _found(*_tuned(picture, settings), settings)
 
 
-def quick_dots(frame: Image, exposure: Exposure, settings: BandPassSettings) -> Dots:
-    """Find the dots of a frame whose exposure is known: `band_pass_dots` in less time.
+def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings) -> Dots:
+    """Find the dots of a frame with the tuning of a frame before: `band_pass_dots` in less time.
 
     Parameters
     ----------
     frame
-        Grey image of the exposure's shape, any real type.
-    exposure
+        Grey image of the tuning's shape, any real type.
+    tuning
         Of a frame before.
     settings
-        See `BandPassSettings`; the size is the exposure's.
+        See `BandPassSettings`; the size is the tuning's.
 
     Raises
     ------
     CannotMeasure
         ``no-dots`` if nothing stands out of the noise.
     ValueError
-        If the frame has another size than that of the exposure.
+        If the frame has another size than that of the tuning.
     """
-    if frame.shape != exposure.noise.shape:
-        raise ValueError(f"a frame of {frame.shape}, an exposure of {exposure.noise.shape}")
-    picture = mended(as_picture(frame), exposure.noise, exposure.size_px)
-    return _found(exposure, _Banded(picture, exposure.size_px), settings)
+    if frame.shape != tuning.noise.shape:
+        raise ValueError(f"a frame of {frame.shape}, a tuning of {tuning.noise.shape}")
+    picture = mended(as_picture(frame), tuning.noise, tuning.size_px)
+    return _found(tuning, _BandPassed(picture, tuning.size_px), settings)
 
 
 def dot_at(
@@ -159,10 +161,10 @@ def dot_at(
         its own is within two dots' sizes it is at (u_px, v_px), uncertain by a dot's size.
     """
     size = settings.size_px or (float(np.median(others.size_px)) if len(others) else None)
-    like = BandPassSettings(size, FAINT, 0.0, settings.speckle_px)
-    exposure, seen = _exposed(as_picture(frame), like)
-    size = exposure.size_px
-    u, v = seen.peaks(exposure)
+    like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.speckle_px)
+    tuning, seen = _tuned(as_picture(frame), like)
+    size = tuning.size_px
+    u, v = seen.peaks(tuning)
     away = np.hypot(u - u_px, v - v_px)
     taken = np.full(len(u), np.inf)
     if len(others) and len(u):
@@ -173,14 +175,14 @@ def dot_at(
     if not (away <= 2.0 * size).any():
         at = round(v_px), round(u_px)
         peak = max(float(seen.band[at]), 0.0) / PEAK_GAIN
-        snr = peak / max(float(exposure.noise[at]), 1e-3 * peak, 1e-9)
+        snr = peak / max(float(tuning.noise[at]), 1e-3 * peak, 1e-9)
         unsure = max(size, 1.0)
         return Dots(*(np.array([x]) for x in (u_px, v_px, unsure, unsure, size, peak, snr)))
     k = int(np.argmin(away))
     limit = np.array(frame.shape[::-1]) - 1
     known = np.clip(np.rint(others.image_px), 0, limit).astype(np.int64)
     u, v = np.append(known[:, 0], u[k]), np.append(known[:, 1], v[k])
-    every = _described(seen, u, v, exposure.noise, settings.speckle_px)
+    every = _described(seen, u, v, tuning.noise, settings.speckle_px)
     return Dots(*(getattr(every, column.name)[-1:] for column in fields(every)))
 
 
@@ -191,20 +193,20 @@ def typical(brightness: FloatArray) -> float:
     return float(order[np.searchsorted(light, 0.5 * light[-1])])
 
 
-def _exposed(picture: Picture, settings: BandPassSettings) -> tuple[Exposure, _Banded]:
-    """Take a picture's exposure; also its band, which that needs."""
+def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning, _BandPassed]:
+    """A picture's tuning, and the picture in the band, which it follows from."""
     noise = local_noise(picture)
     size = settings.size_px or size_of(picture, noise)
-    seen = _Banded(mended(picture, noise, size), size)
+    seen = _BandPassed(mended(picture, noise, size), size)
     white = float(np.median(noise[::8, ::8])) / noise_gain(size)
     grain = with_grain(seen.band[::4, ::4], white) / max(white, 1e-9)
     least = 1e-3 * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
     floor = noise * np.float32(settings.threshold * grain / noise_gain(size))
     np.maximum(floor, np.float32(settings.threshold * least), out=floor)
-    return Exposure(size, noise, floor), seen
+    return DetectorTuning(size, noise, floor), seen
 
 
-class _Banded:
+class _BandPassed:
     """A picture and its band at the dots' size, on this thread's scratch pictures."""
 
     def __init__(self, picture: Picture, size: float) -> None:
@@ -218,7 +220,7 @@ class _Banded:
         self._small = widen(self._narrow, self.wide, (1.6**2 - 0.8**2) * self.size**2)
         cv2.subtract(self._narrow, self.wide, dst=self.band)
 
-    def peaks(self, exposure: Exposure) -> tuple[IntArray, IntArray]:
+    def peaks(self, tuning: DetectorTuning) -> tuple[IntArray, IntArray]:
         """Columns and rows of the peaks over the floor that may be dots'.
 
         Where some may not, for they are as sharp as hot pixels or as long as lines of them, these
@@ -227,20 +229,20 @@ class _Banded:
         from labapp.core.images import dot_kernels
 
         disc = peak_disc(self.size)
-        u, v = dot_kernels.peaks(self.band, exposure.floor, disc)
+        u, v = dot_kernels.peaks(self.band, tuning.floor, disc)
         good = self._dot_like(u, v)
         if good.all():
             return u, v
         suspects = u[~good], v[~good]
-        whole = mended(self.picture, exposure.noise, self.size, suspects)
+        whole = mended(self.picture, tuning.noise, self.size, suspects)
         if whole is not self.picture:
             usual = typical(self.band[v, u][good].astype(float)) if good.any() else 0.0
             self.picture = whole
             self._pass()
-            u, v = dot_kernels.peaks(self.band, exposure.floor, disc)
+            u, v = dot_kernels.peaks(self.band, tuning.floor, disc)
             near = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
             good = self._dot_like(u, v)
-            good &= (near > 2.0 * self.size) | (self.band[v, u] >= REMAINS * usual)
+            good &= (near > 2.0 * self.size) | (self.band[v, u] >= REMAINS_SHARE * usual)
         return u[good], v[good]
 
     def _dot_like(self, u: IntArray, v: IntArray) -> BoolArray:
@@ -249,7 +251,7 @@ class _Banded:
 
         scale = max(0.4, self.size / 3.0)
         narrow, wide = (_nine(sigma * scale, 1.6 * scale) for sigma in (0.8, 1.6))
-        sharp = dot_kernels.finest(self.picture, u, v, narrow, wide) >= HOT * self.band[v, u]
+        sharp = dot_kernels.finest(self.picture, u, v, narrow, wide) >= HOT_RATIO * self.band[v, u]
         return np.asarray(~sharp & ~dot_kernels.ridges(self.band, u, v, SLENDER))
 
     def light(
@@ -258,9 +260,9 @@ class _Banded:
         """Centroids and moments of the light over its surroundings (`dot_kernels.centroids`)."""
         from labapp.core.images import dot_kernels
 
-        widen(self._small, self.wide, ((3.0 * WHOLE) ** 2 - 0.8**2) * self.size**2)
+        widen(self._small, self.wide, ((3.0 * CENTROID_WIDENING) ** 2 - 0.8**2) * self.size**2)
         margin, taps, picture = margin_of(reach), kernel(0.5 * self.size), self.picture
-        if len(u) * (2 * margin + 1) ** 2 > MUCH * picture.size:
+        if len(u) * (2 * margin + 1) ** 2 > MOST_SURROUNDINGS * picture.size:
             picture, taps = blur(picture, 0.5 * self.size, self._narrow), kernel(0.0)
         return dot_kernels.centroids(picture, self.wide, taps, u, v, margin, width, reach)
 
@@ -289,17 +291,17 @@ def widen(image: Grey, into: Grey, variance_px2: float) -> Grey:
     return small
 
 
-def _found(exposure: Exposure, seen: _Banded, settings: BandPassSettings) -> Dots:
+def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Dots:
     from labapp.core.images import dot_kernels
 
-    u, v = seen.peaks(exposure)
+    u, v = seen.peaks(tuning)
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
     bright = seen.band[v, u].astype(float)
     keep = bright >= settings.contrast * typical(bright)
     u, v = u[keep], v[keep]
     first = dot_kernels.first_of_each(u, v, max(1.5, seen.size))  # the top of a dot may be flat
-    return _described(seen, u[first], v[first], exposure.noise, settings.speckle_px)
+    return _described(seen, u[first], v[first], tuning.noise, settings.speckle_px)
 
 
 @lru_cache(maxsize=8)
@@ -312,8 +314,8 @@ def _nine(sigma: float, widest: float) -> Grey:
     return np.asarray(nine)
 
 
-def windows(next_px: FloatArray, reach: float) -> FloatArray:
-    """Width of the windows of dots so far from the next one, shape (n,), px.
+def window_widths(next_px: FloatArray, reach: float) -> FloatArray:
+    """Widths of the Gaussian windows of dots so far from the next one, shape (n,), px.
 
     A window that ends half-way to the next dot keeps its light out.
     """
@@ -325,13 +327,13 @@ def margin_of(reach: float) -> int:
     return int(np.ceil(2.2 * reach)) + 1
 
 
-def _described(seen: _Banded, u: IntArray, v: IntArray, noise: Grey, speckle_px: float) -> Dots:
+def _described(seen: _BandPassed, u: IntArray, v: IntArray, noise: Grey, speckle_px: float) -> Dots:
     """Centroid, its uncertainty, size, peak and signal-to-noise of each peak."""
     from labapp.core.images import dot_kernels
 
     place, size = np.stack([u, v], axis=1).astype(float), seen.size
-    width = windows(dot_kernels.two_nearest(place, place)[0][:, 1], WHOLE * size)
-    offset, moment = seen.light(u, v, width, WHOLE * size)
+    width = window_widths(dot_kernels.two_nearest(place, place)[0][:, 1], CENTROID_WIDENING * size)
+    offset, moment = seen.light(u, v, width, CENTROID_WIDENING * size)
     moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
     spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / WIDTH_KEPT**2
     peak = seen.band[v, u].astype(float) / PEAK_GAIN

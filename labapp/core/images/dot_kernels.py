@@ -183,7 +183,7 @@ def centroids(
     width: FloatArray,
     reach: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Centroids and second moments of light round pixels: see `band_pass.described`.
+    """Centroids and second moments of light round pixels: see `band_pass._described`.
 
     Light is the image, blurred by a filter, over what is around it, another picture.
     """

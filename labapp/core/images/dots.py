@@ -1,7 +1,7 @@
 """Reflected dots and how well each is known (§5.2.1, §5.3).
 
-The default detector is `band_pass`, the text's two chains are in `threshold_dots`; `detection`
-chooses.
+`find_dots` finds them: by the default detector, `band_pass`, or by the text's two chains, which are
+in `threshold_dots`. The former's settings are here: they are read where nothing is measured, too.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Inner loops of `lattice`: a grid growing over the dots, compiled (docs/adr/0018).
+"""Inner loops of `lattice_growth`: a grid growing over the dots, compiled (docs/adr/0018).
 
 Dots are complex numbers, px, in order of their real parts.
 """
@@ -16,8 +16,21 @@ from labapp.core.values import BoolArray, ComplexArray, FloatArray, IntArray
 BORDER = 3
 """A site's dot is predicted from sites so far from it at most."""
 
-MOST = 16
-"""A site has so many predictions at most."""
+MOST_PREDICTIONS = 16
+"""A site has so many predictions at most: three along each of four ways, and one a corner."""
+
+LEAST_RATIO, MOST_RATIO = 0.6, 1.6
+"""Steps beside each other on one surface differ by no smaller and no larger factor."""
+
+LOOSER = 1.4
+"""A prediction that no neighbouring row bears out may be so many times farther off."""
+
+SEED_GATE = 0.3
+"""The first neighbours lie within this share of a step from where they are predicted."""
+
+MOST_OPEN = 0.6
+"""The two ways round a sound cell end within this share of its sides; after a slip they end a whole
+one apart."""
 
 Claim = tuple[float, int, int, int]
 """How badly its predictions fit a site's dot; the site's row and column; the dot."""
@@ -54,10 +67,10 @@ def _nearest(plane: ComplexArray, place: complex, within: float) -> tuple[int, f
 
 
 @part
-def _tame(ratio: complex) -> complex:
-    """A ratio of steps, kept within what neighbouring steps of one surface can differ by."""
+def _clamped(ratio: complex) -> complex:
+    """A ratio of steps, its size held between `LEAST_RATIO` and `MOST_RATIO`."""
     size = abs(ratio)
-    return ratio * (min(max(size, 0.6), 1.6) / size) if size > 0.0 else 1.0 + 0.0j
+    return ratio * (min(max(size, LEAST_RATIO), MOST_RATIO) / size) if size > 0.0 else 1.0 + 0.0j
 
 
 @part
@@ -71,7 +84,11 @@ def _predictions(
 
     Returns shapes (p,) and (p, 2).
     """
-    places, sizes, count = np.empty(MOST, np.complex128), np.empty((MOST, 2)), 0
+    places, sizes, count = (
+        np.empty(MOST_PREDICTIONS, np.complex128),
+        np.empty((MOST_PREDICTIONS, 2)),
+        0,
+    )
     for dk, dt in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         one, two = dot_at[k + dk, t + dt], dot_at[k + 2 * dk, t + 2 * dt]
         if one < 0 or two < 0:
@@ -82,12 +99,12 @@ def _predictions(
             far = dot_at[k + 2 * dk + ek, t + 2 * dt + et]
             if near >= 0 and next_one >= 0 and far >= 0:
                 ratio = (plane[near] - plane[next_one]) / (plane[next_one] - plane[far])
-                places[count] = plane[one] + step * _tame(ratio)
+                places[count] = plane[one] + step * _clamped(ratio)
                 sizes[count, 0], sizes[count, 1] = abs(step), gate * abs(step)
                 count += 1
             elif near == one:
                 places[count] = plane[one] + step
-                sizes[count, 0], sizes[count, 1] = abs(step), 1.4 * gate * abs(step)
+                sizes[count, 0], sizes[count, 1] = abs(step), LOOSER * gate * abs(step)
                 count += 1
     for dt in (1, -1):
         for dk in (1, -1):
@@ -95,7 +112,7 @@ def _predictions(
             if one >= 0 and other >= 0 and corner >= 0:
                 shorter = min(abs(plane[other] - plane[corner]), abs(plane[one] - plane[corner]))
                 places[count] = plane[one] + plane[other] - plane[corner]
-                sizes[count, 0], sizes[count, 1] = shorter, 1.4 * gate * shorter
+                sizes[count, 0], sizes[count, 1] = shorter, LOOSER * gate * shorter
                 count += 1
     return places[:count], sizes[:count]
 
@@ -130,14 +147,14 @@ def _claim(
 
 
 @part
-def _beginning(
+def _seed_claims(
     plane: ComplexArray, middle: int, seed: int, first: complex, second: complex
 ) -> list[Claim]:
     """A dot and its neighbours: claims that come before all others, in this order."""
     queue = [(-5.0, middle, middle, seed)]
     for dk, dt, step in ((0, 1, first), (0, -1, -first), (1, 0, second), (-1, 0, -second)):
-        dot, distance, _ = _nearest(plane, plane[seed] + step, 0.3 * abs(step))
-        if dot >= 0 and distance < 0.3 * abs(step):
+        dot, distance, _ = _nearest(plane, plane[seed] + step, SEED_GATE * abs(step))
+        if dot >= 0 and distance < SEED_GATE * abs(step):
             queue.append((len(queue) - 5.0, middle + dk, middle + dt, dot))
     return queue
 
@@ -152,12 +169,8 @@ def _root(parent: IntArray, dot: int) -> int:
 
 
 @part
-def _joined(plane: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntArray:
-    """Parent of each dot in trees of those that hang together by cells whose two ways round agree.
-
-    Opposite sides of a cell may differ by little more than half of a step; where a row or column
-    has slipped they differ by a whole one.
-    """
+def _connected_parts(plane: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntArray:
+    """Parent of each dot in trees (union-find) of those that sound cells connect (`MOST_OPEN`)."""
     parent = np.arange(len(plane))
     for _, k, t, dot in placed:
         right, up, across = dot_at[k, t + 1], dot_at[k + 1, t], dot_at[k + 1, t + 1]
@@ -165,7 +178,7 @@ def _joined(plane: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntAr
             continue
         a, b, c, d = plane[dot], plane[right], plane[up], plane[across]
         sides = min(max(abs(b - a), abs(d - c)), max(abs(c - a), abs(d - b)))
-        if abs(a - b - c + d) < 0.6 * sides:
+        if abs(a - b - c + d) < MOST_OPEN * sides:
             for corner in (right, up, across):
                 parent[_root(parent, corner)] = _root(parent, dot)
     return parent
@@ -181,7 +194,7 @@ def grow(
     gate: float,
     doubt: float,
 ) -> IntArray:
-    """Grow a grid from a dot, and tell which parts of it hang together.
+    """Grow a grid from a dot, best fitting site first, and find its connected parts.
 
     Parameters
     ----------
@@ -193,16 +206,16 @@ def grow(
     seed, first, second
         The dot to begin with, and the steps to the next column and to the next row, px.
     gate, doubt
-        As in `lattice.GrowSettings`.
+        As in `lattice_growth.GrowSettings`.
 
     Returns
     -------
     IntArray
-        Of each site its row and column in ``dot_at``, its dot, and one dot of the part that hangs
-        together with it by sound cells (`_joined`), shape (s, 4).
+        Of each site its row and column in ``dot_at``, its dot, and a dot that stands for the part
+        it is connected with by sound cells (`_connected_parts`), shape (s, 4).
     """
     taken, middle, end = np.zeros(len(plane), np.bool_), len(dot_at) // 2, len(dot_at) - BORDER
-    queue, placed = _beginning(plane, middle, seed, first, second), [(0.0, 0, 0, 0)][:0]
+    queue, placed = _seed_claims(plane, middle, seed, first, second), [(0.0, 0, 0, 0)][:0]
     while queue:
         claim = heapq.heappop(queue)
         badness, k, t, dot = claim
@@ -223,7 +236,7 @@ def grow(
                     near = _claim(plane, dot_at, taken, near_k, near_t, gate, doubt)
                     if near[3] >= 0:
                         heapq.heappush(queue, near)
-    parent = _joined(plane, dot_at, placed)
+    parent = _connected_parts(plane, dot_at, placed)
     sites = np.empty((len(placed), 4), np.int64)
     for at, (_, k, t, dot) in enumerate(placed):
         sites[at, 0], sites[at, 1], sites[at, 2], sites[at, 3] = k, t, dot, _root(parent, dot)

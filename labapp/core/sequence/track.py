@@ -14,7 +14,7 @@ from numba import types
 
 from labapp.core.compiled import compiled
 from labapp.core.geometry.rig import Rig
-from labapp.core.images.band_pass import Exposure
+from labapp.core.images.band_pass import DetectorTuning
 from labapp.core.images.dots import Image
 from labapp.core.match import Match
 from labapp.core.matching.observation import UNLABELLED, Observation
@@ -61,7 +61,7 @@ class Track:
     ----------
     geometry
         Splines and rays.
-    exposure
+    tuning
         Size of dots and noise.
     match
         Of the cold chain, where the track began.
@@ -84,7 +84,7 @@ class Track:
     """
 
     geometry: SequenceGeometry
-    exposure: Exposure
+    tuning: DetectorTuning
     match: Match
     residual_mm: float
     pool: WarmPool
@@ -131,7 +131,7 @@ def begin(
         past, before = former.past[1 - MEMORY :], former.slopes[1 - MEMORY :]
     return Track(
         geometry=geometry,
-        exposure=Exposure.of(image, settings.dots.band_pass),
+        tuning=DetectorTuning.of(image, settings.dots.band_pass),
         match=match,
         residual_mm=rms(made.residual_mm),
         pool=pool,

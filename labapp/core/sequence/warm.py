@@ -180,9 +180,9 @@ def follow(
         If there are no dots, or no surface.
     """
     geometry = track.geometry
-    if image.shape != track.exposure.noise.shape:
+    if image.shape != track.tuning.noise.shape:
         raise TrackLost("the frame has another size than the one before")
-    dots = quick_dots(image, track.exposure, settings.dots.band_pass)
+    dots = quick_dots(image, track.tuning, settings.dots.band_pass)
     passed("dots")
     observed = Observation.of(dots, geometry.rig, calibration, (image.shape[0], image.shape[1]))
     pool, labels, off = found_again(track, observed)

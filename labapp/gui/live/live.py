@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from labapp.config.setup import Setup
-from labapp.core.images.band_pass import Exposure, quick_dots
+from labapp.core.images.band_pass import DetectorTuning, quick_dots
 from labapp.core.images.dots import Dots
+from labapp.core.images.find_dots import find_dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import UNMEASURED, Quality, judge_quality
-from labapp.core.rows.detection import find_dots
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.errors import InputError
 from labapp.log import NAME
@@ -170,7 +170,7 @@ class Live:
         self._is_stale = False
         self._closing = threading.Event()
         self._turn = threading.Lock()
-        self._light: Exposure | None = None
+        self._light: DetectorTuning | None = None
         self._light_s = 0.0
         self._workers: list[threading.Thread] = []
 
@@ -295,7 +295,7 @@ class Live:
             places = _places_px(self._dots_in(frame.image, light))
         self._newest.append(LiveFrame(frame, places))
 
-    def _dots_in(self, image: GreyImage, light: Exposure | None) -> Dots | None:
+    def _dots_in(self, image: GreyImage, light: DetectorTuning | None) -> Dots | None:
         """Dots of a frame, quickly where its light is known; None if there is none."""
         try:
             if light is not None:
@@ -308,7 +308,7 @@ class Live:
         quick = self._dots.method == "band-pass"
         now_s, known = time.monotonic(), self._light
         if quick and (known is None or now_s > self._light_s or not _fits(known, frame.image)):
-            self._light = Exposure.of(frame.image, self._dots.band_pass)
+            self._light = DetectorTuning.of(frame.image, self._dots.band_pass)
             self._light_s = now_s + LIGHT_S
         dots = self._dots_in(frame.image, self._light)
         found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
@@ -466,7 +466,7 @@ class Live:
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
 
 
-def _fits(light: Exposure, image: GreyImage) -> bool:
+def _fits(light: DetectorTuning, image: GreyImage) -> bool:
     return light.noise.shape == image.shape
 
 

@@ -17,11 +17,11 @@ from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.images import dots, threshold_dots
+from labapp.core.images import dots, find_dots, threshold_dots
 from labapp.core.match import Match, Trial
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.rows import detection, lattice, row_search
+from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import SCHEMES
 from labapp.core.surface.boundary import Boundary
@@ -115,12 +115,12 @@ STORED = {
     "Signals": Stored(Signals, shapes=dict.fromkeys(("time_s", "current_a", "voltage_v"), "n")),
     # Settings
     "Settings": Stored(Settings, fits=_scheme_is_known),
-    "DotSettings": Stored(detection.DotSettings),
+    "DotSettings": Stored(find_dots.DotSettings),
     "BandPassSettings": Stored(dots.BandPassSettings),
     "BlockThresholdSettings": Stored(threshold_dots.BlockThresholdSettings),
     "WaveletSettings": Stored(threshold_dots.WaveletSettings),
-    "LatticeSettings": Stored(detection.LatticeSettings),
-    "GrowSettings": Stored(lattice.GrowSettings),
+    "LatticeSettings": Stored(find_lattice.LatticeSettings),
+    "GrowSettings": Stored(lattice_growth.GrowSettings),
     "RowSearchSettings": Stored(row_search.RowSearchSettings),
     "MaskRowsSettings": Stored(row_search.MaskRowsSettings),
     "MatchSettings": Stored(MatchSettings),

@@ -15,7 +15,7 @@ from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
 from labapp.core.images.exposure import judge_exposure
-from labapp.core.rows.detection import DotSettings
+from labapp.core.images.find_dots import DotSettings
 from labapp.errors import InputError
 from labapp.gui import dialogs
 from labapp.gui.live.camera_fields import calibrated_px, other_size

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from labapp.core.images.exposure import Exposure, judge_exposure
-from labapp.core.rows.detection import DotSettings, find_dots
+from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.gui.shell.steps import recording_gone

@@ -11,9 +11,10 @@ import numpy as np
 
 from labapp.config.setup import parse_setup
 from labapp.core.images.dots import Dots, Image
+from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.pipeline import Measurement, Settings, start_correction
 from labapp.core.rows.correction import Correction
-from labapp.core.rows.detection import DotSettings, LatticeSettings, find_dots, find_lattice
+from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.rows.tracking import carry_on
 from labapp.core.values import CannotMeasure, FloatArray, IntArray

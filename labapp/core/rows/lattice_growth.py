@@ -1,0 +1,304 @@
+"""The default search for rows and columns: a grid grows from neighbour to neighbour.
+
+Each new dot is predicted from the local steps both ways. Its contract: no dot is given a wrong row
+or column; a dot in doubt is given none. The text's two searches are in `row_search`.
+
+A *grid* is an array of the dot at each site, −1 where there is none, shape (rows, columns). Places
+of dots are complex numbers here, u − iv, px: to the right and up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from labapp.core.images.dots import Dots
+from labapp.core.rows.lattice import Lattice, Site, find_holes, lattice_of_sites
+from labapp.core.values import BoolArray, CannotMeasure, ComplexArray, FloatArray, IntArray
+
+MOST_STEPS = 1000
+"""A grid grows no further than so many steps from the dot that it begins at."""
+
+LEAST_SHARED = 4
+"""Grids are merged that have so many dots in common, not all on one line, in the same rows and
+columns."""
+
+MOST_SLIP, MOST_SLANT = 0.55, 0.7
+"""A row has slipped by a column where its columns slant by more than the first more than those of
+other rows, or by more than the second at all, in steps along the row: half a step and a little."""
+
+
+@dataclass(frozen=True)
+class GrowSettings:
+    """How the default search decides.
+
+    Parameters
+    ----------
+    gate
+        A dot is taken for a site if it lies within this fraction of the local step from where
+        the site is predicted.
+    doubt
+        … and is left in doubt if another dot lies within this many times that distance.
+    least, share
+        A grid of fewer dots, or of a smaller share of them, is no grid.
+    """
+
+    gate: float = 0.36
+    doubt: float = 1.8
+    least: int = 9
+    share: float = 0.5
+
+
+def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
+    """Index the dots by growing a grid from the most regular neighbourhoods.
+
+    Raises
+    ------
+    CannotMeasure
+        ``too-few-dots`` if fewer dots than a grid needs were found, ``no-rows`` if they do not
+        form one.
+    """
+    from labapp.core.rows.lattice_kernels import BORDER, grow
+
+    if len(dots) < settings.least:
+        raise CannotMeasure(
+            "too-few-dots", f"{len(dots)} dots were found, a grid needs {settings.least}"
+        )
+    plane = dots.u_px - 1j * dots.v_px
+    order = np.argsort(plane.real)
+    rank, in_order = np.argsort(order), plane[order]
+    across = 2 * (min(len(dots), MOST_STEPS) + BORDER) + 1
+    dot_at = np.full((across, across), -1)
+    tried = np.zeros(len(dots), np.bool_)
+    grids: list[IntArray] = []
+    for seed, first, second in _seeds(plane):
+        if tried[seed]:
+            continue
+        k, t, dot = _largest_part(
+            grow(in_order, dot_at, rank[seed], first, second, settings.gate, settings.doubt)
+        )
+        dot = order[dot]
+        tried[dot] = True
+        if len(dot) >= settings.least:
+            grown = _upright(_reduced(_grid_of(k, t, dot), plane), plane)
+            grids.append(_without_slips(grown, plane))
+    grid = max(grids, key=_count, default=np.empty((0, 0), np.int64))
+    if len(grids) > 1 and _count(grid) < settings.share * len(dots):
+        whole = _upright(_reduced(merge_grids(grids), plane), plane)
+        grid = max(grid, _without_slips(whole, plane), key=_count)
+    if _count(grid) < max(settings.least, settings.share * len(dots)):
+        raise CannotMeasure("no-rows", "the dots do not form rows and columns")
+    grid = _grid_of(*_sites(grid))
+    sites = {(k + 1, t + 1): dot for k, t, dot in np.stack(_sites(grid), axis=-1).tolist()}
+    holes = find_holes(sites, dots)
+    certain = [site for site, sides in holes if sides == 4]
+    return lattice_of_sites(
+        sites,
+        len(dots),
+        reference=certain[0] if len(certain) == 1 else None,
+        candidates=tuple(site for site, _ in holes),
+    )
+
+
+def merge_grids(grids: list[IntArray]) -> IntArray:
+    """Merge grids that overlap with the largest, as far as they agree on all dots they share.
+
+    Each is the dot at each site, −1 where there is none, shape (rows, columns); so is the result.
+    A gap between tiles of a pattern ends a grid's growth in most places, and not in all: grids of
+    two tiles then have some dots of each other.
+    """
+    first, *rest = sorted(grids, key=_count, reverse=True)
+    whole = _site_of(first)
+    while True:
+        for number, other in enumerate(rest):
+            further = _sites_to_add(whole, _site_of(other))
+            if further is not None:
+                whole |= further
+                del rest[number]
+                break
+        else:
+            k, t = np.array(list(whole.values())).T
+            return _grid_of(k, t, np.array(list(whole)))
+
+
+def _site_of(grid: IntArray) -> dict[int, Site]:
+    """The site of each dot of a grid."""
+    return {dot: (k, t) for k, t, dot in np.stack(_sites(grid), axis=-1).tolist()}
+
+
+def _sites_to_add(whole: dict[int, Site], other: dict[int, Site]) -> dict[int, Site] | None:
+    """Sites of another grid's further dots in a grid; None where the two do not agree."""
+    shared = list(whole.keys() & other.keys())
+    if len(shared) < LEAST_SHARED:
+        return None
+    own, its = (np.array([sites[dot] for dot in shared]) for sites in (whole, other))
+    # What is a row of one may be a diagonal of the other.
+    turn, _, rank, _ = np.linalg.lstsq(_centered(its), _centered(own), rcond=None)
+    if rank < 2:
+        return None
+    turn = np.rint(turn).astype(np.int64)
+    offset = own - its @ turn
+    if abs(round(np.linalg.det(turn))) != 1 or np.ptp(offset, axis=0).any():
+        return None
+    sites = np.array(list(other.values())) @ turn + offset[0]
+    taken = set(whole.values())
+    return {
+        dot: site
+        for dot, site in zip(other, map(tuple, sites.tolist()), strict=True)
+        if dot not in whole and site not in taken
+    }
+
+
+def _centered(sites: IntArray) -> FloatArray:
+    return np.asarray(sites - sites.mean(axis=0))
+
+
+def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
+    """Dots that lie midway between two neighbours, the most regular first.
+
+    Returns triples of the dot, the step to such a neighbour, and the step across: to the other
+    such neighbour where there is one, otherwise to the nearest dot well off the first line (rows
+    may be ten times further apart than the dots within them).
+    """
+    points = np.stack([plane.real, plane.imag], axis=-1)
+    near = scipy.spatial.cKDTree(points).query(points, k=min(41, len(points)))[1][:, 1:]
+    offset = plane[near] - plane[:, None]
+    length = np.abs(offset)
+    a, b = np.triu_indices(min(10, near.shape[1]), 1)
+    step = (offset[:, b] - offset[:, a]) / 2
+    dots = np.arange(len(plane))
+    with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
+        error = np.abs(offset[:, a] + offset[:, b]) / np.minimum(length[:, a], length[:, b])
+        size = np.where(error < 0.5, length[:, a] + length[:, b], np.inf)
+        shortest = dots, size.argmin(axis=1)
+        first = step[shortest]
+        crossing = np.where(_sine_between(first, step) > 0.4, size, np.inf)
+        off_line = _sine_between(first, offset) > 0.6
+    # A dot off the line is taken after all that have another one opposite.
+    last = np.where(off_line.any(axis=1), np.finfo(float).max, np.inf)
+    size_across = np.column_stack([crossing, last])
+    across = np.column_stack([step, offset[dots, off_line.argmax(axis=1)]])
+    doubt = np.column_stack([error, np.full(len(plane), 0.5)])
+    found = np.isfinite(size_across)
+    ends = np.where(found, size_across, -np.inf).argmax(axis=1)
+    both = np.column_stack([size_across.argmin(axis=1), ends])
+    second = np.take_along_axis(across, both, axis=1)
+    doubt = np.take_along_axis(doubt, both, axis=1) + error[shortest][:, None]
+    doubt[~(found.any(axis=1) & np.isfinite(size[shortest]))] = np.inf
+    order = np.argsort(doubt, axis=None, kind="stable")[: np.isfinite(doubt).sum()]
+    seed = order // 2
+    return list(
+        zip(seed.tolist(), first[seed].tolist(), second.ravel()[order].tolist(), strict=True)
+    )
+
+
+def _sine_between(first: ComplexArray, second: ComplexArray) -> FloatArray:
+    """Absolute sine of the angle between steps of shapes (n,) and (n, m), shape (n, m)."""
+    return np.abs((first[:, None].conj() * second).imag) / np.abs(first[:, None]) / np.abs(second)
+
+
+def _largest_part(sites: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Row, column and dot of the largest connected part of what `grow` returns; none of one dot."""
+    k, t, dot, part = sites.T
+    size = np.bincount(part)[part]
+    kept = (part == part[size.argmax()]) & (size > 1)
+    return k[kept], t[kept], dot[kept]
+
+
+def _count(grid: IntArray) -> int:
+    """How many sites of a grid have a dot."""
+    return int((grid >= 0).sum())
+
+
+def _sites(grid: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Row, column and dot of each site that has one, shape (s,) each."""
+    k, t = np.nonzero(grid >= 0)
+    return k, t, grid[k, t]
+
+
+def _grid_of(k: IntArray, t: IntArray, dot: IntArray) -> IntArray:
+    """Dot at each site, −1 where there is none, shape (rows, columns)."""
+    grid = np.full((np.ptp(k) + 1, np.ptp(t) + 1), -1)
+    grid[k - k.min(), t - t.min()] = dot
+    return grid
+
+
+def _places(grid: IntArray, plane: ComplexArray) -> ComplexArray:
+    """Place of each site's dot, px; NaN where there is none."""
+    return np.where(grid >= 0, plane[grid], complex(np.nan, np.nan))
+
+
+def _reduced(grid: IntArray, plane: ComplexArray) -> IntArray:
+    """Index by the two shortest steps: a grid grown next to a hole may run along diagonals.
+
+    Lagrange's reduction of the lattice, its inner products summed over the cells.
+    """
+    place = _places(grid, plane)
+    a, b = place[:-1, 1:] - place[:-1, :-1], place[1:, :-1] - place[:-1, :-1]
+    with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
+        along, across = np.nansum(np.abs(a) / np.abs(b)), np.nansum(np.abs(b) / np.abs(a))
+        mixed = np.nansum((a * b.conj()).real / (np.abs(a) * np.abs(b)))
+    row, column = (1, 0), (0, 1)  # how many times the old k and t go into the new k, the new t
+    for _ in range(8):
+        if 2 * abs(mixed) <= 1.05 * min(along, across):
+            break
+        if along <= across:  # step over rows less as many steps along them
+            m = round(mixed / along)
+            column = column[0] + m * row[0], column[1] + m * row[1]
+            mixed, across = mixed - m * along, across - 2 * m * mixed + m * m * along
+        else:
+            m = round(mixed / across)
+            row = row[0] + m * column[0], row[1] + m * column[1]
+            mixed, along = mixed - m * across, along - 2 * m * mixed + m * m * across
+    rows, columns = (abs(a) * grid.shape[0] + abs(b) * grid.shape[1] for a, b in (row, column))
+    if rows * columns > 4 * MOST_STEPS**2:  # steps that differ so much are of no grid
+        return grid
+    k, t, dot = _sites(grid)
+    return _grid_of(row[0] * k + row[1] * t, column[0] * k + column[1] * t, dot)
+
+
+def _upright(grid: IntArray, plane: ComplexArray) -> IntArray:
+    """Turn the grid so that rows run left to right and are counted from the bottom up."""
+    place = _places(grid, plane)
+    along, across = np.diff(place, axis=1), np.diff(place, axis=0)
+    level = [
+        np.nansum(np.abs(steps.real)) / max(np.nansum(np.abs(steps)), 1e-9)
+        for steps in (along, across)
+    ]
+    if level[0] < level[1]:
+        grid, along, across = grid.T, across, along
+    if np.nansum(along.real) < 0:
+        grid = grid[:, ::-1]
+    if np.nansum(across.imag) < 0:
+        grid = grid[::-1]
+    return grid
+
+
+def _without_slips(grid: IntArray, plane: ComplexArray) -> IntArray:
+    """Keep the most rows that hang together without a slip.
+
+    Neighbour by neighbour a row may be joined to the next one column off all along, or by dots of
+    two rows in turn. Its columns then slant by a whole step more than those of other rows, which
+    bowed and fanned rows do not.
+    """
+    place = _places(grid, plane)
+    with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
+        lean = (np.diff(place, axis=0) / _steps_along(place[:-1])).real
+    slant = np.full(len(grid), np.nan)
+    for k in np.nonzero(~np.isnan(lean).all(axis=1))[0]:
+        slant[k + 1] = np.median(lean[k][~np.isnan(lean[k])])
+    usual = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
+    sound = (np.abs(slant - usual) < MOST_SLIP) & (np.abs(slant) < MOST_SLANT)
+    part = np.cumsum(~sound)
+    kept: BoolArray = part == np.bincount(part, (grid >= 0).sum(axis=1)).argmax()
+    return grid[kept]
+
+
+def _steps_along(place: ComplexArray) -> ComplexArray:
+    """Step along its row at each site: across it, or to the one neighbour there is, else NaN."""
+    wide = np.pad(place, ((0, 0), (1, 1)), constant_values=np.nan)
+    left, right = place - wide[:, :-2], wide[:, 2:] - place
+    step = np.where(np.isnan(left), right, left)
+    return np.where(np.isnan(left + right), step, (left + right) / 2)
