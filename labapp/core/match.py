@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 Orientation = Literal["S/S", "S/I", "I/I"]
 """Column/row correspondence: S grows the same way as the rays, I the other way."""
@@ -39,7 +39,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Match:
+class Match(ReadOnlyArrays):
     """Matched pairs of ray and reflected dot, n of them.
 
     Parameters
@@ -72,9 +72,6 @@ class Match:
     plane_covariance_mm2: FloatArray
     witness: IntArray
     trials: tuple[Trial, ...] = ()
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def margin(self) -> float:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
@@ -31,13 +29,15 @@ class CannotMeasure(Exception):
         self.reason = reason
 
 
-def freeze(value: Any) -> None:
-    """Make every array field of a dataclass instance read-only (call from ``__post_init__``)."""
-    fields = vars(value)
-    for name, item in fields.items():
-        if isinstance(item, np.ndarray) and item.flags.writeable:
-            view = fields[name] = item.view()
-            view.flags.writeable = False
+class ReadOnlyArrays:
+    """Base of a dataclass whose array fields are read-only."""
+
+    def __post_init__(self) -> None:
+        fields = vars(self)
+        for name, item in fields.items():
+            if isinstance(item, np.ndarray) and item.flags.writeable:
+                view = fields[name] = item.view()
+                view.flags.writeable = False
 
 
 def median(values: FloatArray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 PROFILE_POINTS = 241
 
@@ -47,7 +47,7 @@ def difference_at(
 
 
 @dataclass(frozen=True)
-class Profile:
+class Profile(ReadOnlyArrays):
     """A vertical section through a pool; n points, NaN outside the boundary.
 
     Parameters
@@ -67,9 +67,6 @@ class Profile:
     height_mm: FloatArray
     sigma_mm: FloatArray
     edge_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def profile(

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from labapp.core.surface.measures import surface_grid, surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
 
 SPACING_MM = 0.1
@@ -39,7 +39,7 @@ PLY_FACE = np.dtype([("count", "u1"), ("corner", "<i4", 3)])
 
 
 @dataclass(frozen=True)
-class Mesh:
+class Mesh(ReadOnlyArrays):
     """Triangles; n vertices, k triangles.
 
     Parameters
@@ -52,9 +52,6 @@ class Mesh:
 
     vertices_mm: FloatArray
     triangles: IntArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:

@@ -11,7 +11,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.measures import surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.export.heights import difference_at, sigma_at
 from labapp.export.meshes import drawn_spacing, known_part
 
@@ -33,7 +33,7 @@ EMPTY = np.empty((0, 3))
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(ReadOnlyArrays):
     """Content of a 3-D picture, mm, UCS; n vertices.
 
     Parameters
@@ -84,9 +84,6 @@ class Scene:
     notice: str = ""
     foreground: str = "#202020"
     background: str = "#ffffff"
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def scene_of(

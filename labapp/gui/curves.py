@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from labapp.core.values import FloatArray, IntArray, freeze
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.gui.digits import rounded
 
 
@@ -35,7 +35,7 @@ def _none() -> IntArray:
 
 
 @dataclass(frozen=True)
-class Curve:
+class Curve(ReadOnlyArrays):
     """One plot's curve; n points.
 
     Parameters
@@ -79,9 +79,6 @@ class Curve:
     from_zero: bool = False
     limits: tuple[float | None, float | None] = (None, None)
     quick: bool = False
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def title(self) -> str:

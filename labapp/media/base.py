@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import freeze
+from labapp.core.values import ReadOnlyArrays
 
 GreyImage = npt.NDArray[Any]
 """Grey levels, shape (rows, columns): uint8 or uint16 as recorded, float32 where it was neither."""
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(ReadOnlyArrays):
     """A frame of a source.
 
     Parameters
@@ -34,9 +34,6 @@ class Frame:
     index: int
     time_s: float | None
     image: GreyImage
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 class FrameSource(Protocol):

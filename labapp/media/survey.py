@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage
 
@@ -25,7 +25,7 @@ NAMED_FRAMES = 10
 
 
 @dataclass(frozen=True)
-class Survey:
+class Survey(ReadOnlyArrays):
     """Findings of reading a recording through.
 
     Parameters
@@ -50,9 +50,6 @@ class Survey:
     frame_exact: bool
     checked: int
     warnings: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def frame_checksum(image: GreyImage) -> int:

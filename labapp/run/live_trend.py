@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.run.limits import NAMES, Limits, beyond, sizes_of
 from labapp.run.live_measuring import LiveResult
 
@@ -26,7 +26,7 @@ MOST_KEPT = 12_000
 
 
 @dataclass(frozen=True)
-class Trend:
+class Trend(ReadOnlyArrays):
     """Sizes of the last frames that were tried; n frames, the oldest first.
 
     Parameters
@@ -49,9 +49,6 @@ class Trend:
     value_mm: FloatArray
     sigma_mm: FloatArray
     beyond: BoolArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from labapp.config.setup import Setup, parse_setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.schemes import SCHEMES
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
 from labapp.session.file.blobs import Damaged, fingerprint, pack, unpack
 from labapp.session.file.database import Database
@@ -90,7 +90,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Overview:
+class Overview(ReadOnlyArrays):
     """Status, staleness and measures of all frames of a session; n frames.
 
     Parameters
@@ -115,9 +115,6 @@ class Overview:
     corrected: BoolArray
     stale: BoolArray
     measures: dict[str, FloatArray]
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 class _Row(NamedTuple):

@@ -15,7 +15,7 @@ from typing import TextIO
 
 import numpy as np
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
 from labapp.session.csv_tables import (
     PROBLEMS_SHOWN,
@@ -45,7 +45,7 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class Signals:
+class Signals(ReadOnlyArrays):
     """Current and voltage of a weld; n samples.
 
     Parameters
@@ -65,9 +65,6 @@ class Signals:
     current_a: FloatArray
     voltage_v: FloatArray
     start_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from labapp.core.sequence.mean import sigma_of_mean
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.session.measured import Overview
 
 NEIGHBOURS = 15
@@ -69,7 +69,7 @@ BY_KEY = {quantity.key: quantity for quantity in QUANTITIES}
 
 
 @dataclass(frozen=True)
-class Trend:
+class Trend(ReadOnlyArrays):
     """One measure over the frames that have it; n frames.
 
     Parameters
@@ -107,9 +107,6 @@ class Trend:
     counts: BoolArray
     measures: Mapping[str, FloatArray]
 
-    def __post_init__(self) -> None:
-        freeze(self)
-
 
 @dataclass(frozen=True)
 class Spread:
@@ -136,7 +133,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Spectrum:
+class Spectrum(ReadOnlyArrays):
     """Amplitudes of a measure's oscillation.
 
     Parameters
@@ -164,9 +161,6 @@ class Spectrum:
     last: int
     count: int
     resolution: float
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def peak(self) -> tuple[float, float]:

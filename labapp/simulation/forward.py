@@ -13,7 +13,7 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match, Orientation
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.simulation.pools import PoolSize
 from labapp.simulation.torch import Torch, YozTorch
 
@@ -48,7 +48,7 @@ class PoolSurface(Protocol):
 
 
 @dataclass(frozen=True)
-class Reflections:
+class Reflections(ReadOnlyArrays):
     """What becomes of every ray of the pattern; ray (i, j) is at ``[i - 1, j - 1]``.
 
     Parameters
@@ -83,9 +83,6 @@ class Reflections:
     incident: FloatArray
     reflected: FloatArray
     plane_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def lit(self) -> BoolArray:

@@ -11,7 +11,7 @@ from matplotlib.path import Path as Polygon
 from scipy.interpolate import RBFInterpolator, RectBivariateSpline
 from scipy.ndimage import binary_dilation, distance_transform_edt
 
-from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.pools import PoolSize, size_of
 
 STEP = 1e-4
@@ -27,7 +27,7 @@ Function = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
-class OutlinedPool:
+class OutlinedPool(ReadOnlyArrays):
     """A pool that is any function of (x, y) within any closed polygon.
 
     Parameters
@@ -51,7 +51,7 @@ class OutlinedPool:
     slope: Function | None = None
 
     def __post_init__(self) -> None:
-        freeze(self)
+        super().__post_init__()
         x, y = np.asarray(self.outline_mm, float).reshape(-1, 2).T
         area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
         if len(x) < 3 or not area > 0:

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import tifffile
 
 from labapp.core.geometry.rig import Rig
-from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
 from labapp.simulation.parallel import Progress, processes, wait_for
@@ -62,7 +62,7 @@ class TruePool(PoolSurface, Protocol):
 
 
 @dataclass(frozen=True)
-class RecordedFrame:
+class RecordedFrame(ReadOnlyArrays):
     """A rendered frame and its ground truth.
 
     Parameters
@@ -83,9 +83,6 @@ class RecordedFrame:
     image: Picture
     dot_px: FloatArray
     shown: BoolArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
-from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import Reflections
 
@@ -75,7 +75,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(ReadOnlyArrays):
     """A rendered frame and what is in it.
 
     Parameters
@@ -93,9 +93,6 @@ class Frame:
     image: Picture
     dot_px: FloatArray
     shown: BoolArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def ray_brightness(

@@ -23,7 +23,7 @@ from labapp.core.match import Match
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.schemes import ers, irs
 from labapp.core.surface.measures import Measures, measure_surface
-from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool, caps_8_3_1
@@ -101,7 +101,7 @@ def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str)
 
 
 @dataclass(frozen=True)
-class ErrorSurvey:
+class ErrorSurvey(ReadOnlyArrays):
     """Errors of the schemes on caps, with the laser at one or more places.
 
     Parameters
@@ -124,9 +124,6 @@ class ErrorSurvey:
     schemes: tuple[str, ...]
     errors: FloatArray
     lost: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def of(self, scheme: str, error: str, surface: str = "all") -> FloatArray:
         """One of `ERRORS` of the caps: ``convex``, ``concave`` or ``all``."""

@@ -14,14 +14,14 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings, reconstruct
 from labapp.core.surface.measures import Measures, measure_surface
-from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.studies.parameter_deviation import NOMINAL, OFFSETS, QUANTITIES, AxisPoints, move
 
 SIZES = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
 
 
 @dataclass(frozen=True)
-class Contribution:
+class Contribution(ReadOnlyArrays):
     """What one quantity's ± does to the sizes.
 
     Parameters
@@ -41,9 +41,6 @@ class Contribution:
     unit: str
     nominal: bool
     change: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def calibration_budget(

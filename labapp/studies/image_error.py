@@ -16,7 +16,7 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.pipeline import measure as measure_frame
 from labapp.core.surface.measures import measure_surface
-from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match
 from labapp.simulation.parallel import Progress, in_parallel
@@ -67,7 +67,7 @@ TACK_TEXT = {"irs": (0.1777, 0.014903, 0.220807), "ers": (0.0912, 0.014903, 0.18
 
 
 @dataclass(frozen=True)
-class FrameErrors:
+class FrameErrors(ReadOnlyArrays):
     """What one rendered frame gave, by each scheme; s of them.
 
     Parameters
@@ -90,9 +90,6 @@ class FrameErrors:
     exact: FloatArray
     off_px: FloatArray
     missed: int
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def wrong(self) -> int:

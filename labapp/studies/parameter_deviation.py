@@ -18,7 +18,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import reconstruct
 from labapp.core.surface.measures import measure_surface
-from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool
 from labapp.studies.error_analysis import circle_settings, relative_errors
@@ -141,7 +141,7 @@ def spread(sigma: Sequence[float]) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class ParameterDeviation:
+class ParameterDeviation(ReadOnlyArrays):
     """What a bench's uncertainties do to height (or depth) and diameter of a pool.
 
     Parameters
@@ -158,9 +158,6 @@ class ParameterDeviation:
     sigma: FloatArray
     contribution: FloatArray
     draws: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def linear(self) -> FloatArray:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.values import BoolArray, FloatArray, freeze
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import spherical_cap
 from labapp.simulation.positioning import clearance
@@ -96,7 +96,7 @@ def clearance_table() -> Table:
 
 
 @dataclass(frozen=True)
-class Coverage:
+class Coverage(ReadOnlyArrays):
     """Dots of one placement of the imaging plane (Fig. 4-11).
 
     Parameters
@@ -112,9 +112,6 @@ class Coverage:
     distance_mm: float
     plane_mm: FloatArray
     on_plane: BoolArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def coverage() -> tuple[Coverage, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.surface.measures import measure_surface
-from labapp.core.values import CannotMeasure, FloatArray, freeze
+from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool
@@ -59,7 +59,7 @@ class Bench:
 
 
 @dataclass(frozen=True)
-class SetupBudget:
+class SetupBudget(ReadOnlyArrays):
     """Budget of the height of a kind of pool; m pools of it.
 
     Parameters
@@ -80,9 +80,6 @@ class SetupBudget:
     predicted: tuple[PredictedError, ...]
     random: FloatArray
     parameters: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def setup_budget(

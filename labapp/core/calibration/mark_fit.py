@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 Model = Literal["three points", "affine", "homography"]
 """What takes pixels to the plane: the text's three points, or a fit to all marks."""
@@ -48,7 +48,7 @@ ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class MarkFit:
+class MarkFit(ReadOnlyArrays):
     """Imaging plane → picture, fitted to marks.
 
     Parameters
@@ -77,9 +77,6 @@ class MarkFit:
     left_out_px: FloatArray
     spare: FloatArray
     variance: float
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def calibration(self) -> ImageCalibration:

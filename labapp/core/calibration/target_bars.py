@@ -13,14 +13,14 @@ import numpy as np
 import scipy
 
 from labapp.core.calibration.target_marks import Mark, Refusal
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 END_PX = 4.0
 """The end of a bar is within so many pixels of where it is first seen."""
 
 
 @dataclass(frozen=True)
-class Bar:
+class Bar(ReadOnlyArrays):
     """A bar measured on the grey levels.
 
     Parameters
@@ -43,9 +43,6 @@ class Bar:
     sigma_px: float
     darkness: float
     midline: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def normal(self) -> FloatArray:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays
 
 Image = npt.NDArray[Any]
 
@@ -53,7 +53,7 @@ class Refusal(Exception):
 
 
 @dataclass(frozen=True)
-class Mark:
+class Mark(ReadOnlyArrays):
     """One of the three objects.
 
     Parameters
@@ -72,9 +72,6 @@ class Mark:
     direction: FloatArray
     length: float
     width: float
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def grey_levels(image: Image) -> FloatArray:

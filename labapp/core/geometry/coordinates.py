@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 
 @dataclass(frozen=True)
-class ImageCalibration:
+class ImageCalibration(ReadOnlyArrays):
     """Pixel ↔ imaging plane as a homography; the three-point calibration is its affine case.
 
     Parameters
@@ -34,7 +34,7 @@ class ImageCalibration:
         if np.linalg.cond(matrix) > 1e12:
             raise ValueError("the image calibration cannot be inverted: its axes coincide")
         object.__setattr__(self, "matrix", matrix)
-        freeze(self)
+        super().__post_init__()
 
     @classmethod
     def from_three_points(

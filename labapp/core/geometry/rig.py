@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from labapp.core.geometry.patterns import PATTERNS
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Electrode:
 
 
 @dataclass(frozen=True)
-class ImagingPlane:
+class ImagingPlane(ReadOnlyArrays):
     """The imaging plane, of any pose: O′ and the directions of O′X′ and O′Z′ in the UCS.
 
     Parameters
@@ -116,9 +116,6 @@ class ImagingPlane:
     z_axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     width_mm: float = 101.6
     height_mm: float = 101.6
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def vertical(

@@ -29,7 +29,7 @@ from labapp.core.images.dot_size import (
     with_grain,
 )
 from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 HOT_RATIO = 1.6
 """What a cluster of hot pixels answers to a band of a third of the dots' size, over its answer to
@@ -64,7 +64,7 @@ WIDTH_KEPT = 0.8
 
 
 @dataclass(frozen=True)
-class DetectorTuning:
+class DetectorTuning(ReadOnlyArrays):
     """What the detector is set to by a frame: dot size and noise, good for the frames after it.
 
     It holds as long as light and camera stay as they are.
@@ -82,9 +82,6 @@ class DetectorTuning:
     size_px: float
     noise: Grey
     floor: Grey
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def of(cls, frame: Image, settings: BandPassSettings) -> DetectorTuning:

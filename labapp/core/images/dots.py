@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 Image = npt.NDArray[np.generic]
 Grey = npt.NDArray[np.float32]
@@ -19,7 +19,7 @@ Picture = Grey | npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Dots:
+class Dots(ReadOnlyArrays):
     """Reflected dots found in one frame; every array has shape (n,).
 
     Parameters
@@ -43,9 +43,6 @@ class Dots:
     size_px: FloatArray
     peak: FloatArray
     snr: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def __len__(self) -> int:
         return len(self.u_px)

@@ -17,7 +17,14 @@ from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, landing_spacing
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze, median
+from labapp.core.values import (
+    BoolArray,
+    CannotMeasure,
+    FloatArray,
+    IntArray,
+    ReadOnlyArrays,
+    median,
+)
 
 UNLABELLED = -1
 """In labels: the ray has no dot."""
@@ -45,7 +52,7 @@ in that order."""
 
 
 @dataclass(frozen=True)
-class Observation:
+class Observation(ReadOnlyArrays):
     """The n dots of one frame on the imaging plane, and the bench that they were seen on.
 
     Parameters
@@ -71,9 +78,6 @@ class Observation:
     calibration: ImageCalibration
     frame_shape: tuple[int, int]
     hidden_rows: frozenset[int] = frozenset()
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def of(

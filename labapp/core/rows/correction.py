@@ -19,7 +19,7 @@ import numpy as np
 from labapp.core.images.band_pass import dot_at
 from labapp.core.images.dots import BandPassSettings, Dots, Image
 from labapp.core.rows.lattice import Lattice, Site, find_holes
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 PLACED_PX = 0.5
 """A dot that was moved by hand is at least so uncertain, px."""
@@ -33,7 +33,7 @@ Indices = Sequence[int] | IntArray
 
 
 @dataclass(frozen=True)
-class Correction:
+class Correction(ReadOnlyArrays):
     """The dots and rows of one frame as the operator left them.
 
     Parameters
@@ -58,7 +58,7 @@ class Correction:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "manual", np.asarray(self.manual, bool))
-        freeze(self)
+        super().__post_init__()
         row, column = self.lattice.row, self.lattice.column
         columns = [getattr(self.dots, field.name) for field in fields(Dots)]
         if {array.shape for array in (*columns, row, column, self.manual)} != {(len(self.dots),)}:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from labapp.core.images.dots import Dots
-from labapp.core.values import IntArray, freeze
+from labapp.core.values import IntArray, ReadOnlyArrays
 
 Site = tuple[int, int]
 """Reflected row k and column t, counted from 1."""
@@ -20,7 +20,7 @@ _NEXT: tuple[Site, ...] = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 @dataclass(frozen=True)
-class Lattice:
+class Lattice(ReadOnlyArrays):
     """Which reflected row and column each dot is in.
 
     Parameters
@@ -41,9 +41,6 @@ class Lattice:
     reference: Site | None = None
     candidates: tuple[Site, ...] = ()
     blocked_rows: frozenset[int] = frozenset()
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def lattice_of_sites(

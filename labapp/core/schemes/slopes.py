@@ -33,7 +33,7 @@ from labapp.core.surface.interpolation import SurfaceThroughPoints, whole_surfac
 from labapp.core.surface.measures import reflection_scale
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import Surface, intersect
-from labapp.core.values import CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 FEWEST_DOTS = 9
 FEWEST_ROWS = 3
@@ -51,7 +51,7 @@ edge points of the edge-points algorithm boundary_slope from loop to loop and ne
 
 
 @dataclass(frozen=True)
-class ReflectedRays:
+class ReflectedRays(ReadOnlyArrays):
     """The rays that came back, with what came back of them; n of them.
 
     The absent centre reference is the last one where its dot can be stood in for (§6.3.1).
@@ -78,9 +78,6 @@ class ReflectedRays:
     plane_mm: FloatArray
     imaging_plane: ImagingPlane
     measured: int
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def points(self, distance_mm: FloatArray) -> FloatArray:
         """Points at a distance along each ray, shape (n, 3), mm."""
@@ -149,7 +146,7 @@ def reflected_rays(match: Match, rig: Rig) -> ReflectedRays:
 
 
 @dataclass(frozen=True)
-class Paths:
+class Paths(ReadOnlyArrays):
     """Steps from base points to all other points: a forest over the reflected rays.
 
     Parameters
@@ -177,9 +174,6 @@ class Paths:
     end_components: FloatArray
     apart: FloatArray
     matrix: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def along(cls, parent: IntArray, direction: FloatArray) -> Paths:

@@ -16,7 +16,7 @@ from labapp.core.surface import kernels
 from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
 from labapp.core.surface.solver import NormalEquations
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 ROUNDS = 8
 SETTLED_MM = 3e-4
@@ -24,7 +24,7 @@ SETTLED_MM = 3e-4
 
 
 @dataclass(frozen=True)
-class SequenceGeometry:
+class SequenceGeometry(ReadOnlyArrays):
     """What stays the same along a track: the splines, and the R rays that land among them.
 
     Parameters
@@ -66,9 +66,6 @@ class SequenceGeometry:
     stiffness: FloatArray
     settings: FitSettings
 
-    def __post_init__(self) -> None:
-        freeze(self)
-
     @classmethod
     def of(cls, rig: Rig, basis: SplineBasis, settings: FitSettings) -> SequenceGeometry:
         """Lay it out for a rig and the basis of a cold fit."""
@@ -101,7 +98,7 @@ class SequenceGeometry:
 
 
 @dataclass(frozen=True)
-class WarmPool:
+class WarmPool(ReadOnlyArrays):
     """A surface, and what it makes of all rays.
 
     Parameters
@@ -121,9 +118,6 @@ class WarmPool:
     points_mm: FloatArray
     slopes: FloatArray
     plane_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 def intersect_and_reflect(

@@ -10,7 +10,7 @@ import numpy as np
 from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 BoundaryModel = Literal["piecewise", "circle"]
 """Three cubic pieces and two transitions (§6.3.2.2), or a circle (§8.2.1)."""
@@ -23,7 +23,7 @@ LARGEST_STRETCH = 1.5
 
 
 @dataclass(frozen=True)
-class Boundary:
+class Boundary(ReadOnlyArrays):
     """A closed boundary around a centre, one point per polar angle.
 
     Parameters
@@ -40,9 +40,6 @@ class Boundary:
     center_mm: FloatArray
     theta_deg: FloatArray
     points_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def polar(cls, center_mm: FloatArray, radius_mm: FloatArray) -> Boundary:
@@ -71,7 +68,7 @@ class Boundary:
 
 
 @dataclass(frozen=True)
-class EdgePoints:
+class EdgePoints(ReadOnlyArrays):
     """Estimated boundary points on the work piece, one pair per row of rays; r rows.
 
     Parameters
@@ -85,9 +82,6 @@ class EdgePoints:
     left_mm: FloatArray
     right_mm: FloatArray
     steps: IntArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def center_mm(self) -> FloatArray:

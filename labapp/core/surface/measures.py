@@ -14,7 +14,7 @@ from labapp.core.match import Match
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import Surface
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 RINGS = 16
 """Samples along each radius; Gauss–Legendre, so that smooth pools are integrated exactly."""
@@ -24,7 +24,7 @@ STENCIL_MM = 0.1
 
 
 @dataclass(frozen=True)
-class ReflectionErrors:
+class ReflectionErrors(ReadOnlyArrays):
     """How far the computed dots are from the captured ones, mapped onto the work piece.
 
     Parameters
@@ -47,9 +47,6 @@ class ReflectionErrors:
     mre_inner_mm: float
     per_dot_mm: FloatArray
     scale: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 @dataclass(frozen=True)

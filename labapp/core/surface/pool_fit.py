@@ -25,7 +25,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.surface.level import Level, Rear, find_level, guess_level
 from labapp.core.surface.solver import NormalEquations, propagate_sigma
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import CannotMeasure, FloatArray, IntArray, freeze, median
+from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays, median
 
 MARGIN_ROWS = 2.5
 """How far beyond the outermost reflection points the splines go on, in rows of rays: the torch may
@@ -67,7 +67,7 @@ class FitSettings:
 
 
 @dataclass(frozen=True)
-class FittedPool:
+class FittedPool(ReadOnlyArrays):
     """A fitted surface, where the n matched rays meet it, and how well it is known.
 
     Parameters
@@ -92,9 +92,6 @@ class FittedPool:
     points_mm: FloatArray
     residual_mm: FloatArray
     unsettled_mm: float
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def residual_rms_mm(self) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.surface import Surface
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 ROUNDING = 1e-9
 """Share of the way from the centre by which a place may lie beyond the boundary and be on it."""
@@ -46,7 +46,7 @@ class BoundedSurface:
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(ReadOnlyArrays):
     """A pool surface and how far it explains the reflected dots.
 
     Parameters
@@ -91,7 +91,7 @@ class Reconstruction:
     own_are_mm: float = math.nan
 
     def __post_init__(self) -> None:
-        freeze(self)
+        super().__post_init__()
         object.__setattr__(self, "surface", BoundedSurface(self.whole, self.boundary))
 
     @property

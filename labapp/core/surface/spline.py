@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from labapp.core.values import BoolArray, FloatArray, IntArray, freeze
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 DEGREE = 3
 
@@ -92,7 +92,7 @@ def _products(count: int) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class SplineBasis:
+class SplineBasis(ReadOnlyArrays):
     """Tensor product of uniform cubic B-splines over a rectangle.
 
     Parameters
@@ -103,9 +103,6 @@ class SplineBasis:
 
     x_knots: FloatArray
     y_knots: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave what is kept of earlier calls behind: it is many times larger."""
@@ -199,7 +196,7 @@ class SplineBasis:
 
 
 @dataclass(frozen=True)
-class SplineSurface:
+class SplineSurface(ReadOnlyArrays):
     """z = f(x, y) in a `SplineBasis`; NaN outside its rectangle.
 
     Parameters
@@ -212,9 +209,6 @@ class SplineSurface:
 
     basis: SplineBasis
     coefficients: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height z at (x, y), arrays of one shape, mm."""

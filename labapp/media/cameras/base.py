@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, Protocol, Self
 
-from labapp.core.values import freeze
+from labapp.core.values import ReadOnlyArrays
 from labapp.errors import InputError
 from labapp.media.base import GreyImage
 
@@ -132,7 +132,7 @@ class CameraSettings:
 
 
 @dataclass(frozen=True)
-class CameraFrame:
+class CameraFrame(ReadOnlyArrays):
     """A frame as a camera gave it.
 
     Parameters
@@ -151,9 +151,6 @@ class CameraFrame:
     time_s: float
     arrived_s: float
     image: GreyImage = field(repr=False)
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 class Camera(Protocol):

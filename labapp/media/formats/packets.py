@@ -17,7 +17,7 @@ import numpy.typing as npt
 from av.index import IndexEntry
 from av.packet import Packet
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -219,7 +219,7 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class PacketTable:
+class PacketTable(ReadOnlyArrays):
     """Index by which any frame of a video is found.
 
     Parameters
@@ -253,9 +253,6 @@ class PacketTable:
     warnings: tuple[str, ...] = ()
     seekable: bool = True
     slice_crc: bool = False
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @classmethod
     def build(cls, packets: Packets, number: IntArray, timing: Timing, name: str) -> Self:

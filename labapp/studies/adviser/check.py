@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.studies.adviser.bench_limits import LaserPlace, Place
 from labapp.studies.adviser.expected_pools import Sample
@@ -26,7 +26,7 @@ BLOCK = 10
 
 
 @dataclass(frozen=True)
-class Check:
+class Check(ReadOnlyArrays):
     """What fresh pools say of an advice; n pools, each at k places, m set-ups of a grid.
 
     Which rays come back hangs on where a pool lies under the torch, to a fraction of a row, and one
@@ -53,9 +53,6 @@ class Check:
     places: tuple[Place, ...]
     errors: FloatArray
     rematch: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def error_mm(self) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 from scipy.stats import qmc
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.pools import Pool, ellipsoidal_cap
 from labapp.studies.parameter_deviation import OFFSETS
 
@@ -104,7 +104,7 @@ class ExpectedPools:
 
 
 @dataclass(frozen=True)
-class Sample:
+class Sample(ReadOnlyArrays):
     """Pools that set-ups are compared on: the same ones, with the same errors.
 
     Parameters
@@ -120,6 +120,3 @@ class Sample:
     pools: tuple[Pool, ...]
     deviate: FloatArray
     seed: int
-
-    def __post_init__(self) -> None:
-        freeze(self)

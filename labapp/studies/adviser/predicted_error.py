@@ -17,7 +17,7 @@ from labapp.core.geometry.rig import Laser, Rig
 from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings, landing_spacing
 from labapp.core.surface.solver import SlopeFit, fit_slopes
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import Pool
 from labapp.studies.parameter_deviation import (
@@ -41,7 +41,7 @@ DECIDING = 4
 
 
 @dataclass(frozen=True)
-class PredictedError:
+class PredictedError(ReadOnlyArrays):
     """Predicted standard uncertainties of a pool's height, mm.
 
     Parameters
@@ -67,9 +67,6 @@ class PredictedError:
     blocked: int
     off_plane: int
     lost: int
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def random_mm(self) -> float:

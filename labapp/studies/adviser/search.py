@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import minimize
 
-from labapp.core.values import FloatArray, freeze
+from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.parallel import Progress, in_parallel, shared_processes
 from labapp.studies.adviser.bench_limits import (
     CONSTRAINTS,
@@ -99,7 +99,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class Sweep(ReadOnlyArrays):
     """Sensitivity to one quantity, with the others as recommended; n places.
 
     Parameters
@@ -118,9 +118,6 @@ class Sweep:
     value: FloatArray
     error_mm: FloatArray
     margins: tuple[dict[Constraint, float], ...]
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     def breaks(self, number: int) -> tuple[Constraint, ...]:
         """Constraints that are violated there."""
