@@ -1,4 +1,6 @@
-"""The command line: one thin command each, over the calls that the pages make too.
+"""The command line: `main`, and the commands that have no module of their own here.
+
+Commands are thin, over the calls that the pages make too.
 
 What measures is imported inside the commands: `labapp --help` answers at once, and Ctrl-C while
 it loads is handled like any other.
@@ -11,47 +13,31 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 import typer.core
 import typer.main
 
-from labapp.cli import advise, analyze, benchmark, cameras, session, simulate
+from labapp.cli import advise, analyze, benchmark, cameras, reconstruct, session, simulate
 from labapp.cli.shared import (
-    ABOUT_SCHEMES,
     BAD_INPUT,
     FAULT,
     FRAMES_HELP,
     FRAMES_METAVAR,
     INTERRUPTED,
-    NOTHING,
-    RECORDING_HELP,
+    NOTHING_MEASURED,
     TERMINATED,
-    Algorithm,
     Commands,
-    SchemeName,
-    SigmaParts,
-    Warm,
     choose_frames,
     measure_frames,
-    note,
-    progress_bar,
-    shown,
 )
 from labapp.cli.window import asks_for_app, open_app, show_in_app
-from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError
 from labapp.log import log_file, start_log
 from labapp.version import VERSION
-
-if TYPE_CHECKING:
-    from labapp.core.pipeline import Settings
-    from labapp.export.summary import Summary
-    from labapp.run.runner import Measurer, Sink
-    from labapp.run.streams import Stream
 
 IMPATIENT_S = 2.0
 """Asked to stop again within this time, nothing more happens: the first is being obeyed."""
@@ -190,135 +176,7 @@ def program(
     """Hold the options of the program itself."""
 
 
-@app.command()
-def reconstruct(
-    source: Annotated[Path, typer.Argument(help=RECORDING_HELP)],
-    setup: Annotated[Path, typer.Option(help="Setup file (TOML; mm, degrees, px).")],
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="Folder for the results (CSV, STL; mm). An earlier run in it is replaced."
-        ),
-    ],
-    scheme: Annotated[
-        SchemeName, typer.Option(help=f"How the surface is found: {ABOUT_SCHEMES}.")
-    ] = "fit",
-    algorithm: Annotated[
-        Algorithm,
-        typer.Option(help="Algorithm of IRS; the other schemes have none."),
-    ] = "opa",
-    correspondence: Annotated[
-        Literal["auto", "S/S", "S/I", "I/I"],
-        typer.Option(help="Order of columns/rows of dots to that of rays: same S, inverse I."),
-    ] = "auto",
-    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
-    surfaces: Annotated[
-        Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
-    ] = "all",
-    *,
-    sigma_parts: SigmaParts = False,
-    warm: Warm = False,
-    lines: Annotated[
-        str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP."),
-    ] = None,
-    opcua: Annotated[
-        str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Publish measures as variables of OPC UA."),
-    ] = None,
-    anywhere: Annotated[
-        bool, typer.Option("--anywhere", help="Let other machines connect, unauthenticated.")
-    ] = False,
-) -> None:
-    """Measure frames and write measures, dots, points, boundaries and surfaces.
-
-    Ctrl-C or SIGTERM stops after whole frames: what was finished stays readable.
-
-    A frame that cannot be measured keeps its row in measures.csv, with the reason.
-    """
-    from labapp.core.pipeline import Settings
-
-    if algorithm != "opa" and not SCHEMES[scheme].algorithms:
-        raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
-    settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
-    places = {"lines": lines, "opcua": opcua}
-    with ExitStack() as at_end:
-        streams = _stream_sinks(at_end, places, anywhere)
-        summary = _run(
-            *(source, setup, out, settings, frames),
-            surfaces=surfaces == "all",
-            sigma_parts=sigma_parts,
-            warm=warm,
-            streams=streams,
-        )
-    if not summary.statuses["ok"]:
-        raise typer.Exit(NOTHING)
-
-
-def _stream_sinks(at_end: ExitStack, places: dict[str, str | None], anywhere: bool) -> list[Sink]:
-    """Open the streams that are asked for; returns a sink for each."""
-    asked = {kind: place for kind, place in places.items() if place is not None}
-    if not asked:
-        return []
-    from labapp.run.streams import open_stream, stream_values
-
-    def sink(stream: Stream) -> Sink:
-        return lambda result: stream.publish(stream_values(result))
-
-    sinks = []
-    for kind, place in asked.items():
-        stream = open_stream(kind, place, anywhere)
-        at_end.callback(stream.close)
-        typer.echo(f"Measures are sent from {stream.address}", err=True)
-        sinks.append(sink(stream))
-    return sinks
-
-
-def _run(
-    source_path: Path,
-    setup_path: Path,
-    out: Path,
-    settings: Settings,
-    frames: str,
-    *,
-    surfaces: bool,
-    sigma_parts: bool,
-    warm: bool,
-    streams: Sequence[Sink],
-) -> Summary:
-    """Measure, showing progress and failures on stderr and the summary on stdout."""
-    from labapp.config.setup import read_setup
-    from labapp.export.results import ResultsWriter
-    from labapp.export.summary import Summary
-    from labapp.media import open_source
-    from labapp.run.measurers import ColdMeasurer, RecordingMeasurer, stretch_pools
-    from labapp.run.runner import provenance, run, select_frames
-
-    setup = read_setup(setup_path)
-    summary = Summary()
-    with open_source(source_path) as source, progress_bar() as progress:
-        for warning in source.warnings:
-            note(progress.console, f"warning: {warning}")
-        selected = select_frames(frames, len(source))
-        origin = provenance(source, source_path, setup_path, setup, settings, selected, warm)
-        results = ResultsWriter(out, setup.calibration, origin, surfaces, sigma_parts)
-        show = shown(progress, source.name, len(selected))
-        try:
-            with results, ExitStack() as at_end:
-                measurer: Measurer = ColdMeasurer(source.frame, setup, settings)
-                if warm:
-                    given = (source_path, source.index, setup, settings, surfaces, sigma_parts)
-                    pools = at_end.enter_context(stretch_pools(len(selected)))
-                    measurer = RecordingMeasurer(*given, pools)
-                for _ in run(selected, measurer, [results.write, summary.add, *streams, show]):
-                    pass
-        except KeyboardInterrupt:
-            done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
-            note(progress.console, done)
-            raise typer.Exit(INTERRUPTED) from None
-    typer.echo(summary.text())
-    typer.echo(f"Results are in {out.absolute()}")
-    return summary
+app.command()(reconstruct.reconstruct)
 
 
 @app.command()
@@ -358,7 +216,7 @@ def detect(
     told = placed or "none"
     typer.echo(f"{len(dots)} dots, {told} with a row and a column, in {out.absolute()}")
     if not placed:
-        raise typer.Exit(NOTHING)
+        raise typer.Exit(NOTHING_MEASURED)
 
 
 @calibrate.command("laser")
@@ -424,7 +282,7 @@ def calibrate_plane(
         found = core.calibrate_plane(picture, core.PlaneCalibrationSettings(unit_mm=unit_mm))
     except CannotMeasure as answer:
         typer.echo(f"{image}: {answer}", err=True)
-        raise typer.Exit(NOTHING) from answer
+        raise typer.Exit(NOTHING_MEASURED) from answer
     points = {
         "origin_px": found.origin_px,
         "x_axis_px": found.x_axis_px,
@@ -483,7 +341,7 @@ def demo(
         typer.echo(f"The session is {session.path}")
     typer.echo(f"Results are in {out / 'results'}: tables, surfaces, pictures, report.pdf")
     if summary.example is None:
-        raise typer.Exit(NOTHING)
+        raise typer.Exit(NOTHING_MEASURED)
     surface = summary.example.measurement.reconstruction
     assert surface is not None
     picture = out / f"surface_{summary.example.frame:06d}.png"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING, progress_shown, writable_folder, write_file
+from labapp.cli.shared import NOTHING_MEASURED, progress_shown, writable_folder, write_file
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def advise(
             values[table][key] = value
     expected, limits = parse_request(values, question or "labapp advise")
     if not _advised(expected, limits, out, quick, check, seed):
-        raise typer.Exit(NOTHING)
+        raise typer.Exit(NOTHING_MEASURED)
 
 
 def _advised(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from labapp.cli.shared import NOTHING, finite, note, progress_bar
+from labapp.cli.shared import NOTHING_MEASURED, finite, note, progress_bar
 from labapp.errors import InputError
 from labapp.text import pluralize
 
@@ -123,7 +123,7 @@ def record(
     if taken.trouble:
         raise InputError(taken.path, "recording", taken.trouble, "a place that can be written")
     if not taken.frames:
-        raise typer.Exit(NOTHING)
+        raise typer.Exit(NOTHING_MEASURED)
 
 
 def _film(

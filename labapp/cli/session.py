@@ -17,7 +17,7 @@ from labapp.cli.shared import (
     ABOUT_SCHEMES,
     FRAMES_HELP,
     FRAMES_METAVAR,
-    NOTHING,
+    NOTHING_MEASURED,
     RECORDING_HELP,
     Algorithm,
     Commands,
@@ -260,7 +260,7 @@ def measure(
         summary = measure_frames(session, chosen, warm=warm)
     typer.echo(summary.text())
     if not summary.statuses["ok"]:
-        raise typer.Exit(NOTHING)
+        raise typer.Exit(NOTHING_MEASURED)
 
 
 def _set(session: Session, options: dict[str, str]) -> None:
@@ -408,7 +408,7 @@ def verify(
                 "  anything else: a copy from before, or export --frames of what can be read",
                 err=True,
             )
-            raise typer.Exit(NOTHING)
+            raise typer.Exit(NOTHING_MEASURED)
         results = sum(session.measured_by.values())
         parts = ((len(session.frames), "frame"), (results, "result"))
         told = [

@@ -38,8 +38,9 @@ else:  # an option may be what its type lists
 
 ABOUT_SCHEMES = ", ".join(scheme.about for scheme in SCHEMES.values())
 
-TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING = 143, 130, 3, 2, 1
-"""Exit codes; 0 is done. `NOTHING`: done, but nothing was measured, or a session is not whole."""
+TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING_MEASURED = 143, 130, 3, 2, 1
+"""Exit codes; 0 is done. `NOTHING_MEASURED`: done, but nothing was measured, or a session is not
+whole."""
 
 RUNS_SHOWN = 6
 
@@ -103,8 +104,8 @@ def note(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def shown(progress: Progress, name: str, count: int) -> Sink:
-    """Show results as they come: how many of so many there are, and why a frame gave nothing."""
+def progress_sink(progress: Progress, name: str, count: int) -> Sink:
+    """A sink that shows how many results of so many there are, and why a frame gave no surface."""
     task = progress.add_task(name, total=count)
 
     def show(result: FrameResult) -> None:
@@ -168,7 +169,7 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
 
     summary = Summary()
     with progress_bar() as progress:
-        sinks = [summary.add, shown(progress, session.path.name, len(frames))]
+        sinks = [summary.add, progress_sink(progress, session.path.name, len(frames))]
         try:
             for _ in session.measure(frames, warm=warm, sinks=sinks):
                 pass

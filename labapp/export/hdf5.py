@@ -29,7 +29,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.surface.measures import surface_grid
+from labapp.core.surface.mesh import grid_nodes
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.export.tables import TABLES, Column, Table
 from labapp.files import as_bytes
@@ -154,7 +154,7 @@ def _texts(texts: list[str]) -> npt.NDArray[Any]:
 
 def _put_surface(group: Any, reconstruction: Reconstruction, spacing_mm: float) -> None:
     """Write the nodes of the surface within the boundary, as a grid."""
-    x, y, z = surface_grid(reconstruction, spacing_mm)
+    x, y, z = grid_nodes(reconstruction, spacing_mm)
     columns, column = np.unique(x, return_inverse=True)
     rows, row = np.unique(y, return_inverse=True)
     grid = np.full((len(rows), len(columns)), np.nan)

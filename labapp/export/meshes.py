@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.surface.measures import surface_grid, surface_mesh
+from labapp.core.surface.mesh import grid_nodes, surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
@@ -82,13 +82,13 @@ def _radius_mm(reconstruction: Reconstruction) -> float:
     return float(np.hypot(*(boundary.points_mm[:, :2] - boundary.center_mm).T).max())
 
 
-def nodes(reconstruction: Reconstruction, spacing_mm: float) -> FloatArray:
+def known_nodes(reconstruction: Reconstruction, spacing_mm: float) -> FloatArray:
     """Nodes of a grid within the boundary where the surface is known, shape (n, 3), mm."""
-    each = np.column_stack(surface_grid(reconstruction, spacing_mm))
+    each = np.column_stack(grid_nodes(reconstruction, spacing_mm))
     return np.asarray(each[np.isfinite(each).all(axis=1)])
 
 
-def surface(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
+def open_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
     """The pool surface, open below; it ends at the boundary.
 
     Triangles where the surface is not known are left out.
@@ -118,7 +118,7 @@ def known_part(triangles: IntArray, value: FloatArray) -> tuple[IntArray, IntArr
     return used, corner.reshape(triangles.shape)
 
 
-def solid(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
+def solid_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
     """The pool surface as the top of a watertight body.
 
     A pool that lies above its boundary everywhere is closed by the polygon of its boundary: the

@@ -16,7 +16,7 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.export.formats import SURFACE_FORMATS
 from labapp.export.frame_result import FrameResult
-from labapp.export.meshes import SPACING_MM, nodes, solid, surface
+from labapp.export.meshes import SPACING_MM, known_nodes, open_mesh, solid_mesh
 from labapp.export.tables import TABLES, csv_header, table_rows
 from labapp.files import as_bytes, write_atomically
 from labapp.text import SIGMA_OF
@@ -55,7 +55,11 @@ def surface_files(
         return {}
     files: dict[str, bytes] = {}
     chosen = [each for name, each in SURFACE_FORMATS.items() if name in formats]
-    shapes = (("surface", "nodes", nodes), ("surface", "mesh", surface), ("solid", "mesh", solid))
+    shapes = (
+        ("surface", "nodes", known_nodes),
+        ("surface", "mesh", open_mesh),
+        ("solid", "mesh", solid_mesh),
+    )
     for stem, of, make in shapes[: 2 + as_solid]:
         alike = [each for each in chosen if each.of == of]
         if alike:

@@ -9,7 +9,7 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
-from labapp.core.surface.measures import surface_mesh
+from labapp.core.surface.mesh import surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.export.heights import difference_at, sigma_at

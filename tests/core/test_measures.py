@@ -18,13 +18,8 @@ from labapp.core.geometry.optics import (
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.schemes import ers, irs
 from labapp.core.surface.boundary import Boundary
-from labapp.core.surface.measures import (
-    measure_surface,
-    reflection_errors,
-    reflection_scale,
-    surface_grid,
-    surface_mesh,
-)
+from labapp.core.surface.measures import measure_surface, reflection_errors, reflection_scale
+from labapp.core.surface.mesh import grid_nodes, surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Pool, egg, spherical_cap
@@ -88,7 +83,7 @@ def test_an_egg_off_the_origin_is_measured():
     assert measures.length_mm == pytest.approx(size.length_mm, rel=1e-4)
     assert measures.height_mm == pytest.approx(size.height_mm, rel=1e-4)
     assert (measures.peak_x_mm, measures.peak_y_mm) == pytest.approx(size.peak_mm, abs=0.01)
-    x, _, z = surface_grid(reconstruction, 0.02)
+    x, _, z = grid_nodes(reconstruction, 0.02)
     assert measures.volume_mm3 == pytest.approx(z.sum() * 0.02**2, rel=1e-3)
     assert measures.area_mm2 == pytest.approx(len(x) * 0.02**2, rel=1e-3)
 
@@ -157,7 +152,7 @@ def test_two_rows_have_no_inside():
 
 def test_the_grid_is_the_nodes_inside():
     reconstruction, _ = truth(spherical_cap(6.0, 0.3, (0.1, 0.2)))
-    x, y, z = surface_grid(reconstruction, 0.25)
+    x, y, z = grid_nodes(reconstruction, 0.25)
     np.testing.assert_allclose(x / 0.25, np.round(x / 0.25), atol=1e-9)
     assert (np.hypot(x - 0.1, y - 0.2) <= 3.0).all()
     assert len(x) == pytest.approx(np.pi * 9 / 0.25**2, rel=0.03)

@@ -81,7 +81,7 @@ def cap_volume(height_mm: float) -> float:
 
 
 def test_the_solid_of_a_cap_has_its_volume() -> None:
-    solid = body(meshes.solid(of(cap(HEIGHT_MM)), 0.1))
+    solid = body(meshes.solid_mesh(of(cap(HEIGHT_MM)), 0.1))
     assert solid.is_watertight
     assert solid.is_winding_consistent
     assert solid.volume == pytest.approx(cap_volume(HEIGHT_MM), rel=0.002)
@@ -94,7 +94,7 @@ def test_the_solid_of_a_cap_has_its_volume() -> None:
 
 def test_the_boundary_need_not_be_level() -> None:
     tilted = of(Tilted(cap(HEIGHT_MM), 0.05), rim_mm=0.05)
-    solid = body(meshes.solid(tilted, 0.1))
+    solid = body(meshes.solid_mesh(tilted, 0.1))
     assert solid.is_watertight
     assert solid.volume == pytest.approx(cap_volume(HEIGHT_MM), rel=0.002)
 
@@ -108,7 +108,7 @@ def test_any_other_pool_is_the_top_of_a_block(
     pool: Pool, lowest: float, volume: float | None
 ) -> None:
     assert lowest < -0.05
-    solid = body(meshes.solid(of(pool), 0.1))
+    solid = body(meshes.solid_mesh(of(pool), 0.1))
     assert solid.is_watertight
     assert solid.is_winding_consistent
     bottom = lowest - meshes.BLOCK_MM
@@ -125,7 +125,7 @@ def test_any_other_pool_is_the_top_of_a_block(
 
 
 def test_the_open_surface_ends_at_the_boundary_with_its_normals_up() -> None:
-    surface = body(meshes.surface(of(cap(-HEIGHT_MM)), 0.1))
+    surface = body(meshes.open_mesh(of(cap(-HEIGHT_MM)), 0.1))
     assert not surface.is_watertight
     assert surface.is_winding_consistent
     assert (surface.face_normals[:, 2] > 0.5).all()
@@ -152,7 +152,7 @@ def test_what_is_not_known_is_left_out_of_the_surface_and_closed_in_the_solid(
 ) -> None:
     pool = spherical_cap(2 * RADIUS_MM, HEIGHT_MM)
     partly = of(PartlyKnown(pool, unknown), center=(0.0, 0.0))
-    surface, solid = body(meshes.surface(partly, 0.05)), body(meshes.solid(partly, 0.05))
+    surface, solid = body(meshes.open_mesh(partly, 0.05)), body(meshes.solid_mesh(partly, 0.05))
     assert np.isfinite(surface.vertices).all()
     assert len(np.unique(surface.faces)) == len(surface.vertices)
     seen_mm2 = np.sum(surface.area_faces * surface.face_normals[:, 2])
@@ -163,8 +163,8 @@ def test_what_is_not_known_is_left_out_of_the_surface_and_closed_in_the_solid(
 
 
 MESHES = {
-    "surface": meshes.surface(of(cap(HEIGHT_MM)), 0.2),
-    "solid": meshes.solid(of(cap(-HEIGHT_MM)), 0.2),
+    "surface": meshes.open_mesh(of(cap(HEIGHT_MM)), 0.2),
+    "solid": meshes.solid_mesh(of(cap(-HEIGHT_MM)), 0.2),
 }
 both = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
@@ -189,7 +189,7 @@ def test_stl_is_read_back_by_other_programs(
 def test_a_solid_stays_watertight_in_32_bit(
     write: Callable[[Mesh], bytes], height_mm: float
 ) -> None:
-    solid = meshes.solid(of(cap(height_mm)), meshes.SMALLEST_SPACING_MM)
+    solid = meshes.solid_mesh(of(cap(height_mm)), meshes.SMALLEST_SPACING_MM)
     read = trimesh.load_mesh(io.BytesIO(write(solid)), file_type="stl")
     assert read.is_watertight
     assert read.is_winding_consistent
@@ -239,5 +239,5 @@ def test_vtp_is_read_back_by_vtk(mesh: Mesh) -> None:
 @pytest.mark.parametrize("name", mesh_formats())
 def test_the_same_mesh_gives_the_same_bytes(name: str) -> None:
     write = SURFACE_FORMATS[name].content
-    again = meshes.surface(of(cap(HEIGHT_MM)), 0.2)
+    again = meshes.open_mesh(of(cap(HEIGHT_MM)), 0.2)
     assert write(again) == write(MESHES["surface"])

@@ -224,7 +224,7 @@ def surface_sizes(surface: Surface, boundary: Boundary) -> tuple[FloatArray, Flo
     wedge = wedges(boundary)
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     fraction = (node + 1) / 2
-    samples = _spokes(surface, boundary, fraction)
+    samples = spoke_points(surface, boundary, fraction)
     # ∫∫ z dA in triangles about the centre: each spoke stands for half of the two beside it.
     volume = wedge @ (samples[..., 2] @ (weight * fraction))
     points = np.vstack([samples.reshape(-1, 3), outline])
@@ -241,7 +241,7 @@ def wedges(boundary: Boundary) -> FloatArray:
     return np.asarray((after + np.roll(after, 1)) / 2)
 
 
-def _spokes(surface: Surface, boundary: Boundary, fraction: FloatArray) -> FloatArray:
+def spoke_points(surface: Surface, boundary: Boundary, fraction: FloatArray) -> FloatArray:
     """Surface points at fractions of the way from centre to boundary, shape (m, rings, 3)."""
     offset = boundary.points_mm[:, None, :2] - boundary.center_mm
     xy = boundary.center_mm + fraction[:, None] * offset
@@ -279,50 +279,3 @@ def refined(
         return start_mm
     refined = np.append(at, height(at[0], at[1]))
     return refined if sign * refined[2] >= sign * start_mm[2] else start_mm
-
-
-def surface_grid(
-    reconstruction: Reconstruction, spacing_mm: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Nodes within the boundary of a grid through the origin: x, y, z, each shape (n,), mm."""
-    boundary = reconstruction.boundary
-    low = np.ceil(boundary.points_mm[:, :2].min(axis=0) / spacing_mm)
-    high = np.floor(boundary.points_mm[:, :2].max(axis=0) / spacing_mm)
-    x, y = np.meshgrid(*(np.arange(a, b + 1) * spacing_mm for a, b in zip(low, high, strict=True)))
-    inside = boundary.contains(x, y)
-    x, y = x[inside], y[inside]
-    return x, y, reconstruction.surface.height(x, y)
-
-
-def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[FloatArray, IntArray]:
-    """Triangles that end exactly at the boundary: rings of its shape about its centre.
-
-    Parameters
-    ----------
-    reconstruction
-        What to mesh.
-    spacing_mm
-        Largest distance between rings, mm; along a ring there is a vertex per boundary point.
-
-    Returns
-    -------
-    vertices, triangles
-        Shape (n, 3), mm, the centre first and the boundary last; and indices, shape (k, 3),
-        counter-clockwise seen from above.
-    """
-    boundary, surface = reconstruction.boundary, reconstruction.surface
-    radius = np.linalg.norm(boundary.points_mm[:, :2] - boundary.center_mm, axis=-1).max()
-    rings = max(int(np.ceil(radius / spacing_mm)), 1)
-    count = len(boundary.points_mm)
-    inner = _spokes(surface, boundary, np.arange(1, rings) / rings)
-    x, y = boundary.center_mm
-    centre = [x, y, surface.height(np.asarray(x), np.asarray(y))]
-    vertices = np.vstack([centre, inner.transpose(1, 0, 2).reshape(-1, 3), boundary.points_mm])
-    here = np.arange(count)
-    after = np.roll(here, -1)
-    triangles = [np.column_stack([np.zeros(count, int), 1 + here, 1 + after])]
-    for ring in range(rings - 1):
-        a, b = 1 + ring * count, 1 + (ring + 1) * count
-        triangles.append(np.column_stack([a + here, b + here, b + after]))
-        triangles.append(np.column_stack([a + here, b + after, a + after]))
-    return vertices, np.vstack(triangles)

@@ -19,7 +19,7 @@ from labapp.core.geometry.optics import (
 )
 from labapp.core.geometry.rig import Rig
 from labapp.core.pipeline import Measurement
-from labapp.core.surface.measures import surface_mesh
+from labapp.core.surface.mesh import surface_mesh
 from labapp.core.values import FloatArray
 from labapp.export.meshes import drawn_spacing
 from labapp.media import GreyImage

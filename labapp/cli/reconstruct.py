@@ -1,0 +1,174 @@
+"""`labapp reconstruct`: measure a recording and write the results as tables and surfaces.
+
+The way of a frame: `media.open_source` reads it, a measurer (`run.measurers`) measures it
+(`core.pipeline.measure`), and `run.runner.run` passes its `FrameResult` to the sinks: the results
+folder (`export.results`), the summary, streams, progress.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from labapp.cli.shared import (
+    ABOUT_SCHEMES,
+    FRAMES_HELP,
+    FRAMES_METAVAR,
+    INTERRUPTED,
+    NOTHING_MEASURED,
+    RECORDING_HELP,
+    Algorithm,
+    SchemeName,
+    SigmaParts,
+    Warm,
+    note,
+    progress_bar,
+    progress_sink,
+)
+from labapp.core.schemes import SCHEMES
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.core.pipeline import Settings
+    from labapp.export.summary import Summary
+    from labapp.run.runner import Measurer, Sink
+    from labapp.run.streams import Stream
+
+
+def reconstruct(
+    source: Annotated[Path, typer.Argument(help=RECORDING_HELP)],
+    setup: Annotated[Path, typer.Option(help="Setup file (TOML; mm, degrees, px).")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder for the results (CSV, STL; mm). An earlier run in it is replaced."
+        ),
+    ],
+    scheme: Annotated[
+        SchemeName, typer.Option(help=f"How the surface is found: {ABOUT_SCHEMES}.")
+    ] = "fit",
+    algorithm: Annotated[
+        Algorithm,
+        typer.Option(help="Algorithm of IRS; the other schemes have none."),
+    ] = "opa",
+    correspondence: Annotated[
+        Literal["auto", "S/S", "S/I", "I/I"],
+        typer.Option(help="Order of columns/rows of dots to that of rays: same S, inverse I."),
+    ] = "auto",
+    frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
+    surfaces: Annotated[
+        Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
+    ] = "all",
+    *,
+    sigma_parts: SigmaParts = False,
+    warm: Warm = False,
+    lines: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP."),
+    ] = None,
+    opcua: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Publish measures as variables of OPC UA."),
+    ] = None,
+    anywhere: Annotated[
+        bool, typer.Option("--anywhere", help="Let other machines connect, unauthenticated.")
+    ] = False,
+) -> None:
+    """Measure frames and write measures, dots, points, boundaries and surfaces.
+
+    Ctrl-C or SIGTERM stops after whole frames: what was finished stays readable.
+
+    A frame that cannot be measured keeps its row in measures.csv, with the reason.
+    """
+    from labapp.core.pipeline import Settings
+
+    if algorithm != "opa" and not SCHEMES[scheme].algorithms:
+        raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
+    settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
+    places = {"lines": lines, "opcua": opcua}
+    with ExitStack() as at_end:
+        streams = _stream_sinks(at_end, places, anywhere)
+        summary = _measure_recording(
+            *(source, setup, out, settings, frames),
+            surfaces=surfaces == "all",
+            sigma_parts=sigma_parts,
+            warm=warm,
+            streams=streams,
+        )
+    if not summary.statuses["ok"]:
+        raise typer.Exit(NOTHING_MEASURED)
+
+
+def _stream_sinks(at_end: ExitStack, places: dict[str, str | None], anywhere: bool) -> list[Sink]:
+    """A sink for each stream that has a place (`open_stream`), which is closed at the end."""
+    asked = {kind: place for kind, place in places.items() if place is not None}
+    if not asked:
+        return []
+    from labapp.run.streams import open_stream, stream_values
+
+    def sink(stream: Stream) -> Sink:
+        return lambda result: stream.publish(stream_values(result))
+
+    sinks = []
+    for kind, place in asked.items():
+        stream = open_stream(kind, place, anywhere)
+        at_end.callback(stream.close)
+        typer.echo(f"Measures are sent from {stream.address}", err=True)
+        sinks.append(sink(stream))
+    return sinks
+
+
+def _measure_recording(
+    source_path: Path,
+    setup_path: Path,
+    out: Path,
+    settings: Settings,
+    frames: str,
+    *,
+    surfaces: bool,
+    sigma_parts: bool,
+    warm: bool,
+    streams: Sequence[Sink],
+) -> Summary:
+    """Measure, showing progress and failures on stderr and the summary on stdout.
+
+    Parameters are the command's options (`reconstruct`), and sinks for the streams.
+    """
+    from labapp.config.setup import read_setup
+    from labapp.export.results import ResultsWriter
+    from labapp.export.summary import Summary
+    from labapp.media import open_source
+    from labapp.run.measurers import ColdMeasurer, RecordingMeasurer, stretch_pools
+    from labapp.run.runner import provenance, run, select_frames
+
+    setup = read_setup(setup_path)
+    summary = Summary()
+    with open_source(source_path) as source, progress_bar() as progress:
+        for warning in source.warnings:
+            note(progress.console, f"warning: {warning}")
+        selected = select_frames(frames, len(source))
+        origin = provenance(source, source_path, setup_path, setup, settings, selected, warm)
+        results = ResultsWriter(out, setup.calibration, origin, surfaces, sigma_parts)
+        shown = progress_sink(progress, source.name, len(selected))
+        try:
+            with results, ExitStack() as at_end:
+                measurer: Measurer = ColdMeasurer(source.frame, setup, settings)
+                if warm:
+                    processes = at_end.enter_context(stretch_pools(len(selected)))
+                    measurer = RecordingMeasurer(
+                        *(source_path, source.index, setup, settings, surfaces, sigma_parts),
+                        processes,
+                    )
+                for _ in run(selected, measurer, [results.write, summary.add, *streams, shown]):
+                    pass  # the sinks have it
+        except KeyboardInterrupt:
+            done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
+            note(progress.console, done)
+            raise typer.Exit(INTERRUPTED) from None
+    typer.echo(summary.text())
+    typer.echo(f"Results are in {out.absolute()}")
+    return summary

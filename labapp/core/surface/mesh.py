@@ -1,0 +1,56 @@
+"""Points and triangles of a pool's surface within its boundary, for files and pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from labapp.core.surface.measures import spoke_points
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.values import FloatArray, IntArray
+
+
+def grid_nodes(
+    reconstruction: Reconstruction, spacing_mm: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Nodes within the boundary of a grid through the origin: x, y, z, each shape (n,), mm."""
+    boundary = reconstruction.boundary
+    low = np.ceil(boundary.points_mm[:, :2].min(axis=0) / spacing_mm)
+    high = np.floor(boundary.points_mm[:, :2].max(axis=0) / spacing_mm)
+    x, y = np.meshgrid(*(np.arange(a, b + 1) * spacing_mm for a, b in zip(low, high, strict=True)))
+    inside = boundary.contains(x, y)
+    x, y = x[inside], y[inside]
+    return x, y, reconstruction.surface.height(x, y)
+
+
+def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[FloatArray, IntArray]:
+    """Triangles that end exactly at the boundary: rings of its shape about its centre.
+
+    Parameters
+    ----------
+    reconstruction
+        What to mesh.
+    spacing_mm
+        Largest distance between rings, mm; along a ring there is a vertex per boundary point.
+
+    Returns
+    -------
+    vertices, triangles
+        Shape (n, 3), mm, the centre first and the boundary last; and indices, shape (k, 3),
+        counter-clockwise seen from above.
+    """
+    boundary, surface = reconstruction.boundary, reconstruction.surface
+    radius = np.linalg.norm(boundary.points_mm[:, :2] - boundary.center_mm, axis=-1).max()
+    rings = max(int(np.ceil(radius / spacing_mm)), 1)
+    count = len(boundary.points_mm)
+    inner = spoke_points(surface, boundary, np.arange(1, rings) / rings)
+    x, y = boundary.center_mm
+    centre = [x, y, surface.height(np.asarray(x), np.asarray(y))]
+    vertices = np.vstack([centre, inner.transpose(1, 0, 2).reshape(-1, 3), boundary.points_mm])
+    here = np.arange(count)
+    after = np.roll(here, -1)
+    triangles = [np.column_stack([np.zeros(count, int), 1 + here, 1 + after])]
+    for ring in range(rings - 1):
+        a, b = 1 + ring * count, 1 + (ring + 1) * count
+        triangles.append(np.column_stack([a + here, b + here, b + after]))
+        triangles.append(np.column_stack([a + here, b + after, a + after]))
+    return vertices, np.vstack(triangles)
