@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from datetime import datetime
+
 SIGMA_OF = "noise and level only"
 """What the ± of a measured pool covers; an error of the set-up is not in it."""
+
+
+def now() -> str:
+    """Present time, ISO 8601 with the time zone, to the second."""
+    return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 def pluralize(count: int, noun: str) -> str:

@@ -28,14 +28,14 @@ from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, mesh_
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
 from labapp.export.pictures import write_frame_picture, write_surface_picture, write_trend_picture
-from labapp.export.results import SURFACES, now, surface_files
+from labapp.export.results import SURFACES, surface_files
 from labapp.export.studio import PICTURE_PX, drawing_errors, drawing_process
 from labapp.export.summary import Summary
 from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
 from labapp.files import as_bytes, beside
 from labapp.media import GreyImage
 from labapp.system import sync_folder
-from labapp.text import SIGMA_OF
+from labapp.text import SIGMA_OF, now
 from labapp.version import VERSION
 
 MANIFEST = "manifest.json"

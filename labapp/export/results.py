@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import io
 import json
 import os
@@ -19,7 +18,7 @@ from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SPACING_MM, known_nodes, open_mesh, solid_mesh
 from labapp.export.tables import TABLES, csv_header, table_rows
 from labapp.files import as_bytes, write_atomically
-from labapp.text import SIGMA_OF
+from labapp.text import SIGMA_OF, now
 from labapp.version import VERSION
 
 RUN_FILE = "run.json"
@@ -230,8 +229,3 @@ def _append(file: io.FileIO, text: str) -> None:
     content = as_bytes(text)
     while content:
         content = content[file.write(content) :]
-
-
-def now() -> str:
-    """Present time, ISO 8601 with the time zone."""
-    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

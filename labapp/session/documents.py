@@ -7,7 +7,6 @@ some of them, in one transaction with what they were before.
 
 from __future__ import annotations
 
-import datetime
 import sqlite3
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from labapp.session.file.read_cache import ReadCache
 from labapp.session.file.schema import NO_FRAME
 from labapp.session.record import LaserReadings, PlanePicture, Record
 from labapp.session.signals import Signals
+from labapp.text import now
 
 Kind = Literal[
     "record",
@@ -160,9 +160,8 @@ class Documents:
             if not parts:
                 return False
             connection.execute("DELETE FROM change WHERE undone = 1")
-            made = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
             number = connection.execute(
-                "INSERT INTO change (label, made) VALUES (?, ?)", (label, made)
+                "INSERT INTO change (label, made) VALUES (?, ?)", (label, now())
             ).lastrowid
             connection.executemany(
                 "INSERT INTO change_part VALUES (?, ?, ?, ?, ?)",

@@ -6,7 +6,6 @@ embedded in the session, lossless.
 
 from __future__ import annotations
 
-import datetime
 import hashlib
 import os
 import threading
@@ -31,6 +30,7 @@ from labapp.session.file.blobs import MAGIC, pack, unpack_from
 from labapp.session.file.database import Database
 from labapp.session.file.read_cache import ReadCache
 from labapp.session.record import Recording
+from labapp.text import now
 
 Progress = Callable[[int, int], None]
 """Called with steps done and in all; may raise to stop."""
@@ -147,7 +147,7 @@ class Frames:
                 embedded=embed,
                 warnings=tuple(dict.fromkeys((*source.warnings, *found.warnings))),
                 index=source.index,
-                imported=datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+                imported=now(),
             )
             return self._store(recording, source, selected, found)
 

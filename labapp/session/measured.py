@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import functools
 import sqlite3
 from collections import OrderedDict
@@ -20,6 +19,7 @@ from labapp.errors import InputError
 from labapp.session.file.blobs import Damaged, fingerprint, pack, unpack
 from labapp.session.file.database import Database
 from labapp.session.file.schema import MEASURES
+from labapp.text import now
 from labapp.version import VERSION
 
 SETUP_CHANGED = "the rig or a calibration was changed"
@@ -164,7 +164,7 @@ class Results:
             If it cannot be saved; then nothing has changed.
         """
         setup, settings = pack(basis.setup.text), pack(basis.settings)
-        key, made = (VERSION, setup, settings), (correction, _now())
+        key, made = (VERSION, setup, settings), (correction, now())
         seal = fingerprint((frame, basis.scheme, *key, *made))
         content = pack((measurement, seal))
         row = _Row(*key, *made, content)
@@ -418,7 +418,3 @@ def scheme_name(settings: Settings) -> str:
     """Name of the scheme; with its algorithm where it has several: ``irs-opa``."""
     several = SCHEMES[settings.scheme].algorithms
     return f"{settings.scheme}-{settings.algorithm}" if several else settings.scheme
-
-
-def _now() -> str:
-    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")

@@ -140,6 +140,11 @@ def spread(sigma: Sequence[float]) -> FloatArray:
     return each
 
 
+def by_quantity(change: FloatArray) -> FloatArray:
+    """Root of the sum of squares of each of `QUANTITIES`, shape (8, …), from offsets, (11, …)."""
+    return np.array([np.linalg.norm(change[list(q.parts)], axis=0) for q in QUANTITIES])
+
+
 @dataclass(frozen=True)
 class ParameterDeviation(ReadOnlyArrays):
     """What a bench's uncertainties do to height (or depth) and diameter of a pool.
@@ -226,8 +231,8 @@ def parameter_deviation(
     found = np.array(in_parallel(moved_errors, tasks, f"parameters, {scheme}", progress, workers))
     plus, minus = found[1 : OFFSETS + 1], found[OFFSETS + 1 : 2 * OFFSETS + 1]
     half = (plus - minus) / 2
-    parts = [np.sqrt((half[list(quantity.parts)] ** 2).sum(axis=0)) for quantity in QUANTITIES]
-    return ParameterDeviation(np.array(sigma), np.array(parts), found[2 * OFFSETS + 1 :] - found[0])
+    draws_apart = found[2 * OFFSETS + 1 :] - found[0]
+    return ParameterDeviation(np.array(sigma), by_quantity(half), draws_apart)
 
 
 def moved_errors(task: tuple[KnownPool, FloatArray, str]) -> FloatArray:

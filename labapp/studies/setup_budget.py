@@ -26,6 +26,7 @@ from labapp.studies.parameter_deviation import (
     QUANTITIES,
     AxisPoints,
     KnownPool,
+    by_quantity,
     moved_errors,
     spread,
 )
@@ -133,7 +134,7 @@ def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, Fl
         for k, step in enumerate(np.diag(spread(bench.sigma))):
             both = [moved_errors((known, way * step, "fit"))[0] for way in (1, -1)]
             half[k] = (both[0] - both[1]) / 2
-        changes = np.array([np.linalg.norm(half[list(q.parts)]) for q in QUANTITIES])
+        changes = by_quantity(half)
     return predicted, error, changes
 
 

@@ -24,6 +24,7 @@ from labapp.studies.parameter_deviation import (
     OFFSETS,
     QUANTITIES,
     AxisPoints,
+    by_quantity,
     dots_moved,
     spread,
 )
@@ -214,7 +215,7 @@ class _Model:
         for k, step in enumerate(np.diag(spread(sigma))):
             if step.any() and (axes is not None or not step[5:].any()):
                 change[k] = self._believed(step, axes) - base
-        return np.array([np.linalg.norm(change[list(q.parts)]) for q in QUANTITIES])
+        return by_quantity(change)
 
     def _believed(self, offset: FloatArray, axes: AxisPoints | None) -> float:
         """Height that is measured if the bench is taken to be off by ``offset``."""
