@@ -34,7 +34,7 @@ TOY = '''
 
 import numpy as np
 
-from labapp.core.schemes.slopes import Estimate, reflected_rays, whole_pool
+from labapp.core.schemes.slopes import Estimate, reflected_rays, reconstruction_within
 from labapp.core.surface.boundary import boundary_on_work_piece
 from labapp.core.surface.interpolation import ThinPlateSurface
 
@@ -57,7 +57,7 @@ def reconstruct(match, rig, settings):
 
     points[:, 2] = height(x, y) - height(*boundary.points_mm[:, :2].T).mean()
     best = Estimate(points, ThinPlateSurface(points), np.nan)
-    return whole_pool("toy", match, rays, best, boundary)
+    return reconstruction_within("toy", match, rays, best, boundary)
 '''
 
 IN_THE_WINDOW = """

@@ -49,8 +49,8 @@ def compiled_for(*signatures: tuple[types.Type, ...]) -> Callable[[F], F]:
     return lambda function: _kept(function, list(signatures))
 
 
-def part(function: F) -> F:
-    """Compile as a part of the functions of its file that call it."""
+def inner(function: F) -> F:
+    """Compile a function that compiled functions of its own file call, and nothing else does."""
     return _kept(function)
 
 

@@ -37,7 +37,7 @@ from labapp.simulation.parallel import NICE, start_worker
 T = TypeVar("T")
 
 AHEAD = 8
-"""So many frames are submitted to a pool beyond the one whose result is awaited."""
+"""So many frames are submitted to a pool of processes beyond the one whose result is awaited."""
 
 VOTERS, WAITS = 3, 5
 """A frame is judged with two more that have a surface, so that of three that disagree two decide;
@@ -86,10 +86,11 @@ class ColdMeasurer:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
-        measured = _in_order(map(self._begun, frames), AHEAD)
+        measured = _results_in_order(map(self._submit, frames), AHEAD)
         return _agreeing(measured, self.setup, self.settings)
 
-    def _begun(self, number: int) -> Future[FrameResult]:
+    def _submit(self, number: int) -> Future[FrameResult]:
+        """Read a frame here, and have it measured in the pool, or here and now."""
         frame = _read(self.read, number, self.settings)
         if isinstance(frame, FrameResult):
             return _here(lambda: frame)
@@ -184,7 +185,7 @@ def measuring_pool(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, spawn, initializer=start_worker, initargs=(NICE,))
 
 
-def _in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
+def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
     """Results in their order, so many begun ahead, which are cancelled if it is closed early."""
     waiting: deque[Future[T]] = deque()
     try:
@@ -259,7 +260,7 @@ class RecordingMeasurer:
         The recording, and what opening it found out (`FrameSource.index`), where it was.
     setup, settings
         What it is measured with.
-    whole
+    with_surfaces
         Whether results have dots, rays and surface, too: to pass them from process to process takes
         a twentieth of the time that it took to measure them.
     sigma_parts
@@ -277,7 +278,7 @@ class RecordingMeasurer:
     index: bytes | None
     setup: Setup
     settings: Settings
-    whole: bool = False
+    with_surfaces: bool = False
     sigma_parts: bool = False
     pools: Sequence[Executor] = ()
 
@@ -291,7 +292,7 @@ class RecordingMeasurer:
                 found = result.measurement
                 yield replace(
                     result,
-                    measurement=found if self.whole else without_surface(found),
+                    measurement=found if self.with_surfaces else without_surface(found),
                     rows=table_rows(result, self.setup.calibration, self.sigma_parts),
                 )
 
@@ -309,7 +310,7 @@ class RecordingMeasurer:
                     yield pool.submit(_next_batch)
 
         batches = -(-STRETCH // BATCH)
-        for batch in _in_order(begun(), len(self.pools) * batches):
+        for batch in _results_in_order(begun(), len(self.pools) * batches):
             yield from batch
 
 

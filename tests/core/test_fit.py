@@ -90,7 +90,7 @@ def test_a_dent_and_an_oscillation_are_followed(term: Term, rms_mm: float) -> No
     pool = egg(6.6, 3.2, 4.2, 0.3, terms=(term,))
     made, match = fitted(pool)
     xy = inside(pool)
-    error = made.whole.height(*xy.T) - pool.height(*xy.T)
+    error = made.unbounded.height(*xy.T) - pool.height(*xy.T)
     assert np.sqrt(np.mean(error**2)) < rms_mm
     measures = measure_surface(made, match, OPEN_RIG)
     assert measures.height_mm == pytest.approx(pool.size.height_mm, abs=0.01)
@@ -104,7 +104,7 @@ def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
     assert made.scheme == "fit"
     np.testing.assert_array_equal(made.ray, match.ray)
     x, y, z = made.points_mm.T
-    np.testing.assert_allclose(z, made.whole.height(x, y), atol=1e-6)
+    np.testing.assert_allclose(z, made.unbounded.height(x, y), atol=1e-6)
     true = trace(pool, OPEN_RIG).point_mm[tuple(match.ray.T - 1)]
     np.testing.assert_allclose(made.points_mm, true, atol=0.02)
     assert np.linalg.norm(made.residual_mm, axis=-1).max() < 0.02
@@ -114,7 +114,7 @@ def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
     assert made.boundary.contains(x, y).mean() > 0.97
     # Beyond the boundary there is no surface, though its splines go on.
     beyond = outline[:, :2] + 1e-3 * (outline[:, :2] - made.boundary.center_mm)
-    assert np.isfinite(made.whole.height(*beyond.T)).all()
+    assert np.isfinite(made.unbounded.height(*beyond.T)).all()
     assert np.isnan(made.surface.height(*beyond.T)).all()
     assert np.isnan(made.surface.gradient(*beyond.T)).all()
 

@@ -82,7 +82,7 @@ def test_stretches_are_measured_alike_here_and_by_processes(
     for workers in (0, 2):
         with stretch_pools(FRAMES, workers) as pools:
             assert len(pools) == workers
-            told[workers] = list(replace(recording, whole=True, pools=pools)(range(FRAMES)))
+            told[workers] = list(replace(recording, with_surfaces=True, pools=pools)(range(FRAMES)))
     assert [one.frame for one in told[2]] == list(range(FRAMES))
     for here, there in zip(told[0], told[2], strict=True):
         assert here.rows == there.rows

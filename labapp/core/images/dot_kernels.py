@@ -10,7 +10,7 @@ from numba import types
 
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import compiled_for as _compiled_for
-from labapp.core.compiled import part as _inner
+from labapp.core.compiled import inner as _inner
 from labapp.core.images.dots import Grey, Picture
 from labapp.core.values import BoolArray, FloatArray, IntArray
 

@@ -10,7 +10,7 @@ import heapq
 import numpy as np
 from numba import types
 
-from labapp.core.compiled import compiled, part
+from labapp.core.compiled import compiled, inner
 from labapp.core.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 BORDER = 3
@@ -40,7 +40,7 @@ _plane = types.Array(_c, 1, "C", readonly=True)
 _sites = types.Array(_i, 2, "C")
 
 
-@part
+@inner
 def _nearest(plane: ComplexArray, place: complex, within: float) -> tuple[int, float, float]:
     """The dot nearest to a place, its distance and the next one's, of dots within a distance.
 
@@ -66,14 +66,14 @@ def _nearest(plane: ComplexArray, place: complex, within: float) -> tuple[int, f
     return nearest, np.sqrt(least), np.sqrt(second)
 
 
-@part
+@inner
 def _clamped(ratio: complex) -> complex:
     """A ratio of steps, its size held between `LEAST_RATIO` and `MOST_RATIO`."""
     size = abs(ratio)
     return ratio * (min(max(size, LEAST_RATIO), MOST_RATIO) / size) if size > 0.0 else 1.0 + 0.0j
 
 
-@part
+@inner
 def _predictions(
     plane: ComplexArray, dot_at: IntArray, k: int, t: int, gate: float
 ) -> tuple[ComplexArray, FloatArray]:
@@ -117,7 +117,7 @@ def _predictions(
     return places[:count], sizes[:count]
 
 
-@part
+@inner
 def _claim(
     plane: ComplexArray,
     dot_at: IntArray,
@@ -146,7 +146,7 @@ def _claim(
     return error / fitting / fitting, k, t, chosen
 
 
-@part
+@inner
 def _seed_claims(
     plane: ComplexArray, middle: int, seed: int, first: complex, second: complex
 ) -> list[Claim]:
@@ -159,7 +159,7 @@ def _seed_claims(
     return queue
 
 
-@part
+@inner
 def _root(parent: IntArray, dot: int) -> int:
     """The dot at the root of another's tree."""
     while parent[dot] != dot:
@@ -168,7 +168,7 @@ def _root(parent: IntArray, dot: int) -> int:
     return dot
 
 
-@part
+@inner
 def _connected_parts(plane: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntArray:
     """Parent of each dot in trees (union-find) of those that sound cells connect (`MOST_OPEN`)."""
     parent = np.arange(len(plane))

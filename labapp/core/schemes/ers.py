@@ -12,8 +12,8 @@ from labapp.core.schemes.slopes import (
     Paths,
     best_of_loops,
     parents_from,
+    reconstruction_within,
     reflected_rays,
-    whole_pool,
 )
 from labapp.core.surface.boundary import BoundaryModel, boundary_on_work_piece
 from labapp.core.surface.interpolation import ThinPlateSurface
@@ -65,7 +65,7 @@ def reconstruct(match: Match, rig: Rig, settings: ErsSettings | None = None) -> 
     outline = boundary_on_work_piece(match, rig, settings.boundary)
     x, y, _ = outline.points_mm.T
     boundary = outline.at_height(best.surface.height(x, y))
-    return whole_pool("ers", match, rays, best, boundary)
+    return reconstruction_within("ers", match, rays, best, boundary)
 
 
 def head_left(ray: IntArray) -> int:

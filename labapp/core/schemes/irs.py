@@ -18,8 +18,8 @@ from labapp.core.schemes.slopes import (
     lines,
     parents_along,
     parents_from,
+    reconstruction_within,
     reflected_rays,
-    whole_pool,
 )
 from labapp.core.surface.boundary import BoundaryModel, boundary_on_work_piece
 from labapp.core.surface.interpolation import CloughTocherSurface
@@ -83,7 +83,7 @@ def reconstruct(match: Match, rig: Rig, settings: IrsSettings | None = None) -> 
             estimates.append((height, estimate))
     best = _best(estimates, settings.are_margin)
     boundary = boundary_on_work_piece(match, rig, settings.boundary)
-    return whole_pool("irs", match, rays, best, boundary)
+    return reconstruction_within("irs", match, rays, best, boundary)
 
 
 def lower_left(match: Match) -> int:

@@ -186,7 +186,7 @@ class Paths(ReadOnlyArrays):
         horizontal /= np.linalg.norm(horizontal, axis=-1, keepdims=True)
         upward = np.cross(normal, horizontal)
         upward *= np.sign(upward[:, 2:]) / np.linalg.norm(upward, axis=-1, keepdims=True)
-        base, matrix = _ways(parent, end)
+        base, matrix = _steps_to(parent, end)
         return cls(
             base=base,
             start=start,
@@ -220,8 +220,8 @@ class Paths(ReadOnlyArrays):
         # Points are left open by SETTLED_MM, slopes by what they change over that way. One that is
         # less is nothing, and has no sign to lend: the mean keeps its own.
         way = base_distance_mm[self.base[self.end]] * self.apart
-        told = np.abs(slope_a) > SETTLED_MM / way * np.abs(slope_b - slope_a)
-        slope = np.where(told, np.sign(slope_a) * np.abs(mean), mean)  # Eq. 6-1, 7-1
+        has_sign = np.abs(slope_a) > SETTLED_MM / way * np.abs(slope_b - slope_a)
+        slope = np.where(has_sign, np.sign(slope_a) * np.abs(mean), mean)  # Eq. 6-1, 7-1
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.log(
                 (self.start_components[:, 1] - slope * self.start_components[:, 0])
@@ -230,8 +230,8 @@ class Paths(ReadOnlyArrays):
         return np.asarray(base_distance_mm[self.base] * np.exp(self.matrix @ step))
 
 
-def _ways(parent: IntArray, end: IntArray) -> tuple[IntArray, FloatArray]:
-    """Base point of each point and the steps that lead to it, shapes (n,) and (n, s)."""
+def _steps_to(parent: IntArray, end: IntArray) -> tuple[IntArray, FloatArray]:
+    """Base point of each point, and which steps lead to it: shapes (n,) and (n, s)."""
     number = np.full(len(parent), -1)
     number[end] = np.arange(len(end))
     base = np.arange(len(parent))
@@ -382,10 +382,10 @@ def best_of_loops(
     return best
 
 
-def whole_pool(
+def reconstruction_within(
     scheme: str, match: Match, rays: ReflectedRays, best: Estimate, boundary: Boundary
 ) -> Reconstruction:
-    """Interpolate the whole surface through an estimate's points and the boundary, and test it.
+    """The reconstruction with the surface through an estimate's points and the boundary (step 5).
 
     Raises
     ------

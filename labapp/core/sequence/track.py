@@ -107,18 +107,18 @@ def begin(
     What is remembered of a ``former`` track, of the frames just before, stays.
     """
     match, made = measurement.match, measurement.reconstruction
-    if match is None or made is None or not isinstance(made.whole, SplineSurface):
+    if match is None or made is None or not isinstance(made.unbounded, SplineSurface):
         return None
     if made.scheme != "fit":
         return None
     if settings.dots.method != "band-pass" or rig.pattern.marker is None:
         return None
-    own, pool = SequenceGeometry.of(rig, made.whole.basis, settings.fit), None
+    own, pool = SequenceGeometry.of(rig, made.unbounded.basis, settings.fit), None
     if former is not None and np.array_equal(own.at, former.geometry.at):
         geometry, pool = former.geometry, _moved_to(former, match, made)
     if pool is None:
         former, geometry = None, own
-        pool = intersect_and_reflect(geometry, made.whole.coefficients, geometry.landing_mm, 4)
+        pool = intersect_and_reflect(geometry, made.unbounded.coefficients, geometry.landing_mm, 4)
     witness = match.witness[tuple(geometry.at.T)]
     witnesses = witness != 0
     surface = SplineSurface(geometry.basis, pool.coefficients)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled as _compiled
-from labapp.core.compiled import part as _inner
+from labapp.core.compiled import inner as _inner
 from labapp.core.values import FloatArray
 
 _f, _i = types.float64, types.int64

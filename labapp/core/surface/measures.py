@@ -124,7 +124,7 @@ def measure_surface(reconstruction: Reconstruction, match: Match, rig: Rig) -> M
     """Measure a reconstructed pool."""
     errors = reflection_errors(reconstruction, match, rig)
     boundary = reconstruction.boundary
-    size, peak = surface_sizes(reconstruction.whole, boundary)
+    size, peak = surface_sizes(reconstruction.unbounded, boundary)
     made = assemble_measures(errors, size, peak, boundary.center_mm, reconstruction)
     return replace(made, own_are_mm=reconstruction.own_are_mm)
 

@@ -21,23 +21,23 @@ class BoundedSurface:
 
     Parameters
     ----------
-    whole
+    unbounded
         The surface, which may go on beyond.
     boundary
         Where it ends.
     """
 
-    whole: Surface
+    unbounded: Surface
     boundary: Boundary
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height z at (x, y), arrays of one shape, mm."""
-        return np.where(self._within(x_mm, y_mm), self.whole.height(x_mm, y_mm), np.nan)
+        return np.where(self._within(x_mm, y_mm), self.unbounded.height(x_mm, y_mm), np.nan)
 
     def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
         within = self._within(x_mm, y_mm)[..., None]
-        return np.where(within, self.whole.gradient(x_mm, y_mm), np.nan)
+        return np.where(within, self.unbounded.gradient(x_mm, y_mm), np.nan)
 
     def _within(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
         x, y = self.boundary.center_mm
@@ -54,7 +54,7 @@ class Reconstruction(ReadOnlyArrays):
     scheme
         Which scheme made it.
     surface
-        z = f(x, y); NaN outside the boundary, whatever surface it is made with (`whole`).
+        z = f(x, y); NaN outside the boundary, whatever surface it is made with (`unbounded`).
     boundary
         The pool's boundary.
     ray
@@ -92,9 +92,9 @@ class Reconstruction(ReadOnlyArrays):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "surface", BoundedSurface(self.whole, self.boundary))
+        object.__setattr__(self, "surface", BoundedSurface(self.unbounded, self.boundary))
 
     @property
-    def whole(self) -> Surface:
+    def unbounded(self) -> Surface:
         """The surface as the scheme made it, which may go on beyond the boundary."""
-        return self.surface.whole if isinstance(self.surface, BoundedSurface) else self.surface
+        return self.surface.unbounded if isinstance(self.surface, BoundedSurface) else self.surface

@@ -176,7 +176,7 @@ def _tree(value: object, arrays: dict[bytes, int]) -> object:
     if isinstance(value, dict):
         return {"dict": [[key, _tree(item, arrays)] for key, item in value.items()]}
     if isinstance(value, BoundedSurface):
-        value = value.whole  # the boundary is kept beside it, in the reconstruction
+        value = value.unbounded  # the boundary is kept beside it, in the reconstruction
     if type(value) in SURFACE_NAMES:
         name = SURFACE_NAMES[type(value)]
         return {name: _tree(getattr(value, SURFACES[name][1]), arrays)}

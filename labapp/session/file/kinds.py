@@ -66,7 +66,7 @@ def is_a(value: object, hint: Any) -> bool:
     if hint in (Any, Never):
         return hint is Any
     if hint is Surface:
-        made = value.whole if isinstance(value, BoundedSurface) else value
+        made = value.unbounded if isinstance(value, BoundedSurface) else value
         return hasattr(made, "height") and hasattr(made, "gradient")
     return value is None if hint is None else isinstance(value, hint)
 
