@@ -35,6 +35,21 @@ _FLATTEST, _STEEPEST = 0.004, 0.6
 """Curvature below which no dots could be told apart, and above which no pool is, mm⁻¹."""
 
 
+ROW_SLOPE, REGULAR, LEAST_GAP = 0.6, 0.42, 0.3
+"""A hole is looked for between two dots of a row no steeper than the first. As one dot is missing
+between them, the next one on should lie half as far off as they are apart, on one side at least: it
+does within the second. No dot is in the hole: none is nearer to it than the third. The latter two
+are shares of the distance of the two dots."""
+
+CORE_LOOSE, CORE_TIGHT = 5, 6
+"""So many of the eight rays round the reference must find their dots: loosely, at first, and once
+the quadric is fitted."""
+
+SILENT_COST, NEARNESS_GAIN = 3.0, 4.0
+"""What a ray beside the reference that should have a dot and has none takes off a guess's score,
+and what dots exactly where they are predicted add to it; a ray with a dot counts 1."""
+
+
 @dataclass(frozen=True)
 class QuadricGuess:
     """The dots that a quadric's rays fall on.
@@ -43,12 +58,13 @@ class QuadricGuess:
     ----------
     labels
         Index of the dot of each ray next to the reference or `UNLABELLED`, shape (rows, columns).
-    hits
-        How many rays found their dot, less those that should have and did not.
+    score
+        How many rays found their dot, less for those that should have and did not, and more for
+        dots near their predictions.
     """
 
     labels: IntArray
-    hits: float
+    score: float
 
 
 def search_quadrics(observed: Observation, most: int = 8) -> list[QuadricGuess]:
@@ -69,9 +85,9 @@ def search_quadrics(observed: Observation, most: int = 8) -> list[QuadricGuess]:
     quadrics = [_quadrics(window, *hole) for hole in _holes(observed, window.tree)]
     for guess in window.scored(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
         key = guess.labels.tobytes()
-        if key not in found or found[key].hits < guess.hits:
+        if key not in found or found[key].score < guess.score:
             found[key] = guess
-    return sorted(found.values(), key=lambda guess: -guess.hits)[:most]
+    return sorted(found.values(), key=lambda guess: -guess.score)[:most]
 
 
 def _holes(
@@ -82,16 +98,15 @@ def _holes(
     near = tree.query(dots, k=min(10, len(dots)))[1][:, 1:]
     one, other = dots[np.repeat(np.arange(len(dots)), near.shape[1])], dots[near.ravel()]
     step = other - one
-    beside = (step[:, 0] > 0) & (np.abs(step[:, 1]) <= 0.6 * step[:, 0])
+    beside = (step[:, 0] > 0) & (np.abs(step[:, 1]) <= ROW_SLOPE * step[:, 0])
     one, other, step = one[beside], other[beside], step[beside]
     length = np.linalg.norm(step, axis=-1)
-    # Where one dot is missing between two, the next one on lies half as far off.
     beyond = tree.query(np.stack([one - step / 2, other + step / 2]))[0].min(axis=0)
-    regular = beyond <= 0.42 * length
+    regular = beyond <= REGULAR * length
     one, other, step, length = one[regular], other[regular], step[regular], length[regular]
     lifts = length[:, None, None] * _LIFTS[:, None] * [0.0, 1.0]
     holes = ((one + other) / 2)[:, None] + lifts
-    for k, lift in np.argwhere(tree.query(holes)[0] > 0.3 * length[:, None]):
+    for k, lift in np.argwhere(tree.query(holes)[0] > LEAST_GAP * length[:, None]):
         yield holes[k, lift], step[k, 0] / 2
 
 
@@ -122,7 +137,7 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
     patterns = window.intersect(quadrics, rays.reshape(-1, 3))[1].reshape(-1, *rays.shape[:2], 2)
     hit = window.hits(patterns, LOOSE_GATE, window.absent[window.near])[0]
     hit = hit[(slice(None), *window.core_of_near)]
-    return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= 5])
+    return np.asarray(quadrics[hit.sum(axis=(1, 2)) >= CORE_LOOSE])
 
 
 class _Window:
@@ -184,7 +199,7 @@ class _Window:
         patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
         hit, dot, off = self.hits(patterns, TIGHT_GATE, self.absent)
         core = (slice(None), *self.core)
-        explains = np.flatnonzero(hit[core].sum(axis=(1, 2)) >= 6)
+        explains = np.flatnonzero(hit[core].sum(axis=(1, 2)) >= CORE_TIGHT)
         seen = self.observed.in_view(np.nan_to_num(patterns[core][explains], nan=1e6))
         # A ray next to the hole that should show its dot and does not speaks against the quadric.
         silent = seen & ~self.absent[self.core] & ~hit[core][explains]
@@ -202,5 +217,5 @@ class _Window:
         near[core] = own[core]
         labels = np.full(self.observed.rays.shape[:2], UNLABELLED, np.int64)
         labels[self.part] = near
-        hits = float(np.sum(own != UNLABELLED) - 3.0 * silent + 4.0 * nearness)
-        return QuadricGuess(labels, hits)
+        score = np.sum(own != UNLABELLED) - SILENT_COST * silent + NEARNESS_GAIN * nearness
+        return QuadricGuess(labels, float(score))
