@@ -21,7 +21,7 @@ from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.match import Match
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
-from labapp.core.matching.decision import MatchSettings
+from labapp.core.matching.decision import NOTHING_EXPLAINS, MatchSettings
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
@@ -125,7 +125,8 @@ def measure(
             try:
                 match = match_rays(dots, lattice, *bench)
             except CannotMeasure as why:
-                raise (no_lattice if no_lattice and why.status == "no-match" else why) from None
+                nothing = why.reason == NOTHING_EXPLAINS
+                raise (no_lattice if no_lattice and nothing else why) from None
             lattice = lattice_of_match(match, rig, len(dots))
         else:
             dots, given = correction.dots, correction.lattice

@@ -27,6 +27,7 @@ from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.decision import (
     MISFIT_MM,
     MISFIT_TIMES,
+    NOTHING_EXPLAINS,
     QUICK_MISFIT_TIMES,
     MatchSettings,
     any_explains,
@@ -123,7 +124,7 @@ def _decide_among(
     if not found:
         if observed.rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
-        raise CannotMeasure("no-match", "no surface explains the reflected dots")
+        raise CannotMeasure("no-match", NOTHING_EXPLAINS)
     return decide(observed, found, settings)
 
 

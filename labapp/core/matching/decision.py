@@ -62,6 +62,9 @@ FAR_COST = 30.0
 """With rough surfaces, labels that cost more than the best by so much, and by `CLOSE_COST` besides
 where the marker counts, do not come near it with settled ones."""
 
+NOTHING_EXPLAINS = "no surface explains the reflected dots"
+"""Why there is no match, where not even most of the dots have a ray."""
+
 PAIR, BESIDE_SPACINGS = 2, 1.5
 """So many missed rays, or dots without a ray, side by side are no row; dots are where they are
 nearer to one another than so many spacings."""
@@ -218,6 +221,8 @@ def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: Match
         and (best.stray_count <= settings.most_strays(best) or _strays_lie_apart(observed, best))
         and best.stray_count + best.missed_count <= MOST_SCATTERED * best.label_count
     )
+    if not nearly_explains(observed, best):
+        raise CannotMeasure("no-match", NOTHING_EXPLAINS)
     if not scattered and settings.leaves_much(best):
         raise CannotMeasure(
             "no-match",
