@@ -21,6 +21,14 @@ def ways(orientation: Orientation) -> IntArray:
     return np.array([1 if by_row == "S" else -1, 1 if by_column == "S" else -1])
 
 
+def missing_share(missed: int, pairs: int) -> float:
+    """Share of the dots that are missing, where so many rays amid so many pairs have no dot.
+
+    The mean of its posterior, with a quarter of a dot missing beforehand: never none.
+    """
+    return (missed + 0.25) / (pairs + missed + 1)
+
+
 @dataclass(frozen=True)
 class Trial:
     """How well the matched dots fit with one orientation.
@@ -62,6 +70,8 @@ class Match(ReadOnlyArrays):
         0 where it cannot testify (absent, blocked by the torch, off the plane, in doubt).
     trials
         Every orientation that was tried, the best first.
+    missing
+        Share of the dots that are missing: the probability that a ray that came back has no dot.
     """
 
     orientation: Orientation
@@ -72,6 +82,7 @@ class Match(ReadOnlyArrays):
     plane_covariance_mm2: FloatArray
     witness: IntArray
     trials: tuple[Trial, ...] = ()
+    missing: float = 0.0
 
     @property
     def margin(self) -> float:

@@ -508,19 +508,24 @@ def test_quadrics_are_fitted_by_least_squares_of_slopes(lit: list[int]) -> None:
         np.testing.assert_allclose(fitted, true, atol=2e-4)
 
 
+@pytest.mark.parametrize("missing", [0.0, 0.004, 0.3])
 @pytest.mark.parametrize("witnesses", [1, 90, 2 * level_kernels.FACTORS + 7])
-def test_doubts_are_logarithms_of_what_was_seen(witnesses: int) -> None:
+def test_doubts_are_logarithms_of_what_was_seen(witnesses: int, missing: float) -> None:
     # Some lie so far off that an exponential alone would be infinite, one never changes its mind.
     over = random().normal(0.0, 0.1, (3, witnesses))
     side = random().choice([-1.0, 1.0], witnesses) / random().uniform(0.01, 0.04, witnesses)
     side[0] = 0.0
     levels, blurs = np.linspace(-0.05, 0.07, 31), np.array([0.005, 0.04, 0.25])
+    dark = random().uniform(size=witnesses) < 0.4
     made = level_kernels.level_negative_log_likelihood(
-        over, side, levels[0], levels[1] - levels[0], 31, blurs
+        over, side, dark, missing, levels[0], levels[1] - levels[0], 31, blurs
     )
-    inside = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
-    expected = np.logaddexp(0.0, -inside).sum(axis=-1)
-    np.testing.assert_allclose(made, expected, rtol=1e-11)
+    right = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
+    against = np.logaddexp(0.0, -right)
+    if missing:  # a dark ray is outside, or inside and its dot is missing
+        against -= np.where(dark, np.logaddexp(0.0, np.log(missing) - right), 0.0)
+    rtol = 1e-9 if missing else 1e-11  # of two sums that nearly cancel each other
+    np.testing.assert_allclose(made, against.sum(axis=-1), rtol=rtol, atol=1e-9 * bool(missing))
 
 
 @pytest.mark.parametrize("depth", [0, 1])
@@ -547,7 +552,10 @@ def test_levels_are_weighed_by_what_speaks_against_them(depth: int) -> None:
 
 def test_the_likelihood_of_what_is_unknown_is_unknown() -> None:
     over = np.array([[0.1, np.nan], [0.1, 0.2]])
-    made = level_kernels.level_negative_log_likelihood(over, np.ones(2), 0.0, 0.1, 3, np.ones(2))
+    lit = np.zeros(2, bool)
+    made = level_kernels.level_negative_log_likelihood(
+        over, np.ones(2), lit, 0.0, 0.0, 0.1, 3, np.ones(2)
+    )
     assert np.isnan(made[0]).all()
     assert np.isfinite(made[1]).all()
 

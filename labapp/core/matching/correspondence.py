@@ -22,7 +22,7 @@ import numpy as np
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
-from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, ways
+from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, missing_share, ways
 from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.decision import (
     MISFIT_MM,
@@ -244,9 +244,8 @@ def match_of_hypothesis(
     at = np.argwhere(best.labels != UNLABELLED)
     dot = best.labels[at[:, 0], at[:, 1]]
     trials.sort(key=lambda trial: trial.residual_mm)
-    return match_of_pairs(
-        observed, at, dot, own, certain_witness(observed, best), trials, reference
-    )
+    witness, missed = certain_witness(observed, best), best.missed_count
+    return match_of_pairs(observed, at, dot, own, witness, missed, trials, reference)
 
 
 def match_of_pairs(
@@ -255,6 +254,7 @@ def match_of_pairs(
     dot: IntArray,
     orientation: Orientation,
     witness: IntArray,
+    missed: int,
     trials: Iterable[Trial],
     reference: Site | None = None,
 ) -> Match:
@@ -270,6 +270,8 @@ def match_of_pairs(
         Index of its dot, shape (n,).
     orientation, witness, trials
         See `Match`.
+    missed
+        How many rays amid the others have no dot.
     reference
         Reflected row and column (k, t) of the marker; None: so that rows and columns begin at 1.
     """
@@ -286,4 +288,5 @@ def match_of_pairs(
         plane_covariance_mm2=observed.covariance_mm2[dot],
         witness=witness,
         trials=tuple(trials),
+        missing=missing_share(missed, len(dot)),
     )

@@ -38,7 +38,8 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
             "open-boundary", "no ray that would show stayed away: where the pool ends is not seen"
         )
     pool = fit_pool(
-        match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness, rig, settings
+        *(match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness, rig, settings),
+        missing=match.missing,
     )
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")

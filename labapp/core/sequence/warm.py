@@ -22,7 +22,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.band_pass import quick_dots
 from labapp.core.images.dot_size import estimate_size
 from labapp.core.images.dots import Image
-from labapp.core.match import Match, Trial
+from labapp.core.match import Match, Trial, missing_share
 from labapp.core.matching.correspondence import lattice_of_match, match_of_pairs
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.pipeline import Measurement, Settings, measure
@@ -36,7 +36,7 @@ from labapp.core.sequence.warm_fit import (
     fit_slopes_to,
     intersect_and_reflect,
 )
-from labapp.core.sequence.warm_match import beyond, classify_rays, widened
+from labapp.core.sequence.warm_match import RayClasses, beyond, classify_rays, widened
 from labapp.core.surface import kernels, measures
 from labapp.core.surface.boundary_trace import retrace_boundary
 from labapp.core.surface.level import Level, find_level
@@ -190,13 +190,13 @@ def follow(
     pool, labels, lower = _fitted(geometry, observed, pool, labels)
     passed("fit")
     classes = classify_rays(geometry, observed, pool, lower, labels)
-    level, open_mm = _level(track, pool, classes.witness)
+    level, open_mm = _level(track, pool, classes, labels)
     outside = beyond(geometry, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
         pool, lower = _settled(geometry, _shifted(pool, level), _slopes(geometry, observed, labels))
         classes = classify_rays(geometry, observed, pool, lower, labels)
-        level, open_mm = _level(track, pool, classes.witness)
+        level, open_mm = _level(track, pool, classes, labels)
     pool = intersect_and_reflect(geometry, pool.coefficients + level.shift_mm, pool.points_mm, 1)
     passed("level")
     ray = np.flatnonzero(labels != UNLABELLED)
@@ -212,7 +212,7 @@ def follow(
     unseen = 0 if _datum_seen(geometry, observed, pool, labels, off) else track.unseen + 1
     if unseen > HELD:
         raise TrackLost("the dots beside the absent one have not been seen for long")
-    match = _match(track, observed, classes.witness, ray, dot, rms(residual))
+    match = _match(track, observed, classes, ray, dot, rms(residual))
     track = _with_uncertainty(track, pool, ray, lower)
     reconstruction, size = _sized(track, pool, level, lower, match, residual, ray)
     after = replace(
@@ -272,11 +272,14 @@ def _slopes(geometry: SequenceGeometry, observed: Observation, labels: IntArray)
     return Slopes.of(geometry, ray, observed.plane_mm[dot], observed.covariance_mm2[dot])
 
 
-def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, float]:
+def _level(
+    track: Track, pool: WarmPool, classes: RayClasses, labels: IntArray
+) -> tuple[Level, float]:
     """Where z = 0 lies on the fitted surface, and how far that was open when the rear was free.
 
     How deep the rear lies is not asked every time; in between the level is known no better.
     """
+    witness = classes.witness
     witnesses = witness != 0
     if not (witness < 0).any():
         raise TrackLost("no ray that would show stayed away")
@@ -284,9 +287,10 @@ def _level(track: Track, pool: WarmPool, witness: IntArray) -> tuple[Level, floa
     height, slope = evaluate_at_landing_points(geometry, pool.coefficients)
     free = track.count % SINKS_EVERY == SINKS_EVERY - 1
     drop = None if free else before.rear.drop_mm
-    y, about = geometry.landing_mm[witnesses, 1], (0.0, before.sign)
+    y, about = geometry.landing_mm[witnesses, 1], (0.0, before.sign, WINDOW)
     at_witnesses = height[witnesses], slope[witnesses], y, witness[witnesses]
-    level = find_level(*at_witnesses, geometry.spacing_mm, drop, about, WINDOW)
+    missing = missing_share(classes.missed, int(np.sum(labels != UNLABELLED)))
+    level = find_level(*at_witnesses, geometry.spacing_mm, drop, about, missing)
     open_mm = level.sigma_mm if free else track.open_mm
     return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
 
@@ -323,17 +327,19 @@ def _datum_seen(
 def _match(
     track: Track,
     observed: Observation,
-    witness: IntArray,
+    classes: RayClasses,
     ray: IntArray,
     dot: IntArray,
     residual_mm: float,
 ) -> Match:
     geometry, orientation = track.geometry, track.match.orientation
     every = np.zeros(observed.absent.shape, np.int64)
-    every[tuple(geometry.at.T)] = witness
+    every[tuple(geometry.at.T)] = classes.witness
     others = (t for t in track.match.trials if t.orientation != orientation)
     trials = (Trial(orientation, residual_mm), *others)
-    return match_of_pairs(observed, geometry.at[ray], dot, orientation, every, trials)
+    return match_of_pairs(
+        observed, geometry.at[ray], dot, orientation, every, classes.missed, trials
+    )
 
 
 def _with_uncertainty(track: Track, pool: WarmPool, ray: IntArray, lower: FloatArray) -> Track:

@@ -107,14 +107,14 @@ def find_level(
     witness: IntArray,
     spacing_mm: FloatArray,
     drop_mm: float | None = None,
-    about: tuple[float, int] | None = None,
-    reach: float = 1.0,
+    about: tuple[float, int, float] | None = None,
+    missing: float = 0.0,
 ) -> Level:
     """Find the level at which lit rays land inside the boundary and dark ones outside.
 
     A ray that lands a distance d inside the boundary came back with probability
-    1/(1 + exp(−d/s)). Level, blur s and drop of the rear are weighed on a grid; the level's mean
-    and standard deviation are taken over it.
+    1/(1 + exp(−d/s)), and then has a dot unless that is missing. Level, blur s and drop of the
+    rear are weighed on a grid; the level's mean and standard deviation are taken over it.
 
     Parameters
     ----------
@@ -130,10 +130,11 @@ def find_level(
     drop_mm
         How deep the rear lies, mm; None: found along with the level.
     about
-        A level that is near, as its shift, mm, and its sign; None: all are tried.
-    reach
-        How far from there the level may be, in rises: heights by which the surface changes from
-        one ray to the next. Where the grid's ends are likely, a wider one is searched.
+        A level that is near, as its shift, mm, its sign, and how far from there the level may be,
+        in rises: heights by which the surface changes from one ray to the next. Where the grid's
+        ends are likely, a wider one is searched. None: all are tried.
+    missing
+        Probability that a ray that came back has no dot (`Match.missing`).
     """
     from labapp.core.surface import level_kernels
 
@@ -141,7 +142,7 @@ def find_level(
     rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
     usual = median(rise)
     rise = np.maximum(rise, usual / 4)
-    shift, sign = about or _scan_levels(height, rise, witness)
+    shift, sign, reach = about or (*_scan_levels(height, rise, witness), 1.0)
     near = np.abs(height + shift) < NEAR_RISES * rise
     count = round(STEPS_A_REACH * reach) + 1
     first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
@@ -153,12 +154,14 @@ def find_level(
     drops = (_DROPS_MM if seen else _DROPS_MM[:1]) if drop_mm is None else np.array([drop_mm])
     over = height[near] - drops[:, None] * Rear(1.0, start, end).height(y[near])
     side = sign * witness[near] / rise[near]
-    nats = level_kernels.level_negative_log_likelihood(over, side, first, step, count, _BLURS)
+    nats = level_kernels.level_negative_log_likelihood(
+        over, side, witness[near] < 0, missing, first, step, count, _BLURS
+    )
     costs = _BLUR_COST, _SUNK_COST, drops
     drop, mean, sigma, at_ends = level_kernels.level_posterior(nats, *costs, first, step)
     if about is not None and at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
-        about = about if reach < 1.0 else None
-        return find_level(height, slope, y, witness, spacing_mm, drop_mm, about)
+        about = (shift, sign, 1.0) if reach < 1.0 else None
+        return find_level(height, slope, y, witness, spacing_mm, drop_mm, about, missing)
     least, rays = float(nats.min()), int(near.sum())
     return Level(mean, sigma, sign, Rear(drop, start, end), least, rays, usual)
 
@@ -168,7 +171,7 @@ def _scan_levels(height: FloatArray, rise: FloatArray, witness: IntArray) -> tup
     from labapp.core.surface import level_kernels
 
     scan, side = np.linspace((-height).min(), (-height).max(), SCAN_LEVELS), witness / rise
-    grid = scan[0], scan[1] - scan[0], len(scan), _WIDEST_BLUR
+    grid = witness < 0, 0.0, scan[0], scan[1] - scan[0], len(scan), _WIDEST_BLUR
     above, below = (
         level_kernels.level_negative_log_likelihood(height[None], k * side, *grid)[0, 0]
         for k in (1, -1)

@@ -7,7 +7,7 @@ from numba import types
 
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
-from labapp.core.values import FloatArray
+from labapp.core.values import BoolArray, FloatArray
 
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
@@ -46,13 +46,48 @@ def _multiply(factors: FloatArray, k: int, way: int, factor: float, shrinks: flo
             k += way
 
 
-@_compiled(_f2, _f1, _f, _f, _i, _f1)
-def level_negative_log_likelihood(
-    over: FloatArray, side: FloatArray, first: float, step: float, count: int, blurs: FloatArray
-) -> FloatArray:
-    """−log likelihood of witnesses at levels: Σ log(1 + exp(−side · (over + level) / blur)).
+@_inner
+def _accumulate(
+    factors: FloatArray,
+    starts: FloatArray,
+    slopes: FloatArray,
+    start: float,
+    slope: float,
+    shrinks: float,
+) -> None:
+    """Add log(1 + exp(−(start + k · slope))) to every level k.
 
-    Along the levels the exponential is a geometric progression, away from where it is 1.
+    Along the levels the exponential is a geometric progression, away from where it is 1. Where the
+    exponent is above 0 it is taken out of the logarithm, into ``starts`` and ``slopes``.
+    """
+    count = len(factors)
+    turn = -start / slope if slope != 0.0 else np.inf * start
+    turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
+    begins, ends = (0, turn) if slope > 0.0 else (turn, count)
+    starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
+    starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
+    if turn < count:
+        _multiply(factors, turn, 1, np.exp(-abs(start + turn * slope)), shrinks)
+    if turn > 0:
+        _multiply(factors, turn - 1, -1, np.exp(-abs(start + (turn - 1) * slope)), shrinks)
+
+
+@_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f, _f, _f, _i, _f1)
+def level_negative_log_likelihood(
+    over: FloatArray,
+    side: FloatArray,
+    dark: BoolArray,
+    missing: float,
+    first: float,
+    step: float,
+    count: int,
+    blurs: FloatArray,
+) -> FloatArray:
+    """−log likelihood of witnesses at levels: −log P of each being lit, or dark.
+
+    With x = side · (over + level) / blur, a ray that is lit has P = 1/(1 + exp(−x)), but for a
+    factor that all levels share. One that is dark has 1/(1 + exp(−x)) too, as its side is the other
+    one, or lands inside and its dot is missing: P = (1 + m · exp(−x))/(1 + exp(−x)).
 
     Parameters
     ----------
@@ -61,6 +96,10 @@ def level_negative_log_likelihood(
         rear, shape (d, n), mm.
     side
         +1 or −1 of each witness, lit or dark, over its rise (`find_level`), shape (n,), mm⁻¹.
+    dark
+        Which witnesses are dark, shape (n,).
+    missing
+        m, the share of the dots that are missing, from 0.
     first, step, count
         The levels: the first, mm, the step to the next, above 0, and how many.
     blurs
@@ -76,31 +115,25 @@ def level_negative_log_likelihood(
     shrinking = np.exp(-step * np.outer(1.0 / blurs, np.abs(side)))
     for d in range(len(over)):
         for b in range(len(blurs)):
-            factors[:], starts[:], slopes[:], total = 1.0, 0.0, 0.0, made[d, b]
+            total = made[d, b]
             total[:] = 0.0
-            for n in range(len(side)):
-                # The exponent is −(start + level · slope) and changes its sign at ``turn``.
-                start = side[n] * (over[d, n] + first) / blurs[b]
-                slope = side[n] * step / blurs[b]
-                turn = -start / slope if slope != 0.0 else np.inf * start
-                turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
-                # Where it is above 0 it is taken out of the logarithm.
-                begins, ends = (0, turn) if slope > 0.0 else (turn, count)
-                starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
-                starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
-                shrinks = shrinking[b, n]
-                if turn < count:
-                    _multiply(factors, turn, 1, np.exp(-abs(start + turn * slope)), shrinks)
-                if turn > 0:
-                    last = turn - 1
-                    _multiply(factors, last, -1, np.exp(-abs(start + last * slope)), shrinks)
-                if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
-                    total += np.log(factors)
-                    factors[:] = 1.0
-            start, slope = 0.0, 0.0
+            for part in range(2 if missing > 0.0 else 1):
+                factors[:], starts[:], slopes[:] = 1.0, 0.0, 0.0
+                sign = 1.0 - 2.0 * part
+                shift = -np.log(missing) if part else 0.0
+                for n in range(len(side)):
+                    if dark[n] or not part:
+                        start = side[n] * (over[d, n] + first) / blurs[b] + shift
+                        slope = side[n] * step / blurs[b]
+                        _accumulate(factors, starts, slopes, start, slope, shrinking[b, n])
+                    if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
+                        total += sign * np.log(factors)
+                        factors[:] = 1.0
+                start, slope = 0.0, 0.0
+                for k in range(count):
+                    start, slope = start + starts[k], slope + slopes[k]
+                    total[k] += sign * (start + k * slope)
             for k in range(count):
-                start, slope = start + starts[k], slope + slopes[k]
-                total[k] += start + k * slope
                 total[k] = max(total[k], 0.0)  # rounded
     return made
 

@@ -120,6 +120,7 @@ def fit_pool(
     rig: Rig,
     settings: FitSettings,
     initial: SplineSurface | None = None,
+    missing: float = 0.0,
 ) -> FittedPool:
     """Fit the surface that turns each ray to its dot.
 
@@ -133,6 +134,8 @@ def fit_pool(
         See `FitSettings`.
     initial
         A surface to begin with: fewer rounds are needed where it is near. None: z = 0.
+    missing
+        Probability that a ray that came back has no dot, for the level (`Match.missing`).
 
     Raises
     ------
@@ -169,10 +172,10 @@ def fit_pool(
             # The drop of the rear is held from half-way on, or the rounds might go to and fro.
             drop = None if 2 * count <= settings.rounds else level.rear.drop_mm
             height, *slope = kernels.surface_at(grid, coefficients, ground[witnesses])
-            about = (0.0, level.sign) if count else None
+            about = (0.0, level.sign, LEVEL_REACH) if count else None
             before = level
             seen = np.array(slope).T, ground[witnesses, 1], witness[witnesses], spacing
-            level = find_level(height, *seen, drop, about, LEVEL_REACH if count else 1.0)
+            level = find_level(height, *seen, drop, about, missing)
             if drop is not None:  # a drop that is held leaves the level as open as a free one
                 level = replace(level, sigma_mm=max(level.sigma_mm, before.sigma_mm))
         coefficients += level.shift_mm  # the splines add up to 1
