@@ -345,6 +345,16 @@ def test_noise_is_that_of_each_tile() -> None:
     assert dot_kernels.tile_noise(ramp[:8, :8].copy(), 1, 1).shape == (1, 1)
 
 
+def test_pixels_that_hang_together_are_those_of_one_spot() -> None:
+    spots = (random().uniform(size=(40, 50)) < 0.2).astype(np.uint8)
+    v, u = np.nonzero(spots)
+    begun = random().uniform(size=len(u)) < 0.1
+    spot = np.asarray(cv2.connectedComponents(spots)[1])[v, u]
+    made = dot_kernels.hanging_together(u, v, begun)
+    np.testing.assert_array_equal(made, np.isin(spot, spot[begun]))
+    assert begun.sum() < made.sum() < len(u)
+
+
 def test_spikes_are_pixels_that_no_dot_has() -> None:
     image = picture()[1] + 20
     hot = {(75, 49): 500.0, (0, 40): 90.0, (100, 88): 70.0, (101, 88): 70.0, (101, 89): 70.0}

@@ -63,6 +63,30 @@ def test_light_is_the_same_round_the_dots_alone_and_over_the_whole_picture(
     np.testing.assert_allclose(made[0].size_px, made[1].size_px, atol=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_dots_in_a_part_of_the_picture_are_those_of_the_whole_of_it(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A faint one far from the others is not overlooked, whether or not any was there before."""
+    rng = np.random.default_rng(seed)
+    group = places(rng)
+    group = group[(group[:, 0] < 160.0) & (np.abs(group[:, 1] - 180.0) < 90.0)]
+    first, faint = frame(group, rng), [255.0 + seed, 431.0 + seed]
+    image = frame(group, rng, hot=6).astype(float)
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    image += 12.0 * np.exp(-((u - faint[0]) ** 2 + (v - faint[1]) ** 2) / (2 * SIZE_PX**2))
+    exposure = Exposure.of(first, BandPassSettings())
+    made = []
+    for halved in (0.0, np.inf):
+        monkeypatch.setattr("labapp.core.images.band_pass.HALVED_PX", halved)
+        made += [quick_dots(each, exposure, BandPassSettings()) for each in (first, image)]
+    for part, whole in zip(made[:2], made[2:], strict=True):
+        assert len(part) == len(whole)
+        assert (np.abs(part.image_px - whole.image_px) < 0.01 * whole.u_sigma_px[:, None]).all()
+        np.testing.assert_allclose(part.size_px, whole.size_px, rtol=1e-2)
+    assert np.linalg.norm(made[1].image_px - faint, axis=-1).min() < 1.0
+
+
 def test_a_frame_with_its_own_exposure_has_the_same_dots() -> None:
     rng = np.random.default_rng(9)
     image = frame(places(rng), rng, hot=6)

@@ -7,8 +7,8 @@ pixels is worked out for these alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from functools import lru_cache
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -30,6 +30,9 @@ from labapp.core.images.dot_size import (
 )
 from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
+
+Part = tuple[slice, slice]
+"""Rows and columns of a picture."""
 
 HOT_RATIO = 1.6
 """What a cluster of hot pixels answers to a band of a third of the dots' size, over its answer to
@@ -55,6 +58,17 @@ speckle, which then move it less."""
 
 MOST_SURROUNDINGS = 0.3
 """Where the dots' surroundings are a larger share of the picture, all of it is blurred at once."""
+
+HALVED_PX, NEARLY = 1.5, 0.75
+"""Dots of this size are seen at half the size, too: where the band there is under so much of the
+floor, no peak is over it."""
+
+SURROUNDINGS = 10.0
+"""How far beyond what may be dots a picture is looked at, in dots' sizes: farther off light moves
+none."""
+
+GRID_PX = 16
+"""A part of a picture begins and ends at a multiple: smaller pictures of it are those of all."""
 
 PEAK_GAIN = 1 / 1.64 - 1 / 3.56
 """What a Gaussian dot of the band's own size keeps of its height: 1/(1 + 0.8²) − 1/(1 + 1.6²)."""
@@ -88,6 +102,20 @@ class DetectorTuning(ReadOnlyArrays):
         """The tuning for a frame, shape (height, width), any real type, and those like it."""
         return _tuned(as_picture(frame), settings)[0]
 
+    @cached_property
+    def coarse(self) -> Grey:
+        """What of every second pixel's floor its square's band is over if a peak may be there."""
+        return np.asarray(np.float32(NEARLY) * self.floor[::2, ::2])
+
+    def part(self, of: Part, inner: Part) -> DetectorTuning:
+        """That of a part of the picture where peaks are asked for in an inner part alone."""
+        floor = self.floor[of].copy()
+        for axis in range(2):
+            lines = floor if axis == 0 else floor.T
+            lines[: inner[axis].start - of[axis].start] = np.inf
+            lines[inner[axis].stop - of[axis].start :] = np.inf
+        return DetectorTuning(self.size_px, np.ascontiguousarray(self.noise[of]), floor)
+
 
 def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
     """Find dots as peaks of a difference of Gaussians at the dots' own size.
@@ -107,7 +135,7 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
     picture = as_picture(np.asarray(frame))
     if picture.ndim != 2 or min(picture.shape) < 8 or not float(np.ptp(picture)) > 0:
         raise CannotMeasure("no-dots", "the frame is blank or too small to hold a dot")
-    return _found(*_tuned(picture, settings), settings)
+    return quick_dots(frame, _tuned(picture, settings)[0], settings)
 
 
 def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings) -> Dots:
@@ -132,7 +160,44 @@ def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings)
     if frame.shape != tuning.noise.shape:
         raise ValueError(f"a frame of {frame.shape}, a tuning of {tuning.noise.shape}")
     picture = mended(as_picture(frame), tuning.noise, tuning.size_px)
-    return _found(tuning, _BandPassed(picture, tuning.size_px), settings)
+    part, inner = _lit(picture, tuning)
+    seen = _BandPassed(as_picture(picture[part]), tuning.size_px)
+    dots = _found(tuning.part(part, inner), seen, settings)
+    rows, columns = part
+    return replace(dots, u_px=dots.u_px + columns.start, v_px=dots.v_px + rows.start)
+
+
+def _lit(picture: Picture, tuning: DetectorTuning) -> tuple[Part, Part]:
+    """Part of a picture that its dots are described in, and the part of that their peaks are in.
+
+    Both are told by the picture at half its size.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-dots`` if nothing stands out of the noise.
+    """
+    (height, width), size = picture.shape, tuning.size_px
+    whole = slice(0, height), slice(0, width)
+    if size < HALVED_PX or height % 2 or width % 2:
+        return whole, whole
+    shape, lost = (height // 2, width // 2), (1 - 2**-2) / 12
+    half = as_picture(cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_AREA))
+    narrow, wide = scratch("half", shape), scratch("half wide", shape)
+    blur(half, float(np.sqrt((0.4 * size) ** 2 - lost)), narrow)
+    widen(narrow, wide, (0.8**2 - 0.4**2) * size**2)
+    lit = cv2.subtract(narrow, wide, dst=narrow) > tuning.coarse
+    part, inner = [], []
+    for axis, end in enumerate(picture.shape):
+        at = np.flatnonzero(lit.any(axis=1 - axis))
+        if len(at) == 0:
+            raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
+        first, last = 2 * int(at[0]) - 2, 2 * int(at[-1]) + 4
+        inner.append(slice(max(first, 0), min(last, end)))
+        away = int(np.ceil(SURROUNDINGS * size))
+        first, last = (first - away) // GRID_PX * GRID_PX, -(-(last + away) // GRID_PX) * GRID_PX
+        part.append(slice(max(first, 0), min(last, end)))
+    return (part[0], part[1]), (inner[0], inner[1])
 
 
 def dot_at(

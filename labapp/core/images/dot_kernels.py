@@ -88,6 +88,19 @@ def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
     return True
 
 
+@_inner
+def _any_over(values: Grey, floor: Grey) -> bool:
+    """Whether any of some values is over its floor; all are looked at, several at once."""
+    some = np.int32(0)
+    for k in range(len(values)):
+        some |= np.int32(values[k] > floor[k])
+    return bool(some)
+
+
+BLOCK = 32
+"""So many pixels of a row are passed over at once where none is over its floor."""
+
+
 @_compiled(_grey, _grey, _mask)
 def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
     """Columns and rows, shape (2, n), of pixels over the floor that none of a disc is over.
@@ -95,20 +108,23 @@ def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
     A floor of shape (1, 1) holds everywhere.
     """
     height, width = band.shape
-    found, count, level = np.empty((2, 256), np.int64), 0, floor[0, 0]
-    everywhere = floor.size == 1
+    found, count = np.empty((2, 256), np.int64), 0
+    level = np.full(width, floor[0, 0])
     for v in range(height):
-        for u in range(width):
-            if not band[v, u] > (level if everywhere else floor[v, u]):
-                continue
-            if not _tops(band, disc, v, u):
-                continue
-            if count == found.shape[1]:
-                more = np.empty((2, 2 * count), np.int64)
-                more[:, :count] = found
-                found = more
-            found[0, count], found[1, count] = u, v
-            count += 1
+        own, floors = band[v], level if floor.size == 1 else floor[v]
+        for first in range(0, width, BLOCK):
+            last = min(first + BLOCK, width)
+            for u in range(
+                first, last if _any_over(own[first:last], floors[first:last]) else first
+            ):
+                if not (own[u] > floors[u] and _tops(band, disc, v, u)):
+                    continue
+                if count == found.shape[1]:
+                    more = np.empty((2, 2 * count), np.int64)
+                    more[:, :count] = found
+                    found = more
+                found[0, count], found[1, count] = u, v
+                count += 1
     return found[:, :count].copy()
 
 
@@ -249,20 +265,58 @@ def _beside(image: Picture, v: int, u: int, away: int) -> float:
 
 
 @_inner
-def _falls(image: Picture, v: int, falls: FloatArray) -> None:
+def _falls(image: Picture, v: int, falls: Grey) -> None:
     """How far the light falls from each pixel of a row to what is beside it, grey levels."""
     (height, width), first, last = image.shape, 0, 0
     if 2 <= v < height - 2 and width > 4:  # no edge between these: several are taken at once
         first, last = 2, width - 2
-        row, top, above = image[v], image[v - 2], image[v - 1]
-        below, bottom = image[v + 1], image[v + 2]
-        for u in range(first, last):
-            one = min(float(above[u]) + float(below[u]), float(row[u - 1]) + float(row[u + 1]))
-            two = min(float(top[u]) + float(bottom[u]), float(row[u - 2]) + float(row[u + 2]))
-            falls[u] = float(row[u]) - 0.5 * min(one, two)
-    for u in range(width):
-        if not first <= u < last:
-            falls[u] = float(image[v, u]) - min(_beside(image, v, u, 1), _beside(image, v, u, 2))
+        row, inner = image[v], falls[first:last]
+        rows = image[v - 2, 2:], image[v - 1, 2:], image[v + 1, 2:], image[v + 2, 2:]
+        _falls_amid(row[first:last], row, row[1:], row[3:], row[4:], rows, inner)
+    for k in range(first + width - last):
+        u = k if k < first else last + k - first
+        falls[u] = float(image[v, u]) - min(_beside(image, v, u, 1), _beside(image, v, u, 2))
+
+
+@_inner
+def _falls_amid(
+    own: Picture,
+    before: Picture,
+    left: Picture,
+    right: Picture,
+    after: Picture,
+    rows: tuple[Picture, Picture, Picture, Picture],
+    falls: Grey,
+) -> None:
+    """Do what `_falls` does where no edge is near, of pixels and those beside them, shape (n,)."""
+    single, half = np.float32, np.float32(0.5)
+    top, above, below, bottom = rows
+    for u in range(len(falls)):
+        one, other = single(above[u]) + single(below[u]), single(left[u]) + single(right[u])
+        near = one if one < other else other
+        one, other = single(top[u]) + single(bottom[u]), single(before[u]) + single(after[u])
+        far = one if one < other else other
+        falls[u] = single(own[u]) - half * (near if near < far else far)
+
+
+@_inner
+def _darkest(image: Picture, v: int, u: int, reach: int, step: int) -> float:
+    """Least of every ``step``-th pixel of a square round one, what is within the picture."""
+    (height, width), least = image.shape, float(image[v, u])
+    for y in range(v - reach, v + reach + 1, step):
+        for x in range(u - reach, u + reach + 1, step):
+            if 0 <= y < height and 0 <= x < width:
+                least = min(least, float(image[y, x]))
+    return least
+
+
+@_inner
+def _times_deeper(
+    over_ground: float, one: float, two: float, near: float, far: float, sharper: float
+) -> float:
+    """How many times deeper a pixel falls than a dot's: towards the next pixels or those beyond."""
+    times = over_ground / max(near * one, 1e-3 * over_ground)
+    return times if times > sharper else over_ground / max(far * two, 1e-3 * over_ground)
 
 
 @_compiled_for(*((own, _f, _f, _f, _i) for own in (_grey, _byte)))
@@ -282,34 +336,56 @@ def spikes(
     found, told, count = np.empty((2, 64), np.int64), np.empty((2, 64)), 0
     near, far = np.exp(0.5 / size**2), np.exp(2.0 / size**2)
     far = far if far < 4.0 else np.inf  # dots so small have no light so far off
-    falls = np.empty(width)
+    falls, floor = np.empty(width, np.float32), np.full(width, np.float32(over))
     for v in range(height):
         _falls(image, v, falls)
-        for u in range(width):
-            if not falls[u] > over:
-                continue
-            own = float(image[v, u])
-            one, two = _beside(image, v, u, 1), _beside(image, v, u, 2)
-            ground = own
-            for y in range(max(v - reach, 0), min(v + reach + 1, height)):
-                for x in range(max(u - reach, 0), min(u + reach + 1, width)):
-                    ground = min(ground, float(image[y, x]))
-            height_over, fit = own - ground - over, one
-            times = height_over / max(near * (one - ground), 1e-3 * height_over)
-            if times <= sharper:
-                times, fit = height_over / max(far * (two - ground), 1e-3 * height_over), two
-            elif far < np.inf:  # the pixel next to it may be a spike as well
-                fit = min(one, ground + far / near * (two - ground))
-            if not (height_over > 0.0 and times > sharper):
-                continue
-            if count == found.shape[1]:
-                more, further = np.empty((2, 2 * count), np.int64), np.empty((2, 2 * count))
-                more[:, :count], further[:, :count] = found, told
-                found, told = more, further
-            found[0, count], found[1, count] = u, v
-            told[0, count], told[1, count] = times, fit
-            count += 1
+        for first in range(0, width, BLOCK):
+            last = min(first + BLOCK, width)
+            for u in range(
+                first, last if _any_over(falls[first:last], floor[first:last]) else first
+            ):
+                if not falls[u] > floor[u]:
+                    continue
+                own = float(image[v, u])
+                one, two = _beside(image, v, u, 1), _beside(image, v, u, 2)
+                # The darkest of some pixels may show already that it falls no deeper.
+                for step in (reach, 1):
+                    ground = _darkest(image, v, u, reach, step)
+                    high, low, lower = own - ground - over, one - ground, two - ground
+                    times = _times_deeper(high, low, lower, near, far, sharper)
+                    if high > 0.0 and times <= sharper:
+                        break
+                if not (high > 0.0 and times > sharper):
+                    continue
+                fit = two
+                if high > sharper * max(near * low, 1e-3 * high):
+                    # The pixel next to it may be a spike as well.
+                    fit = min(one, ground + far / near * lower) if far < np.inf else one
+                if count == found.shape[1]:
+                    more, further = np.empty((2, 2 * count), np.int64), np.empty((2, 2 * count))
+                    more[:, :count], further[:, :count] = found, told
+                    found, told = more, further
+                found[0, count], found[1, count] = u, v
+                told[0, count], told[1, count] = times, fit
+                count += 1
     return found[:, :count].copy(), told[:, :count].copy()
+
+
+@_compiled(_ints, _ints, types.Array(types.boolean, 1, "A", readonly=True))
+def hanging_together(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
+    """Which pixels are begun with, or hang together with such by their sides or corners."""
+    made, waiting = begun.copy(), np.flatnonzero(begun)
+    next_ones = np.empty(len(u), np.int64)
+    next_ones[: len(waiting)] = waiting
+    count, done = len(waiting), 0
+    while done < count:
+        own = next_ones[done]
+        done += 1
+        for k in range(len(u)):
+            if not made[k] and abs(u[k] - u[own]) <= 1 and abs(v[k] - v[own]) <= 1:
+                made[k], next_ones[count] = True, k
+                count += 1
+    return made
 
 
 @_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))

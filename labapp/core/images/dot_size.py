@@ -98,10 +98,7 @@ def mended(
         begun |= away <= 1.5 * size + 1.0
     if not begun.any():
         return picture
-    spots = np.zeros(picture.shape, np.uint8)
-    spots[v, u] = 1
-    spot = np.asarray(cv2.connectedComponents(spots)[1])[v, u]
-    hot = np.isin(spot, spot[begun])
+    hot = dot_kernels.hanging_together(u, v, begun)
     whole = picture.copy()
     whole[v[hot], u[hot]] = np.rint(beside[hot]) if picture.dtype == np.uint8 else beside[hot]
     return whole
@@ -266,20 +263,21 @@ def with_grain(band: Grey, white: float) -> float:
 _own = threading.local()
 
 
-def scratch(name: str, shape: tuple[int, ...]) -> Grey:
+def scratch(name: str, shape: tuple[int, int]) -> Grey:
     """Return this thread's picture of a name to write on, shape (height, width).
 
     Frames of one size follow on each other: made anew for each, pictures would cost as much as the
     work on them.
     """
     kept: dict[str, Grey] = _own.__dict__
-    if name not in kept or kept[name].shape != shape:
+    count = shape[0] * shape[1]
+    if name not in kept or kept[name].size < count:
         kept.pop(name, None)
-        made = np.empty(shape, np.float32)
+        made = np.empty(count, np.float32)
         if made.nbytes > KEPT_BYTES:
-            return made
+            return made.reshape(shape)
         kept[name] = made
-    return kept[name]
+    return kept[name][:count].reshape(shape)
 
 
 def blur(picture: Picture, sigma: float, into: Grey | None = None) -> Grey:
