@@ -108,13 +108,18 @@ class DetectorTuning(ReadOnlyArrays):
         return np.asarray(np.float32(NEARLY) * self.floor[::2, ::2])
 
     def part(self, of: Part, inner: Part) -> DetectorTuning:
-        """That of a part of the picture where peaks are asked for in an inner part alone."""
-        floor = self.floor[of].copy()
+        """That of a part of the picture where peaks are asked for in an inner part alone.
+
+        It stands until this thread asks for the next one.
+        """
+        own = self.floor[of]
+        floor = scratch("floor", (own.shape[0], own.shape[1]))
+        floor[:] = own
         for axis in range(2):
             lines = floor if axis == 0 else floor.T
             lines[: inner[axis].start - of[axis].start] = np.inf
             lines[inner[axis].stop - of[axis].start :] = np.inf
-        return DetectorTuning(self.size_px, np.ascontiguousarray(self.noise[of]), floor)
+        return DetectorTuning(self.size_px, self.noise[of], floor)
 
 
 def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
