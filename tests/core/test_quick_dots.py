@@ -75,11 +75,11 @@ def test_dots_in_a_part_of_the_picture_are_those_of_the_whole_of_it(
     image = frame(group, rng, hot=6).astype(float)
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     image += 12.0 * np.exp(-((u - faint[0]) ** 2 + (v - faint[1]) ** 2) / (2 * SIZE_PX**2))
-    exposure = Exposure.of(first, BandPassSettings())
+    tuning = DetectorTuning.of(first, BandPassSettings())
     made = []
     for halved in (0.0, np.inf):
         monkeypatch.setattr("labapp.core.images.band_pass.HALVED_PX", halved)
-        made += [quick_dots(each, exposure, BandPassSettings()) for each in (first, image)]
+        made += [quick_dots(each, tuning, BandPassSettings()) for each in (first, image)]
     for part, whole in zip(made[:2], made[2:], strict=True):
         assert len(part) == len(whole)
         assert (np.abs(part.image_px - whole.image_px) < 0.01 * whole.u_sigma_px[:, None]).all()
