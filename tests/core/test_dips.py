@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -149,3 +151,18 @@ def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     witness[tuple(geometry.at.T)] = classes.witness
     np.testing.assert_array_equal(witness[12, row], 0)
     np.testing.assert_array_equal(witness[10, [3, 16]], -1)
+
+
+@pytest.mark.parametrize("seed", [51000, 51009, 51018])
+def test_a_dot_that_is_missing_at_the_rim_does_not_lower_the_pool(seed: int) -> None:
+    """A dark ray beside the boundary may have come back, as often as dots are missing elsewhere."""
+    pool, seen = draw(seed, missing=6)
+    match = matched(seen, BENCH_RIG)
+    off = [
+        measure_surface(fit.reconstruct(each, BENCH_RIG, FitSettings()), each, BENCH_RIG).height_mm
+        / pool.size.height_mm
+        - 1
+        for each in (match, replace(match, missing=0.0))
+    ]
+    assert abs(off[0]) < 0.03
+    assert off[1] < -0.05
