@@ -87,17 +87,7 @@ def main(arguments: Sequence[str]) -> int:
 
 @contextlib.contextmanager
 def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iterator[MainWindow]:
-    """Show the window, with all that goes on beside it; ended, what was there before is back.
-
-    Parameters
-    ----------
-    app
-        Of `start_app`.
-    preferences
-        What is remembered from the last start.
-    file
-        Where they are kept.
-    """
+    """Show the window, with all that goes on beside it; ended, what was there before is back."""
     from labapp.gui.shell.commands import make_window
 
     window = make_window(preferences, file)
@@ -187,13 +177,7 @@ def start_app() -> QApplication:
 
 
 class ErrorReporter(QObject):
-    """Uncaught errors: all of them to the log, and in words to the operator; the window stays.
-
-    Parameters
-    ----------
-    say
-        Tells the operator: a sentence, and that it is a problem.
-    """
+    """Uncaught errors: all of them to the log, and in words to the operator; the window stays."""
 
     _happened = Signal(str, bool)
 

@@ -98,11 +98,6 @@ class FootSwitches(QObject):
     Nothing runs while none is in use. Devices are read in threads of their own; what they tell is
     taken from a queue.
 
-    Parameters
-    ----------
-    tasks
-        For what takes a while.
-
     Signals
     -------
     changed

@@ -80,13 +80,6 @@ class Preferences:
 class PreferencesStore(QObject):
     """The preferences of a window and their file, which other windows change, too.
 
-    Parameters
-    ----------
-    preferences
-        What is remembered from the last start.
-    path
-        The file.
-
     Attributes
     ----------
     current

@@ -80,15 +80,7 @@ def is_dark(look: QPalette) -> bool:
 
 
 def apply_theme(app: QApplication, theme: str) -> None:
-    """Show the app light, dark or as the desktop is; dark where the desktop does not say.
-
-    Parameters
-    ----------
-    app
-        The application.
-    theme
-        ``light``, ``dark`` or ``system``.
-    """
+    """Show the app light, dark or as the desktop is; dark where the desktop does not say."""
     if app.style().name().lower() != "fusion":
         app.setStyle("Fusion")
     desktop_is_light = app.styleHints().colorScheme() == Qt.ColorScheme.Light

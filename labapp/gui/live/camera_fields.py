@@ -46,13 +46,6 @@ Apply = Callable[[CameraSettings], "Future[CameraSettings] | None"]
 class CameraFields(QObject):
     """Exposure, gain, rate, trigger and region, where the camera lets them be set.
 
-    Parameters
-    ----------
-    form
-        Where they stand.
-    apply
-        Sets the camera, between two frames; None: there is none.
-
     Signals
     -------
     reset

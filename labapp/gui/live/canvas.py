@@ -25,19 +25,7 @@ PARTS = {
 
 
 class LiveCanvas(QWidget):
-    """A page's picture, beside which other parts can be chosen while a camera is measured.
-
-    Parameters
-    ----------
-    workspace
-        What is open.
-    picture
-        Where frames are shown.
-    watch
-        Gives what measures now; None while nothing does.
-    acknowledge
-        Called when the operator has seen the alarms.
-    """
+    """A page's picture, beside which other parts can be chosen while a camera is measured."""
 
     def __init__(
         self,

@@ -190,13 +190,7 @@ class LiveFigures(QWidget):
 
 
 class AlarmStrip(QFrame):
-    """What the operator must see, below the picture, and the button that says it was seen.
-
-    Parameters
-    ----------
-    acknowledge
-        Called when it was.
-    """
+    """What the operator must see, below the picture, and the button that says it was seen."""
 
     def __init__(self, acknowledge: Callable[[], None]) -> None:
         super().__init__()

@@ -24,11 +24,6 @@ SHARE = 0.5
 class PlanFields(QObject):
     """Fields for a `Plan`.
 
-    Parameters
-    ----------
-    form
-        Where they stand.
-
     Signals
     -------
     edited
@@ -102,17 +97,7 @@ class PlanFields(QObject):
 
 
 def cost_text(plan: Plan, frame_byte: int, rate_hz: float) -> str:
-    """What recording by a plan costs, about: disk and work.
-
-    Parameters
-    ----------
-    plan
-        What is recorded.
-    frame_byte
-        Size of a frame in memory.
-    rate_hz
-        Frames a second of the camera.
-    """
+    """What recording by a plan costs, about: disk and work."""
     part, core_s = COSTS[plan.codec]
     byte_s = frame_byte * rate_hz / plan.every
     core = core_s * byte_s

@@ -17,17 +17,7 @@ BUTTON_PX, RING_BAR_PX = 44, 130
 
 
 class RecordBar(QWidget):
-    """Buttons to record, mark and stop; shows whether frames come, and the state of the recording.
-
-    Parameters
-    ----------
-    trigger
-        Begins a recording, or ends the one that runs.
-    mark
-        Notes this moment beside it.
-    stop
-        Stops the camera.
-    """
+    """Buttons to record, mark and stop; whether frames come, and the state of the recording."""
 
     def __init__(
         self,

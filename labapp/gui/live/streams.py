@@ -43,15 +43,7 @@ IN_USE = "Choose another port, or end the program that has this one."
 
 
 class LiveStreams(QWidget):
-    """Streams of live measures to other programs; all are off at every start.
-
-    Parameters
-    ----------
-    workspace
-        Where work is done and problems are said.
-    watch
-        Gives what measures now; None while nothing does.
-    """
+    """Streams of live measures to other programs; all are off at every start."""
 
     def __init__(self, workspace: Workspace, watch: Callable[[], LiveWatch | None]) -> None:
         super().__init__()

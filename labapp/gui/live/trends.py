@@ -40,17 +40,7 @@ RULE = (
 
 
 def trend_curves(trend: Trend, limits: Limits, names: tuple[str, ...]) -> tuple[Curve, ...]:
-    """Width, length and height over the time from now, with their limits.
-
-    Parameters
-    ----------
-    trend
-        What was measured.
-    limits
-        Of the sizes.
-    names
-        What the sizes are called.
-    """
+    """Width, length and height over the time from now, with their limits."""
     # Nothing was measured in a gap: a frame in it, without values, keeps a line from crossing it.
     gap = np.flatnonzero(np.diff(trend.since_s) > GAP_S) + 1
     since_s = np.insert(trend.since_s, gap, trend.since_s[gap - 1] + GAP_S / 2)
@@ -73,13 +63,7 @@ def trend_curves(trend: Trend, limits: Limits, names: tuple[str, ...]) -> tuple[
 
 
 class LiveTrends(QWidget):
-    """Plots of the last seconds, and below them fields for the limits.
-
-    Parameters
-    ----------
-    workspace
-        Whose session keeps the limits.
-    """
+    """Plots of the last seconds, and below them fields for the limits."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()

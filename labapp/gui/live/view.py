@@ -65,15 +65,6 @@ RING, RING_PX = "#2fd39b", 15
 class LiveView(QObject):
     """A camera that is watched in the page's picture and recorded from.
 
-    Parameters
-    ----------
-    workspace
-        What is open.
-    picture
-        Where live frames are shown.
-    exposure
-        Where the verdict on them is.
-
     Signals
     -------
     changed

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from labapp.gui.shell.steps import STEPS
@@ -19,8 +19,6 @@ class Action:
     ----------
     name
         In code; unique.
-    menu
-        Where it stands.
     text
         Its words there; ``&`` before the letter that chooses it, … where it asks something first.
     key
@@ -35,10 +33,11 @@ class Action:
         Of actions of which one is on.
     begins
         Whether a line divides it from the one before.
+    menu
+        Where it stands.
     """
 
     name: str
-    menu: str
     text: str
     key: str
     tip: str
@@ -46,35 +45,17 @@ class Action:
     checkable: bool = False
     group: str = ""
     begins: bool = False
+    menu: str = ""
 
-
-MENUS = ("&File", "&Edit", "&Steps", "F&rames", "&View", "&Tools", "&Help")
 
 FILE = (
+    Action("new", "&New session …", "Ctrl+N", "Make a file for a new experiment"),
+    Action("open", "&Open …", "Ctrl+O", "Open a session"),
     Action(
-        "new",
-        "&File",
-        "&New session …",
-        "Ctrl+N",
-        "Make a file for a new experiment",
-    ),
-    Action(
-        "open",
-        "&File",
-        "&Open …",
-        "Ctrl+O",
-        "Open a session",
-    ),
-    Action(
-        "sample",
-        "&File",
-        "Try the &sample",
-        "",
-        "Open a copy of a recorded run that is measured already",
+        "sample", "Try the &sample", "", "Open a copy of a recorded run that is measured already"
     ),
     Action(
         "copy",
-        "&File",
         "Save a &copy …",
         "Ctrl+Shift+S",
         "Save the session as it is now under another name; you go on in this one",
@@ -83,14 +64,12 @@ FILE = (
     ),
     Action(
         "import",
-        "&File",
         "&Import a recording …",
         "Ctrl+I",
         "Take frames from a video, an image or a stack into the session",
     ),
     Action(
         "export",
-        "&File",
         "&Export …",
         "Ctrl+E",
         "Go to the step that writes tables, surfaces, pictures and the report",
@@ -98,26 +77,18 @@ FILE = (
     ),
     Action(
         "close",
-        "&File",
         "C&lose the session",
         "Ctrl+W",
         "Close the session and go back to the welcome page; everything is saved",
         needs="session",
         begins=True,
     ),
-    Action(
-        "quit",
-        "&File",
-        "&Quit",
-        "Ctrl+Q",
-        "Stop all work and end the program; everything is saved",
-    ),
+    Action("quit", "&Quit", "Ctrl+Q", "Stop all work and end the program; everything is saved"),
 )
 
 EDIT = (
     Action(
         "undo",
-        "&Edit",
         "&Undo",
         "Ctrl+Z",
         "Take back the last change of set-up, calibration, settings, dots or rows",
@@ -125,7 +96,6 @@ EDIT = (
     ),
     Action(
         "redo",
-        "&Edit",
         "&Redo",
         "Ctrl+Shift+Z",
         "Make the change again that was taken back last",
@@ -133,7 +103,6 @@ EDIT = (
     ),
     Action(
         "copy_picture",
-        "&Edit",
         "Copy &picture",
         "Ctrl+Shift+C",
         "Copy the picture of this step to the clipboard",
@@ -142,7 +111,6 @@ EDIT = (
     ),
     Action(
         "copy_table",
-        "&Edit",
         "Copy &table",
         "Ctrl+Shift+T",
         "Copy the table of this step to the clipboard, for a spreadsheet",
@@ -153,7 +121,6 @@ EDIT = (
 FRAMES = (
     Action(
         "measure",
-        "F&rames",
         "&Measure what is not measured",
         "F5",
         "Measure every frame that is not measured, or whose measures no longer stand",
@@ -161,7 +128,6 @@ FRAMES = (
     ),
     Action(
         "measure_frame",
-        "F&rames",
         "Measure this &frame",
         "Shift+F5",
         "Measure the frame in view",
@@ -169,7 +135,6 @@ FRAMES = (
     ),
     Action(
         "cancel",
-        "F&rames",
         "&Cancel the work",
         "Ctrl+.",
         "Stop the work under way; what is finished is kept",
@@ -177,40 +142,17 @@ FRAMES = (
     ),
     Action(
         "previous",
-        "F&rames",
         "Frame &before",
         "Left",
         "Go to the frame before this one",
         needs="frames",
         begins=True,
     ),
-    Action(
-        "next",
-        "F&rames",
-        "&Next frame",
-        "Right",
-        "Go to the frame after this one",
-        needs="frames",
-    ),
-    Action(
-        "first",
-        "F&rames",
-        "F&irst frame",
-        "Home",
-        "Go to the first frame",
-        needs="frames",
-    ),
-    Action(
-        "last",
-        "F&rames",
-        "&Last frame",
-        "End",
-        "Go to the last frame",
-        needs="frames",
-    ),
+    Action("next", "&Next frame", "Right", "Go to the frame after this one", needs="frames"),
+    Action("first", "F&irst frame", "Home", "Go to the first frame", needs="frames"),
+    Action("last", "&Last frame", "End", "Go to the last frame", needs="frames"),
     Action(
         "play",
-        "F&rames",
         "&Play",
         "Space",
         "Show one frame after another, or stop at this one",
@@ -219,7 +161,6 @@ FRAMES = (
     ),
     Action(
         "record",
-        "F&rames",
         "&Record, or end the recording",
         "Ctrl+R",
         "Record what the live camera sees, or end that; Space does it, too, while a camera is live",
@@ -228,7 +169,6 @@ FRAMES = (
     ),
     Action(
         "mark",
-        "F&rames",
         "Mar&k this moment",
         "Ctrl+K",
         "Note this moment beside the recording that runs; M does it, too, while a camera is live",
@@ -236,7 +176,6 @@ FRAMES = (
     ),
     Action(
         "next_doubtful",
-        "F&rames",
         "Next frame in &doubt",
         "F8",
         "Go to the next frame that could not be measured, stands out, or was changed since",
@@ -245,7 +184,6 @@ FRAMES = (
     ),
     Action(
         "previous_doubtful",
-        "F&rames",
         "Previous frame in d&oubt",
         "Shift+F8",
         "Go to the last frame before this one that stands out, or could not be measured",
@@ -253,7 +191,6 @@ FRAMES = (
     ),
     Action(
         "next_corrected",
-        "F&rames",
         "Next corr&ected frame",
         "F7",
         "Go to the next frame that was corrected by hand",
@@ -261,7 +198,6 @@ FRAMES = (
     ),
     Action(
         "previous_corrected",
-        "F&rames",
         "Pre&vious corrected frame",
         "Shift+F7",
         "Go to the last frame before this one that was corrected by hand",
@@ -274,7 +210,6 @@ STEP_ACTIONS = (
     *(
         Action(
             f"step_{step.key}",
-            "&Steps",
             step.title,
             f"Ctrl+{number}" if number < 10 else "",
             step.hint,
@@ -284,7 +219,6 @@ STEP_ACTIONS = (
     ),
     Action(
         "next_step",
-        "&Steps",
         "&Next step",
         "Ctrl+PgDown",
         "Go on to the next step",
@@ -293,7 +227,6 @@ STEP_ACTIONS = (
     ),
     Action(
         "previous_step",
-        "&Steps",
         "&Previous step",
         "Ctrl+PgUp",
         "Go back to the step before",
@@ -304,7 +237,6 @@ STEP_ACTIONS = (
 VIEW = (
     Action(
         "steps",
-        "&View",
         "&Steps",
         "Ctrl+Shift+1",
         "Show or hide the steps at the left",
@@ -313,7 +245,6 @@ VIEW = (
     ),
     Action(
         "panel",
-        "&View",
         "P&arameters and results",
         "Ctrl+Shift+2",
         "Show or hide the panel at the right",
@@ -322,7 +253,6 @@ VIEW = (
     ),
     Action(
         "timeline",
-        "&View",
         "&Timeline",
         "Ctrl+Shift+3",
         "Show or hide the frames at the bottom",
@@ -331,7 +261,6 @@ VIEW = (
     ),
     Action(
         "log",
-        "&View",
         "&Messages",
         "F4",
         "Show or hide what the app has said since it was started",
@@ -339,7 +268,6 @@ VIEW = (
     ),
     Action(
         "next_part",
-        "&View",
         "&Next part of the window",
         "F6",
         "Give the keys to the next of steps, page, parameters and timeline",
@@ -347,14 +275,12 @@ VIEW = (
     ),
     Action(
         "previous_part",
-        "&View",
         "Part of the window &before",
         "Shift+F6",
         "Give the keys to the part of the window before this one",
     ),
     Action(
         "theme_system",
-        "&View",
         "As the &desktop",
         "",
         "Light or dark, as the desktop is",
@@ -363,17 +289,10 @@ VIEW = (
         begins=True,
     ),
     Action(
-        "theme_light",
-        "&View",
-        "&Light",
-        "",
-        "Dark words on a light ground",
-        checkable=True,
-        group="theme",
+        "theme_light", "&Light", "", "Dark words on a light ground", checkable=True, group="theme"
     ),
     Action(
         "theme_dark",
-        "&View",
         "Dar&k",
         "",
         "Light words on a dark ground, for a dark lab",
@@ -382,7 +301,6 @@ VIEW = (
     ),
     Action(
         "full_screen",
-        "&View",
         "&Full screen",
         "F11",
         "Use all of the screen, or go back to a window",
@@ -391,7 +309,6 @@ VIEW = (
     ),
     Action(
         "reset_layout",
-        "&View",
         "&Reset the layout",
         "",
         "Put the panels back where they were at the first start",
@@ -399,60 +316,51 @@ VIEW = (
 )
 
 
-TOOLS = tuple(
-    Action(name, "&Tools", text, key, tip)
-    for name, text, key, tip in (
-        (
-            "simulator",
-            "&Simulator …",
-            "Ctrl+Shift+M",
-            "Render a recording of a pool that is known, with the truth about every dot",
-        ),
-        (
-            "adviser",
-            "Configuration &adviser …",
-            "Ctrl+Shift+A",
-            "Where laser and imaging plane should stand for the pools that are expected",
-        ),
-        (
-            "analysis",
-            "&Error analysis …",
-            "Ctrl+Shift+E",
-            "How large the error is, and what makes it: the budget of a set-up, and chapter 8",
-        ),
-    )
+TOOLS = (
+    Action(
+        "simulator",
+        "&Simulator …",
+        "Ctrl+Shift+M",
+        "Render a recording of a pool that is known, with the truth about every dot",
+    ),
+    Action(
+        "adviser",
+        "Configuration &adviser …",
+        "Ctrl+Shift+A",
+        "Where laser and imaging plane should stand for the pools that are expected",
+    ),
+    Action(
+        "analysis",
+        "&Error analysis …",
+        "Ctrl+Shift+E",
+        "How large the error is, and what makes it: the budget of a set-up, and chapter 8",
+    ),
 )
 
 HELP = (
-    Action(
-        "guide",
-        "&Help",
-        "&Guide",
-        "F1",
-        "What to do, step by step",
-    ),
-    Action(
-        "keys",
-        "&Help",
-        "&Keys",
-        "Shift+F1",
-        "Every action that has a key",
-    ),
+    Action("guide", "&Guide", "F1", "What to do, step by step"),
+    Action("keys", "&Keys", "Shift+F1", "Every action that has a key"),
     Action(
         "log_folder",
-        "&Help",
         "Show the &log folder",
         "",
         "Open the folder with the log, which tells what went wrong in full",
     ),
-    Action(
-        "about",
-        "&Help",
-        "&About labapp",
-        "",
-        "Version, licence and what it is built on",
-        begins=True,
-    ),
+    Action("about", "&About labapp", "", "Version, licence and what it is built on", begins=True),
 )
 
-ACTIONS: tuple[Action, ...] = (*FILE, *EDIT, *STEP_ACTIONS, *FRAMES, *VIEW, *TOOLS, *HELP)
+BY_MENU = {
+    "&File": FILE,
+    "&Edit": EDIT,
+    "&Steps": STEP_ACTIONS,
+    "F&rames": FRAMES,
+    "&View": VIEW,
+    "&Tools": TOOLS,
+    "&Help": HELP,
+}
+
+MENUS = tuple(BY_MENU)
+
+ACTIONS: tuple[Action, ...] = tuple(
+    replace(action, menu=menu) for menu, actions in BY_MENU.items() for action in actions
+)

@@ -26,15 +26,7 @@ NO_CAMERA = "No camera is watched: start one in the step Recording"
 
 
 def make_window(preferences: Preferences, file: Path) -> MainWindow:
-    """The app's window.
-
-    Parameters
-    ----------
-    preferences
-        What is remembered from the last start.
-    file
-        Where they are kept.
-    """
+    """The app's window."""
     return MainWindow(PreferencesStore(preferences, file), commands)
 
 

@@ -25,17 +25,6 @@ if TYPE_CHECKING:
 class Files(QObject):
     """What the window opens and makes.
 
-    Parameters
-    ----------
-    window
-        Whose questions they are.
-    workspace
-        Where sessions are shown.
-    preferences
-        Where a question for a file begins, and what was opened last.
-    camera
-        Gives the live camera, which may be recording; None while none is watched.
-
     Signals
     -------
     notified

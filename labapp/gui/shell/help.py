@@ -98,15 +98,7 @@ TEXTS: dict[str, Callable[[], str]] = {"guide": guide, "keys": keys, "about": ab
 
 
 class HelpDialog(QDialog):
-    """One of the help texts, beside the window.
-
-    Parameters
-    ----------
-    kind
-        ``guide``, ``keys`` or ``about``.
-    page
-        The page in view, whose keys are listed, too.
-    """
+    """One of the help texts, beside the window."""
 
     def __init__(
         self, kind: str, parent: QWidget | None = None, page: QWidget | None = None

@@ -20,17 +20,6 @@ if TYPE_CHECKING:
 class Menus:
     """The window's menus, and which of their actions are of use now.
 
-    Parameters
-    ----------
-    window
-        Where they stand.
-    actions
-        Those in them.
-    do
-        Does an action, by its name.
-    open_session
-        Opens one of the recent sessions.
-
     Attributes
     ----------
     actions

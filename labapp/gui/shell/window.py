@@ -61,13 +61,6 @@ PAGE_PX = 336
 class MainWindow(QMainWindow):
     """The app's one window.
 
-    Parameters
-    ----------
-    preferences
-        What is remembered from the last start.
-    commands
-        What the actions of the menus do: `labapp.gui.shell.commands`.
-
     Attributes
     ----------
     workspace

@@ -39,13 +39,6 @@ class ScenarioPreview:
 def preview(path: Path, seed: int | None) -> ScenarioPreview:
     """Render the first frame of a scenario.
 
-    Parameters
-    ----------
-    path
-        The scenario.
-    seed
-        None: its own.
-
     Raises
     ------
     InputError

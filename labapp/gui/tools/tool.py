@@ -43,13 +43,6 @@ class ToolWindow(QDialog):
 
     Closing it stops its work, and keeps what it shows.
 
-    Parameters
-    ----------
-    sessions
-        What opens sessions, and where they are shown.
-    window
-        The app's window, which it stands beside.
-
     Attributes
     ----------
     key, title

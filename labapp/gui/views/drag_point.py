@@ -38,15 +38,6 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
     -------
     moved
         It was dragged or nudged, or is being dragged: u, v.
-
-    Parameters
-    ----------
-    name
-        Stands beside it.
-    u, v
-        Where it begins, px.
-    color
-        Of cross and name.
     """
 
     moved = Signal(float, float)

@@ -58,11 +58,6 @@ class PlotStack(Plotted):
     -------
     chosen
         The operator chose a point, with the pointer or the keys: its key.
-
-    Parameters
-    ----------
-    name
-        What it shows, for a screen reader.
     """
 
     chosen = Signal(int)

@@ -8,15 +8,7 @@ from labapp.gui.widgets.fields import Field, NumberField
 
 
 class RangeField(Field):
-    """Two numbers with one unit; ``edited`` gives both.
-
-    Parameters
-    ----------
-    label, unit, tooltip
-        What it is; its unit; what it does.
-    lowest, highest, step
-        Of either, as in `NumberField`.
-    """
+    """Two numbers with one unit; ``edited`` gives both."""
 
     def __init__(
         self,

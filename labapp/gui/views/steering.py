@@ -30,15 +30,7 @@ OBLIQUE = 0
 
 
 class Steering(QObject):
-    """Reads the controller while `start` has been called and `stop` has not.
-
-    Parameters
-    ----------
-    view
-        Gives the view that is to be steered.
-    say
-        Told what happens, each sentence once.
-    """
+    """Reads the controller while `start` has been called and `stop` has not."""
 
     def __init__(
         self, view: Callable[[], View3d], say: Callable[[str], object], parent: QObject

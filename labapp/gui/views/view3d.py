@@ -89,11 +89,6 @@ class View3d(Drawn):
     The mouse turns it, the wheel zooms, Shift or the middle button moves it. Arrow keys turn, + and
     − zoom, 1 to 4 look from the top, the side, the front and obliquely.
 
-    Parameters
-    ----------
-    name
-        What it shows, for a screen reader.
-
     Signals
     -------
     camera_changed

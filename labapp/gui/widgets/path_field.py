@@ -14,13 +14,7 @@ TEXT_MARGIN_PX = 2
 
 
 class PathField(TextField):
-    """A file's or folder's path; its tooltip has it whole.
-
-    Parameters
-    ----------
-    label, tooltip
-        What it is; what it is for.
-    """
+    """A file's or folder's path; its tooltip has it whole."""
 
     def __init__(self, label: str, *, tooltip: str = "") -> None:
         line = PathLine()

@@ -13,13 +13,7 @@ from labapp.gui.widgets.tables import ReadTable
 
 
 class ResultTable(ReadTable):
-    """Results: name, value, ±, unit. Copied as text (Ctrl+C) or CSV (its menu).
-
-    Parameters
-    ----------
-    name
-        What it shows, for a screen reader.
-    """
+    """Results: name, value, ±, unit. Copied as text (Ctrl+C) or CSV (its menu)."""
 
     def __init__(self, name: str) -> None:
         tip = f"{name}: Ctrl+C copies it; right click to copy it as CSV"

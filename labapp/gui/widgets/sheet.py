@@ -16,13 +16,7 @@ MOST_SCALE = 1.25
 
 
 class Sheet(QScrollArea):
-    """A picture as wide as there is room, up to a little more than it was printed.
-
-    Parameters
-    ----------
-    name
-        What it shows, for a screen reader.
-    """
+    """A picture as wide as there is room, up to a little more than it was printed."""
 
     def __init__(self, name: str) -> None:
         super().__init__()

@@ -26,17 +26,7 @@ RIGHT = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
 
 
 class ReadTable(QTableWidget):
-    """A table to read: whole rows are selected, and copied by keys and menu.
-
-    Parameters
-    ----------
-    name
-        What it shows, for a screen reader.
-    tip
-        The tooltip.
-    columns
-        Header texts.
-    """
+    """A table to read: whole rows are selected, and copied by keys and menu."""
 
     def __init__(self, name: str, tip: str, columns: Sequence[str] = ()) -> None:
         super().__init__(0, len(columns))
@@ -90,13 +80,7 @@ class ReadTable(QTableWidget):
 
 
 class CellTable(ReadTable):
-    """A table of a simulation. Copied as text (Ctrl+C), CSV or Markdown (its menu).
-
-    Parameters
-    ----------
-    name
-        What it shows, for a screen reader.
-    """
+    """A table of a simulation. Copied as text (Ctrl+C), CSV or Markdown (its menu)."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, f"{name}: Ctrl+C copies it; right click for CSV and Markdown")

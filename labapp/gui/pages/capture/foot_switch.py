@@ -28,13 +28,7 @@ LISTENING = "Step on the pedal that is to be used …"
 
 
 class FootSwitchPanel(QWidget):
-    """Shows and sets the foot switches of a window.
-
-    Parameters
-    ----------
-    switches
-        Of the window.
-    """
+    """Shows and sets the foot switches of a window."""
 
     def __init__(self, switches: FootSwitches) -> None:
         super().__init__()

@@ -18,15 +18,7 @@ from labapp.session.session import Session
 
 
 class KeptRecordings(QWidget):
-    """Their list, seen where there are any.
-
-    Parameters
-    ----------
-    look
-        Shows the frames of one.
-    begin_next
-        Begins a session with one.
-    """
+    """Their list, seen where there are any."""
 
     def __init__(
         self, look: Callable[[Path], object], begin_next: Callable[[Path], object]

@@ -44,11 +44,6 @@ class Seen:
 class Preview:
     """A recording that may be imported; frames may be read from any thread.
 
-    Parameters
-    ----------
-    path
-        Where it is.
-
     Raises
     ------
     InputError

@@ -35,11 +35,6 @@ class Editor:
         Indices of the chosen dots, ascending.
     shift_px
         How far a drag or a held key has brought the chosen dots so far, shape (2,).
-
-    Parameters
-    ----------
-    commit
-        See `Commit`.
     """
 
     def __init__(self, commit: Commit) -> None:

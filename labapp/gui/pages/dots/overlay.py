@@ -42,13 +42,7 @@ DOT_WIDTHS = 6.0
 
 
 class DotsOverlay:
-    """The marks of the dots page over a picture.
-
-    Parameters
-    ----------
-    view
-        The picture.
-    """
+    """The marks of the dots page over a picture."""
 
     def __init__(self, view: PictureView) -> None:
         self._view = view

@@ -218,15 +218,7 @@ class ExportPlan:
 
 
 def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
-    """What would be written, and whether it can be.
-
-    Parameters
-    ----------
-    session, request
-        Of what, and what of it.
-    frame
-        The frame in view.
-    """
+    """What would be written, and whether it can be."""
     own = scheme_name(session.settings)
     scheme = request.scheme or own
     seen = session.overview(scheme)

@@ -50,162 +50,50 @@ class Entry:
 
 
 RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
-    (
-        "Dot pattern",
-        (
-            Entry("pattern.rows", "Rows", "", "Rows of the dot matrix, odd", 3, 99, 2, 0, 19),
-            Entry("pattern.columns", "Columns", "", "Columns of it, odd", 3, 99, 2, 0, 19),
-            Entry(
-                "pattern.inter_beam_angle_deg",
-                "Inter-beam angle",
-                "°",
-                "Angle between neighbouring rays at the centre",
-                0,
-                45,
-                0.01,
-                2,
-                0.77,
-            ),
-        ),
-    ),
-    (
-        "Laser",
-        (
-            Entry(
-                "laser.projection_angle_deg",
-                "Projection angle",
-                "°",
-                "Elevation of the beam above the work piece; step 2 measures it",
-                0,
-                90,
-                0.5,
-                2,
-                30,
-            ),
-            Entry(
-                "laser.distance_mm",
-                "Distance",
-                "mm",
-                "From the diode to the work piece under the electrode; step 2 measures it",
-                0,
-                10_000,
-                0.5,
-                2,
-                35,
-            ),
-        ),
-    ),
-    (
-        "Torch",
-        (
-            Entry(
-                "electrode.height_mm",
-                "Electrode height",
-                "mm",
-                "From the work piece up to the electrode's tip",
-                0,
-                10_000,
-                0.5,
-                2,
-                4,
-            ),
-        ),
-    ),
-    (
-        "Imaging plane",
-        (
-            Entry(
-                "imaging_plane.distance_mm",
-                "Distance",
-                "mm",
-                "From the electrode's axis back to O′, along −Y",
-                0,
-                10_000,
-                1,
-                2,
-                50,
-            ),
-            Entry(
-                "imaging_plane.s_mm",
-                "s, to the left",
-                "mm",
-                "How far O′ lies to the left of the electrode, as the camera sees it",
-                -10_000,
-                10_000,
-                1,
-                2,
-            ),
-            Entry(
-                "imaging_plane.h_mm",
-                "h, above",
-                "mm",
-                "How high O′ lies above the work piece",
-                -10_000,
-                10_000,
-                0.5,
-                2,
-            ),
-            Entry(
-                "imaging_plane.width_mm",
-                "Width",
-                "mm",
-                "Size along O′X′, from O′",
-                0,
-                10_000,
-                1,
-                1,
-                101.6,
-            ),
-            Entry(
-                "imaging_plane.height_mm",
-                "Height",
-                "mm",
-                "Size along O′Z′, from O′",
-                0,
-                10_000,
-                1,
-                1,
-                101.6,
-            ),
-            Entry(
-                "imaging_plane.pitch_deg",
-                "Pitch",
-                "°",
-                "How far its upper edge leans away from the torch; empty: upright",
-                -90,
-                90,
-                0.5,
-                2,
-            ),
-            Entry(
-                "imaging_plane.yaw_deg",
-                "Yaw",
-                "°",
-                "How far it is turned about the upright; empty: square to the welding direction",
-                -90,
-                90,
-                0.5,
-                2,
-            ),
-        ),
-    ),
-)
+    ("Dot pattern", (
+        Entry("pattern.rows", "Rows", "", "Rows of the dot matrix, odd", 3, 99, 2, 0, 19),
+        Entry("pattern.columns", "Columns", "", "Columns of it, odd", 3, 99, 2, 0, 19),
+        Entry("pattern.inter_beam_angle_deg", "Inter-beam angle", "°",
+              "Angle between neighbouring rays at the centre", 0, 45, 0.01, 2, 0.77),
+    )),
+    ("Laser", (
+        Entry("laser.projection_angle_deg", "Projection angle", "°",
+              "Elevation of the beam above the work piece; step 2 measures it", 0, 90, 0.5, 2, 30),
+        Entry("laser.distance_mm", "Distance", "mm",
+              "From the diode to the work piece under the electrode; step 2 measures it",
+              0, 10_000, 0.5, 2, 35),
+    )),
+    ("Torch", (
+        Entry("electrode.height_mm", "Electrode height", "mm",
+              "From the work piece up to the electrode's tip", 0, 10_000, 0.5, 2, 4),
+    )),
+    ("Imaging plane", (
+        Entry("imaging_plane.distance_mm", "Distance", "mm",
+              "From the electrode's axis back to O′, along −Y", 0, 10_000, 1, 2, 50),
+        Entry("imaging_plane.s_mm", "s, to the left", "mm",
+              "How far O′ lies to the left of the electrode, as the camera sees it",
+              -10_000, 10_000, 1, 2),
+        Entry("imaging_plane.h_mm", "h, above", "mm",
+              "How high O′ lies above the work piece", -10_000, 10_000, 0.5, 2),
+        Entry("imaging_plane.width_mm", "Width", "mm",
+              "Size along O′X′, from O′", 0, 10_000, 1, 1, 101.6),
+        Entry("imaging_plane.height_mm", "Height", "mm",
+              "Size along O′Z′, from O′", 0, 10_000, 1, 1, 101.6),
+        Entry("imaging_plane.pitch_deg", "Pitch", "°",
+              "How far its upper edge leans away from the torch; empty: upright", -90, 90, 0.5, 2),
+        Entry("imaging_plane.yaw_deg", "Yaw", "°",
+              "How far it is turned about the upright; empty: square to the welding direction",
+              -90, 90, 0.5, 2),
+    )),
+)  # fmt: skip
 """Of the rig, by headings."""
 
 POOL = (
     Entry("expected_width_mm", "Width", "mm", "Of the pool that is expected", 0.1, 100, 0.5, 2),
     Entry("expected_length_mm", "Length", "mm", "Of the pool that is expected", 0.1, 100, 0.5, 2),
-    Entry(
-        "expected_height_mm",
-        "Height",
-        "mm",
-        "Of the pool that is expected; negative for a concave one",
-        -50,
-        50,
-        0.05,
-        2,
-    ),
-)
+    Entry("expected_height_mm", "Height", "mm",
+          "Of the pool that is expected; negative for a concave one", -50, 50, 0.05, 2),
+)  # fmt: skip
 
 EXPERIMENT = (
     Entry("title", "Title", tooltip="What this experiment is called"),
@@ -218,7 +106,7 @@ EXPERIMENT = (
     Entry("gas", "Shielding gas", tooltip="Which gas"),
     Entry("gas_flow_l_min", "Gas flow", "l/min", "Of the shielding gas", 0, 1000, 0.5, 1),
     Entry("notes", "Notes", tooltip="Anything else worth keeping; Ctrl+Enter keeps it"),
-)
+)  # fmt: skip
 
 SAFETY: tuple[tuple[str, str], ...] = (
     (

@@ -26,17 +26,7 @@ ZOOM = 1.25
 
 
 class Chart(Plotted):
-    """One plot with a line of words above it, in the colours of the window.
-
-    Parameters
-    ----------
-    name
-        What it shows, for a screen reader.
-    x_label, y_label
-        What the axes are, with units.
-    equal
-        Whether a millimetre is as long on both axes.
-    """
+    """One plot with a line of words above it, in the colours of the window."""
 
     def __init__(self, name: str, x_label: str, y_label: str, equal: bool) -> None:
         super().__init__(name, KEYS)

@@ -30,11 +30,6 @@ NUMBERS = (1, 2, 3)
 class CompareView(QWidget):
     """The frame in view by two schemes; the cameras of all views turn together.
 
-    Parameters
-    ----------
-    workspace
-        What is open.
-
     Signals
     -------
     closed

@@ -26,15 +26,7 @@ SIGNS = {"measured": "✓", "stale": "⟳", "failed": "✗", "unmeasured": "○"
 
 
 class SurfacePanel:
-    """Fills a page's panel.
-
-    Parameters
-    ----------
-    workspace
-        What is open.
-    layout
-        Of the panel.
-    """
+    """Fills a page's panel."""
 
     def __init__(self, workspace: Workspace, layout: QVBoxLayout) -> None:
         self.workspace = workspace
