@@ -104,8 +104,7 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     former = {number: signal.signal(number, lambda *_: window.close()) for number in stops}
     window.show()
     loading = threading.Thread(target=_load_what_is_needed, name="loading", daemon=True)
-    load = QTimer(window)
-    load.setSingleShot(True)
+    load = QTimer(window, singleShot=True)
     load.timeout.connect(loading.start)
     load.start(LOAD_AFTER_MS)
     try:

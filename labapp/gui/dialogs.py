@@ -28,12 +28,27 @@ def recordings() -> str:
     return f"Recordings ({' '.join(f'*{suffix}' for suffix in suffixes)})"
 
 
+def ask_file(parent: QWidget, title: str, folder: Path, kinds: str = "") -> Path | None:
+    """Ask for a file that is there; ``kinds`` is Qt's filter: "Tables (*.csv)"."""
+    name, _ = QFileDialog.getOpenFileName(parent, title, str(folder), kinds)
+    return Path(name) if name else None
+
+
+def ask_folder(parent: QWidget, title: str, folder: Path) -> Path | None:
+    """Ask for a folder."""
+    name = QFileDialog.getExistingDirectory(parent, title, str(folder))
+    return Path(name) if name else None
+
+
+def ask_save(parent: QWidget, title: str, proposed: Path, kinds: str) -> Path | None:
+    """Ask for a file to write, which may be there already."""
+    name, _ = QFileDialog.getSaveFileName(parent, title, str(proposed), kinds)
+    return Path(name) if name else None
+
+
 def ask_session(parent: QWidget, folder: Path) -> Path | None:
     """Ask which session to open."""
-    name, _ = QFileDialog.getOpenFileName(
-        parent, "Open a session", str(folder), f"{SESSIONS};;{EVERYTHING}"
-    )
-    return Path(name) if name else None
+    return ask_file(parent, "Open a session", folder, f"{SESSIONS};;{EVERYTHING}")
 
 
 def ask_new_session(parent: QWidget, proposed: Path, title: str = "New session") -> Path | None:
@@ -48,10 +63,7 @@ def ask_new_session(parent: QWidget, proposed: Path, title: str = "New session")
 
 def ask_recording(parent: QWidget, folder: Path) -> Path | None:
     """Ask which recording to import."""
-    name, _ = QFileDialog.getOpenFileName(
-        parent, "Import a recording", str(folder), f"{recordings()};;{EVERYTHING}"
-    )
-    return Path(name) if name else None
+    return ask_file(parent, "Import a recording", folder, f"{recordings()};;{EVERYTHING}")
 
 
 def ask_read_only(parent: QWidget, path: Path) -> bool:

@@ -136,8 +136,7 @@ class FootSwitches(QObject):
         self._learning: Task | None = None
         self._looking: Task | None = None
         self._received: queue.SimpleQueue[tuple[str, Action | Event]] = queue.SimpleQueue()
-        self._timer = QTimer(self)
-        self._timer.setInterval(POLL_MS)
+        self._timer = QTimer(self, interval=POLL_MS)
         self._timer.timeout.connect(self._take)
         tasks.changed.connect(self.changed)
 

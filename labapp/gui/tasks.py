@@ -89,7 +89,7 @@ class Task:
         Its side of the talk.
     thread
         Where it runs.
-    on_part, on_done, on_failed
+    on_part, on_done, beside
         Called on the GUI thread with parts, with the result, and with why it failed.
     kind
         What work fails and goes well together: "Exporting", wherever to.
@@ -100,7 +100,7 @@ class Task:
     thread: threading.Thread
     on_part: Callable[[Any], None] | None
     on_done: Callable[[Any], None] | None
-    on_failed: Callable[[str], None] | None
+    beside: Callable[[str], object] | None
     kind: str
 
     @property
@@ -141,8 +141,7 @@ class Tasks(QObject):
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
         self.active: list[Task] = []
-        self._timer = QTimer(self)
-        self._timer.setInterval(POLL_MS)
+        self._timer = QTimer(self, interval=POLL_MS)
         self._timer.timeout.connect(self._poll)
         self._reported: tuple[float, list[tuple[int, int]]] = (0.0, [])
 
@@ -152,7 +151,7 @@ class Tasks(QObject):
         work: Work,
         on_done: Callable[[Any], None] | None = None,
         on_part: Callable[[Any], None] | None = None,
-        on_failed: Callable[[str], None] | None = None,
+        beside: Callable[[str], object] | None = None,
         kind: str = "",
     ) -> Task:
         """Begin work in a thread of its own.
@@ -166,14 +165,16 @@ class Tasks(QObject):
         on_done, on_part
             Called on the GUI thread with what ``work`` returns, and with each part it hands over.
             Not called after a cancel or a failure.
-        on_failed
-            Called on the GUI thread with why it failed, to be shown beside what was pressed.
+        beside
+            Shows why it failed beside what was pressed, too; called with nothing at the beginning.
         kind
             A failure is forgotten when work of its kind begins again; empty: its title.
         """
+        if beside is not None:
+            beside("")
         control = Control()
         thread = threading.Thread(target=_run, args=(work, control), name=title, daemon=True)
-        task = Task(title, control, thread, on_part, on_done, on_failed, kind or title)
+        task = Task(title, control, thread, on_part, on_done, beside, kind or title)
         self.active.append(task)
         self.settled.emit(task.kind)
         thread.start()
@@ -215,8 +216,8 @@ class Tasks(QObject):
         self.active.remove(task)
         if kind == "failed":
             self.failed.emit(task.title, value, task.kind)
-            if task.on_failed is not None:
-                task.on_failed(value)
+            if task.beside is not None:
+                task.beside(f"▲ {value}")
         elif kind == "done" and task.on_done is not None:
             task.on_done(value)
         self.changed.emit()

@@ -13,9 +13,10 @@ from PySide6.QtWidgets import QWidget
 
 from labapp.errors import InputError
 from labapp.gui.shell.steps import calibrations_in_use
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import selectable_label
+from labapp.gui.widgets.layouts import hbox
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
 from labapp.session.session import Session
 
@@ -85,9 +86,9 @@ class CameraFields(QObject):
         self.shoot_button = button(
             "Take a frame", "Have the camera take a frame now", self._take_frame
         )
-        row = QWidget()
-        row.setLayout(button_row(self.shoot_button, self.whole_button))
-        form.add_wide(row)
+        buttons = QWidget()
+        hbox(self.shoot_button, self.whole_button, of=buttons)
+        form.add_wide(buttons)
         self.part_words = selectable_label()
         form.add_wide(self.part_words)
 

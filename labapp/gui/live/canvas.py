@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QFrame, QScrollArea, QStackedWidget, QTabBar, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QScrollArea, QStackedWidget, QTabBar, QWidget
 
 from labapp.gui.live.figures import AlarmStrip
 from labapp.gui.live.streams import LiveStreams
 from labapp.gui.live.surface import LiveSurface
 from labapp.gui.live.trends import LiveTrends
 from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.layouts import scrolled, vbox
 from labapp.gui.workspace import Workspace
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_watch import LiveWatch
@@ -50,12 +50,8 @@ class LiveCanvas(QWidget):
         for part in (picture, self.surface, _scrolled(self.trends), _scrolled(self.streams)):
             self.stack.addWidget(part)
         self.tabs.currentChanged.connect(self._choose)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.setSpacing(2)
-        layout.addWidget(self.tabs)
-        layout.addWidget(self.stack, 1)
-        layout.addWidget(self.alarms)  # below: what is above stays under the hand
+        # Alarms below: what is above stays under the hand.
+        vbox(self.tabs, (self.stack, 1), self.alarms, of=self).setSpacing(2)
         self.set_live(False)
 
     @property
@@ -98,10 +94,6 @@ class LiveCanvas(QWidget):
 
 def _scrolled(part: QWidget) -> QScrollArea:
     """A part that scrolls where the screen is small."""
-    area = QScrollArea()
-    area.setWidget(part)
-    area.setWidgetResizable(True)
-    area.setFrameShape(QFrame.Shape.NoFrame)
-    area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+    area = scrolled(part)
     area.setMinimumWidth(part.minimumSizeHint().width())
     return area

@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QAccessible, QAccessibleEvent, QPalette
-from PySide6.QtWidgets import QFrame, QGridLayout, QHBoxLayout, QLabel, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QFrame, QGridLayout, QLabel, QWidget
 
 from labapp.gui.digits import NOTHING, plain
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label, selectable_label
+from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_measuring import LiveResult
@@ -132,13 +133,10 @@ class LiveFigures(QWidget):
 
     def __init__(self) -> None:
         super().__init__()
-        column = QVBoxLayout(self)
-        column.setContentsMargins(0, 0, 0, 0)
         self._grid = QGridLayout()
         self._grid.setColumnStretch(1, 1)
-        column.addLayout(self._grid)
         self.words = Message(3)
-        column.addWidget(self.words)
+        vbox(self._grid, self.words, of=self)
         self._labels: dict[tuple[int, int], QLabel] = {}
         self._looks: dict[QLabel, tuple[Look, bool]] = {}
 
@@ -203,10 +201,7 @@ class AlarmStrip(QFrame):
             "Acknowledge", "Say that the alarms were seen (A); those that hold stay", acknowledge
         )
         self.button.setMinimumHeight(ACKNOWLEDGE_PX)
-        row = QHBoxLayout(self)
-        row.setContentsMargins(6, 2, 6, 2)
-        row.addWidget(self.words, 1)
-        row.addWidget(self.button)
+        hbox((self.words, 1), self.button, of=self).setContentsMargins(6, 2, 6, 2)
         self._alarms: tuple[Alarm, ...] = ()
         self._kept: tuple[Alarm, ...] = ()
         self._paint()

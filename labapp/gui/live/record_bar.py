@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from PySide6.QtGui import QPalette
-from PySide6.QtWidgets import QHBoxLayout, QProgressBar, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QProgressBar, QWidget
 
 from labapp.gui.live.live import Live
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label
+from labapp.gui.widgets.layouts import hbox, vbox
 
 BUTTON_PX, RING_BAR_PX = 44, 130
 """Least height of the buttons that are pressed in gloves; width of the bar beside them."""
@@ -26,21 +27,13 @@ class RecordBar(QWidget):
         stop: Callable[[], object],
     ) -> None:
         super().__init__()
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(8, 2, 8, 4)
         self.state = Message(1)
         self.ring = QProgressBar()
         self.ring.setRange(0, 100)
         self.ring.setFixedWidth(RING_BAR_PX)
         self.ring.setToolTip("How much from before the trigger is in memory")
-        line = QHBoxLayout()
-        line.addWidget(self.state, 1)
-        line.addWidget(plain_label("Before the trigger:"))
-        line.addWidget(self.ring)
-        layout.addLayout(line)
+        line = hbox((self.state, 1), plain_label("Before the trigger:"), self.ring)
         self.recording = Message(2)
-        layout.addWidget(self.recording)
-        row = QHBoxLayout()
         self.record_button = button(
             "● Record",
             "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
@@ -52,10 +45,10 @@ class RecordBar(QWidget):
         stop_button = button(
             "Stop the camera", "Release the camera; a recording is finished first", stop
         )
-        for each, wide in ((self.record_button, 3), (self.mark_button, 1), (stop_button, 2)):
+        buttons = ((self.record_button, 3), (self.mark_button, 1), (stop_button, 2))
+        for each, _ in buttons:
             each.setMinimumHeight(BUTTON_PX)
-            row.addWidget(each, wide)
-        layout.addLayout(row)
+        vbox(line, self.recording, hbox(*buttons), of=self).setContentsMargins(8, 2, 8, 4)
 
     def show_status(self, live: Live, room_byte: int | None) -> None:
         """Show the state of a camera and its recording; ``room_byte`` is free on the disk."""

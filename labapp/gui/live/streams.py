@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from PySide6.QtWidgets import QCheckBox, QGridLayout, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QCheckBox, QGridLayout, QWidget
 
 from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task
+from labapp.gui.widgets.buttons import check_box
 from labapp.gui.widgets.fields import NumberField
-from labapp.gui.widgets.labels import Message, headed, selectable_label
+from labapp.gui.widgets.labels import Message, selectable_label
+from labapp.gui.widgets.layouts import Group, vbox
 from labapp.gui.workspace import Workspace
 from labapp.run.live_watch import LiveWatch
 from labapp.run.streams import Stream, open_stream
@@ -53,17 +55,10 @@ class LiveStreams(QWidget):
         self.words = {kind: Message(2) for kind in KINDS}
         self._problems: dict[str, str] = {}
         self._tasks: dict[str, Task] = {}
-        outer = QVBoxLayout(self)
-        outer.setContentsMargins(8, 8, 8, 8)
-        group, layout = headed("Send every measured frame to control software")
-        outer.addWidget(group)
         grid = QGridLayout()
         grid.setColumnStretch(3, 1)
-        layout.addLayout(grid)
         for row, (kind, (words, port, tip)) in enumerate(KINDS.items()):
-            box = self.boxes[kind] = QCheckBox(words)
-            box.setToolTip(tip)
-            box.toggled.connect(partial(self._switch, kind))
+            box = self.boxes[kind] = check_box(words, tip, partial(self._switch, kind))
             field = self.ports[kind] = NumberField(
                 "port", lowest=1024, highest=65_535, decimals=0, tooltip=f"Port of {words}"
             )
@@ -74,13 +69,15 @@ class LiveStreams(QWidget):
             for column, widget in enumerate((box, field.label, field)):
                 grid.addWidget(widget, 2 * row, column)
             grid.addWidget(self.words[kind], 2 * row + 1, 0, 1, 4)
-        self.anywhere = QCheckBox("Other machines may connect")
-        self.anywhere.setToolTip("Otherwise only programs on this machine can")
-        self.anywhere.toggled.connect(lambda _: self._open_to_all())
+        self.anywhere = check_box(
+            "Other machines may connect",
+            "Otherwise only programs on this machine can",
+            lambda _: self._open_to_all(),
+        )
         self.warning = selectable_label()
-        layout.addWidget(self.anywhere)
-        layout.addWidget(self.warning)
-        outer.addStretch(1)
+        words = "Send every measured frame to control software"
+        group = Group(words, grid, self.anywhere, self.warning)
+        vbox(group, 1, of=self).setContentsMargins(8, 8, 8, 8)
         self.show_state()
 
     # --- what is done -------------------------------------------------------------------------

@@ -6,12 +6,13 @@ import time
 from dataclasses import replace
 from functools import partial
 
-from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
 from labapp.export.scene import Scene
 from labapp.gui.live.figures import OLD_S
 from labapp.gui.views.view3d import LOOKS, make_view3d
 from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_watch import LiveWatch
 
@@ -34,15 +35,13 @@ class LiveSurface(QWidget):
         self.view.set_words(WAITING)
         self._shown_s = 0.0
         self._limits: tuple[float, float] | None = None
-        row = QHBoxLayout()
+        looks = [
+            button(words, tip, partial(self.view.look, direction))
+            for direction, (words, tip) in LOOKS.items()
+        ]
+        row = hbox(*looks, 1)
         row.setContentsMargins(8, 0, 8, 0)
-        for direction, (words, tip) in LOOKS.items():
-            row.addWidget(button(words, tip, partial(self.view.look, direction)))
-        row.addStretch(1)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addLayout(row)
-        layout.addWidget(self.view, 1)
+        vbox(row, (self.view, 1), of=self)
 
     def follow(self, result: LiveResult | None, watch: LiveWatch) -> bool:
         """Show the newest surface that was drawn, and ask for the next; whether there was one.

@@ -8,13 +8,14 @@ from functools import partial
 import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QResizeEvent
-from PySide6.QtWidgets import QBoxLayout, QGridLayout, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QBoxLayout, QGridLayout, QWidget
 
 from labapp.errors import InputError
 from labapp.gui.curves import PLAIN, Axis, Curve, Mark
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.widgets.fields import FieldForm, NumberField
 from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.layouts import vbox
 from labapp.gui.workspace import Workspace
 from labapp.run.limits import LARGEST_MM, NAMES, Ends, Limits
 from labapp.run.live_trend import TREND_S, Trend
@@ -105,15 +106,12 @@ class LiveTrends(QWidget):
         }
         for (name, end), field in self.fields.items():
             field.edited.connect(partial(self._enter, name, end))
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.plots, 1)
         self._below = QBoxLayout(QBoxLayout.Direction.TopToBottom)
         self._below.setContentsMargins(8, 0, 8, 0)
         self._parts = limits, others = self._limits(), self._others()
         self._below.addLayout(limits, 3)
         self._below.addWidget(others, 2, Qt.AlignmentFlag.AlignTop)
-        layout.addLayout(self._below)
+        vbox((self.plots, 1), self._below, of=self)
         workspace.changed.connect(self.refresh)
 
     def _limits(self) -> QGridLayout:

@@ -8,28 +8,23 @@ from functools import partial
 
 import pyqtgraph as pg
 from PySide6.QtCore import QObject, Qt, QTimer, Signal
-from PySide6.QtWidgets import QVBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
 from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
 from labapp.gui.live.camera_fields import CameraFields, calibrated_px
 from labapp.gui.live.canvas import LiveCanvas
-from labapp.gui.live.figures import (
-    NO_SETUP,
-    OLD_S,
-    LiveFigures,
-    figures,
-    pace_text,
-)
+from labapp.gui.live.figures import NO_SETUP, OLD_S, LiveFigures, figures, pace_text
 from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.picture import PictureView
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.exposure import ExposureBars
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import Message, headed
+from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.layouts import Group, hbox, vbox
 from labapp.gui.workspace import Workspace
 from labapp.media.cameras import (
     Camera,
@@ -103,8 +98,7 @@ class LiveView(QObject):
         self._status_s = self.measured_s = 0.0
         self._result: LiveResult | None = None
         self._room_byte: int | None = None
-        self._timer = QTimer(self)
-        self._timer.setInterval(TICK_MS)
+        self._timer = QTimer(self, interval=TICK_MS)
         self._timer.timeout.connect(self._tick)
         self._rings = pg.ScatterPlotItem(
             size=RING_PX, pxMode=True, pen=pg.mkPen(RING, width=1.2), brush=None
@@ -165,10 +159,9 @@ class LiveView(QObject):
             f"Opening {name}",
             work,
             lambda _: self._opened(live),
-            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+            beside=self.refused.setText,
             kind="Opening the camera",
         )
-        self.refused.setText("")
         self.live = live
         self._show_state()
         self.changed.emit()
@@ -416,7 +409,6 @@ class LiveView(QObject):
         self.bar.show_recording(recording)
 
     def _make_group(self) -> None:
-        self.group, layout = headed("Capture")
         form = FieldForm()
         self._choices = choices([])
         self.camera = ChoiceField(
@@ -425,21 +417,12 @@ class LiveView(QObject):
             tooltip="Which camera to watch; the simulated one films a pool on this bench",
         )
         form.add(self.camera)
-        layout.addWidget(form)
         self.start_button = button("Start", "Show live what the camera sees", self.start)
         self.find_button = button(
             "Look for cameras", "Find the cameras that are connected", self.find
         )
-        layout.addLayout(button_row(self.start_button, self.find_button))
-        self.refused = Message(2)
-        layout.addWidget(self.refused)
-        self.settings = QWidget()
-        inner = QVBoxLayout(self.settings)
-        inner.setContentsMargins(0, 0, 0, 0)
+        self.refused, self.counts = Message(2), Message(2)
         self.figures = LiveFigures()
-        self.counts = Message(2)
-        inner.addWidget(self.figures)
-        inner.addWidget(self.counts)
         fields = FieldForm()
         self.camera_fields = CameraFields(
             fields, lambda wanted: None if self.live is None else self.live.apply(wanted)
@@ -447,8 +430,10 @@ class LiveView(QObject):
         self.camera_fields.reset.connect(self._begin_anew)
         self.plan_fields = PlanFields(fields)
         self.plan_fields.edited.connect(self._replan)
-        inner.addWidget(fields)
-        layout.addWidget(self.settings)
+        self.settings = QWidget()
+        vbox(self.figures, self.counts, fields, of=self.settings)
+        buttons = hbox(self.start_button, self.find_button)
+        self.group = Group("Capture", form, buttons, self.refused, self.settings)
 
     def take_key(self, key: Qt.Key) -> bool:
         """Do what a plain key means while live; whether it means anything."""

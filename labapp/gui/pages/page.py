@@ -10,10 +10,13 @@ from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.shell.steps import State, read_only
 from labapp.gui.widgets.fields import Field
+from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.layouts import vbox
 from labapp.gui.workspace import Workspace
 
 if TYPE_CHECKING:
     from labapp.gui.live.view import LiveView
+    from labapp.session.session import Session
 
 
 class Page(QWidget):
@@ -32,6 +35,8 @@ class Page(QWidget):
         What is open.
     panel
         Parameters and results; the window puts the step's hint above it.
+    refused
+        Says why what was pressed was refused; a page that refuses puts it beside that.
     """
 
     key = ""
@@ -41,13 +46,20 @@ class Page(QWidget):
         super().__init__()
         self.workspace = workspace
         self.panel = QWidget()
-        self.canvas_layout = QVBoxLayout(self)
-        self.canvas_layout.setContentsMargins(0, 0, 0, 0)
+        self.canvas_layout = vbox(of=self)
         self.panel_layout = QVBoxLayout(self.panel)
         self.setObjectName(f"page-{self.key}")
         self.panel.setObjectName(f"panel-{self.key}")
+        self.refused = Message(2)
         self._changing: list[QWidget] = []
         workspace.opened.connect(self._take_session)
+
+    @property
+    def session(self) -> Session:
+        """The session that is open; a page is in view only while one is."""
+        session = self.workspace.session
+        assert session is not None
+        return session
 
     @property
     def locked(self) -> str:
@@ -73,6 +85,7 @@ class Page(QWidget):
 
     def _take_session(self) -> None:
         """What was refused in the former session is of no interest in another."""
+        self.refused.setText("")
         for side in (self, self.panel):
             for field in side.findChildren(Field):
                 field.refuse("")

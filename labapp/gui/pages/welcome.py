@@ -10,7 +10,6 @@ from PySide6.QtCore import QEvent, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPixmap
 from PySide6.QtWidgets import (
     QFrame,
-    QHBoxLayout,
     QListWidget,
     QListWidgetItem,
     QPushButton,
@@ -20,8 +19,9 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
 from labapp.gui.tasks import Control
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import hbox
 from labapp.gui.workspace import Workspace
 
 BUTTONS = (
@@ -74,7 +74,7 @@ class Welcome(QWidget):
         for name, text, tip in BUTTONS:
             made = self.buttons[name] = button(text, tip, partial(self.action_requested.emit, name))
             made.setMinimumHeight(made.fontMetrics().height() * 2)
-        column.addLayout(button_row(*self.buttons.values()))
+        column.addLayout(hbox(*self.buttons.values()))
         self.label = plain_label("&Recent sessions")
         column.addWidget(self.label)
         self.list = QListWidget()
@@ -95,11 +95,7 @@ class Welcome(QWidget):
         )
         column.addWidget(self.nothing)
         column.addStretch(0)
-        layout = QHBoxLayout(self)
-        layout.setContentsMargins(24, 20, 24, 12)
-        layout.addStretch(1)
-        layout.addWidget(inner, 100)
-        layout.addStretch(1)
+        hbox(1, (inner, 100), 1, of=self).setContentsMargins(24, 20, 24, 12)
 
     def show_recent(self, paths: Sequence[Path]) -> None:
         """List these sessions; what is in them is looked at in the background."""

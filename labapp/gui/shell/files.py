@@ -27,13 +27,10 @@ class Files(QObject):
 
     Signals
     -------
-    notified
-        Something for the operator to read: a sentence, and whether it is a problem.
     recording_requested
         The step Recording is to be shown, and to take this file or folder, unless it is None.
     """
 
-    notified = Signal(str, bool)
     recording_requested = Signal(object)
 
     def __init__(
@@ -88,7 +85,7 @@ class Files(QObject):
     def take(self, path: Path) -> None:
         """Take a recording to the capture page, in a new session where none is open."""
         if not path.exists():
-            self.notified.emit(f"{path} is not there", True)
+            self.workspace.notified.emit(f"{path} is not there", True)
         elif self.workspace.session is not None or self._create(
             dialogs.new_path(path.parent, path.stem)
         ):
@@ -110,7 +107,7 @@ class Files(QObject):
             self.workspace.tasks.start(
                 "Saving a copy",
                 lambda _: copy_session(source, path),
-                lambda copied: self.notified.emit(f"A copy is in {copied}", False),
+                lambda copied: self.workspace.notified.emit(f"A copy is in {copied}", False),
             )
 
     def begin_next(self, recording: Path) -> None:
@@ -138,7 +135,7 @@ class Files(QObject):
         path = self.workspace.run_or_report(lambda: copy_sample("gtaw", folder))
         if path is not None and self.open(path):
             words = f"This is a copy of the sample, in {path.parent}: change what you like"
-            self.notified.emit(words, False)
+            self.workspace.notified.emit(words, False)
 
     def close(self) -> None:
         """Close the session and go back to the welcome page."""

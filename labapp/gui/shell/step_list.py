@@ -20,6 +20,7 @@ from PySide6.QtWidgets import (
 from labapp.gui.shell.steps import READ_ONLY, Mark, State, Step
 from labapp.gui.theme import is_dark
 from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import fill, scrolled
 
 ICON_PX = 18
 
@@ -164,13 +165,10 @@ class SidePanel(QWidget):
         self._areas: dict[QWidget, QScrollArea] = {}
         layout = QVBoxLayout(self)
         layout.setContentsMargins(10, 8, 6, 6)
-        for widget in (self.title, self.hint, self.state, self.read_only):
-            layout.addWidget(widget)
         line = QFrame()
         line.setFrameShape(QFrame.Shape.HLine)
         line.setForegroundRole(QPalette.ColorRole.Mid)
-        layout.addWidget(line)
-        layout.addWidget(self.stack, 1)
+        fill(layout, self.title, self.hint, self.state, self.read_only, line, (self.stack, 1))
         self.setMinimumWidth(320)
 
     def sizeHint(self) -> QSize:
@@ -180,14 +178,9 @@ class SidePanel(QWidget):
     def show_panel(self, panel: QWidget, step: Step) -> None:
         """Show a page's panel."""
         if panel not in self._areas:
-            area = QScrollArea()
-            area.setWidgetResizable(True)
-            area.setFrameShape(QFrame.Shape.NoFrame)
+            area = scrolled(panel, f"{step.title}: parameters and results")
             # Where it came and went, words would wrap otherwise, and what is below them move.
             area.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOn)
-            area.setAccessibleName(f"{step.title}: parameters and results")
-            area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
-            area.setWidget(panel)
             self._areas[panel] = area
             self.stack.addWidget(area)
         self.stack.setCurrentWidget(self._areas[panel])

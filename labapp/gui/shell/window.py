@@ -86,8 +86,7 @@ class MainWindow(QMainWindow):
         self._steps = tuple(step for step in STEPS if step.key in PAGES)
         self._states = states(None)
         self._changes_due = False
-        self._rest = QTimer(self)
-        self._rest.setSingleShot(True)
+        self._rest = QTimer(self, singleShot=True)
         self._rest.timeout.connect(self._rested)
         self._make_views()
         without = {f"step_{step.key}" for step in STEPS if step not in self._steps}
@@ -139,7 +138,6 @@ class MainWindow(QMainWindow):
         space, preferences = self.workspace, self.preferences
         preferences.changed.connect(lambda: self.menus.show_recent(preferences.current.recent))
         preferences.failed.connect(self.say)
-        self.files.notified.connect(self.say)
         self.files.recording_requested.connect(self._show_recording)
         space.closing.connect(self._leave)
         space.opened.connect(self._session_opened)

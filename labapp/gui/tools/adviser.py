@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtWidgets import (
-    QFileDialog,
-    QScrollArea,
-    QTabWidget,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QScrollArea, QTabWidget, QVBoxLayout, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
 from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField
-from labapp.gui.widgets.labels import headed, wrapping_label
+from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.layouts import Group
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
@@ -65,10 +59,8 @@ class AdviserWindow(ToolWindow):
         self.numbers: dict[str, NumberField] = {}
         self._make_form()
         self._make_results()
-        self.save_button = self.add_button(
-            "Save the advice …",
-            "Write words, tables, picture and set-up file to a folder",
-            self.choose_folder,
+        self.add_save_button(
+            "Save the advice …", "Write words, tables, picture and set-up file to a folder"
         )
         self.use_button = self.add_button(
             "Use these",
@@ -111,7 +103,8 @@ class AdviserWindow(ToolWindow):
         self.words = QWidget()
         column = QVBoxLayout(self.words)
         column.addWidget(self.headline)
-        self.groups = [_titled(table) for table in (self.place, self.kept, self.costs)]
+        tables = (self.place, self.kept, self.costs)
+        self.groups = [Group(table.accessibleName(), table) for table in tables]
         for group in self.groups:
             column.addWidget(group)
             group.hide()
@@ -207,18 +200,3 @@ class AdviserWindow(ToolWindow):
             self.workspace.notified.emit(
                 "The advised set-up is in: measure in steps 2 and 3 where it really stands", False
             )
-
-    def choose_folder(self) -> None:
-        """Ask where to write the files."""
-        name = QFileDialog.getExistingDirectory(
-            self, "Save the advice in", str(self.workspace.folder)
-        )
-        if name:
-            self.save(Path(name))
-
-
-def _titled(table: QWidget) -> QWidget:
-    """A table below its name, which is what a screen reader says of it."""
-    group, layout = headed(table.accessibleName())
-    layout.addWidget(table)
-    return group

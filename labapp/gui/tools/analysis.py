@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QCheckBox, QFileDialog, QStackedWidget, QWidget
+from PySide6.QtWidgets import QCheckBox, QStackedWidget, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import analysing
@@ -58,10 +57,8 @@ class AnalysisWindow(ToolWindow):
         super().__init__(sessions, window)
         self._make_form()
         self._make_results()
-        self.save_button = self.add_button(
-            "Save the results …",
-            "Write all tables (CSV, Markdown) and pictures to a folder",
-            self.choose_folder,
+        self.add_save_button(
+            "Save the results …", "Write all tables (CSV, Markdown) and pictures to a folder"
         )
         self.start_button = self.add_button(
             "Work out", "Work out what is ticked; each part is shown when it is done", self.start
@@ -232,11 +229,3 @@ class AnalysisWindow(ToolWindow):
         ticked = any(box.isChecked() for box in self.parts.values())
         self.start_button.setEnabled(ticked and not self.working)
         self.save_button.setEnabled(bool(self.files))
-
-    def choose_folder(self) -> None:
-        """Ask where to write the files."""
-        name = QFileDialog.getExistingDirectory(
-            self, "Save the results in", str(self.workspace.folder)
-        )
-        if name:
-            self.save(Path(name))

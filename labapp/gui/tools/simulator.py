@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import pyqtgraph as pg
 from PySide6.QtGui import QCloseEvent
-from PySide6.QtWidgets import QFileDialog, QWidget
+from PySide6.QtWidgets import QWidget
 
 from labapp.config.scenario import Scenario, read_scenario
-from labapp.gui.dialogs import new_path
+from labapp.gui.dialogs import ask_file, ask_folder, new_path
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import simulating
 from labapp.gui.tools.simulating import ScenarioPreview
@@ -137,18 +137,15 @@ class SimulatorWindow(ToolWindow):
 
     def choose_scenario(self) -> None:
         """Ask for a scenario."""
-        name, _ = QFileDialog.getOpenFileName(
-            self, "Choose a scenario", str(self._preferences.current.folder), "Scenarios (*.toml)"
-        )
-        if name:
-            self.take(Path(name))
+        folder = self._preferences.current.folder
+        if path := ask_file(self, "Choose a scenario", folder, "Scenarios (*.toml)"):
+            self.take(path)
 
     def choose_folder(self) -> None:
         """Ask where the simulation goes."""
-        start = str(Path(self.folder.value()).parent)
-        name = QFileDialog.getExistingDirectory(self, "Put the simulation in", start)
-        if name:
-            self._propose(Path(name))
+        start = Path(self.folder.value()).parent
+        if folder := ask_folder(self, "Put the simulation in", start):
+            self._propose(folder)
 
     def _propose(self, parent: Path) -> None:
         folder = new_path(parent, Path(self.scenario.value() or "simulation").stem, suffix="")

@@ -10,23 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QCloseEvent
-from PySide6.QtWidgets import (
-    QDialog,
-    QFrame,
-    QHBoxLayout,
-    QProgressBar,
-    QPushButton,
-    QScrollArea,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QDialog, QHBoxLayout, QProgressBar, QPushButton, QVBoxLayout, QWidget
 
-from labapp.gui.dialogs import refused_as_input, write_file
+from labapp.gui.dialogs import ask_folder, refused_as_input, write_file
 from labapp.gui.shell.messages import PROBLEM
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm
 from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.simulation.parallel import Progress, low_priority
 
 if TYPE_CHECKING:
@@ -98,27 +90,13 @@ class ToolWindow(QDialog):
 
     def _lay_out(self) -> None:
         column = QWidget()
-        high = QVBoxLayout(column)
-        high.setContentsMargins(0, 0, 8, 0)
-        high.addWidget(self.form)
-        high.addStretch(1)
-        side = QScrollArea()
-        side.setWidget(column)
-        side.setWidgetResizable(True)
-        side.setFrameShape(QFrame.Shape.NoFrame)
+        vbox(self.form, 1, of=column).setContentsMargins(0, 0, 8, 0)
+        side = scrolled(column)
         side.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         side.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         side.setFixedWidth(FORM_PX + side.verticalScrollBar().sizeHint().width())
-        middle = QHBoxLayout()
-        middle.addWidget(side)
-        middle.addLayout(self.results, 1)
-        state = QHBoxLayout()
-        state.addWidget(self.message, 1)
-        state.addWidget(self.bar)
-        layout = QVBoxLayout(self)
-        layout.addLayout(middle, 1)
-        layout.addLayout(state)
-        layout.addLayout(self.buttons)
+        middle = hbox(side, (self.results, 1))
+        fill(QVBoxLayout(self), (middle, 1), hbox((self.message, 1), self.bar), self.buttons)
         self.buttons.insertStretch(0, 1)
 
     def add_button(self, words: str, tip: str, do: Callable[[], object]) -> QPushButton:
@@ -126,6 +104,10 @@ class ToolWindow(QDialog):
         made = button(words, tip, do)
         self.buttons.insertWidget(0, made)
         return made
+
+    def add_save_button(self, words: str, tip: str) -> None:
+        """Put the button that writes `files` to a folder."""
+        self.save_button = self.add_button(words, tip, self.choose_folder)
 
     def add_to_form(self, words: str, tip: str, do: Callable[[], object]) -> None:
         """Put a button below the fields that are there."""
@@ -211,6 +193,11 @@ class ToolWindow(QDialog):
         for task in self.tasks.active:
             task.cancel()
         self._show_progress()
+
+    def choose_folder(self) -> None:
+        """Ask where to write what was found."""
+        if folder := ask_folder(self, f"{self.title}: save in", self.workspace.folder):
+            self.save(folder)
 
     def save(self, folder: Path) -> None:
         """Write what was found, as the command does; each file is whole."""

@@ -1,4 +1,4 @@
-"""Plots whose numbers are in the unit of the axis' label: no SI prefix scales them."""
+"""Plots whose numbers are in the unit of the axis' label, and drawings to scale made of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from typing import Any
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
+
+from labapp.core.values import FloatArray
+from labapp.gui.views.canvas import Drawn
+from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.layouts import hbox, vbox
 
 
 class PlainAxis(pg.AxisItem):  # type: ignore[misc]
@@ -52,3 +57,43 @@ def paint_axes(plot: pg.PlotWidget | pg.PlotItem, lines: QColor, text: QColor) -
         axis = plot.getAxis(side)
         axis.setPen(lines)
         axis.setTextPen(text)  # after the pen, which would colour the label too
+
+
+class Sketch(Drawn):
+    """A drawing to scale with words below it; they stand in the middle where nothing is drawn."""
+
+    def __init__(self, name: str, *plots: tuple[pg.PlotWidget, int]) -> None:
+        super().__init__(name)
+        self._plots = [plot for plot, _ in plots]
+        self.words = wrapping_label()
+        self.words.setMargin(6)
+        self._column = vbox(hbox(*plots), self.words, of=self)
+        self._column.setSpacing(0)
+
+    def say(self, words: str, drawn: bool) -> None:
+        """Show words, which a screen reader says, too, below the drawing or in its place."""
+        self.words.setText(words)
+        self.describe(words)
+        for plot in self._plots:
+            plot.setVisible(drawn)
+        for place, wide in enumerate((drawn, not drawn)):
+            self._column.setStretch(place, int(wide))
+        center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft
+        self.words.setAlignment(left if drawn else center)
+
+
+def draw_line(
+    plot: pg.PlotWidget, points: FloatArray, pen: object, **symbol: object
+) -> pg.PlotDataItem:
+    """Join points, shape (n, 2), in a plot; NaN breaks the line."""
+    return plot.plot(points[:, 0], points[:, 1], pen=pen, connect="finite", **symbol)
+
+
+def draw_text(
+    plot: pg.PlotWidget, words: str, place: FloatArray, color: QColor, anchor: tuple[float, float]
+) -> None:
+    """Put words at a place, shape (2,), above all else."""
+    item = pg.TextItem(words, color=color, anchor=anchor)
+    item.setZValue(10)
+    item.setPos(float(place[0]), float(place[1]))
+    plot.addItem(item, ignoreBounds=True)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QEvent, Qt
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor, QPalette
-from PySide6.QtWidgets import QHBoxLayout, QVBoxLayout
 
 from labapp.core.values import FloatArray
-from labapp.gui.views.axes import make_plot, paint_axes
-from labapp.gui.views.canvas import Drawn
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
@@ -21,40 +18,23 @@ TORCH_MM, SHOULDER_MM = 14.0, 3.5
 """How far up the torch is drawn, and the radius of its electrode."""
 
 
-class BenchView(Drawn):
+class BenchView(Sketch):
     """Side view of the bench along −X: Y to the right, Z up, mm.
 
     The fates of the rays differ by line as well as by colour: solid, dashed, dotted.
     """
 
     def __init__(self) -> None:
-        super().__init__("Side view of the bench")
         self._view: SideView | None = None
-        self.words = wrapping_label()
-        self.words.setMargin(6)
         self.whole = make_plot("Y, welding direction, mm", "Z, mm")
         self.near = make_plot("enlarged, mm")
-        self._column = layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.setSpacing(0)
-        plots = QHBoxLayout()
-        plots.addWidget(self.whole, 3)
-        plots.addWidget(self.near, 2)
-        layout.addLayout(plots, 1)
-        layout.addWidget(self.words)
-        self._paint()
+        super().__init__("Side view of the bench", (self.whole, 3), (self.near, 2))
+        self.follow_theme()
 
     def show_bench(self, view: SideView | None, words: str) -> None:
         """Draw a bench, or none; the words stand below and are what a screen reader says."""
         former, self._view = self._view, view
-        self.words.setText(words)
-        self.describe(words)
-        for plot in (self.whole, self.near):
-            plot.setVisible(view is not None)
-        for place, wide in enumerate((view is not None, view is None)):
-            self._column.setStretch(place, int(wide))  # alone, the words stand in the middle
-        center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft
-        self.words.setAlignment(center if view is None else left)
+        self.say(words, view is not None)
         self._draw()
         if view is not None and (former is None or _extent(view) != _extent(former)):
             self.fit()
@@ -67,13 +47,8 @@ class BenchView(Drawn):
             left, right = _near(self._view)
             self.near.setRange(xRange=(-left, right), yRange=(-0.4 * right, right), padding=0)
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "near"):
-            self._paint()
-
-    def _paint(self) -> None:
+    def apply_theme(self) -> None:
+        """Draw in the window's colours."""
         palette = self.palette()
         self._ground = palette.color(QPalette.ColorRole.Base)
         self._ink = palette.color(QPalette.ColorRole.Text)
@@ -117,19 +92,19 @@ class BenchView(Drawn):
         for fate in (Fate.UNUSED, Fate.PAST, Fate.CAUGHT, Fate.BLOCKED):
             paths = [ray.path_mm for ray in view.rays if ray.fate is fate]
             if paths:
-                _line(plot, _broken(paths), pens[fate])
+                draw_line(plot, _broken(paths), pens[fate])
         thick = pg.mkPen(self._ink, width=2.5)
-        _line(plot, view.plane_mm, pg.mkPen(self._ink, width=4))
+        draw_line(plot, view.plane_mm, pg.mkPen(self._ink, width=4))
         left, right, _ = _extent(view)
         half = view.pool_mm[-1, 0]
         for start, end in ((left, -half), (half, right)):
-            _line(plot, np.array([[start, 0.0], [end, 0.0]]), thick)
-        _line(plot, view.pool_mm, pg.mkPen(RED[self._dark], width=3.5))
+            draw_line(plot, np.array([[start, 0.0], [end, 0.0]]), thick)
+        draw_line(plot, view.pool_mm, pg.mkPen(RED[self._dark], width=3.5))
         tip = view.tip_mm[1]
         shoulder = tip + 1.6 * SHOULDER_MM
         y = SHOULDER_MM * np.array([-1, -1, 0, 1, 1])
         z = np.array([tip + TORCH_MM, shoulder, tip, shoulder, tip + TORCH_MM])
-        torch = _line(plot, np.stack([y, z], axis=-1), thick)
+        torch = draw_line(plot, np.stack([y, z], axis=-1), thick)
         torch.setFillLevel(tip + TORCH_MM)
         torch.setBrush(self._faint(0.2))
         torch.setZValue(5)
@@ -139,10 +114,10 @@ class BenchView(Drawn):
     def _draw_labels(self, view: SideView) -> None:
         """Names, and L1 and L2 as measured lengths under the work piece."""
         torch = view.tip_mm + np.array([0.0, TORCH_MM])
-        self._text(self.whole, "torch", torch, (0.5, 1.0))
-        self._text(self.whole, "laser", view.laser_mm, (0.5, 1.5))
+        draw_text(self.whole, "torch", torch, self._ink, (0.5, 1.0))
+        draw_text(self.whole, "laser", view.laser_mm, self._ink, (0.5, 1.5))
         top = np.minimum(view.plane_mm[1], [np.inf, _extent(view)[2]])
-        self._text(self.whole, "imaging plane", top, (-0.1, 0.0))
+        draw_text(self.whole, "imaging plane", top, self._ink, (-0.1, 0.0))
         left, right = _near(view)
         lengths = (
             ("L1", -view.clearance.l1_mm, -left / 2),
@@ -154,23 +129,9 @@ class BenchView(Drawn):
                 continue
             ends = np.array([[0.0, level], [length, level]])
             pen = pg.mkPen(self._ink, width=1.2)
-            _line(self.near, ends, pen, symbol="|", symbolSize=10, symbolPen=pen)
+            draw_line(self.near, ends, pen, symbol="|", symbolSize=10, symbolPen=pen)
             words = f"{name}\n{abs(length):.1f} mm"
-            self._text(self.near, words, np.array([middle, level]), (0.5, 0.0))
-
-    def _text(
-        self, plot: pg.PlotWidget, words: str, place: FloatArray, anchor: tuple[float, float]
-    ) -> None:
-        item = pg.TextItem(words, color=self._ink, anchor=anchor)
-        item.setZValue(10)
-        item.setPos(float(place[0]), float(place[1]))
-        plot.addItem(item, ignoreBounds=True)
-
-
-def _line(
-    plot: pg.PlotWidget, points: FloatArray, pen: object, **symbol: object
-) -> pg.PlotDataItem:
-    return plot.plot(points[:, 0], points[:, 1], pen=pen, connect="finite", **symbol)
+            draw_text(self.near, words, np.array([middle, level]), self._ink, (0.5, 0.0))
 
 
 def _near(view: SideView) -> tuple[float, float]:

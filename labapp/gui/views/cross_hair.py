@@ -4,50 +4,33 @@ from __future__ import annotations
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QEvent, Qt
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QPalette
-from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
-from labapp.gui.views.axes import make_plot, paint_axes
-from labapp.gui.views.canvas import Drawn
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes
 
 
-class CrossHairView(Drawn):
+class CrossHairView(Sketch):
     """Diode, beam, the fan's two edges, and l₁ and l₂ on the work piece; mm."""
 
     def __init__(self) -> None:
-        super().__init__("Drawing of the laser and its cross hair")
         self.plot = make_plot("Y, mm", "Z, mm")
-        self.words = wrapping_label()
-        self.words.setMargin(6)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.plot, 1)
-        layout.addWidget(self.words)
+        super().__init__("Drawing of the laser and its cross hair", (self.plot, 1))
         self._shown: tuple[LaserCalibration | None, float, float] = (None, 0.0, 0.0)
-        self.show_laser(None, 0.0, 0.0, "")
+        self.say("", False)
+        self.follow_theme()
 
     def show_laser(
         self, found: LaserCalibration | None, l1_mm: float, l2_mm: float, words: str
     ) -> None:
         """Draw a laser and the lengths that were read, or say in words why there is none."""
         self._shown = (found, l1_mm, l2_mm)
-        self.words.setText(words)
-        self.describe(words)
-        self.plot.setVisible(found is not None)
-        center, left = Qt.AlignmentFlag.AlignCenter, Qt.AlignmentFlag.AlignLeft
-        self.words.setAlignment(center if found is None else left)
-        self._draw()
+        self.say(words, found is not None)
+        self.apply_theme()
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_shown"):
-            self._draw()
-
-    def _draw(self) -> None:
+    def apply_theme(self) -> None:
+        """Draw in the window's colours."""
         ground = self.palette().color(QPalette.ColorRole.Base)
         ink = self.palette().color(QPalette.ColorRole.Text)
         beam = "#ff6b5e" if ground.lightness() < 128 else "#c62828"
@@ -70,7 +53,8 @@ class CrossHairView(Drawn):
         level = -0.06 * max(right + l2, diode[1])
         # Away from each other: a small window brings their middles together.
         for name, end, anchor in (("l₁", l1, (-0.05, 0.0)), ("l₂", -l2, (1.05, 0.0))):
-            self._line([[0.0, level], [end, level]], pg.mkPen(ink, width=1.2), symbol="|")
+            pen = pg.mkPen(ink, width=1.2)
+            self._line([[0.0, level], [end, level]], pen, symbol="|", symbolPen=pen)
             self._text(f"{name} {abs(end):.2f} mm", (0.0, level), anchor)
         self.plot.plot(*diode[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=ink)
         self._text("laser", diode, (0.5, 1.4))
@@ -80,13 +64,8 @@ class CrossHairView(Drawn):
         self.plot.setRange(xRange=(-l2 - 4, right), yRange=(2 * level, diode[1] * 1.15))
 
     def _line(self, points: object, pen: object, **symbol: object) -> None:
-        ends = np.array(points, float)
-        if symbol:
-            symbol["symbolPen"] = pen
-        self.plot.plot(ends[:, 0], ends[:, 1], pen=pen, **symbol)
+        draw_line(self.plot, np.array(points, float), pen, **symbol)
 
     def _text(self, words: str, place: object, anchor: tuple[float, float]) -> None:
-        item = pg.TextItem(words, color=self.palette().color(QPalette.ColorRole.Text))
-        item.setAnchor(anchor)
-        item.setPos(*np.asarray(place, float))
-        self.plot.addItem(item, ignoreBounds=True)
+        color = self.palette().color(QPalette.ColorRole.Text)
+        draw_text(self.plot, words, np.asarray(place, float), color, anchor)

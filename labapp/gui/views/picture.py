@@ -128,7 +128,7 @@ class PictureView(Drawn):
         self.canvas.scene().sigMouseMoved.connect(self._moved)
         self.box.sigRangeChangedManually.connect(lambda *_: self._stop_fitting())
         self.box.sigResized.connect(lambda *_: self._refit())
-        self._paint()
+        self.follow_theme()
 
     # --- the picture --------------------------------------------------------------------------
 
@@ -273,14 +273,9 @@ class PictureView(Drawn):
         self._place.setText("" if level is None else f"u {u:.1f}, v {v:.1f} px, level {level:g}")
         self.pointed.emit(u, v, level)
 
-    def _paint(self) -> None:
+    def apply_theme(self) -> None:
+        """Take the ground from the window's."""
         self.canvas.setBackground(self.palette().color(QPalette.ColorRole.Window).darker(120))
-
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "canvas"):
-            self._paint()
 
     def event(self, event: QEvent) -> bool:
         """Keep keys that the tool or a point takes from the window's shortcuts."""

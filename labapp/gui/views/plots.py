@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QEvent, QPointF, Qt, Signal
+from PySide6.QtCore import QPointF, Qt, Signal
 from PySide6.QtGui import (
     QAction,
     QColor,
@@ -21,7 +21,7 @@ from PySide6.QtGui import (
     QKeySequence,
     QPalette,
 )
-from PySide6.QtWidgets import QFrame, QGraphicsItem, QScrollArea, QSizePolicy, QVBoxLayout
+from PySide6.QtWidgets import QGraphicsItem, QSizePolicy, QVBoxLayout
 
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_text
@@ -29,6 +29,7 @@ from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.widgets.labels import plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import fill, scrolled
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
@@ -73,11 +74,7 @@ class PlotStack(Plotted):
         self.canvas = pg.GraphicsLayoutWidget()
         self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         self.canvas.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
-        area = QScrollArea()
-        area.setWidget(self.canvas)
-        area.setWidgetResizable(True)
-        area.setFrameShape(QFrame.Shape.NoFrame)
-        area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+        area = scrolled(self.canvas)
         area.setMinimumSize(240, 110)
         self.legend = wrapping_label()
         self.legend.setContentsMargins(8, 0, 8, 0)
@@ -88,13 +85,12 @@ class PlotStack(Plotted):
         layout = QVBoxLayout(self)
         layout.setContentsMargins(1, 1, 1, 1)
         layout.setSpacing(2)
-        layout.addWidget(area, 1)
-        layout.addWidget(self.legend)
-        layout.addWidget(self.read_out)
+        fill(layout, (area, 1), self.legend, self.read_out)
         scene = self.canvas.scene()
         scene.sigMouseClicked.connect(self._clicked)
         scene.sigMouseMoved.connect(self._moved)
         self._add_actions()
+        self.follow_theme()
 
     # --- what it shows ------------------------------------------------------------------------
 
@@ -189,9 +185,10 @@ class PlotStack(Plotted):
         self.canvas.setMinimumHeight(LEAST_HEIGHT * len(self._plots) + 40)
         lines = 2 if sum(len(curve.key) > 0 for curve in self.curves) > 1 else 1
         self.read_out.setFixedHeight(lines * self.fontMetrics().lineSpacing() + 6)
-        self._paint()
+        self.apply_theme()
 
-    def _paint(self) -> None:
+    def apply_theme(self) -> None:
+        """Draw in the window's colours."""
         look = self.palette()
         self.canvas.setBackground(look.color(Role.Base))
         for plot, curve in zip(self._plots, self.curves, strict=True):
@@ -267,12 +264,6 @@ class PlotStack(Plotted):
             self.fit()
         else:
             super().keyPressEvent(event)
-
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "canvas"):
-            self._paint()
 
 
 class _Plot(pg.PlotItem):  # type: ignore[misc]

@@ -43,8 +43,7 @@ class Steering(QObject):
         self._held: deque[SixAxes] = deque([SixAxes()], maxlen=1)
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._ticked_s = 0.0
-        self._timer = QTimer(self)
-        self._timer.setInterval(TICK_MS)
+        self._timer = QTimer(self, interval=TICK_MS)
         self._timer.timeout.connect(self._tick)
 
     def start(self) -> None:

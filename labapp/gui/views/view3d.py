@@ -105,6 +105,7 @@ class View3d(Drawn):
         self._scene: Scene | None = None
         self._drawing: Drawing | None = None
         self._wanted: Camera | Direction | None = None
+        self.follow_theme()
 
     # --- what is shown -----------------------------------------------------------------------
 
@@ -280,10 +281,9 @@ class View3d(Drawn):
         else:
             super().keyPressEvent(event)
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow the window from light to dark."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and self._scene is not None:
+    def apply_theme(self) -> None:
+        """Draw in the window's colours."""
+        if self._scene is not None:
             self.show_scene(self._scene)
 
     def _paint_words(self, painter: QPainter, words: str) -> None:
@@ -368,9 +368,7 @@ class InteractiveView(View3d):
         super().__init__(name)
         self._layout = QVBoxLayout(self)
         self._layout.setContentsMargins(1, 1, 1, 1)
-        self._late = QTimer(self)
-        self._late.setSingleShot(True)
-        self._late.setInterval(0)
+        self._late = QTimer(self, singleShot=True, interval=0)
         self._late.timeout.connect(self._render)
 
     def _new_plotter(self) -> Any:

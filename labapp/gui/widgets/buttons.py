@@ -1,10 +1,10 @@
-"""Buttons, and rows of them."""
+"""Buttons, and boxes to tick."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from PySide6.QtWidgets import QHBoxLayout, QPushButton
+from PySide6.QtWidgets import QCheckBox, QPushButton
 
 
 def button(text: str, tip: str, work: Callable[[], object]) -> QPushButton:
@@ -16,10 +16,9 @@ def button(text: str, tip: str, work: Callable[[], object]) -> QPushButton:
     return button
 
 
-def button_row(*buttons: QPushButton) -> QHBoxLayout:
-    """Buttons beside each other."""
-    row = QHBoxLayout()
-    row.setContentsMargins(0, 0, 0, 0)
-    for each in buttons:
-        row.addWidget(each)
-    return row
+def check_box(text: str, tip: str, toggled: Callable[[bool], object]) -> QCheckBox:
+    """A box to tick, which calls ``toggled`` with whether it is ticked."""
+    box = QCheckBox(text)
+    box.setToolTip(tip)
+    box.toggled.connect(toggled)
+    return box

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from PySide6.QtWidgets import QFormLayout, QProgressBar, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QFormLayout, QProgressBar
 
 from labapp.core.images.exposure import Exposure
-from labapp.gui.widgets.labels import Message, headed, plain_tip
+from labapp.gui.widgets.labels import Message, plain_tip
+from labapp.gui.widgets.layouts import Group
 
 
 @dataclass(frozen=True)
@@ -32,15 +33,10 @@ class ExposureBar:
     tip: str
 
 
-class ExposureBars(QWidget):
+class ExposureBars(Group):
     """Exposure, saturation and contrast of the frame in view, and a verdict in words."""
 
     def __init__(self) -> None:
-        super().__init__()
-        outer = QVBoxLayout(self)
-        outer.setContentsMargins(0, 0, 0, 0)
-        inner, layout = headed("Exposure of the frame in view")
-        outer.addWidget(inner)
         form = QFormLayout()
         self.bars = []
         for name in ("Exposure", "Saturation", "Contrast"):
@@ -48,9 +44,8 @@ class ExposureBars(QWidget):
             bar.setRange(0, 100)
             self.bars.append(bar)
             form.addRow(f"{name}:", bar)
-        layout.addLayout(form)
         self.verdict = Message(3)
-        layout.addWidget(self.verdict)
+        super().__init__("Exposure of the frame in view", form, self.verdict)
 
     def show_exposure(self, exposure: Exposure, verdict: str, good: bool) -> None:
         """Show how a frame is exposed, and what to do about it."""

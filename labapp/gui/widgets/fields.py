@@ -11,14 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from PySide6.QtCore import QEvent, QObject, QSignalBlocker, Qt, QTimer, Signal
-from PySide6.QtGui import (
-    QFocusEvent,
-    QGuiApplication,
-    QKeyEvent,
-    QPalette,
-    QValidator,
-    QWheelEvent,
-)
+from PySide6.QtGui import QFocusEvent, QGuiApplication, QKeyEvent, QPalette, QValidator, QWheelEvent
 from PySide6.QtWidgets import (
     QAbstractSpinBox,
     QComboBox,
@@ -167,9 +160,7 @@ class NumberField(Field):
         self._box.line.textEdited.connect(self._note_typing)
         self._box.stepped.connect(self._step)
         self._box.editingFinished.connect(self._commit)
-        self._pause = QTimer(self)
-        self._pause.setSingleShot(True)
-        self._pause.setInterval(STEP_PAUSE_MS)
+        self._pause = QTimer(self, singleShot=True, interval=STEP_PAUSE_MS)
         self._pause.timeout.connect(self._emit_change)
 
     def value(self) -> float | None:
@@ -307,30 +298,20 @@ class TextField(Field):
         )
         super().__init__(label, self._edit, tooltip)
         self._emitted = ""
-        if isinstance(self._edit, QLineEdit):
-            self._edit.editingFinished.connect(self.flush)
-        else:
-            self._edit.finished.connect(self.flush)
+        self._edit.editingFinished.connect(self.flush)
 
     def value(self) -> str:
         """The words."""
-        edit = self._edit
-        return edit.text() if isinstance(edit, QLineEdit) else edit.toPlainText()
+        return self._edit.text()
 
     def set_value(self, value: str) -> None:
         """Show another text; emits no signal, and leaves alone what is being typed."""
-        edit = self._edit
-        modified = edit if isinstance(edit, QLineEdit) else edit.document()
-        typing = modified.isModified() and self.value() != self._emitted
+        typing = self._edit.isModified() and self.value() != self._emitted
         if value != self._emitted:
             self.refuse("")
         self._emitted = value
-        if typing or value == self.value():
-            return
-        if isinstance(self._edit, QLineEdit):
+        if not typing and value != self.value():
             self._edit.setText(value)
-        else:
-            self._edit.setPlainText(value)
 
     def flush(self) -> None:
         """Finish an edit under way, as leaving the field does."""
@@ -349,23 +330,32 @@ class TextField(Field):
 
 
 class _Paragraphs(QPlainTextEdit):
-    """Several lines, left with Tab."""
+    """Several lines, left with Tab; to a field it is as a `QLineEdit`."""
 
-    finished = Signal()
+    editingFinished = Signal()  # noqa: N815  # Qt's name
 
     def __init__(self, lines: int) -> None:
         super().__init__()
         self.setTabChangesFocus(True)
         self.setFixedHeight(self.fontMetrics().lineSpacing() * lines + 14)
 
+    def text(self) -> str:
+        return self.toPlainText()
+
+    def setText(self, text: str) -> None:
+        self.setPlainText(text)
+
+    def isModified(self) -> bool:
+        return self.document().isModified()
+
     def focusOutEvent(self, event: QFocusEvent) -> None:
         super().focusOutEvent(event)
-        self.finished.emit()
+        self.editingFinished.emit()
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         enter = event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter)
         if enter and event.modifiers() & Qt.KeyboardModifier.ControlModifier:
-            self.finished.emit()
+            self.editingFinished.emit()
         else:
             super().keyPressEvent(event)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from PySide6 import QtGui
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QPainter, QPaintEvent, QResizeEvent, QTextLayout, QTextOption
-from PySide6.QtWidgets import QLabel, QSizePolicy, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
 
 
 def plain_label(text: str = "", parent: QWidget | None = None) -> QLabel:
@@ -36,15 +36,6 @@ def heading(text: str) -> QLabel:
     font.setBold(True)
     label.setFont(font)
     return label
-
-
-def headed(text: str) -> tuple[QWidget, QVBoxLayout]:
-    """A group of widgets under a heading, and its layout."""
-    group = QWidget()
-    layout = QVBoxLayout(group)
-    layout.setContentsMargins(0, 6, 0, 0)
-    layout.addWidget(heading(text))
-    return group, layout
 
 
 def selectable_label(text: str = "") -> QLabel:

@@ -22,13 +22,7 @@ from PySide6.QtGui import (
     QResizeEvent,
     QWheelEvent,
 )
-from PySide6.QtWidgets import (
-    QAbstractSlider,
-    QSizePolicy,
-    QStyle,
-    QStyleOptionFocusRect,
-    QToolTip,
-)
+from PySide6.QtWidgets import QAbstractSlider, QSizePolicy, QStyle, QStyleOptionFocusRect, QToolTip
 
 GAP_FROM_PX = 4
 """Ticks at least this wide stand apart."""

@@ -119,7 +119,7 @@ def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
 def made(workspace: Workspace) -> CapturePage:
     page = CapturePage(workspace)
     KEPT.extend((workspace, page))
-    workspace.changed.connect(page.refresh)
+    workspace.changed.connect(lambda: page.refresh() if workspace.session else None)
     workspace.frame_changed.connect(page.refresh)
     for widget in (page, page.panel):
         widget.resize(800, 600)

@@ -35,7 +35,7 @@ def page(qtbot: QtBot) -> Iterator[DotsPage]:
     """The page with its panel beside it, and the signals as the window connects them."""
     space = Workspace()
     page = DotsPage(space)
-    space.changed.connect(page.refresh)
+    space.changed.connect(lambda: page.refresh() if space.session else None)
     space.frame_changed.connect(lambda _: page.refresh())
     beside = QWidget()
     layout = QHBoxLayout(beside)
@@ -273,7 +273,7 @@ def test_an_unmeasured_frame_shows_what_is_found_in_it(
     assert origin(page) == "measured"
     count = len(page.editor.dots_px)
     # Other settings: the dots are found anew, in the background, and the fewer are shown.
-    page.dots_panel.number_given.emit(1, 40.0)
+    page.dots_panel.numbers[1].edited.emit(40.0)
     assert session.settings.dots.band_pass.threshold == 40
     qtbot.waitUntil(lambda: page.editor.correction is not None)
     assert origin(page) == "found"
@@ -392,7 +392,7 @@ def test_a_refused_edit_says_why_and_changes_nothing(
     lattice = page.editor.correction.lattice if page.editor.correction else None
     assert lattice is not None
     page.editor.choose_rows([4])
-    page.dots_panel.row_given.emit(5)  # where other dots are
+    page.dots_panel.row.edited.emit(5)  # where other dots are
     assert [problem for _, problem in said] == [True] * 6
     assert "no dot is chosen" in said[0][0]
     assert "and cannot be that of" in said[-1][0]

@@ -118,7 +118,7 @@ def page(qtbot: QtBot, gtaw: Path) -> ExportPage:
     workspace.show(Session.open(gtaw))
     page = ExportPage(workspace)
     KEPT.extend((workspace, page))
-    workspace.changed.connect(page.refresh)
+    workspace.changed.connect(lambda: page.refresh() if workspace.session else None)
     workspace.frame_changed.connect(page.refresh)
     page.refresh()
     for widget in (page, page.panel):

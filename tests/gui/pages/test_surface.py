@@ -49,7 +49,7 @@ def page(qapp: QApplication, copy_sample: CopySample) -> SurfacePage:
     whole.resize(1180, 560)
     whole.setSizes([880, 300])
     KEPT.append(whole)
-    workspace.changed.connect(made.refresh)
+    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
     workspace.frame_changed.connect(lambda _: made.refresh())
     workspace.show(Session.open(copy_sample("gtaw")))
     whole.show()

@@ -100,7 +100,7 @@ def page(qtbot: QtBot, gtaw: Path) -> TrendsPage:
     workspace.show(Session.open(gtaw))
     page = TrendsPage(workspace)
     KEPT.extend((workspace, page))
-    workspace.changed.connect(page.refresh)
+    workspace.changed.connect(lambda: page.refresh() if workspace.session else None)
     workspace.frame_changed.connect(page.refresh)
     for widget in (page, page.panel):
         widget.resize(800, 600)

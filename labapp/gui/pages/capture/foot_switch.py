@@ -6,12 +6,13 @@ from functools import partial
 from typing import cast
 
 from PySide6.QtGui import QGuiApplication, QTextOption
-from PySide6.QtWidgets import QLabel, QPlainTextEdit, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QLabel, QPlainTextEdit, QWidget
 
 from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import headed, selectable_label
+from labapp.gui.widgets.labels import selectable_label
+from labapp.gui.widgets.layouts import Group, fill, hbox, vbox
 from labapp.media.devices.foot_switch import Action
 from labapp.media.devices.hid import commands
 
@@ -27,22 +28,15 @@ LINES = 5
 LISTENING = "Step on the pedal that is to be used …"
 
 
-class FootSwitchPanel(QWidget):
+class FootSwitchPanel(Group):
     """Shows and sets the foot switches of a window."""
 
     def __init__(self, switches: FootSwitches) -> None:
-        super().__init__()
+        super().__init__("Foot switch")
         self.switches = switches
-        self._shown: object = None
-        outer = QVBoxLayout(self)
-        outer.setContentsMargins(0, 0, 0, 0)
-        group, self._layout = headed("Foot switch")
-        outer.addWidget(group)
-        self.words = selectable_label()
+        self.words, self.learned_words = selectable_label(), selectable_label()
         self.rows = QWidget()
         self.pedals: dict[tuple[str, int], ChoiceField] = {}
-        self._layout.addWidget(self.words)
-        self._layout.addWidget(self.rows)
         self._make_learning()
         self._make_rights()
         switches.changed.connect(self.refresh)
@@ -55,34 +49,28 @@ class FootSwitchPanel(QWidget):
         self.look_button = button(
             "Look for devices", "See which foot switches are plugged in", self.switches.look
         )
-        # Above the words, which need more or less room.
-        self._layout.insertLayout(1, button_row(self.learn_button, self.look_button))
-        self.learned_words = selectable_label()
-        self._layout.addWidget(self.learned_words)
-        self.learned = QWidget()
-        inner = QVBoxLayout(self.learned)
-        inner.setContentsMargins(0, 0, 0, 0)
         form = FieldForm()
         self.action = ChoiceField(
             "It is to", list(DOES.items()), tooltip="What stepping on this pedal does from now on"
         )
         form.add(self.action)
-        inner.addWidget(form)
         self.use_button = button("Use it", "Use the pedal so, now and after each start", self._use)
         leave = button("Not this one", "Leave this pedal as it is", self.switches.give_up)
-        inner.addLayout(button_row(self.use_button, leave))
-        self._layout.addWidget(self.learned)
+        self.learned = QWidget()
+        vbox(form, hbox(self.use_button, leave), of=self.learned)
+        # The buttons stand above the words, which need more or less room.
+        fill(
+            self.column,
+            *(hbox(self.learn_button, self.look_button), self.words, self.rows),
+            *(self.learned_words, self.learned),
+        )
 
     def _make_rights(self) -> None:
-        self.rights = QWidget()
-        inner = QVBoxLayout(self.rights)
-        inner.setContentsMargins(0, 0, 0, 0)
         form = FieldForm()
         self.closed = ChoiceField(
             "May not be read", tooltip="Devices that the system keeps from you: choose yours"
         )
         form.add(self.closed)
-        inner.addWidget(form)
         self.commands = QPlainTextEdit()
         self.commands.setReadOnly(True)
         self.commands.setTabChangesFocus(True)
@@ -92,16 +80,16 @@ class FootSwitchPanel(QWidget):
         self.commands.setToolTip(
             "Type them in a terminal, then unplug the device and plug it in again"
         )
-        inner.addWidget(self.commands)
         self.copy_button = button(
             "Copy the commands",
             "Copy what installs the rule that lets you read it, for a terminal",
             self._copy,
         )
-        inner.addWidget(self.copy_button)
         self.closed.edited.connect(lambda _: self._show_commands())
-        inner.addWidget(selectable_label("Then unplug it and plug it in again."))
-        self._layout.addWidget(self.rights)
+        then = selectable_label("Then unplug it and plug it in again.")
+        self.rights = QWidget()
+        vbox(form, self.commands, self.copy_button, then, of=self.rights)
+        self.column.addWidget(self.rights)
 
     # --- what is shown ------------------------------------------------------------------------
 
@@ -149,7 +137,7 @@ class FootSwitchPanel(QWidget):
                 )
                 field.edited.connect(partial(self._assign, key, pedal))
                 form.add(field)
-            self._layout.replaceWidget(former, form)
+            self.column.replaceWidget(former, form)
             self.rows = form
             former.hide()  # it is deleted only later
             former.deleteLater()

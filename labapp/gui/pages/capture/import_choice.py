@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from PySide6.QtCore import Signal
-from PySide6.QtWidgets import QCheckBox, QVBoxLayout, QWidget
 
 from labapp.gui.pages.capture.presenter import Choice, Preview, choice_text, refusal
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button, check_box
 from labapp.gui.widgets.fields import FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import Message, headed, plain_tip, selectable_label
+from labapp.gui.widgets.labels import Message, plain_tip, selectable_label
+from labapp.gui.widgets.layouts import Group, fill, hbox
 from labapp.session.session import Session
 
 MOST_HZ = 1e7
@@ -27,7 +27,7 @@ NEXT_TIP = (
 )
 
 
-class ImportChoice(QWidget):
+class ImportChoice(Group):
     """Which frames to import; seen while a recording is looked at.
 
     Parameters
@@ -49,31 +49,24 @@ class ImportChoice(QWidget):
         begin_next: Callable[[], object],
         leave: Callable[[], object],
     ) -> None:
-        super().__init__()
-        outer = QVBoxLayout(self)
-        outer.setContentsMargins(0, 0, 0, 0)
-        group, layout = headed("To be imported")
-        outer.addWidget(group)
-        self.source_words = selectable_label()
-        layout.addWidget(self.source_words)
-        layout.addWidget(self._form())
-        self.embed = QCheckBox("Keep the frames in the session")
-        self.embed.setToolTip(
+        super().__init__("To be imported")
+        self.source_words, self.replace_words = selectable_label(), selectable_label()
+        self.embed = check_box(
+            "Keep the frames in the session",
             "The session then needs no other file, and is about as large as the recording; "
-            "otherwise the recording stays where it is and must not be changed"
+            "otherwise the recording stays where it is and must not be changed",
+            lambda _: self.edited.emit(),
         )
-        self.embed.toggled.connect(lambda _: self.edited.emit())
-        layout.addWidget(self.embed)
         self.choice_words = Message(2)
-        layout.addWidget(self.choice_words)
         self.import_button = button("Import", "", do_import)
         self.import_button.setDefault(True)
         stop = button("Not this one", "Leave it, and see the session's frames", leave)
-        layout.addLayout(button_row(self.import_button, stop))
         self.next_button = button(NEXT, NEXT_TIP, begin_next)
-        layout.addWidget(self.next_button)
-        self.replace_words = selectable_label()
-        layout.addWidget(self.replace_words)
+        fill(
+            self.column,
+            *(self.source_words, self._form(), self.embed, self.choice_words),
+            *(hbox(self.import_button, stop), self.next_button, self.replace_words),
+        )
         self.hide()
 
     def _form(self) -> FieldForm:

@@ -5,41 +5,32 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from PySide6.QtWidgets import QVBoxLayout, QWidget
-
 from labapp.gui.pages.capture.import_choice import NEXT, NEXT_TIP
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import headed
+from labapp.gui.widgets.layouts import Group
 from labapp.media.recording.recorder import recordings_beside
 from labapp.media.recording.take_files import Take
 from labapp.session.file.database import SUFFIX
 from labapp.session.session import Session
 
 
-class KeptRecordings(QWidget):
+class KeptRecordings(Group):
     """Their list, seen where there are any."""
 
     def __init__(
         self, look: Callable[[Path], object], begin_next: Callable[[Path], object]
     ) -> None:
-        super().__init__()
-        outer = QVBoxLayout(self)
-        outer.setContentsMargins(0, 0, 0, 0)
-        group, layout = headed("Recorded besides")
-        outer.addWidget(group)
         form = FieldForm()
         self.choice = ChoiceField("Beside the session", tooltip="Recordings not in the session")
         form.add(self.choice)
-        layout.addWidget(form)
-        layout.addWidget(
-            button(
-                "Look at it",
-                "Show its frames, and choose which of them to import",
-                lambda: look(Path(self.choice.value())),
-            )
+        see = button(
+            "Look at it",
+            "Show its frames, and choose which of them to import",
+            lambda: look(Path(self.choice.value())),
         )
-        layout.addWidget(button(NEXT, NEXT_TIP, lambda: begin_next(Path(self.choice.value()))))
+        begin = button(NEXT, NEXT_TIP, lambda: begin_next(Path(self.choice.value())))
+        super().__init__("Recorded besides", form, see, begin)
         self.hide()
 
     def list_beside(self, session: Session, running: Take | None) -> None:

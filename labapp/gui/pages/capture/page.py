@@ -6,13 +6,9 @@ from pathlib import Path
 
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QKeyEvent
-from PySide6.QtWidgets import (
-    QFileDialog,
-    QGridLayout,
-    QSlider,
-)
+from PySide6.QtWidgets import QGridLayout, QSlider
 
-from labapp.gui.dialogs import EVERYTHING, recordings
+from labapp.gui.dialogs import ask_file, ask_folder, ask_recording
 from labapp.gui.live.camera_fields import calibrated_px, other_size
 from labapp.gui.live.view import LiveView
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
@@ -30,16 +26,10 @@ from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Mark, State
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.picture import PictureView
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.exposure import ExposureBars
-from labapp.gui.widgets.labels import (
-    Message,
-    headed,
-    keep_room,
-    plain_label,
-    selectable_label,
-    wrapping_label,
-)
+from labapp.gui.widgets.labels import keep_room, plain_label, selectable_label, wrapping_label
+from labapp.gui.widgets.layouts import Group, fill, hbox
 from labapp.gui.workspace import MISSING, Workspace
 from labapp.media.recording.take_files import Take
 from labapp.session.record import Recording
@@ -71,9 +61,7 @@ class CapturePage(Page):
         self._wanted: tuple[Preview | None, int] | None = None
         self._seen: tuple[Preview | None, int] | None = None
         self._told: object = None
-        self._rest = QTimer(self)
-        self._rest.setSingleShot(True)
-        self._rest.setInterval(REST_MS)
+        self._rest = QTimer(self, singleShot=True, interval=REST_MS)
         self._rest.timeout.connect(self._judge)
         self._last_folder = Path()
         self._listed: Session | None = None
@@ -85,14 +73,11 @@ class CapturePage(Page):
         self.slider.setAccessibleName("Frame of the preview")
         self.slider.setToolTip("Which frame of the recording to look at before importing it")
         self.slider.valueChanged.connect(lambda _: self._look())
-        self.canvas_layout.addWidget(self.title)
         self.exposure = ExposureBars()
-        self.live_view = LiveView(workspace, self.picture_view, self.exposure)
-        self.canvas_layout.addWidget(self.live_view.canvas, 1)
-        self.canvas_layout.addWidget(self.slider)
-        self.live_view.changed.connect(self._live_changed)
-        self.live_view.recorded.connect(self._recorded)
-        self.canvas_layout.addWidget(self.live_view.bar)
+        live = self.live_view = LiveView(workspace, self.picture_view, self.exposure)
+        live.changed.connect(self._live_changed)
+        live.recorded.connect(self._recorded)
+        fill(self.canvas_layout, self.title, (live.canvas, 1), self.slider, live.bar)
         self._make_panel()
         workspace.opened.connect(self._forget)
         workspace.tasks.changed.connect(self._show_import)
@@ -273,19 +258,13 @@ class CapturePage(Page):
 
     def choose_file(self) -> None:
         """Ask for a recording that is a file."""
-        name, _ = QFileDialog.getOpenFileName(
-            self, "Choose a recording", str(self._folder()), f"{recordings()};;{EVERYTHING}"
-        )
-        if name:
-            self.take(Path(name))
+        if path := ask_recording(self, self._folder()):
+            self.take(path)
 
     def choose_folder(self) -> None:
         """Ask for a recording that is a folder of images."""
-        name = QFileDialog.getExistingDirectory(
-            self, "Choose a folder of images", str(self._folder())
-        )
-        if name:
-            self.take(Path(name))
+        if path := ask_folder(self, "Choose a folder of images", self._folder()):
+            self.take(path)
 
     def _folder(self) -> Path:
         return self._last_folder if self._last_folder.name else self.workspace.folder
@@ -293,7 +272,6 @@ class CapturePage(Page):
     def take(self, path: Path) -> None:
         """Look at a recording, to import it."""
         self._last_folder = path.parent
-        self.refused.setText("")
         self.live_view.stop()
         if self._opening in self.workspace.tasks.active and self._opening is not None:
             self._opening.cancel()
@@ -315,7 +293,7 @@ class CapturePage(Page):
             f"Opening {path.name}",
             lambda _: Preview(path),
             opened,
-            on_failed=lambda why: self.refused.setText(f"▲ {path.name}: {why}"),
+            beside=self.refused.setText,
             kind="Opening a recording",
         )
 
@@ -325,11 +303,9 @@ class CapturePage(Page):
 
     def import_chosen(self) -> None:
         """Import what was chosen, in the background."""
-        session, preview, choice = self.workspace.session, self.preview, self.choice()
-        if session is None or preview is None or choice is None or not choice.count:
-            return
-
-        self._import(preview.path, choice.frames, choice.rate_hz, choice.embed)
+        preview, choice = self.preview, self.choice()
+        if preview is not None and choice is not None and choice.count:
+            self._import(preview.path, choice.frames, choice.rate_hz, choice.embed)
 
     def begin_next(self) -> None:
         """Import what was chosen into a new session, with this one's set-up."""
@@ -344,8 +320,7 @@ class CapturePage(Page):
             self._import(path, frames, rate_hz, embed)
 
     def _import(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
-        session = self.workspace.session
-        assert session is not None
+        session = self.session
 
         def work(control: Control) -> Recording:
             recording = session.import_recording(
@@ -355,8 +330,6 @@ class CapturePage(Page):
             return recording
 
         def done(recording: Recording) -> None:
-            if self.workspace.session is not session:
-                return
             self._drop_preview()
             frames = session.frames.tolist()
             if self.workspace.frame not in frames:
@@ -366,13 +339,8 @@ class CapturePage(Page):
             self.workspace.notified.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
             self.workspace.changed.emit()
 
-        def failed(why: str) -> None:
-            if self.workspace.session is session:
-                self.refused.setText(f"▲ {path.name} is not imported: {why}")
-
-        self.refused.setText("")
         self._importing = self.workspace.tasks.start(
-            f"Importing {path.name}", work, done, on_failed=failed, kind="Importing"
+            f"Importing {path.name}", work, done, beside=self.refused.setText, kind="Importing"
         )
         self._listed = None  # one of them may be the session's own then
         self._show_import()
@@ -390,7 +358,6 @@ class CapturePage(Page):
     def _forget(self) -> None:
         """Forget what was to be imported into the session before."""
         self._listed = None
-        self.refused.setText("")
         self._drop_preview()
 
     def cancel_choice(self) -> None:
@@ -401,80 +368,57 @@ class CapturePage(Page):
 
     def find_recording(self) -> None:
         """Ask where a missing recording is now."""
-        session = self.workspace.session
-        missing = None if session is None else session.missing_recording
-        if session is None or missing is None:
+        missing = self.session.missing_recording
+        if missing is None:
             return
         # A folder of images has no ending; files are chosen otherwise.
-        ask = QFileDialog.getOpenFileName if missing.suffix else QFileDialog.getExistingDirectory
-        found = ask(self, f"Where is {missing.name}?", str(self._folder()))
-        name = found[0] if isinstance(found, tuple) else found
-        if name:
-            self.relink(Path(name))
+        ask = ask_file if missing.suffix else ask_folder
+        if found := ask(self, f"Where is {missing.name}?", self._folder()):
+            self.relink(found)
 
     def relink(self, path: Path) -> None:
         """Say where the recording is now; another one is refused, in words."""
-        session = self.workspace.session
-        if session is None:
-            return
+        session = self.session
 
         def done(_: object) -> None:
-            if self.workspace.session is session:
-                self._seen = None
-                self.workspace.settle(MISSING)
-                self.workspace.notified.emit(f"The recording is found at {path}", False)
-                self.workspace.changed.emit()
+            self._seen = None
+            self.workspace.settle(MISSING)
+            self.workspace.notified.emit(f"The recording is found at {path}", False)
+            self.workspace.changed.emit()
 
-        def failed(why: str) -> None:
-            if self.workspace.session is session:
-                self.refused.setText(f"▲ {why}")
-
-        self.refused.setText("")
         self.workspace.tasks.start(
             f"Comparing {path.name}",
             lambda _: session.relink(path),
             done,
-            on_failed=failed,
+            beside=self.refused.setText,
             kind="Comparing",
         )
 
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        self.panel_layout.addLayout(
-            button_row(
-                button("Choose a file …", "A video, an image or a stack", self.choose_file),
-                button("Choose a folder …", "A folder of images in order", self.choose_folder),
-            )
+        choose = hbox(
+            button("Choose a file …", "A video, an image or a stack", self.choose_file),
+            button("Choose a folder …", "A folder of images in order", self.choose_folder),
         )
-        self.refused = Message(2)
-        self.panel_layout.addWidget(self.refused)
-        self.panel_layout.addWidget(self.live_view.group)
-        self._make_missing()
-        self.chosen = ImportChoice(self.import_chosen, self.begin_next, self.cancel_choice)
-        self.chosen.edited.connect(self._show_import)
-        self.panel_layout.addWidget(self.chosen)
-        self.exposure.hide()
-        keep_room(self.exposure)
-        self.panel_layout.addWidget(self.exposure)
-        self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
-        self.panel_layout.addWidget(self.foot_switch)
-        # Below the other buttons: it comes when a recording ends.
-        self.kept = KeptRecordings(
-            self.take, lambda path: self._import_next(path, ":", None, False)
-        )
-        self.panel_layout.addWidget(self.kept)
-        self.told_group, layout = headed("What was read")
-        self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
-        self.told.setColumnStretch(1, 1)
-        layout.addLayout(self.told)
-        self.panel_layout.addWidget(self.told_group)
-        self.panel_layout.addStretch(1)
-
-    def _make_missing(self) -> None:
         self.missing = selectable_label()
         self.find_button = button(
             "Say where it is …", "Find the recording in its new place", self.find_recording
         )
-        self.panel_layout.addWidget(self.missing)
-        self.panel_layout.addWidget(self.find_button)
+        self.chosen = ImportChoice(self.import_chosen, self.begin_next, self.cancel_choice)
+        self.chosen.edited.connect(self._show_import)
+        self.exposure.hide()
+        keep_room(self.exposure)
+        self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
+        # Below the other buttons: it comes when a recording ends.
+        self.kept = KeptRecordings(
+            self.take, lambda path: self._import_next(path, ":", None, False)
+        )
+        self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
+        self.told.setColumnStretch(1, 1)
+        self.told_group = Group("What was read", self.told)
+        fill(
+            self.panel_layout,
+            *(choose, self.refused, self.live_view.group, self.missing, self.find_button),
+            *(self.chosen, self.exposure, self.foot_switch, self.kept, self.told_group, 1),
+        )

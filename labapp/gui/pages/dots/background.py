@@ -44,9 +44,7 @@ class Looking(QObject):
         super().__init__()
         self._space = workspace
         self._task: Task | None = None
-        self._rest = QTimer(self)
-        self._rest.setSingleShot(True)
-        self._rest.setInterval(REST_MS)
+        self._rest = QTimer(self, singleShot=True, interval=REST_MS)
         self._rest.timeout.connect(self._look)
         self.forget()
         workspace.opened.connect(self.forget)

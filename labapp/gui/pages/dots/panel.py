@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt, Signal, SignalInstance
+from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import (
-    QGridLayout,
-    QHeaderView,
-    QSizePolicy,
-    QToolButton,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QGridLayout, QHeaderView, QSizePolicy, QToolButton, QWidget
 
 from labapp.core.pipeline import Settings
+from labapp.core.rows.lattice import Site
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import Message, heading, plain_label, wrapping_label
+from labapp.gui.widgets.layouts import vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
 
@@ -28,61 +23,28 @@ COLUMNS_OF_BUTTONS = 3
 
 
 class DotsPanel(QWidget):
-    """What stands beside the frame.
-
-    Signals
-    -------
-    rows_chosen
-        Rows were chosen in the list: their numbers, 0 for the dots in doubt.
-    row_given, column_given
-        The chosen dots are to have this row, this column.
-    reference_given
-        The reference is to be at this row and column.
-    method_chosen
-        Another detector is wanted.
-    number_given
-        A number of a detector: index in `presenter.NUMBERS`, value or None.
-    """
-
-    rows_chosen = Signal(list)
-    row_given = Signal(int)
-    column_given = Signal(int)
-    reference_given = Signal(int, int)
-    method_chosen = Signal(str)
-    number_given = Signal(int, object)
+    """What stands beside the frame; the page listens to its fields and its list of rows."""
 
     def __init__(self, edits: Sequence[QAction], frames: Sequence[QAction]) -> None:
         super().__init__()
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
         # The buttons stay under the hand, whatever there is to say.
         self.seen, self.chosen, self.why = Message(3), Message(2), wrapping_label()
         self.fit = ResultTable("Fit before the last edit and after it")
-        layout.addWidget(self.seen)
-        layout.addWidget(heading("Correct"))
-        layout.addWidget(self.chosen)
-        layout.addLayout(self._sites())
         self.buttons: dict[str, QToolButton] = {}
-        layout.addLayout(self._buttons(edits))
-        layout.addWidget(heading("Following frames"))
         self.most = NumberField(
             "At most", "frames", lowest=1, highest=1_000_000, decimals=0, optional=True,
             tooltip="Carry on over no more frames than this; empty: to the end of the recording",
         )  # fmt: skip
         form = FieldForm()
         form.add(self.most)
-        layout.addWidget(form)
-        layout.addLayout(self._buttons(frames))
-        layout.addWidget(heading("Fit"))
-        layout.addWidget(self.why)
-        layout.addWidget(self.fit)
-        layout.addWidget(heading("Rows"))
         self.rows = _RowList()
-        self.rows.itemSelectionChanged.connect(lambda: self.rows_chosen.emit(self.rows.chosen()))
-        layout.addWidget(self.rows)
-        layout.addWidget(heading("Detector"))
-        layout.addWidget(self._detector())
-        layout.addStretch(1)
+        vbox(
+            *(self.seen, heading("Correct"), self.chosen, self._sites(), self._buttons(edits)),
+            *(heading("Following frames"), form, self._buttons(frames)),
+            *(heading("Fit"), self.why, self.fit, heading("Rows"), self.rows),
+            *(heading("Detector"), self._detector(), 1),
+            of=self,
+        )
 
     def show_frame(
         self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine] | None
@@ -156,10 +118,6 @@ class DotsPanel(QWidget):
         self.column = field("Column of the chosen dots", "Their column, counted from the left")
         self.reference_row = field("Row of the reference", "Row of the pattern's dark centre")
         self.reference_column = field("Column of the reference", "Column of that dark centre")
-        self.row.edited.connect(lambda value: _told(self.row_given, value))
-        self.column.edited.connect(lambda value: _told(self.column_given, value))
-        for part in (self.reference_row, self.reference_column):
-            part.edited.connect(lambda _: self._tell_reference())
         grid = QGridLayout()
         for k, words in enumerate(("", "Row", "Column")):
             grid.addWidget(plain_label(words), 0, k)
@@ -173,26 +131,25 @@ class DotsPanel(QWidget):
                 grid.addWidget(one, line, k)
         return grid
 
-    def _tell_reference(self) -> None:
+    @property
+    def reference(self) -> Site | None:
+        """Row and column that were entered for the reference; None without both."""
         row, column = self.reference_row.value(), self.reference_column.value()
-        if row is not None and column is not None:
-            self.reference_given.emit(int(row), int(column))
+        return None if row is None or column is None else (int(row), int(column))
 
     def _detector(self) -> FieldForm:
         form = FieldForm()
         self.method = ChoiceField(
             "Method", METHODS, tooltip="How dots are found in frames not corrected by hand"
         )
-        self.method.edited.connect(self.method_chosen.emit)
         form.add(self.method)
         self.numbers = []
-        for k, number in enumerate(NUMBERS):
+        for number in NUMBERS:
             field = NumberField(
                 number.label, number.unit, lowest=number.lowest, highest=number.highest,
                 step=number.step, decimals=number.decimals, tooltip=number.tooltip,
                 optional=number.optional,
             )  # fmt: skip
-            field.edited.connect(lambda value, k=k: self.number_given.emit(k, value))
             form.add(field)
             self.numbers.append(field)
         return form
@@ -258,8 +215,3 @@ class _RowList(ReadTable):
                 if row in rows:
                     model.select(self.model().index(k, 0), ways.Select | ways.Rows)
         self.viewport().update()
-
-
-def _told(signal: SignalInstance, value: float | None) -> None:
-    if value is not None:
-        signal.emit(int(value))

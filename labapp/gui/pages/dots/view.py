@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from PySide6.QtCore import QEvent, QObject, Qt
@@ -17,7 +18,7 @@ from labapp.gui.pages.dots.editing import Editor
 from labapp.gui.pages.dots.fitting import Refit
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
-from labapp.gui.pages.dots.presenter import DotsState, Figures, Need
+from labapp.gui.pages.dots.presenter import DetectorNumber, DotsState, Figures, Need
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.views.drag_point import SHIFT, arrow_step
@@ -77,14 +78,18 @@ class DotsPage(Page):
 
     def _connect(self) -> None:
         panel = self.dots_panel
-        panel.rows_chosen.connect(lambda rows: self.choose(self.editor.choose_rows, rows))
-        panel.row_given.connect(lambda row: self.editor.assign(row=row))
-        panel.column_given.connect(lambda column: self.editor.assign(column=column))
-        panel.reference_given.connect(lambda *site: self._refer(site))
-        panel.method_chosen.connect(
+        panel.rows.itemSelectionChanged.connect(
+            lambda: self.choose(self.editor.choose_rows, panel.rows.chosen())
+        )
+        for name in ("row", "column"):
+            getattr(panel, name).edited.connect(partial(self._assign, name))
+        for field in (panel.reference_row, panel.reference_column):
+            field.edited.connect(lambda _: self._refer(panel.reference))
+        panel.method.edited.connect(
             lambda method: self._set(lambda now: presenter.with_method(now, method), "detector")
         )
-        panel.number_given.connect(self._set_number)
+        for number, field in zip(presenter.NUMBERS, panel.numbers, strict=True):
+            field.edited.connect(partial(self._set_number, number))
         self.view.pointed.connect(self._point)
         self.view.canvas.installEventFilter(self)
         self.looking.ready.connect(self._again)
@@ -96,9 +101,7 @@ class DotsPage(Page):
 
     def refresh(self) -> None:
         """Show the frame in view as the session has it now."""
-        session = self.workspace.session
-        if session is None:
-            return
+        session = self.session
         self._in_view = True
         frame = self.workspace.frame
         if not len(session.frames):
@@ -122,8 +125,7 @@ class DotsPage(Page):
         self.draw()
 
     def _show_words(self) -> None:
-        session, seen = self.workspace.session, self.seen
-        assert session is not None
+        session, seen = self.session, self.seen
         assert seen is not None
         before = self._before
         sentence = presenter.sentence(seen)
@@ -204,7 +206,7 @@ class DotsPage(Page):
         self._pointer = (u, v) if level is not None else None
 
     def _again(self) -> None:
-        if self._in_view:
+        if self._in_view and self.workspace.session is not None:
             self.workspace.run_or_report(self.refresh)
 
     def _forget(self) -> None:
@@ -236,16 +238,20 @@ class DotsPage(Page):
             self.draw()
         return done
 
-    def _refer(self, site: Site) -> None:
+    def _assign(self, what: str, value: float | None) -> None:
+        if value is not None:
+            self.editor.assign(**{what: int(value)})
+
+    def _refer(self, site: Site | None) -> None:
         correction = self.editor.correction
-        if correction is not None and correction.lattice.reference != site:
+        known = None if correction is None else correction.lattice.reference
+        if correction is not None and site not in (None, known):
             self.editor.set_reference(site)
 
     def _set(self, change: Callable[[Settings], Settings], label: str) -> None:
         self.workspace.attempt(lambda own: own.set_settings(change(own.settings), label))
 
-    def _set_number(self, index: int, value: float | None) -> None:
-        number = presenter.NUMBERS[index]
+    def _set_number(self, number: DetectorNumber, value: float | None) -> None:
         if value is not None or number.optional:
             label = f"detector: {number.label.lower()}"
             self._set(lambda now: presenter.with_detector_value(now, number, value), label)

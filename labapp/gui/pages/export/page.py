@@ -8,18 +8,10 @@ from pathlib import Path
 
 from PySide6.QtCore import QUrl
 from PySide6.QtGui import QDesktopServices
-from PySide6.QtWidgets import (
-    QCheckBox,
-    QFileDialog,
-    QFrame,
-    QGridLayout,
-    QHBoxLayout,
-    QScrollArea,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QCheckBox, QGridLayout, QWidget
 
 from labapp.export.meshes import SMALLEST_SPACING_MM
+from labapp.gui.dialogs import ask_folder
 from labapp.gui.pages.export.presenter import (
     SIZES,
     USUAL,
@@ -39,6 +31,7 @@ from labapp.gui.tasks import Control, Task
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, whole
 from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import Group, fill, hbox, scrolled, vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
@@ -73,9 +66,7 @@ class ExportPage(Page):
 
     def refresh(self) -> None:
         """Show what would be written of what the session holds now."""
-        session, frame = self.workspace.session, self.workspace.frame
-        if session is None:
-            return
+        session, frame = self.session, self.workspace.frame
         moved = self._in_view not in (None, frame)
         self._in_view = frame
         if moved:  # the frame in view is another one, and nothing else
@@ -129,8 +120,8 @@ class ExportPage(Page):
         )
         count = len(made.frames)
         ready = f"{count} frame{'s' * (count != 1)} will be written."
-        wrong = "" if writing else why_not or self._failed
-        self.why_not.setText(f"▲ {wrong}" if wrong else why_not or ready)
+        wrong = f"▲ {why_not}" if why_not and not writing else why_not or self._failed
+        self.why_not.setText(wrong or ready)
         again = len(made.again) > 0 and not self.workspace.session.read_only
         self.again_button.setVisible(again)
         self.again_button.setEnabled(again and not measuring)
@@ -160,13 +151,9 @@ class ExportPage(Page):
 
     def choose_folder(self) -> None:
         """Ask for a folder; where it holds something else, a new one in it is taken."""
-        session = self.workspace.session
-        if session is None:
-            return
-        here = Path(self.folder.value() or proposed_folder(session))
-        name = QFileDialog.getExistingDirectory(self, "Where to", str(here.parent))
-        if name:
-            self.folder.set_value(str(folder_within(Path(name), session)))
+        here = Path(self.folder.value() or proposed_folder(self.session))
+        if folder := ask_folder(self, "Where to", here.parent):
+            self.folder.set_value(str(folder_within(folder, self.session)))
 
     def measure_again(self) -> None:
         """Measure what is missing or no longer stands of the frames chosen."""
@@ -175,8 +162,8 @@ class ExportPage(Page):
 
     def export(self) -> None:
         """Write what is ticked, in the background."""
-        session, made, request = self.workspace.session, self.plan, self.request
-        if session is None or made is None or made.why_not:
+        session, made, request = self.session, self.plan, self.request
+        if made is None or made.why_not:
             return
         folder = Path(self.folder.value() or proposed_folder(session)).expanduser()
         if not folder.is_absolute():
@@ -187,19 +174,17 @@ class ExportPage(Page):
             return write(session, request, frames, folder, control.progress)
 
         def done(written: Written) -> None:
-            if self.workspace.session is session:
-                self.written = written
-                self.workspace.notified.emit(written.words, bool(written.problems))
-                self._show_state()
+            self.written = written
+            self.workspace.notified.emit(written.words, bool(written.problems))
+            self._show_state()
 
-        def failed(why: str) -> None:
-            if self.workspace.session is session:
-                self._failed = f"Not exported: {why}"
-                self._show_state()
+        def failed(words: str) -> None:
+            self._failed = words
+            self._show_state()
 
-        self.written, self._failed = None, ""
+        self.written = None
         self._writing = self.workspace.tasks.start(
-            f"Exporting to {folder.name}", work, done, on_failed=failed, kind="Exporting"
+            f"Exporting to {folder.name}", work, done, beside=failed, kind="Exporting"
         )
         self._show_state()
 
@@ -219,47 +204,25 @@ class ExportPage(Page):
         grid.setHorizontalSpacing(32)
         grid.setVerticalSpacing(18)
         for number, (title, items) in enumerate(groups()):
-            column = QVBoxLayout()
-            column.addWidget(heading(title))
+            boxes = {item.key: QCheckBox(item.name) for item in items}
             for item in items:
-                box = QCheckBox(item.name)
+                box = boxes[item.key]
                 box.setToolTip(item.tip)
                 box.setChecked(item.key in USUAL)
                 box.toggled.connect(lambda _: self._ticked())
-                self._boxes[item.key] = box
-                column.addWidget(box)
-            column.addStretch(1)
-            grid.addLayout(column, number // 2, number % 2)
-        will = QVBoxLayout()
-        will.addWidget(heading("In the folder there will be"))
-        self.files = wrapping_label()
-        will.addWidget(self.files)
+            self._boxes |= boxes
+            grid.addLayout(vbox(heading(title), *boxes.values(), 1), number // 2, number % 2)
+        self.files, self.result = wrapping_label(), wrapping_label()
+        will = vbox(heading("In the folder there will be"), self.files)
+        see = button("Open the folder", "Show it in the file manager", self.open_folder)
+        self.result_group = Group("Written", self.result, hbox(see, 1))
+        self.result_group.hide()
         grid.addLayout(will, 2, 0, 1, 2)
-        grid.addWidget(self._make_result(), 3, 0, 1, 2)
+        grid.addWidget(self.result_group, 3, 0, 1, 2)
         grid.setRowStretch(4, 1)
         grid.setColumnStretch(0, 1)
         grid.setColumnStretch(1, 1)
-        area = QScrollArea()
-        area.setWidget(inner)
-        area.setWidgetResizable(True)
-        area.setFrameShape(QFrame.Shape.NoFrame)
-        area.setAccessibleName("What is exported")
-        area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
-        self.canvas_layout.addWidget(area)
-
-    def _make_result(self) -> QWidget:
-        self.result_group = QWidget()
-        layout = QVBoxLayout(self.result_group)
-        layout.setContentsMargins(0, 8, 0, 0)
-        layout.addWidget(heading("Written"))
-        self.result = wrapping_label()
-        layout.addWidget(self.result)
-        row = QHBoxLayout()
-        row.addWidget(button("Open the folder", "Show it in the file manager", self.open_folder))
-        row.addStretch(1)
-        layout.addLayout(row)
-        self.result_group.hide()
-        return self.result_group
+        self.canvas_layout.addWidget(scrolled(inner, "What is exported"))
 
     def _make_panel(self) -> None:
         form = FieldForm()
@@ -291,22 +254,17 @@ class ExportPage(Page):
             lambda value: self._change_request(spacing_mm=value) if value is not None else None
         )
         self._make_view_fields()
-        for field in (self.which, self.first, self.last, self.every, self.scheme, self.spacing):
+        for field in (
+            *(self.which, self.first, self.last, self.every, self.scheme, self.spacing),
+            *(self.view, self.picture_size, self.rate),
+        ):
             form.add(field)
-        for one in (self.view, self.picture_size, self.rate):
-            form.add(one)
-        self.panel_layout.addWidget(form)
         self.folder = PathField(
             "Folder",
             tooltip="Where to: a new or empty folder, or an earlier export, which is replaced",
         )
-        self.panel_layout.addWidget(self.folder.label)
-        self.panel_layout.addWidget(self.folder)
-        self.panel_layout.addWidget(
-            button("Choose a folder …", "Choose where to write", self.choose_folder)
-        )
-        self.notes = wrapping_label()
-        self.why_not = wrapping_label()
+        choose = button("Choose a folder …", "Choose where to write", self.choose_folder)
+        self.notes, self.why_not = wrapping_label(), wrapping_label()
         self.again_button = button(
             "Measure now",
             "Measure the chosen frames that are not measured, or no longer stand",
@@ -315,9 +273,11 @@ class ExportPage(Page):
         keep_room(self.again_button)
         self.export_button = button("Export", "", self.export)
         # The buttons stand above the words, which need more or less room.
-        for widget in (self.export_button, self.again_button, self.why_not, self.notes):
-            self.panel_layout.addWidget(widget)
-        self.panel_layout.addStretch(1)
+        fill(
+            self.panel_layout,
+            *(form, self.folder.label, self.folder, choose, self.export_button),
+            *(self.again_button, self.why_not, self.notes, 1),
+        )
 
     def _make_view_fields(self) -> None:
         self.view = ChoiceField(

@@ -6,15 +6,9 @@ from pathlib import Path
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QKeyEvent
-from PySide6.QtWidgets import (
-    QFileDialog,
-    QHeaderView,
-    QStackedWidget,
-    QTableWidget,
-    QTableWidgetItem,
-    QWidget,
-)
+from PySide6.QtWidgets import QHeaderView, QStackedWidget, QTableWidget, QTableWidgetItem, QWidget
 
+from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place, Readings
 from labapp.gui.pages.page import Page
@@ -24,6 +18,7 @@ from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import RIGHT
 from labapp.gui.workspace import Workspace
@@ -49,8 +44,8 @@ class LaserPage(Page):
         self.picture_view = PictureView("Picture of the cross hair")
         self.picture_view.show_picture(None, NO_PICTURE)
         self.canvas = QStackedWidget()
-        self.canvas.addWidget(self.drawing)
-        self.canvas.addWidget(self.picture_view)
+        for view in (self.drawing, self.picture_view):
+            self.canvas.addWidget(view)
         self.canvas_layout.addWidget(self.canvas)
         self._points: dict[str, DragPoint] = {}
         self._from_picture: GreyImage | None = None
@@ -60,15 +55,13 @@ class LaserPage(Page):
 
     def refresh(self) -> None:
         """Show the readings in use when they changed, and the values in use."""
-        session = self.workspace.session
-        assert session is not None
-        kept = presenter.kept(session)
-        loaded = (session.path, kept)
+        kept = presenter.kept(self.session)
+        loaded = (self.session.path, kept)
         if loaded != self._loaded:
             self._loaded = loaded
             self._from_picture = None
             self._fill(kept or Readings())
-        self.in_use.set_rows(presenter.in_use(session))
+        self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
 
     def readings(self) -> Readings:
@@ -83,12 +76,11 @@ class LaserPage(Page):
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross, with the points to drag."""
-        self.refused.setText("")
         self.workspace.tasks.start(
             "Loading the picture",
             lambda _: presenter.read_picture(path),
             self._show_picture,
-            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+            beside=self.refused.setText,
         )
 
     def add_reading(self) -> None:
@@ -133,31 +125,24 @@ class LaserPage(Page):
         self.fan.set_value(presenter.FAN_ANGLE_DEG)
         self.fan.edited.connect(lambda _: self._follow())
         form.add(self.fan)
-        self.panel_layout.addWidget(form)
-        self.panel_layout.addWidget(self._picture_part())
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
         readings = wrapping_label("Readings, mm: a line each, as often as you like")
-        self.panel_layout.addWidget(readings)
-        self.panel_layout.addWidget(self.table)
         self.use_button = button("Use these", "", self.use)
-        self.panel_layout.addWidget(self.use_button)
         self.words = wrapping_label()
-        self.panel_layout.addWidget(self.words)
         self.result = ResultTable("The laser that follows")
-        self.panel_layout.addWidget(self.result)
-        self.panel_layout.addWidget(plain_label("In the rig now"))
         self.in_use = ResultTable("Laser in use")
-        self.panel_layout.addWidget(self.in_use)
-        self.panel_layout.addStretch(1)
+        fill(
+            self.panel_layout,
+            *(form, self._picture_part(), readings, self.table, self.use_button),
+            *(self.words, self.result, plain_label("In the rig now"), self.in_use, 1),
+        )
         self.lock_with_session(self.fan, self.table)
 
     def _picture_part(self) -> QWidget:
         self.picture_part = FieldForm()
         tip = "A picture of the cross hair beside a scale"
         self.picture_part.add_wide(button("Load picture…", tip, self._choose_picture))
-        self.refused = Message(2)
-        self.workspace.opened.connect(lambda: self.refused.setText(""))
         self.picture_part.add_wide(self.refused)
         self.scale = NumberField(
             "Scale length",
@@ -249,10 +234,8 @@ class LaserPage(Page):
     # --- the picture ------------------------------------------------------------------------
 
     def _choose_picture(self) -> None:
-        folder = str(self.workspace.folder)
-        path, _ = QFileDialog.getOpenFileName(self, "Picture of the cross hair", folder)
-        if path:
-            self.load_picture(Path(path))
+        if path := ask_file(self, "Picture of the cross hair", self.workspace.folder):
+            self.load_picture(path)
 
     def _show_picture(self, image: GreyImage) -> None:
         former = self.picture_view.picture

@@ -6,21 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import pyqtgraph as pg
-from PySide6.QtWidgets import QFileDialog
 
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
-from labapp.gui.dialogs import write_file
+from labapp.gui.dialogs import ask_file, ask_save, write_file
 from labapp.gui.pages.laser.presenter import read_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
-from labapp.gui.tasks import Control
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -54,10 +53,8 @@ class PlanePage(Page):
 
     def refresh(self) -> None:
         """Show the picture and the points in use when they changed, and the values in use."""
-        session = self.workspace.session
-        assert session is not None
-        kept = session.plane_calibration
-        loaded = (session.path, kept)
+        kept = self.session.plane_calibration
+        loaded = (self.session.path, kept)
         if loaded != self._loaded:
             self._loaded = loaded
             self._clear()
@@ -67,7 +64,7 @@ class PlanePage(Page):
         self.kept_button.setEnabled(kept is not None)
         none = "The session keeps no picture yet: Use keeps it"
         self.kept_button.setToolTip("Show what is in use again" if kept else none)
-        self.in_use.set_rows(presenter.in_use(session))
+        self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
 
     def load(self, path: Path) -> None:
@@ -78,29 +75,28 @@ class PlanePage(Page):
             self._show(image, None)
             self.find_axes()
 
-        self.refused.setText("")
         self.workspace.tasks.start(
             "Loading the picture",
             lambda _: read_picture(path),
             loaded,
-            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+            beside=self.refused.setText,
         )
 
     def take_kept(self) -> None:
         """Show the picture that the session keeps, and the points in use."""
-        session = self.workspace.session
-        kept = None if session is None else session.plane_calibration
-        if session is None or kept is None:
+        session, kept = self.session, self.session.plane_calibration
+        if kept is None:
             return
-        sha256 = kept.picture_sha256
 
         def shown(image: GreyImage) -> None:
-            if (self.workspace.session, session.plane_calibration) == (session, kept):
+            if session.plane_calibration == kept:
                 self.unit.set_value(kept.unit_mm)
                 self._show(image, kept.found)
 
         self.workspace.tasks.start(
-            "Showing the calibration picture", lambda _: session.picture(sha256), shown
+            "Showing the calibration picture",
+            lambda _: session.picture(kept.picture_sha256),
+            shown,
         )
 
     def find_axes(self) -> None:
@@ -110,19 +106,15 @@ class PlanePage(Page):
             return
         unit = self._unit()
 
-        def work(_: Control) -> PlaneCalibration:
-            return presenter.find(image, unit)
-
         def found(calibration: PlaneCalibration) -> None:
             if self.view.picture is image:
                 self._place(presenter.with_unit(calibration, self._unit()))
 
-        self.refused.setText("")
         self.workspace.tasks.start(
             "Looking for O′ and the axes",
-            work,
+            lambda _: presenter.find(image, unit),
             found,
-            on_failed=lambda why: self.refused.setText(f"▲ {why}"),
+            beside=self.refused.setText,
         )
 
     def use(self) -> None:
@@ -172,8 +164,6 @@ class PlanePage(Page):
             self.find_axes,
         )
         form.add_wide(self.find_button)
-        self.refused = Message(2)
-        self.workspace.opened.connect(lambda: self.refused.setText(""))
         form.add_wide(self.refused)
         form.add_wide(
             button(
@@ -182,14 +172,12 @@ class PlanePage(Page):
                 self._choose_target,
             )
         )
-        self.panel_layout.addWidget(form)
         help_text = wrapping_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
             "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
         )
-        self.panel_layout.addWidget(help_text)
+        fill(self.panel_layout, form, help_text)
         self._make_results()
-        self.panel_layout.addStretch(1)
         self.lock_with_session(self.unit)
 
     def _make_results(self) -> None:
@@ -201,31 +189,24 @@ class PlanePage(Page):
         )
         self.model.edited.connect(self.choose_model)
         model.add(self.model)
-        self.panel_layout.addWidget(model)
         self.use_button = button("Use", "", self.use)
-        self.panel_layout.addWidget(self.use_button)
-        self.words = wrapping_label()
-        self.panel_layout.addWidget(self.words)
+        self.words, self.why = wrapping_label(), wrapping_label()
         self.result = ResultTable("What follows from the points and marks")
-        self.panel_layout.addWidget(self.result)
-        self.why = wrapping_label()
-        self.panel_layout.addWidget(self.why)
-        self.panel_layout.addWidget(plain_label("In use now"))
         self.in_use = ResultTable("Image calibration in use")
-        self.panel_layout.addWidget(self.in_use)
+        fill(
+            self.panel_layout,
+            *(model, self.use_button, self.words, self.result, self.why),
+            *(plain_label("In use now"), self.in_use, 1),
+        )
 
     def _choose(self) -> None:
-        path, _ = QFileDialog.getOpenFileName(
-            self, "Picture of the target", str(self.workspace.folder)
-        )
-        if path:
-            self.load(Path(path))
+        if path := ask_file(self, "Picture of the target", self.workspace.folder):
+            self.load(path)
 
     def _choose_target(self) -> None:
         proposed = self.workspace.folder / "imaging_plane_4_inch.svg"
-        path, _ = QFileDialog.getSaveFileName(self, "Save target", str(proposed), "SVG (*.svg)")
-        if path:
-            self.save_target(Path(path))
+        if path := ask_save(self, "Save target", proposed, "SVG (*.svg)"):
+            self.save_target(path)
 
     def save_target(self, path: Path) -> None:
         """Write the target for the printer."""

@@ -13,13 +13,7 @@ from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
 from labapp.session.session import Session
-from labapp.simulation.positioning import (
-    USUAL_LENGTH_MM,
-    USUAL_WIDTH_MM,
-    Fate,
-    SideView,
-    side_view,
-)
+from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM, Fate, SideView, side_view
 
 
 @dataclass(frozen=True)

@@ -5,24 +5,18 @@ from __future__ import annotations
 from datetime import datetime
 from pathlib import Path
 
-from PySide6.QtWidgets import (
-    QCheckBox,
-    QFileDialog,
-    QLabel,
-    QTabWidget,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QCheckBox, QLabel, QTabWidget, QVBoxLayout, QWidget
 
 from labapp.config.setup import read_setup
-from labapp.gui.dialogs import write_file
+from labapp.gui.dialogs import EVERYTHING, ask_file, ask_save, write_file
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
 from labapp.gui.views.bench import BenchView
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, wrapping_label
+from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 
@@ -58,7 +52,6 @@ class SetupPage(Page):
 
         self.tabs.currentChanged.connect(show_tab)
         show_tab(EXPERIMENT_TAB)
-        workspace.opened.connect(lambda: self.refused.setText(""))
         self.panel_layout.addWidget(self.tabs)
         self.lock_with_session(
             *(*self.rig_fields.values(), *self.record_fields.values(), *self.ticks.values()),
@@ -68,9 +61,7 @@ class SetupPage(Page):
 
     def refresh(self) -> None:
         """Show record, safety list and setup as the session holds them."""
-        session = self.workspace.session
-        assert session is not None
-        shown = presenter.shown(session)
+        session, shown = self.session, presenter.shown(self.session)
         for key, field in self.rig_fields.items():
             field.set_value(shown.values[key])
             if shown.problems.get(key):
@@ -109,10 +100,7 @@ class SetupPage(Page):
 
     def save(self, path: Path) -> None:
         """Write the setup to a file."""
-        session = self.workspace.session
-        if session is None:
-            return
-        content = session.setup_text.encode()
+        content = self.session.setup_text.encode()
         if self.workspace.run_or_report(
             lambda: write_file(path, content), "Saving", self.refused.setText
         ):
@@ -173,10 +161,9 @@ class SetupPage(Page):
             lambda: self.workspace.attempt(presenter.put_usual),
         )
         self._filling = load, usual
-        row = QWidget()
-        row.setLayout(button_row(load, save, usual))
-        form.add_wide(row)
-        self.refused = Message(2)
+        buttons = QWidget()
+        hbox(load, save, usual, of=buttons)
+        form.add_wide(buttons)
         form.add_wide(self.refused)
         for heading, entries in RIG:
             form.add_heading(heading)
@@ -209,18 +196,14 @@ class SetupPage(Page):
         form.add(field)
 
     def _choose_load(self) -> None:
-        path, _ = QFileDialog.getOpenFileName(
-            self, "Load set-up", str(self.workspace.folder), f"{SETUP_FILES};;All files (*)"
-        )
-        if path:
-            self.load(Path(path))
+        kinds = f"{SETUP_FILES};;{EVERYTHING}"
+        if path := ask_file(self, "Load set-up", self.workspace.folder, kinds):
+            self.load(path)
 
     def _choose_save(self) -> None:
-        path, _ = QFileDialog.getSaveFileName(
-            self, "Save set-up", str(self.workspace.folder / "setup.toml"), SETUP_FILES
-        )
-        if path:
-            self.save(Path(path))
+        proposed = self.workspace.folder / "setup.toml"
+        if path := ask_save(self, "Save set-up", proposed, SETUP_FILES):
+            self.save(path)
 
 
 def _number(entry: Entry) -> NumberField:
@@ -238,9 +221,7 @@ def _number(entry: Entry) -> NumberField:
 
 def _top(content: QWidget) -> QWidget:
     page = QWidget()
-    layout = QVBoxLayout(page)
-    layout.addWidget(content)
-    layout.addStretch(1)
+    fill(QVBoxLayout(page), content, 1)
     return page
 
 

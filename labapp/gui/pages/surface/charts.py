@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QEvent, QPointF, Qt, Signal
+from PySide6.QtCore import QPointF, Qt, Signal
 from PySide6.QtGui import QKeyEvent, QPalette
 from PySide6.QtWidgets import QVBoxLayout
 
@@ -45,7 +45,7 @@ class Chart(Plotted):
         self.title.setText(words)
         self.describe(words)
 
-    def paint(self) -> None:
+    def apply_theme(self) -> None:
         """Take the window's colours."""
         text = self.colour(QPalette.ColorRole.Text)
         self.plot.setBackground(self.colour(QPalette.ColorRole.Base))
@@ -67,12 +67,6 @@ class Chart(Plotted):
         else:
             super().keyPressEvent(event)
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow the window from light to dark."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "plot"):
-            self.paint()
-
 
 class DotsChart(Chart):
     """Captured dots as rings, computed ones as crosses, their errors drawn longer."""
@@ -84,7 +78,7 @@ class DotsChart(Chart):
         self._errors = pg.PlotCurveItem(connect="pairs")
         for item in (self._errors, self._captured, self._computed):
             self.plot.addItem(item)
-        self.paint()
+        self.follow_theme()
 
     def show_dots(self, dots: tuple[FloatArray, FloatArray] | None) -> None:
         """Show captured and computed dots, each of shape (n, 2), mm; None shows nothing."""
@@ -100,9 +94,9 @@ class DotsChart(Chart):
         self.say(told if dots is not None else "No reflected dots to compare")
         self.plot.autoRange()
 
-    def paint(self) -> None:
+    def apply_theme(self) -> None:
         """Take the window's colours."""
-        super().paint()
+        super().apply_theme()
         text, accent = (
             self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
         )
@@ -132,7 +126,7 @@ class PlanChart(Chart):
         self._telling = False
         self.plot.addItem(self._outline)
         self.plot.addItem(self._line)
-        self.paint()
+        self.follow_theme()
 
     def show_pool(self, boundary: Boundary | None, section: tuple[float, float] | None) -> None:
         """Show a boundary and the section line through it; None shows nothing of it."""
@@ -173,9 +167,9 @@ class PlanChart(Chart):
         self.dragged.emit(angle, offset)
         self._telling = False
 
-    def paint(self) -> None:
+    def apply_theme(self) -> None:
         """Take the window's colours."""
-        super().paint()
+        super().apply_theme()
         self._outline.setPen(pg.mkPen(self.colour(QPalette.ColorRole.Text), width=2))
         pen = pg.mkPen(self.colour(QPalette.ColorRole.Highlight), width=3)
         self._line.setPen(pen)
@@ -195,7 +189,7 @@ class ProfileChart(Chart):
         self._edge = pg.ScatterPlotItem(size=10, symbol="d")
         for item in (self._band, self._low, self._high, self._height, self._edge):
             self.plot.addItem(item)
-        self.paint()
+        self.follow_theme()
 
     def show_profile(self, cut: Profile | None) -> None:
         """Show a profile; None shows nothing."""
@@ -216,9 +210,9 @@ class ProfileChart(Chart):
         self.say(f"Height along the section; ◆ boundary{band}")
         self.plot.autoRange()
 
-    def paint(self) -> None:
+    def apply_theme(self) -> None:
         """Take the window's colours."""
-        super().paint()
+        super().apply_theme()
         text, accent = (
             self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
         )

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import Qt, Signal
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QResizeEvent
-from PySide6.QtWidgets import (
-    QHBoxLayout,
-    QHeaderView,
-    QVBoxLayout,
-    QWidget,
-)
+from PySide6.QtWidgets import QHeaderView, QWidget
 from threadpoolctl import threadpool_limits
 
 from labapp.gui.pages.surface.comparison import Comparison, compared, other_scheme
@@ -18,6 +13,7 @@ from labapp.gui.tasks import Control, Task
 from labapp.gui.views.view3d import View3d, make_view3d
 from labapp.gui.widgets.fields import ChoiceField
 from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.widgets.tables import ReadTable
 from labapp.gui.workspace import Workspace
@@ -28,15 +24,7 @@ NUMBERS = (1, 2, 3)
 
 
 class CompareView(QWidget):
-    """The frame in view by two schemes; the cameras of all views turn together.
-
-    Signals
-    -------
-    closed
-        The operator has seen enough.
-    """
-
-    closed = Signal()
+    """The frame in view by two schemes; the cameras of all views turn together."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
@@ -55,10 +43,7 @@ class CompareView(QWidget):
         for box in (self.first, self.second):
             box.choice.edited.connect(lambda _: self.refresh(self._options))
         figures = QWidget()
-        column = QVBoxLayout(figures)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.addWidget(self.words)
-        column.addWidget(self.table, 1)
+        vbox(self.words, (self.table, 1), of=figures)
         surfaces = _side_by_side(self.first, self.second)
         below = _side_by_side(self.difference, figures)
         self.parts = PartsBar(
@@ -70,11 +55,7 @@ class CompareView(QWidget):
                 "Figures": (below, figures),
             },
         )
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.parts)
-        layout.addWidget(surfaces, 1)
-        layout.addWidget(below, 1)
+        vbox(self.parts, (surfaces, 1), (below, 1), of=self)
 
     @property
     def views(self) -> tuple[View3d, View3d, View3d]:
@@ -89,8 +70,7 @@ class CompareView(QWidget):
     def refresh(self, options: Options) -> None:
         """Show the frame in view by the two schemes, computed in the background."""
         session, frame = self.workspace.session, self.workspace.frame
-        if session is None:
-            return
+        assert session is not None
         schemes = (self.first.choice.value(), self.second.choice.value())
         result = session.result(frame)
         wanted = (frame, schemes, options, None if result is None else result.measured)
@@ -150,12 +130,9 @@ class CompareView(QWidget):
 
 def _side_by_side(*widgets: QWidget) -> QWidget:
     """Widgets of equal width."""
-    row = QWidget()
-    line = QHBoxLayout(row)
-    line.setContentsMargins(0, 0, 0, 0)
-    for widget in widgets:
-        line.addWidget(widget, 1)
-    return row
+    line = QWidget()
+    hbox(*((widget, 1) for widget in widgets), of=line)
+    return line
 
 
 class _SchemeBox(QWidget):
@@ -165,13 +142,7 @@ class _SchemeBox(QWidget):
         super().__init__()
         self.choice = ChoiceField(order, SCHEME_CHOICES, tooltip=f"{order} of the two to compare")
         self.view = make_view3d(f"{order} surface")
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        line = QHBoxLayout()
-        line.addWidget(self.choice.label)
-        line.addWidget(self.choice, 1)
-        layout.addLayout(line)
-        layout.addWidget(self.view, 1)
+        vbox(hbox(self.choice.label, (self.choice, 1)), (self.view, 1), of=self)
 
 
 class _FiguresTable(ReadTable):

@@ -17,6 +17,7 @@ from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
 from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
@@ -51,16 +52,15 @@ class SurfacePanel:
         self.sizes = ResultTable("Size of the pool")
         self.errors = ResultTable("Reflection errors")
         self.trials = ResultTable("Errors of the correspondences tried")
-        layout.addWidget(form)
-        layout.addLayout(self._measuring())
+        grid = self._measuring()
         measuring = (self.one, self.missing, self.all, self.again)
         self._tips = {each: each.toolTip() for each in measuring}
         keep_room(self.progress, self.cancel, self.again)
-        for widget in (self.again, self.status, self.sizes, self.errors, self.provenance):
-            layout.addWidget(widget)
-        for widget in (self.verdict, self.trials):
-            layout.addWidget(widget)
-        layout.addStretch(1)
+        fill(
+            layout,
+            *(form, grid, self.again, self.status, self.sizes, self.errors, self.provenance),
+            *(self.verdict, self.trials, 1),
+        )
         workspace.tasks.changed.connect(self._show_progress)
         workspace.tasks.progressed.connect(self._show_progress)
 

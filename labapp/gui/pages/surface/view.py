@@ -20,7 +20,6 @@ from PySide6.QtGui import (
 )
 from PySide6.QtWidgets import (
     QBoxLayout,
-    QFileDialog,
     QHBoxLayout,
     QLayout,
     QMenu,
@@ -28,13 +27,13 @@ from PySide6.QtWidgets import (
     QStackedWidget,
     QStyleOptionToolButton,
     QToolButton,
-    QVBoxLayout,
     QWidget,
 )
 
 from labapp.errors import InputError
 from labapp.export.drawing import Direction
 from labapp.export.heights import profile
+from labapp.gui.dialogs import ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.surface.charts import DotsChart, PlanChart, ProfileChart
 from labapp.gui.pages.surface.compare import CompareView
@@ -51,6 +50,7 @@ from labapp.gui.pages.surface.presenter import (
 from labapp.gui.views.steering import Steering
 from labapp.gui.views.view3d import LOOKS, View3d, make_view3d
 from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
@@ -90,8 +90,7 @@ class SurfacePage(Page):
         self.side = SurfacePanel(workspace, self.panel_layout)
         self.lock_with_session(self.side.scheme, self.side.correspondence)
         self._charts_due: Callable[[], None] | None = None
-        self._rest = QTimer(self)
-        self._rest.setSingleShot(True)
+        self._rest = QTimer(self, singleShot=True)
         self._rest.timeout.connect(self._show_charts)
         self.stack = QStackedWidget()
         self.stack.addWidget(self._single())
@@ -99,18 +98,14 @@ class SurfacePage(Page):
         self.steering = Steering(
             self._steered, lambda told: workspace.notified.emit(told, False), self
         )
-        self.canvas_layout.addWidget(self._tools())
-        self.canvas_layout.addWidget(self.stack, 1)
+        fill(self.canvas_layout, self._tools(), (self.stack, 1))
 
     # --- what is where -----------------------------------------------------------------------
 
     def _single(self) -> QWidget:
         left, right = QSplitter(Qt.Orientation.Vertical), QSplitter(Qt.Orientation.Vertical)
         below = QWidget()
-        column = QVBoxLayout(below)
-        column.setContentsMargins(0, 0, 0, 0)
-        column.addWidget(self._section_fields())
-        column.addWidget(self.profile, 1)
+        vbox(self._section_fields(), (self.profile, 1), of=below)
         for splitter, widgets, sizes in (
             (left, (self.view, below), (5, 3)),
             (right, (self.dots, self.plan), (1, 1)),
@@ -136,10 +131,7 @@ class SurfacePage(Page):
             },
         )
         canvas = QWidget()
-        layout = QVBoxLayout(canvas)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.canvas_parts)
-        layout.addWidget(whole, 1)
+        vbox(self.canvas_parts, (whole, 1), of=canvas)
         return canvas
 
     def resizeEvent(self, event: QResizeEvent) -> None:
@@ -164,12 +156,11 @@ class SurfacePage(Page):
             decimals=2,
             tooltip="How far to the left of the electrode the line passes",
         )
-        direction, place = QHBoxLayout(), QHBoxLayout()
-        for field, line in ((self.angle, direction), (self.offset, place)):
+        for field in (self.angle, self.offset):
             field.label.setWordWrap(False)
             field.edited.connect(self._enter_section)
-            line.addWidget(field.label)
-            line.addWidget(field, 1)
+        direction = hbox(self.angle.label, (self.angle, 1))
+        place = hbox(self.offset.label, (self.offset, 1))
         for words, angle in (("Along X", 0.0), ("Along Y", 90.0)):
             cut = partial(self._set_section, angle, 0.0)
             what = f"Cut {words.lower()}, through the electrode's axis"
@@ -192,24 +183,22 @@ class SurfacePage(Page):
             tooltip="Heights are drawn so many times as high; the axes tell true ones",
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
-        first, line = QHBoxLayout(), QHBoxLayout()
         for field in (self.colour, self.high):
             field.label.setWordWrap(False)
-            first.addWidget(field.label)
-            first.addWidget(field)
-        first.addWidget(self._parts_button())
-        for direction, (words, what) in LOOKS.items():
-            line.addWidget(_tool(words, what, partial(self._look, direction)))
-        line.addStretch(1)
+        looks = [
+            _tool(words, what, partial(self._look, direction))
+            for direction, (words, what) in LOOKS.items()
+        ]
         self.copy = _tool("Copy", "Copy the 3-D picture to the clipboard", self.copy_picture)
         self.save = _tool("Save …", "Save the 3-D picture as PNG (Ctrl+Shift+P)", self.save_picture)
         self.save.setShortcut(QKeySequence("Ctrl+Shift+P"))
         what = "Put two schemes side by side, or show one again"
         self.comparing = _tool("Compare", what, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
-        for button in (self.copy, self.save, self.comparing):
-            line.addWidget(button)
-        return _Tools(first, line)
+        return _Tools(
+            hbox(self.colour.label, self.colour, self.high.label, self.high, self._parts_button()),
+            hbox(*looks, 1, self.copy, self.save, self.comparing),
+        )
 
     def _parts_button(self) -> QToolButton:
         menu = QMenu(self)
@@ -230,11 +219,8 @@ class SurfacePage(Page):
 
     def refresh(self) -> None:
         """Show the frame in view by the scheme that the session's settings choose."""
-        session = self.workspace.session
-        if session is None:
-            return
         try:
-            self.told = shown(session, self.workspace.frame)
+            self.told = shown(self.session, self.workspace.frame)
         except InputError as error:
             self.told = SurfaceState(None, "failed", str(error))
         self.side.show(self.told)
@@ -262,10 +248,9 @@ class SurfacePage(Page):
 
     def save_picture(self) -> None:
         """Ask for a file and write the picture to it."""
-        name = str(self.workspace.folder / f"surface_{self.workspace.frame:06d}.png")
-        chosen, _ = QFileDialog.getSaveFileName(self, "Save picture", name, "PNG (*.png)")
-        if chosen:
-            self.write_picture(Path(chosen))
+        proposed = self.workspace.folder / f"surface_{self.workspace.frame:06d}.png"
+        if path := ask_save(self, "Save picture", proposed, "PNG (*.png)"):
+            self.write_picture(path)
 
     def write_picture(self, path: Path) -> None:
         """Write the picture as PNG; a refusal is said."""
@@ -352,11 +337,9 @@ class SurfacePage(Page):
         self.steering.stop()
 
     def _toggle_compare(self) -> None:
-        session = self.workspace.session
-        wanted = self.comparing.isChecked() and session is not None
-        self.comparing.setChecked(wanted)
-        if wanted and session is not None:
-            self.compare.begin(scheme_name(session.settings))
+        wanted = self.comparing.isChecked()
+        if wanted:
+            self.compare.begin(scheme_name(self.session.settings))
         else:
             self.compare.leave()
         self.stack.setCurrentIndex(int(wanted))

@@ -8,28 +8,25 @@ from pathlib import Path
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QPixmap
-from PySide6.QtWidgets import (
-    QCheckBox,
-    QFileDialog,
-    QGridLayout,
-    QHBoxLayout,
-    QSplitter,
-    QWidget,
-)
+from PySide6.QtWidgets import QCheckBox, QGridLayout, QSplitter
 
+from labapp.gui.dialogs import EVERYTHING, ask_file
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.trends.presenter import FIRST_SHOWN, SIGNALS, TrendOptions, TrendsState, show
 from labapp.gui.tasks import Control
 from labapp.gui.views.plots import PlotStack
-from labapp.gui.widgets.buttons import button, button_row
+from labapp.gui.widgets.buttons import button, check_box
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.labels import Message, heading, keep_room, wrapping_label
+from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.signals import Signals, read_signals
 from labapp.session.trends import QUANTITIES
 
 FAR_S = 1e6
+
+TABLES = f"Tables (*.csv *.txt *.tsv);;{EVERYTHING}"
 
 
 class TrendsPage(Page):
@@ -63,9 +60,7 @@ class TrendsPage(Page):
 
     def refresh(self) -> None:
         """Show the session's results."""
-        session, frame = self.workspace.session, self.workspace.frame
-        if session is None:
-            return
+        session, frame = self.session, self.workspace.frame
         if self._in_view not in (None, frame):
             # The frame in view is another one, and nothing else: stepping must be quick.
             self._in_view = frame
@@ -120,32 +115,23 @@ class TrendsPage(Page):
     def choose_signals(self) -> None:
         """Ask for a table with current and voltage."""
         folder = self._last_folder if self._last_folder.name else self.workspace.folder
-        name, _ = QFileDialog.getOpenFileName(
-            self,
-            "Read current and voltage",
-            str(folder),
-            "Tables (*.csv *.txt *.tsv);;All files (*)",
-        )
-        if name:
-            self._last_folder = Path(name).parent
-            self.read_signals(Path(name))
+        if path := ask_file(self, "Read current and voltage", folder, TABLES):
+            self._last_folder = path.parent
+            self.read_signals(path)
 
     def read_signals(self, path: Path) -> None:
         """Read a table with current and voltage, and keep it in the session."""
         self._keep(f"Reading {path.name}", lambda: read_signals(path))
 
     def _start_at(self, start_s: object) -> None:
-        session = self.workspace.session
-        signals = None if session is None else session.signals
+        signals = self.session.signals
         if signals is not None and isinstance(start_s, int | float):
             moved = replace(signals, start_s=float(start_s))
             self._keep("Moving current and voltage", lambda: moved)
 
     def _keep(self, title: str, signals: Callable[[], Signals]) -> None:
         """Keep signals in the session, in the background: they may be half a million."""
-        session = self.workspace.session
-        if session is None:
-            return
+        session = self.session
 
         def work(_: Control) -> Signals:
             found = signals()
@@ -154,15 +140,14 @@ class TrendsPage(Page):
 
         def done(kept: Signals) -> None:
             self.workspace.notified.emit(f"{kept.file}: {len(kept.time_s)} samples", False)
-            if self.workspace.session is session:
-                self.workspace.changed.emit()
-
-        def failed(why: str) -> None:
-            if self.workspace.session is session:
-                self.signals_words.setText(f"▲ {why}")
+            self.workspace.changed.emit()
 
         self.workspace.tasks.start(
-            title, work, done, on_failed=failed, kind="Reading current and voltage"
+            title,
+            work,
+            done,
+            beside=lambda words: self.signals_words.setText(words or self.signals_words.text()),
+            kind="Reading current and voltage",
         )
 
     # --- the panel ----------------------------------------------------------------------------
@@ -173,34 +158,27 @@ class TrendsPage(Page):
         )
         self.nothing.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self.canvas_layout.addWidget(self.nothing, 1)
-        layout = self.panel_layout
-        layout.addWidget(heading("Shown"))
-        layout.addLayout(self._make_choice())
-        layout.addWidget(heading("Mean ± standard deviation, range"))
         self.table = ResultTable("Statistics of the measures")
-        layout.addWidget(self.table)
         self.counted = Message(3)
-        layout.addWidget(self.counted)
-        self.without = QCheckBox("Leave out frames that stand out")
-        self.without.setToolTip(
+        self.without = check_box(
+            "Leave out frames that stand out",
             "Mean, deviation, range and spectrum are of the frames that do not stand out from "
-            "their neighbours by size or ARE; open circles mark those that do"
+            "their neighbours by size or ARE; open circles mark those that do",
+            lambda on: self._set_options(without_doubtful=on),
         )
-        self.without.toggled.connect(lambda on: self._set_options(without_doubtful=on))
-        layout.addWidget(self.without)
-        layout.addLayout(
-            button_row(
-                button(
-                    "Copy values",
-                    "Copy the values of all frames shown, for a spreadsheet",
-                    self.plots.copy_table,
-                ),
-                button("Copy picture", "Copy the plots as a picture", self.plots.copy_picture),
-            )
+        values = button(
+            "Copy values",
+            "Copy the values of all frames shown, for a spreadsheet",
+            self.plots.copy_table,
+        )
+        picture = button("Copy picture", "Copy the plots as a picture", self.plots.copy_picture)
+        fill(
+            self.panel_layout,
+            *(heading("Shown"), self._make_choice(), heading("Mean ± standard deviation, range")),
+            *(self.table, self.counted, self.without, hbox(values, picture)),
         )
         self._make_spectrum()
         self._make_signals()
-        layout.addStretch(1)
 
     def _make_choice(self) -> QGridLayout:
         grid = QGridLayout()
@@ -217,16 +195,14 @@ class TrendsPage(Page):
         return grid
 
     def _make_spectrum(self) -> None:
-        self.panel_layout.addWidget(heading("Spectrum"))
         choices = [("", "none"), *((q.key, q.label) for q in QUANTITIES)]
         self.of = ChoiceField("Spectrum of", choices, tooltip="Shows oscillations of a measure")
         self.of.edited.connect(lambda key: self._set_options(spectrum_of=key))
-        self.panel_layout.addLayout(_labelled(self.of))
         self.spectrum_words = Message(2)
-        self.panel_layout.addWidget(self.spectrum_words)
+        of = hbox(self.of.label, (self.of, 1))
+        fill(self.panel_layout, heading("Spectrum"), of, self.spectrum_words)
 
     def _make_signals(self) -> None:
-        self.panel_layout.addWidget(heading("Current and voltage"))
         self.signals_words = wrapping_label()
         self.start = NumberField(
             "Starts at",
@@ -238,7 +214,6 @@ class TrendsPage(Page):
             tooltip="Added to the table's times: when its zero is on the recording's clock",
         )
         self.start.edited.connect(self._start_at)
-        self.panel_layout.addLayout(_labelled(self.start))
         self.read_button = button(
             "Read a table …",
             "Read current and voltage from a CSV table and keep them in the session",
@@ -250,13 +225,8 @@ class TrendsPage(Page):
             lambda: self.workspace.attempt(lambda session: session.set_signals(None)),
         )
         keep_room(self.start, self.start.label, self.forget_button)
-        self.panel_layout.addLayout(button_row(self.read_button, self.forget_button))
-        self.panel_layout.addWidget(self.signals_words)
-
-
-def _labelled(field: ChoiceField | NumberField) -> QHBoxLayout:
-    row = QHBoxLayout()
-    row.addWidget(field.label)
-    widget: QWidget = field
-    row.addWidget(widget, 1)
-    return row
+        fill(
+            self.panel_layout,
+            *(heading("Current and voltage"), hbox(self.start.label, (self.start, 1))),
+            *(hbox(self.read_button, self.forget_button), self.signals_words, 1),
+        )

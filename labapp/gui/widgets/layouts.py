@@ -1,0 +1,75 @@
+"""Layouts that are filled in one go."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import (
+    QBoxLayout,
+    QFrame,
+    QHBoxLayout,
+    QLayout,
+    QScrollArea,
+    QVBoxLayout,
+    QWidget,
+)
+
+from labapp.gui.widgets.labels import heading
+
+Part = QWidget | QLayout | int | tuple[QWidget | QLayout, int]
+"""A widget or a layout, alone or with its stretch; a number: so much of a stretch, empty."""
+
+L = TypeVar("L", bound=QBoxLayout)
+
+
+def fill(layout: L, *parts: Part) -> L:
+    """Put parts after those that are there; returns the layout."""
+    for part in parts:
+        if isinstance(part, int):
+            layout.addStretch(part)
+            continue
+        each, stretch = part if isinstance(part, tuple) else (part, 0)
+        if isinstance(each, QWidget):
+            layout.addWidget(each, stretch)
+        else:
+            layout.addLayout(each, stretch)
+    return layout
+
+
+def vbox(*parts: Part, of: QWidget | None = None) -> QVBoxLayout:
+    """Parts under each other, without margins; ``of`` is the widget that has this layout."""
+    return _bare(QVBoxLayout() if of is None else QVBoxLayout(of), parts)
+
+
+def hbox(*parts: Part, of: QWidget | None = None) -> QHBoxLayout:
+    """Parts beside each other, without margins; ``of`` is the widget that has this layout."""
+    return _bare(QHBoxLayout() if of is None else QHBoxLayout(of), parts)
+
+
+def scrolled(widget: QWidget, name: str = "") -> QScrollArea:
+    """An area that scrolls a widget; with a name also by keys."""
+    area = QScrollArea()
+    area.setWidget(widget)
+    area.setWidgetResizable(True)
+    area.setFrameShape(QFrame.Shape.NoFrame)
+    if name:
+        area.setAccessibleName(name)
+        area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
+    else:
+        area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
+    return area
+
+
+class Group(QWidget):
+    """Parts under a heading; ``column`` is its layout."""
+
+    def __init__(self, words: str, *parts: Part) -> None:
+        super().__init__()
+        self.column = vbox(heading(words), *parts, of=self)
+        self.column.setContentsMargins(0, 6, 0, 0)
+
+
+def _bare(layout: L, parts: tuple[Part, ...]) -> L:
+    layout.setContentsMargins(0, 0, 0, 0)
+    return fill(layout, *parts)
