@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -102,17 +104,11 @@ def as_text(rows: Iterable[ResultRow]) -> str:
 
 def as_csv(rows: Iterable[ResultRow]) -> str:
     """Result rows for a program: comma-separated, numbers in full."""
-    lines = ["quantity,value,sigma,unit"]
-    for row in rows:
-        value = "" if row.value is None else f"{row.value}"
-        sigma = "" if row.sigma is None else f"{row.sigma}"
-        lines.append(",".join(_quoted(cell) for cell in (row.name, value, sigma, row.unit)))
-    return "\n".join(lines) + "\n"
-
-
-def _quoted(cell: str) -> str:
-    quoted = cell.replace('"', '""')
-    return f'"{quoted}"' if any(mark in cell for mark in ',"\n') else cell
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("quantity", "value", "sigma", "unit"))
+    writer.writerows((row.name, row.value, row.sigma, row.unit) for row in rows)
+    return text.getvalue()
 
 
 UNITS = {"mm": "mm", "deg": "°", "px": "px", "pct": "%", "um per unit": "µm per mm or °"}

@@ -8,52 +8,31 @@ from PySide6.QtWidgets import QApplication
 
 Role = QPalette.ColorRole
 
-LIGHT = {
-    Role.Window: "#f3f4f5",
-    Role.WindowText: "#1c2024",
-    Role.Base: "#ffffff",
-    Role.AlternateBase: "#f0f2f4",
-    Role.Text: "#1c2024",
-    Role.PlaceholderText: "#6b7480",
-    Role.Button: "#e7e9ec",
-    Role.ButtonText: "#1c2024",
-    Role.BrightText: "#ffffff",
-    Role.ToolTipBase: "#ffffff",
-    Role.ToolTipText: "#1c2024",
-    Role.Link: "#0a62a8",
-    Role.LinkVisited: "#0a62a8",
-    Role.Highlight: "#0a6fc2",
-    Role.HighlightedText: "#ffffff",
-    Role.Accent: "#0a6fc2",
-    Role.Light: "#ffffff",
-    Role.Midlight: "#e2e5e9",
-    Role.Mid: "#b7bec7",
-    Role.Dark: "#8f98a3",
-    Role.Shadow: "#5d656f",
+COLOURS = {
+    Role.Window: ("#f3f4f5", "#1f2326"),
+    Role.WindowText: ("#1c2024", "#e4e7ea"),
+    Role.Base: ("#ffffff", "#2a3036"),
+    Role.AlternateBase: ("#f0f2f4", "#30373e"),
+    Role.Text: ("#1c2024", "#e4e7ea"),
+    Role.PlaceholderText: ("#6b7480", "#929ba6"),
+    Role.Button: ("#e7e9ec", "#383f46"),
+    Role.ButtonText: ("#1c2024", "#e4e7ea"),
+    Role.BrightText: ("#ffffff", "#ffffff"),
+    Role.ToolTipBase: ("#ffffff", "#31363c"),
+    Role.ToolTipText: ("#1c2024", "#e4e7ea"),
+    Role.Link: ("#0a62a8", "#6db8f2"),
+    Role.LinkVisited: ("#0a62a8", "#6db8f2"),
+    Role.Highlight: ("#0a6fc2", "#2a7fc4"),
+    Role.HighlightedText: ("#ffffff", "#ffffff"),
+    Role.Accent: ("#0a6fc2", "#4ba3e3"),
+    Role.Light: ("#ffffff", "#4a5159"),
+    Role.Midlight: ("#e2e5e9", "#3a4047"),
+    Role.Mid: ("#b7bec7", "#50575f"),
+    Role.Dark: ("#8f98a3", "#14171a"),
+    Role.Shadow: ("#5d656f", "#0b0c0e"),
 }
-DARK = {
-    Role.Window: "#1f2326",
-    Role.WindowText: "#e4e7ea",
-    Role.Base: "#2a3036",
-    Role.AlternateBase: "#30373e",
-    Role.Text: "#e4e7ea",
-    Role.PlaceholderText: "#929ba6",
-    Role.Button: "#383f46",
-    Role.ButtonText: "#e4e7ea",
-    Role.BrightText: "#ffffff",
-    Role.ToolTipBase: "#31363c",
-    Role.ToolTipText: "#e4e7ea",
-    Role.Link: "#6db8f2",
-    Role.LinkVisited: "#6db8f2",
-    Role.Highlight: "#2a7fc4",
-    Role.HighlightedText: "#ffffff",
-    Role.Accent: "#4ba3e3",
-    Role.Light: "#4a5159",
-    Role.Midlight: "#3a4047",
-    Role.Mid: "#50575f",
-    Role.Dark: "#14171a",
-    Role.Shadow: "#0b0c0e",
-}
+"""On a light and on a dark ground."""
+
 RED = QColor("#b8321f"), QColor("#f0705a")
 """Of alarms, limits, and a recording under way: on a light and on a dark ground."""
 
@@ -64,8 +43,8 @@ DISABLED = {False: "#8b939d", True: "#767e88"}
 def palette(dark: bool) -> QPalette:
     """The light or the dark palette."""
     made = QPalette()
-    for role, colour in (DARK if dark else LIGHT).items():
-        made.setColor(role, QColor(colour))
+    for role, colours in COLOURS.items():
+        made.setColor(role, QColor(colours[dark]))
     for role in (Role.WindowText, Role.Text, Role.ButtonText, Role.HighlightedText):
         made.setColor(QPalette.ColorGroup.Disabled, role, QColor(DISABLED[dark]))
     made.setColor(

@@ -84,13 +84,10 @@ class JudgedFrame:
         (u, v) of its dots, shape (n, 2); None where they come with the frames that are shown.
     quality
         Whether it is fit to be measured.
-    room_byte
-        Free on the disk; None where that cannot be told.
     """
 
     dots_px: FloatArray | None
     quality: Quality
-    room_byte: int | None
 
 
 @dataclass(frozen=True)
@@ -137,6 +134,8 @@ class Live:
         Measures the frames; None where there is no set-up, and before the camera is open.
     takes
         The recordings made, in their order.
+    room_byte
+        Free on the disk; None where that is not known.
     """
 
     def __init__(
@@ -167,6 +166,7 @@ class Live:
         self._discarded: list[Take] = []
         self._counted: deque[tuple[float, int]] = deque()
         self._frame_byte = 0
+        self.room_byte: int | None = None
         self._is_stale = False
         self._closing = threading.Event()
         self._turn = threading.Lock()
@@ -316,11 +316,11 @@ class Live:
         quality = judge_quality(frame.image, found, depth, rays_of(self._setup))
         self._frame_byte = frame.image.nbytes
         try:
-            room_byte = shutil.disk_usage(self._folder).free
+            self.room_byte = shutil.disk_usage(self._folder).free
         except OSError:
-            room_byte = None
+            self.room_byte = None
         places = None if quick else _places_px(dots)
-        self._judged.append(JudgedFrame(places, quality, room_byte))
+        self._judged.append(JudgedFrame(places, quality))
 
     # --- to look at ---------------------------------------------------------------------------
 
@@ -385,14 +385,8 @@ class Live:
         kept_s = 0.0 if recorder is None else min(wanted_s, recorder.ring_s)
         return kept_s / wanted_s, f"{kept_s:.1f} of {wanted_s:g} s"
 
-    def recording_text(self, room_byte: int | None) -> str:
-        """What is being recorded, or what became of the last recording, and for how long is room.
-
-        Parameters
-        ----------
-        room_byte
-            Free on the disk; None: not known yet.
-        """
+    def recording_text(self) -> str:
+        """What is being recorded, or became of the last recording, and for how long is room."""
         take, told = self.running, []
         if take is not None:
             told = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
@@ -402,9 +396,9 @@ class Live:
         elif self.takes:
             told = [f"{self.takes[-1].path.name}: {self.takes[-1].summary.words}"]
         rate = self.rate_hz()
-        if room_byte is not None and rate:
-            room_s = room_byte / (self._frame_byte * rate / self.plan.every)
-            told.append(f"room for {_lasting(room_s)} ({format_bytes(room_byte)})")
+        if self.room_byte is not None and rate:
+            room_s = self.room_byte / (self._frame_byte * rate / self.plan.every)
+            told.append(f"room for {_lasting(room_s)} ({format_bytes(self.room_byte)})")
         return "; ".join(told)
 
     # --- to do --------------------------------------------------------------------------------

@@ -50,14 +50,14 @@ class RecordBar(QWidget):
             each.setMinimumHeight(BUTTON_PX)
         vbox(line, self.recording, hbox(*buttons), of=self).setContentsMargins(8, 2, 8, 4)
 
-    def show_status(self, live: Live, room_byte: int | None) -> None:
-        """Show the state of a camera and its recording; ``room_byte`` is free on the disk."""
+    def show_status(self, live: Live) -> None:
+        """Show the state of a camera and its recording."""
         self.state.setText(live.state_text())
         part, told = live.ring()
         self.ring.setValue(round(100 * part))
         self.ring.setFormat(told)
         self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
-        self.recording.setText(live.recording_text(room_byte))
+        self.recording.setText(live.recording_text())
 
     def show_recording(self, recording: bool) -> None:
         """Let the button that records say whether it does: by its words, its sign, and in red."""

@@ -97,7 +97,6 @@ class LiveView(QObject):
         self._finding: Task | None = None
         self._status_s = self.measured_s = 0.0
         self._result: LiveResult | None = None
-        self._room_byte: int | None = None
         self._timer = QTimer(self, interval=TICK_MS)
         self._timer.timeout.connect(self._tick)
         self._rings = pg.ScatterPlotItem(
@@ -186,7 +185,6 @@ class LiveView(QObject):
         self.camera_fields.show_camera(
             live.feed, None if session is None else calibrated_px(session)
         )
-        self._room_byte = None
         self._rings.setData([])
         self.measured_s, self._result = 0.0, None
         self.figures.show_figures(figures(None) if live.watch is not None else ())
@@ -312,7 +310,6 @@ class LiveView(QObject):
             self.updates += 1
         looked = live.looked()
         if looked is not None:
-            self._room_byte = looked.room_byte
             self._ring_dots(looked.dots_px)
             if self._result is None or self._age_s > OLD_S:
                 self._show_quality(looked.quality)
@@ -372,7 +369,7 @@ class LiveView(QObject):
 
     def _show_status(self, live: Live) -> None:
         self._status_s = time.monotonic()
-        self.bar.show_status(live, self._room_byte)
+        self.bar.show_status(live)
         self.counts.setText(live.counts_text())
         if live.watch is not None:
             pace, came_hz = live.watch.trend.pace(), live.rate_hz()

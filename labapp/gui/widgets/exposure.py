@@ -2,35 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from PySide6.QtWidgets import QFormLayout, QProgressBar
 
 from labapp.core.images.exposure import Exposure
 from labapp.gui.widgets.labels import Message, plain_tip
 from labapp.gui.widgets.layouts import Group
 
-
-@dataclass(frozen=True)
-class ExposureBar:
-    """A bar that shows how much.
-
-    Parameters
-    ----------
-    name
-        Of what.
-    part
-        From 0 to 1.
-    words
-        How much, in words.
-    tip
-        What it means.
-    """
-
-    name: str
-    part: float
-    words: str
-    tip: str
+BARS = (
+    ("Exposure", "Level of the bright {} as a part of the camera's full scale"),
+    ("Saturation", "Part of the {} at the top of the scale: their centres are inaccurate"),
+    ("Contrast", "How far the dots rise above their background, as a part of their level"),
+)
+"""Names, and what they mean, of dots or pixels."""
 
 
 class ExposureBars(Group):
@@ -39,7 +22,7 @@ class ExposureBars(Group):
     def __init__(self) -> None:
         form = QFormLayout()
         self.bars = []
-        for name in ("Exposure", "Saturation", "Contrast"):
+        for name, _ in BARS:
             bar = QProgressBar()
             bar.setRange(0, 100)
             self.bars.append(bar)
@@ -49,36 +32,22 @@ class ExposureBars(Group):
 
     def show_exposure(self, exposure: Exposure, verdict: str, good: bool) -> None:
         """Show how a frame is exposed, and what to do about it."""
-        for bar, widget in zip(bars(exposure), self.bars, strict=True):
-            widget.setValue(round(100 * bar.part))
-            widget.setFormat(bar.words)
-            widget.setAccessibleName(f"{bar.name}: {bar.words}")
-            widget.setToolTip(plain_tip(bar.tip))
+        of = "dots" if exposure.snr > 0 else "pixels"
+        for bar, (name, tip), (part, words) in zip(self.bars, BARS, bars(exposure), strict=True):
+            bar.setValue(round(100 * part))
+            bar.setFormat(words)
+            bar.setAccessibleName(f"{name}: {words}")
+            bar.setToolTip(plain_tip(tip.format(of)))
         self.verdict.setText(f"{'●' if good else '▲'} {verdict}")
 
 
-def bars(exposure: Exposure) -> tuple[ExposureBar, ExposureBar, ExposureBar]:
-    """Exposure, saturation and contrast."""
+def bars(exposure: Exposure) -> tuple[tuple[float, str], ...]:
+    """Exposure, saturation and contrast: 0 … 1, and in words."""
     dots = exposure.snr > 0
-    of = "dots" if dots else "pixels"
     contrast = f"{exposure.contrast:.0%}, {exposure.snr:.0f} × the noise" if dots else "no dots"
+    clipped = f"{exposure.clipped:.0%} of the {'dots' if dots else 'pixels'} clipped"
     return (
-        ExposureBar(
-            "Exposure",
-            exposure.level,
-            f"{exposure.level:.0%} of full scale",
-            f"Level of the bright {of} as a part of the camera's full scale",
-        ),
-        ExposureBar(
-            "Saturation",
-            exposure.clipped,
-            f"{exposure.clipped:.0%} of the {of} clipped",
-            f"Part of the {of} at the top of the scale: their centres are inaccurate",
-        ),
-        ExposureBar(
-            "Contrast",
-            exposure.contrast,
-            contrast,
-            "How far the dots rise above their background, as a part of their level",
-        ),
+        (exposure.level, f"{exposure.level:.0%} of full scale"),
+        (exposure.clipped, clipped),
+        (exposure.contrast, contrast),
     )

@@ -31,7 +31,7 @@ from labapp.gui.pages.capture.presenter import (
 )
 from labapp.gui.shell.steps import Mark, State
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.widgets.exposure import bars
+from labapp.gui.widgets.exposure import BARS, bars
 from labapp.gui.workspace import Workspace
 from labapp.session.copies import next_session
 from labapp.session.record import Record
@@ -99,11 +99,12 @@ def test_what_was_read_is_told(copy_sample) -> None:
         seen = look(session, 0)
         assert seen.exposure is not None
         assert seen.exposure.verdict == "good"
-        assert [bar.name for bar in bars(seen.exposure)] == ["Exposure", "Saturation", "Contrast"]
+        assert len(bars(seen.exposure)) == len(BARS)
+    assert [name for name, _ in BARS] == ["Exposure", "Saturation", "Contrast"]
     assert format_bytes(999) == "999 bytes"
     assert format_bytes(2_500_000_000) == "2.5 GB"
     blank = bars(judge_exposure(np.zeros((9, 9), np.uint8), None, 8))
-    assert [bar.part for bar in blank] == [0, 0, 0]
+    assert [part for part, _ in blank] == [0, 0, 0]
 
 
 def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
