@@ -102,13 +102,7 @@ class PreferencesStore(QObject):
         self.path = path
 
     def remember(self, change: Callable[[Preferences], Preferences]) -> None:
-        """Change what is remembered by now, one window at a time, and write it.
-
-        Parameters
-        ----------
-        change
-            Gives the preferences to write for those that are there.
-        """
+        """Change what is remembered by now, one window at a time, and write it."""
         lock = FileLock(self.path.with_name(f".{self.path.name}.lock"), timeout=LOCK_S)
         with ExitStack() as held:
             with suppress(OSError, Timeout):  # better written without a turn than not at all

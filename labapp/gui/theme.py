@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QEvent, Qt
 from PySide6.QtGui import QColor, QPalette
 from PySide6.QtWidgets import QApplication
 
@@ -56,6 +56,26 @@ def palette(dark: bool) -> QPalette:
 def is_dark(look: QPalette) -> bool:
     """Whether a palette is a dark one; what no role can say is chosen by this."""
     return look.color(Role.Window).lightness() < 128
+
+
+class FollowsTheme:
+    """Of a widget that takes colours which its palette alone does not give; before its class."""
+
+    _follows = False
+
+    def follow_theme(self) -> None:
+        """Take the window's colours, now and whenever they change."""
+        self._follows = True
+        self.take_colours()
+
+    def take_colours(self) -> None:
+        """Take the window's colours."""
+
+    def changeEvent(self, event: QEvent) -> None:
+        """Follow a change of theme."""
+        super().changeEvent(event)  # type: ignore[misc]
+        if event.type() == QEvent.Type.PaletteChange and self._follows:
+            self.take_colours()
 
 
 def apply_theme(app: QApplication, theme: str) -> None:

@@ -184,15 +184,7 @@ class Workspace(QObject):
         cause: str = "",
         beside: Callable[[str], object] | None = None,
     ) -> bool:
-        """Change the session and emit `changed`; False if it was refused, which is reported.
-
-        Parameters
-        ----------
-        change
-            What is done to it.
-        cause, beside
-            As of `run_or_report`.
-        """
+        """Change the session and emit `changed`; False if it was refused, which is reported."""
         session = self.session
         if session is None or self.run_or_report(lambda: (change(session),), cause, beside) is None:
             return False

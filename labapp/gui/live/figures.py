@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from PySide6.QtCore import QEvent, Qt
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QAccessible, QAccessibleEvent, QPalette
 from PySide6.QtWidgets import QFrame, QGridLayout, QLabel, QWidget
 
 from labapp.gui.digits import NOTHING, plain
-from labapp.gui.theme import RED, is_dark
+from labapp.gui.theme import RED, FollowsTheme, is_dark
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label, selectable_label
 from labapp.gui.widgets.layouts import hbox, vbox
@@ -128,7 +128,7 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
     return " ".join(told)
 
 
-class LiveFigures(QWidget):
+class LiveFigures(FollowsTheme, QWidget):
     """Results in large figures, to be read from where the work is."""
 
     def __init__(self) -> None:
@@ -139,6 +139,7 @@ class LiveFigures(QWidget):
         vbox(self._grid, self.words, of=self)
         self._labels: dict[tuple[int, int], QLabel] = {}
         self._looks: dict[QLabel, tuple[Look, bool]] = {}
+        self.follow_theme()
 
     def show_figures(self, shown: Sequence[Figure]) -> None:
         """Show figures, each in a row, and no others."""
@@ -179,15 +180,13 @@ class LiveFigures(QWidget):
             colours.setColor(QPalette.ColorRole.WindowText, pale)
         label.setPalette(colours)
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_looks"):
-            for label, (look, _) in list(self._looks.items()):
-                self._apply_look(label, look)
+    def take_colours(self) -> None:
+        """Colour the labels for the window's ground."""
+        for label, (look, _) in list(self._looks.items()):
+            self._apply_look(label, look)
 
 
-class AlarmStrip(QFrame):
+class AlarmStrip(FollowsTheme, QFrame):
     """What the operator must see, below the picture, and the button that says it was seen."""
 
     def __init__(self, acknowledge: Callable[[], None]) -> None:
@@ -204,20 +203,15 @@ class AlarmStrip(QFrame):
         hbox((self.words, 1), self.button, of=self).setContentsMargins(6, 2, 6, 2)
         self._alarms: tuple[Alarm, ...] = ()
         self._kept: tuple[Alarm, ...] = ()
-        self._paint()
+        self.follow_theme()
         self.hide()
 
-    def _paint(self) -> None:
+    def take_colours(self) -> None:
+        """Say it in the red of the window's ground."""
         colours = QPalette()
         colours.setColor(QPalette.ColorRole.WindowText, RED[is_dark(colours)])
         for widget in (self, self.words):
             widget.setPalette(colours)
-
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "_kept"):
-            self._paint()
 
     def show_alarms(self, alarms: Sequence[Alarm]) -> None:
         """Show alarms, after those that are kept; none hides it."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from PySide6.QtCore import QEvent, QSize, Qt, Signal
+from PySide6.QtCore import QSize, Qt, Signal
 from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPixmap
 from PySide6.QtWidgets import (
     QFrame,
@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
 from labapp.gui.tasks import Control
+from labapp.gui.theme import FollowsTheme
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
 from labapp.gui.widgets.layouts import hbox
@@ -33,7 +34,7 @@ BUTTONS = (
 WIDTH_PX = 760
 
 
-class Welcome(QWidget):
+class Welcome(FollowsTheme, QWidget):
     """Recent sessions with thumbnail, date and frames; New; Open; Try the sample.
 
     Signals
@@ -96,6 +97,7 @@ class Welcome(QWidget):
         column.addWidget(self.nothing)
         column.addStretch(0)
         hbox(1, (inner, 100), 1, of=self).setContentsMargins(24, 20, 24, 12)
+        self.follow_theme()
 
     def show_recent(self, paths: Sequence[Path]) -> None:
         """List these sessions; what is in them is looked at in the background."""
@@ -137,24 +139,18 @@ class Welcome(QWidget):
         item.setData(Qt.ItemDataRole.AccessibleTextRole, f"{recent.title}, {recent.about}")
         if not recent.there:
             self._gone.append(recent.path)
-            self._show_gone()
+            self.take_colours()
         if recent.thumbnail is not None:
             rows, columns = recent.thumbnail.shape
             grey = QImage.Format.Format_Grayscale8
             image = QImage(recent.thumbnail.tobytes(), columns, rows, columns, grey).copy()
             item.setIcon(QIcon(QPixmap.fromImage(image)))
 
-    def _show_gone(self) -> None:
+    def take_colours(self) -> None:
         """Have sessions that are not there be paler."""
         for path in self._gone:
             item = self.list.item(self._shown.index(path))
             item.setForeground(self.palette().placeholderText())
-
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange:
-            self._show_gone()
 
     def _open(self, item: QListWidgetItem) -> None:
         self.chosen.emit(item.data(Qt.ItemDataRole.UserRole))

@@ -83,17 +83,7 @@ class Menus:
     def refresh(
         self, there: Mapping[Needs, bool], on: Mapping[str, bool], undo: str, redo: str
     ) -> None:
-        """Enable what is of use now, check what is on, say what undo and redo would do.
-
-        Parameters
-        ----------
-        there
-            Whether that is there which actions need.
-        on
-            Whether those actions are on that can be, by their names.
-        undo, redo
-            Labels of the changes that they would take back and make again; or nothing.
-        """
+        """Enable what is of use now, check what is on, say what undo and redo would do."""
         for name, made in self.actions.items():
             made.setEnabled(there[self._needs[name]])
         for name, is_on in on.items():

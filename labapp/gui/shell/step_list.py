@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from PySide6.QtCore import QEvent, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
 from PySide6.QtGui import QColor, QIcon, QPainter, QPalette, QPen, QPixmap, QPolygonF
 from PySide6.QtWidgets import (
     QFrame,
@@ -18,7 +18,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.shell.steps import READ_ONLY, Mark, State, Step
-from labapp.gui.theme import is_dark
+from labapp.gui.theme import FollowsTheme, is_dark
 from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
 from labapp.gui.widgets.layouts import fill, scrolled
 
@@ -79,7 +79,7 @@ def _drawn(mark: Mark, colour: QColor, ground: QColor) -> QPixmap:
     return pixmap
 
 
-class StepList(QListWidget):
+class StepList(FollowsTheme, QListWidget):
     """The steps that have a page.
 
     Signals
@@ -91,8 +91,8 @@ class StepList(QListWidget):
     chosen = Signal(str)
 
     def __init__(self, steps: Sequence[Step]) -> None:
-        self._states: Mapping[str, State] = {}
         super().__init__()
+        self._states: Mapping[str, State] = {}
         self._steps = tuple(steps)
         self.setAccessibleName("Steps")
         self.setToolTip("The steps from the bench to the results: ↑ and ↓ choose one")
@@ -107,6 +107,7 @@ class StepList(QListWidget):
             self.addItem(item)
         self.setMinimumWidth(self.sizeHint().width())
         self.currentRowChanged.connect(self._told)
+        self.follow_theme()
 
     def sizeHint(self) -> QSize:
         """As wide as the longest title needs."""
@@ -126,10 +127,9 @@ class StepList(QListWidget):
             told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
             item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and self._states:
+    def take_colours(self) -> None:
+        """Draw the marks in the window's colours."""
+        if self._states:
             self.show_states(self._states)
 
     def show_step(self, key: str) -> None:
@@ -144,12 +144,12 @@ class StepList(QListWidget):
             self.chosen.emit(self._steps[row].key)
 
 
-class SidePanel(QWidget):
+class SidePanel(FollowsTheme, QWidget):
     """What to do now, how far the step is, and the page's own panel, which scrolls."""
 
     def __init__(self) -> None:
-        self._shown: State | None = None
         super().__init__()
+        self._shown: State | None = None
         self.title = plain_label()
         font = self.title.font()
         font.setPointSizeF(font.pointSizeF() * 1.25)
@@ -170,6 +170,7 @@ class SidePanel(QWidget):
         line.setForegroundRole(QPalette.ColorRole.Mid)
         fill(layout, self.title, self.hint, self.state, self.read_only, line, (self.stack, 1))
         self.setMinimumWidth(320)
+        self.follow_theme()
 
     def sizeHint(self) -> QSize:
         """Room for two columns of numbers."""
@@ -196,8 +197,7 @@ class SidePanel(QWidget):
         palette.setColor(QPalette.ColorRole.WindowText, QColor(colour))
         self.state.setPalette(palette)
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and self._shown is not None:
+    def take_colours(self) -> None:
+        """Say how far the step is in the colour of its mark."""
+        if self._shown is not None:
             self.show_state(self._shown)

@@ -32,15 +32,7 @@ def plain_axes() -> dict[str, PlainAxis]:
 
 
 def make_plot(x_label: str, y_label: str = "", equal: bool = True) -> pg.PlotWidget:
-    """Make a plot that leaves keys and the right button to its parent.
-
-    Parameters
-    ----------
-    x_label, y_label
-        What the axes are, with units; empty: no label.
-    equal
-        Whether a millimetre is as long on both axes.
-    """
+    """Make a plot that leaves keys and the right button to its parent."""
     plot: Any = pg.PlotWidget(axisItems=plain_axes())
     plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
     plot.setMenuEnabled(False)

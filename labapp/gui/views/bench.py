@@ -47,7 +47,7 @@ class BenchView(Sketch):
             left, right = _near(self._view)
             self.near.setRange(xRange=(-left, right), yRange=(-0.4 * right, right), padding=0)
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Draw in the window's colours."""
         palette = self.palette()
         self._ground = palette.color(QPalette.ColorRole.Base)

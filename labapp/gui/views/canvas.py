@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QEvent, QObject, Qt
+from PySide6.QtCore import QObject, Qt
 from PySide6.QtGui import QAccessible, QAccessibleInterface, QPainter, QPaintEvent, QPalette
 from PySide6.QtWidgets import QAccessibleWidget, QWidget
 
+from labapp.gui.theme import FollowsTheme
 
-class Drawn(QWidget):
+
+class Drawn(FollowsTheme, QWidget):
     """A drawing to look at; without keys of its own Tab goes past it.
 
     Parameters
@@ -19,7 +21,6 @@ class Drawn(QWidget):
     """
 
     ROLE = QAccessible.Role.Graphic
-    _follows = False
 
     def __init__(self, name: str, keys: str = "") -> None:
         super().__init__()
@@ -33,20 +34,6 @@ class Drawn(QWidget):
         """Set the description for screen readers; the keys follow it."""
         told = (words.strip().rstrip("."), self._keys)
         self.setAccessibleDescription(". ".join(part for part in told if part))
-
-    def follow_theme(self) -> None:
-        """Take the window's colours, now and whenever they change."""
-        self._follows = True
-        self.apply_theme()
-
-    def apply_theme(self) -> None:
-        """Take the window's colours where the palette alone does not give them."""
-
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and self._follows:
-            self.apply_theme()
 
     def paintEvent(self, _event: QPaintEvent) -> None:
         """Draw the focus frame; what lies on the widget leaves a px at the edge."""

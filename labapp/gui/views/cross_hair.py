@@ -27,9 +27,9 @@ class CrossHairView(Sketch):
         """Draw a laser and the lengths that were read, or say in words why there is none."""
         self._shown = (found, l1_mm, l2_mm)
         self.say(words, found is not None)
-        self.apply_theme()
+        self.take_colours()
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Draw in the window's colours."""
         ground = self.palette().color(QPalette.ColorRole.Base)
         ink = self.palette().color(QPalette.ColorRole.Text)

@@ -273,7 +273,7 @@ class PictureView(Drawn):
         self._place.setText("" if level is None else f"u {u:.1f}, v {v:.1f} px, level {level:g}")
         self.pointed.emit(u, v, level)
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Take the ground from the window's."""
         self.canvas.setBackground(self.palette().color(QPalette.ColorRole.Window).darker(120))
 

@@ -185,9 +185,9 @@ class PlotStack(Plotted):
         self.canvas.setMinimumHeight(LEAST_HEIGHT * len(self._plots) + 40)
         lines = 2 if sum(len(curve.key) > 0 for curve in self.curves) > 1 else 1
         self.read_out.setFixedHeight(lines * self.fontMetrics().lineSpacing() + 6)
-        self.apply_theme()
+        self.take_colours()
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Draw in the window's colours."""
         look = self.palette()
         self.canvas.setBackground(look.color(Role.Base))

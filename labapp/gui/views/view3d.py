@@ -281,7 +281,7 @@ class View3d(Drawn):
         else:
             super().keyPressEvent(event)
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Draw in the window's colours."""
         if self._scene is not None:
             self.show_scene(self._scene)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, Qt
+from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction, QGuiApplication, QImage, QKeySequence, QPixmap, QResizeEvent
 from PySide6.QtWidgets import QFrame, QScrollArea
 
-from labapp.gui.theme import is_dark
+from labapp.gui.theme import FollowsTheme, is_dark
 from labapp.gui.widgets.labels import plain_label
 
 MOST_SCALE = 1.25
 """Larger than so many times as it was printed it is not shown."""
 
 
-class Sheet(QScrollArea):
+class Sheet(FollowsTheme, QScrollArea):
     """A picture as wide as there is room, up to a little more than it was printed."""
 
     def __init__(self, name: str) -> None:
@@ -37,6 +37,7 @@ class Sheet(QScrollArea):
         copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
         copy.triggered.connect(self.copy_picture)
         self.addAction(copy)
+        self.follow_theme()
 
     def describe(self, words: str) -> None:
         """Say what is to be seen."""
@@ -47,7 +48,7 @@ class Sheet(QScrollArea):
         """Show a picture; the words are what a screen reader says."""
         self._printed = QImage.fromData(content).convertToFormat(QImage.Format.Format_RGB32)
         self.describe(words)
-        self._show()
+        self.take_colours()
 
     def copy_picture(self) -> None:
         """Put it on the clipboard, as it was printed."""
@@ -57,15 +58,10 @@ class Sheet(QScrollArea):
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Follow the width."""
         super().resizeEvent(event)
-        self._show()
+        self.take_colours()
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange:
-            self._show()
-
-    def _show(self) -> None:
+    def take_colours(self) -> None:
+        """Show the picture as wide as there is room, in the window's colours."""
         if self._printed.isNull():
             return
         ratio = self.devicePixelRatioF()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, Qt, QTimer, Signal
+from PySide6.QtCore import Qt, QTimer, Signal
 from PySide6.QtGui import QIcon, QPainter, QPalette, QResizeEvent
 from PySide6.QtWidgets import (
     QHBoxLayout,
@@ -18,6 +18,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.gui.theme import FollowsTheme, is_dark
 from labapp.gui.widgets.labels import plain_label
 from labapp.gui.widgets.scrubber import Scrubber, Tick
 
@@ -25,7 +26,7 @@ PLAY_HZ = 30.0
 """Most frames a second while playing; every frame is shown."""
 
 
-class Timeline(QWidget):
+class Timeline(FollowsTheme, QWidget):
     """The scrubber with its buttons, the frame's number and time.
 
     It knows no session: numbers, times and kinds of frames are given to it.
@@ -69,14 +70,13 @@ class Timeline(QWidget):
         self.counts.setMinimumWidth(self.fontMetrics().horizontalAdvance("■ 0000   ") * 3)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self._lay_out()
+        self.follow_theme()
 
-    def changeEvent(self, event: QEvent) -> None:
-        """Follow a change of theme."""
-        super().changeEvent(event)
-        if event.type() == QEvent.Type.PaletteChange and hasattr(self, "counts"):
-            self._show_counts()
-            for button, icon in list(self._icons.items()):
-                self._show_icon(button, icon)
+    def take_colours(self) -> None:
+        """Draw icons and the legend's squares in the window's colours."""
+        self._show_counts()
+        for button, icon in list(self._icons.items()):
+            self._show_icon(button, icon)
 
     def _lay_out(self) -> None:
         style = QStyle.StandardPixmap
@@ -188,7 +188,7 @@ class Timeline(QWidget):
 
     def _show_counts(self) -> None:
         """A legend that counts the kinds that occur, in a word each where there is little room."""
-        dark = self.palette().color(QPalette.ColorRole.Window).lightness() < 128
+        dark = is_dark(self.palette())
         kinds = self.scrubber.kinds
         found = np.bincount(kinds, minlength=len(self._ticks)) if len(kinds) else ()
         long: list[str] = []

@@ -30,11 +30,6 @@ NEXT_TIP = (
 class ImportChoice(Group):
     """Which frames to import; seen while a recording is looked at.
 
-    Parameters
-    ----------
-    do_import, begin_next, leave
-        Import into the session, into a new one like it, or not at all.
-
     Signals
     -------
     edited

@@ -271,17 +271,7 @@ Need = Literal["", "rows", "reference", "dots", "site", "row", "two rows", "corr
 
 
 def unmet_need(need: Need, seen: DotsState | None, selection: IntArray, rows: Sequence[int]) -> str:
-    """What an edit lacks that needs something, as what to do; empty if it is all there.
-
-    Parameters
-    ----------
-    need
-        What it needs.
-    seen
-        What the page shows.
-    selection, rows
-        Indices of the chosen dots, and the rows that they are in.
-    """
+    """What an edit lacks that needs something, as what to do; empty if it is all there."""
     if seen is None or seen.correction is None:
         return "The dots of this frame are not known yet"
     lattice, sited = seen.correction.lattice, seen.correction.sited

@@ -45,7 +45,7 @@ class Chart(Plotted):
         self.title.setText(words)
         self.describe(words)
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Take the window's colours."""
         text = self.colour(QPalette.ColorRole.Text)
         self.plot.setBackground(self.colour(QPalette.ColorRole.Base))
@@ -94,9 +94,9 @@ class DotsChart(Chart):
         self.say(told if dots is not None else "No reflected dots to compare")
         self.plot.autoRange()
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Take the window's colours."""
-        super().apply_theme()
+        super().take_colours()
         text, accent = (
             self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
         )
@@ -167,9 +167,9 @@ class PlanChart(Chart):
         self.dragged.emit(angle, offset)
         self._telling = False
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Take the window's colours."""
-        super().apply_theme()
+        super().take_colours()
         self._outline.setPen(pg.mkPen(self.colour(QPalette.ColorRole.Text), width=2))
         pen = pg.mkPen(self.colour(QPalette.ColorRole.Highlight), width=3)
         self._line.setPen(pen)
@@ -210,9 +210,9 @@ class ProfileChart(Chart):
         self.say(f"Height along the section; ◆ boundary{band}")
         self.plot.autoRange()
 
-    def apply_theme(self) -> None:
+    def take_colours(self) -> None:
         """Take the window's colours."""
-        super().apply_theme()
+        super().take_colours()
         text, accent = (
             self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
         )
