@@ -15,7 +15,7 @@ from labapp.errors import InputError
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField, TextField
-from labapp.gui.widgets.labels import selectable_label
+from labapp.gui.widgets.labels import selectable_label, show_words
 from labapp.gui.widgets.layouts import hbox
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
 from labapp.session.session import Session
@@ -142,8 +142,7 @@ class CameraFields(QObject):
         unlike = other_size(self._calibrated, (height, width))
         if not unlike and is_part:
             unlike = PART_WORDS
-        self.part_words.setText(f"⚠ {unlike}")
-        self.part_words.setVisible(bool(unlike))
+        show_words(self.part_words, f"⚠ {unlike}" if unlike else "")
         self.shoot_button.setVisible(settings.trigger == "software")
 
     # --- to set it ----------------------------------------------------------------------------

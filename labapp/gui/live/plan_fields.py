@@ -84,11 +84,8 @@ class PlanFields(QObject):
 
     def show_cost(self, frame_byte: int, rate_hz: float | None) -> None:
         """Say what recording so costs; nothing while size or rate of the frames is not known."""
-        words = ""
-        if frame_byte and rate_hz:
-            words = cost_text(self.plan(), frame_byte, rate_hz)
-        if words != self.cost.text():
-            self.cost.setText(words)
+        words = cost_text(self.plan(), frame_byte, rate_hz) if frame_byte and rate_hz else ""
+        self.cost.setText(words)
 
     def set_enabled(self, enabled: bool) -> None:
         """Let another plan be entered, or not."""

@@ -11,7 +11,7 @@ from labapp.errors import InputError
 from labapp.gui.tasks import Control, Task
 from labapp.gui.widgets.buttons import check_box
 from labapp.gui.widgets.fields import NumberField
-from labapp.gui.widgets.labels import Message, selectable_label
+from labapp.gui.widgets.labels import Message, selectable_label, show_words
 from labapp.gui.widgets.layouts import Group, vbox
 from labapp.gui.workspace import Workspace
 from labapp.run.live_watch import LiveWatch
@@ -149,12 +149,8 @@ class LiveStreams(QWidget):
         for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
             told = stream_text(stream, self._is_at_work(kind), self._problems.get(kind, ""))
-            if told != self.words[kind].text():
-                self.words[kind].setText(told)
-        warning = WARNING if self.anywhere.isChecked() else ""
-        if warning != self.warning.text():
-            self.warning.setText(warning)
-        self.warning.setVisible(bool(warning))
+            self.words[kind].setText(told)
+        show_words(self.warning, WARNING if self.anywhere.isChecked() else "")
 
 
 def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:

@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.digits import entered, parsed
-from labapp.gui.widgets.labels import heading, plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import heading, plain_label, plain_tip, show_words, wrapping_label
 
 MOUSE_MS = 20
 """How often it is checked whether the mouse button was released."""
@@ -114,8 +114,7 @@ class Field(QWidget):
         if told != self.problem.text() and QGuiApplication.mouseButtons():
             QTimer.singleShot(MOUSE_MS, self, self._show_problem_text)
             return
-        self.problem.setText(told)
-        self.problem.setVisible(bool(told))
+        show_words(self.problem, told)
 
 
 class NumberField(Field):

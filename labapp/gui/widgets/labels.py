@@ -53,6 +53,12 @@ def breakable(text: str) -> str:
     )
 
 
+def show_words(label: QLabel, words: str) -> None:
+    """Show words, or nothing of a label without any."""
+    label.setText(words)
+    label.setVisible(bool(words))
+
+
 def keep_room(*widgets: QWidget) -> None:
     """Let widgets that come and go keep their room: what is below them does not move."""
     for widget in widgets:

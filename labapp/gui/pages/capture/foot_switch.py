@@ -6,12 +6,12 @@ from functools import partial
 from typing import cast
 
 from PySide6.QtGui import QGuiApplication, QTextOption
-from PySide6.QtWidgets import QLabel, QPlainTextEdit, QWidget
+from PySide6.QtWidgets import QPlainTextEdit, QWidget
 
 from labapp.gui.foot_switches import DOES, FootSwitches, pedal_name
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import selectable_label
+from labapp.gui.widgets.labels import selectable_label, show_words
 from labapp.gui.widgets.layouts import Group, fill, hbox, vbox
 from labapp.media.devices.foot_switch import Action
 from labapp.media.devices.hid import commands
@@ -99,7 +99,7 @@ class FootSwitchPanel(Group):
         told = [each.words for each in switches.in_use.values()] or [NONE_YET]
         if switches.found is not None:
             told.append(switches.found.words)
-        _put(self.words, "\n".join(told))
+        show_words(self.words, "\n".join(told))
         self._show_rows()
         self.learn_button.setText("Stop waiting" if switches.learns else "Learn a pedal")
         self.look_button.setEnabled(not (switches.looks or switches.learns))
@@ -108,7 +108,7 @@ class FootSwitchPanel(Group):
         if learned is not None:
             name = pedal_name(learned.pedal, learned.info.is_keyboard)
             words = f"{learned.info.name}: {name} was pressed."
-        _put(self.learned_words, words)
+        show_words(self.learned_words, words)
         if learned is not None and self.learned.isHidden():
             self.action.set_value(switches.proposed)
         self.learned.setVisible(learned is not None)
@@ -167,10 +167,3 @@ class FootSwitchPanel(Group):
     def _copy(self) -> None:
         QGuiApplication.clipboard().setText(self.commands.toPlainText())
         self.switches.notified.emit("The commands are on the clipboard, for a terminal", False)
-
-
-def _put(label: QLabel, words: str) -> None:
-    """Show words, or nothing of a label without any."""
-    if label.text() != words:
-        label.setText(words)
-    label.setVisible(bool(words))

@@ -13,7 +13,7 @@ from labapp.core.rows.lattice import Site
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, heading, plain_label, wrapping_label
+from labapp.gui.widgets.labels import Message, heading, plain_label, show_words, wrapping_label
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
@@ -51,8 +51,7 @@ class DotsPanel(QWidget):
     ) -> None:
         """Show what the session says of the frame in view; None leaves the list of rows."""
         self.seen.setText(seen)
-        self.why.setText(f"⚠ {why[:1].upper()}{why[1:]}" if why else "")
-        self.why.setVisible(bool(why))
+        show_words(self.why, f"⚠ {why[:1].upper()}{why[1:]}" if why else "")
         self.fit.set_rows(fit)
         if rows is not None:
             self.rows.show_lines(rows)

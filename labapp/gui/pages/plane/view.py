@@ -18,7 +18,7 @@ from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
@@ -266,8 +266,7 @@ class PlanePage(Page):
         picture = self.view.picture
         shown = None if picture is None else presenter.residual_map(self.found, picture.shape[0])
         words = (presenter.why(self.found), "" if shown is None else shown.words)
-        self.why.setText("\n".join(filter(None, words)))
-        self.why.setVisible(any(words))
+        show_words(self.why, "\n".join(filter(None, words)))
         if shown is None:
             return
         colors = pg.colormap.get("viridis").map(0.3 + 0.7 * shown.share, mode="qcolor")
@@ -294,8 +293,8 @@ class PlanePage(Page):
         self.result.set_rows(result.rows)
         self.result.setVisible(bool(result.rows))
         why_not = (result.why_not,) if result.why_not else ()
-        self.words.setText("\n".join(f"⚠ {words}" for words in (*why_not, *result.warnings)))
-        self.words.setVisible(bool(self.words.text()))
+        told = (f"⚠ {words}" for words in (*why_not, *result.warnings))
+        show_words(self.words, "\n".join(told))
         unusable = result.why_not or self.locked
         self.use_button.setEnabled(not unusable)
         tip = "Measure with this; undo brings the former back"

@@ -15,7 +15,7 @@ from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entr
 from labapp.gui.views.bench import BenchView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm, NumberField, TextField
-from labapp.gui.widgets.labels import Message, wrapping_label
+from labapp.gui.widgets.labels import Message, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
@@ -74,8 +74,7 @@ class SetupPage(Page):
             self._times[item].setText(f"ticked {_clock(ticked[item])}" if item in ticked else "")
         self.tabs.setTabText(SAFETY_TAB, f"Safety {len(ticked.keys() & self.ticks)}/{len(SAFETY)}")
         self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems else "Bench")
-        self.others.setText("\n".join(shown.others))
-        self.others.setVisible(bool(shown.others))
+        show_words(self.others, "\n".join(shown.others))
         basis = (session.setup_text, shown.record)
         if basis != self._drawn:
             self._drawn = basis

@@ -16,7 +16,7 @@ from labapp.gui.pages.surface.presenter import (
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import heading, keep_room, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
@@ -98,10 +98,8 @@ class SurfacePanel:
         remedy = " Its dots can be corrected in step 5." if told.state == "failed" else ""
         self.status.setText(f"{SIGNS[told.state]} {told.words}{remedy}")
         self.again.setVisible(told.state == "stale")
-        self.provenance.setText(told.provenance)
-        self.provenance.setVisible(bool(told.provenance))
-        self.verdict.setText(told.verdict)
-        self.verdict.setVisible(bool(told.verdict))
+        show_words(self.provenance, told.provenance)
+        show_words(self.verdict, told.verdict)
         for table, rows in (
             (self.sizes, told.sizes),
             (self.errors, told.errors),
