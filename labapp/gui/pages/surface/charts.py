@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QPointF, Qt, Signal
@@ -47,13 +45,11 @@ class Chart(Plotted):
 
     def take_colours(self) -> None:
         """Take the window's colours."""
-        text = self.colour(QPalette.ColorRole.Text)
-        self.plot.setBackground(self.colour(QPalette.ColorRole.Base))
-        paint_axes(self.plot, text, text)
-
-    def colour(self, role: QPalette.ColorRole) -> Any:
-        """A colour of the window."""
-        return self.palette().color(role)
+        palette = self.palette()
+        self.text = palette.color(QPalette.ColorRole.Text)
+        self.accent = palette.color(QPalette.ColorRole.Highlight)
+        self.plot.setBackground(palette.color(QPalette.ColorRole.Base))
+        paint_axes(self.plot, self.text, self.text)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Zoom, or show all."""
@@ -97,13 +93,10 @@ class DotsChart(Chart):
     def take_colours(self) -> None:
         """Take the window's colours."""
         super().take_colours()
-        text, accent = (
-            self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
-        )
-        self._captured.setPen(pg.mkPen(text))
+        self._captured.setPen(pg.mkPen(self.text))
         self._captured.setBrush(pg.mkBrush(None))
-        self._computed.setPen(pg.mkPen(accent, width=2))
-        self._errors.setPen(pg.mkPen(accent, width=2))
+        self._computed.setPen(pg.mkPen(self.accent, width=2))
+        self._errors.setPen(pg.mkPen(self.accent, width=2))
 
 
 class PlanChart(Chart):
@@ -170,8 +163,8 @@ class PlanChart(Chart):
     def take_colours(self) -> None:
         """Take the window's colours."""
         super().take_colours()
-        self._outline.setPen(pg.mkPen(self.colour(QPalette.ColorRole.Text), width=2))
-        pen = pg.mkPen(self.colour(QPalette.ColorRole.Highlight), width=3)
+        self._outline.setPen(pg.mkPen(self.text, width=2))
+        pen = pg.mkPen(self.accent, width=3)
         self._line.setPen(pen)
         for handle in self._line.getHandles():
             handle.pen = handle.currentPen = pen
@@ -213,14 +206,11 @@ class ProfileChart(Chart):
     def take_colours(self) -> None:
         """Take the window's colours."""
         super().take_colours()
-        text, accent = (
-            self.colour(role) for role in (QPalette.ColorRole.Text, QPalette.ColorRole.Highlight)
-        )
-        self._height.setPen(pg.mkPen(accent, width=2))
-        faint = pg.mkColor(accent)
+        self._height.setPen(pg.mkPen(self.accent, width=2))
+        faint = pg.mkColor(self.accent)
         faint.setAlpha(BAND_ALPHA)
         self._band.setBrush(pg.mkBrush(faint))
         for edge in (self._low, self._high):
             edge.setPen(pg.mkPen(faint))
-        self._edge.setPen(pg.mkPen(text))
+        self._edge.setPen(pg.mkPen(self.text))
         self._edge.setBrush(pg.mkBrush(None))
