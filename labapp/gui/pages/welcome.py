@@ -22,7 +22,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.theme import FollowsTheme
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
-from labapp.gui.widgets.layouts import hbox
+from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.workspace import Workspace
 
 BUTTONS = (
@@ -60,24 +60,18 @@ class Welcome(FollowsTheme, QWidget):
         self.buttons: dict[str, QPushButton] = {}
         inner = QWidget()
         inner.setMaximumWidth(WIDTH_PX)
-        column = QVBoxLayout(inner)
-        column.setSpacing(12)
         title = plain_label("labapp")
         font = title.font()
         font.setPointSizeF(font.pointSizeF() * 2.2)
         title.setFont(font)
-        column.addWidget(title)
         about = wrapping_label(
             "The surface of a molten weld pool, measured from the reflections of a laser dot "
             "matrix. An experiment is one session file; everything you do is saved in it at once."
         )
-        column.addWidget(about)
         for name, text, tip in BUTTONS:
             made = self.buttons[name] = button(text, tip, partial(self.action_requested.emit, name))
             made.setMinimumHeight(made.fontMetrics().height() * 2)
-        column.addLayout(hbox(*self.buttons.values()))
         self.label = plain_label("&Recent sessions")
-        column.addWidget(self.label)
         self.list = QListWidget()
         self.list.setAccessibleName("Recent sessions")
         self.list.setToolTip(
@@ -89,13 +83,16 @@ class Welcome(FollowsTheme, QWidget):
         self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open)
         self.label.setBuddy(self.list)
-        column.addWidget(self.list, 1)
         self.nothing = wrapping_label(
             "No session was opened yet. Drop a video, an image, a folder of images or a session "
             "anywhere on this window to begin, or try the sample."
         )
-        column.addWidget(self.nothing)
-        column.addStretch(0)
+        buttons = hbox(*self.buttons.values())
+        column = fill(
+            QVBoxLayout(inner),
+            *(title, about, buttons, self.label, (self.list, 1), self.nothing, 0),
+        )
+        column.setSpacing(12)
         hbox(1, (inner, 100), 1, of=self).setContentsMargins(24, 20, 24, 12)
         self.follow_theme()
 

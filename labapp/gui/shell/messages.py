@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
 from labapp.gui.tasks import Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label
+from labapp.gui.widgets.layouts import fill
 
 KEPT_MESSAGES = 1000
 
@@ -111,10 +112,8 @@ class StatusLine(QWidget):
         self.cancel_button.setAccessibleName("Cancel the work under way")
         layout = QHBoxLayout(self)
         layout.setContentsMargins(6, 0, 6, 0)
-        layout.addWidget(self.read_button)
-        layout.addWidget(self.message, 1)
-        for widget in (self.title, self.bar, self.cancel_button):
-            layout.addWidget(widget)
+        right = (self.title, self.bar, self.cancel_button)
+        fill(layout, self.read_button, (self.message, 1), *right)
         # What comes and goes must not move the window's other parts.
         self.setMinimumHeight(layout.sizeHint().height())
         tasks.changed.connect(self.show_progress)

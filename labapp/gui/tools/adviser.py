@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtWidgets import QScrollArea, QTabWidget, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QTabWidget, QVBoxLayout, QWidget
 
 from labapp.gui.tasks import Control
 from labapp.gui.tools import advising
@@ -12,7 +12,7 @@ from labapp.gui.tools.tool import ToolWindow, progress_of
 from labapp.gui.views.ranges import RangeField
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.labels import wrapping_label
-from labapp.gui.widgets.layouts import Group
+from labapp.gui.widgets.layouts import Group, fill, scrolled
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
@@ -101,23 +101,15 @@ class AdviserWindow(ToolWindow):
         self.costs = CellTable("What each mm and degree away costs")
         self.sheet = Sheet("Bench, places of the laser, and cost curves")
         self.words = QWidget()
-        column = QVBoxLayout(self.words)
-        column.addWidget(self.headline)
         tables = (self.place, self.kept, self.costs)
         self.groups = [Group(table.accessibleName(), table) for table in tables]
+        fill(QVBoxLayout(self.words), self.headline, *self.groups, 1)
         for group in self.groups:
-            column.addWidget(group)
             group.hide()
-        column.addStretch(1)
-        area = QScrollArea()
-        area.setWidget(self.words)
-        area.setWidgetResizable(True)
         self.tabs = QTabWidget()
         self.tabs.tabBar().setAccessibleName("Parts of the advice")
-        self.tabs.addTab(area, "Advice")
+        self.tabs.addTab(scrolled(self.words, "Advice"), "Advice")
         self.tabs.addTab(self.sheet, "Picture")
-        area.setAccessibleName("Advice")
-        area.setAccessibleDescription("Arrow keys and Page Up and Down move it")
         self.results.addWidget(self.tabs)
 
     # --- asking ------------------------------------------------------------------------------

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from PySide6.QtWidgets import QHBoxLayout, QWidget
+from PySide6.QtWidgets import QWidget
 
 from labapp.gui.widgets.fields import Field, NumberField
+from labapp.gui.widgets.layouts import hbox
 
 
 class RangeField(Field):
@@ -32,11 +33,9 @@ class RangeField(Field):
             for end in ("least", "most")
         )
         pair = QWidget()
-        line = QHBoxLayout(pair)
-        line.setContentsMargins(0, 0, 0, 0)
+        hbox((self.least, 1), (self.most, 1), of=pair)
         for field in (self.least, self.most):
             field.unit.hide()  # said once, after both
-            line.addWidget(field, 1)
             field.edited.connect(self._emit_change)
         super().__init__(label, pair, tooltip, unit)
         pair.setFocusProxy(self.least)

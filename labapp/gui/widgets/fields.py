@@ -16,16 +16,15 @@ from PySide6.QtWidgets import (
     QAbstractSpinBox,
     QComboBox,
     QGridLayout,
-    QHBoxLayout,
     QLineEdit,
     QPlainTextEdit,
     QSizePolicy,
-    QVBoxLayout,
     QWidget,
 )
 
 from labapp.gui.digits import entered, parsed
 from labapp.gui.widgets.labels import heading, plain_label, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.layouts import hbox, vbox
 
 MOUSE_MS = 20
 """How often it is checked whether the mouse button was released."""
@@ -66,15 +65,8 @@ class Field(QWidget):
         self.problem = wrapping_label()
         self.problem.hide()
         self.setFocusProxy(editor)
-        line = QHBoxLayout()
-        line.addWidget(editor, 1)
-        if unit:
-            line.addWidget(self.unit)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(0, 0, 0, 0)
-        layout.setSpacing(2)
-        layout.addLayout(line)
-        layout.addWidget(self.problem)
+        line = hbox((editor, 1), self.unit) if unit else hbox((editor, 1))
+        vbox(line, self.problem, of=self).setSpacing(2)
         self.set_problem("")
 
     def set_problem(self, words: str) -> None:

@@ -9,17 +9,16 @@ import numpy.typing as npt
 from PySide6.QtCore import Qt, QTimer, Signal
 from PySide6.QtGui import QIcon, QPainter, QPalette, QResizeEvent
 from PySide6.QtWidgets import (
-    QHBoxLayout,
     QSizePolicy,
     QSpinBox,
     QStyle,
     QToolButton,
-    QVBoxLayout,
     QWidget,
 )
 
 from labapp.gui.theme import FollowsTheme, is_dark
 from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.scrubber import Scrubber, Tick
 
 PLAY_HZ = 30.0
@@ -83,8 +82,7 @@ class Timeline(FollowsTheme, QWidget):
         self.play_button = self._button("Play", "Show one frame after another", style.SP_MediaPlay)
         self.play_button.setCheckable(True)
         self.play_button.clicked.connect(self.set_playing)
-        row = QHBoxLayout()
-        row.setContentsMargins(0, 0, 0, 0)
+        row = hbox()
         for name, tip, icon, go in (
             ("First frame", "Go to the first frame (Home)", style.SP_MediaSkipBackward, -(10**9)),
             ("Frame before", "Go to the frame before (←)", style.SP_MediaSeekBackward, -1),
@@ -98,8 +96,7 @@ class Timeline(FollowsTheme, QWidget):
             button = self._button(name, tip, icon)
             button.clicked.connect(lambda *_, by=go: self.step(by))
             row.addWidget(button)
-        row.addWidget(self.number)
-        row.addWidget(self.told)
+        fill(row, self.number, self.told)
         for kind, words, key in (("doubtful", "in doubt", "F8"), ("corrected", "corrected", "F7")):
             row.addSpacing(8)
             row.addWidget(self._jump(kind, f"previous frame {words}", "◂", f"Shift+{key}", False))
@@ -107,11 +104,9 @@ class Timeline(FollowsTheme, QWidget):
             row.addWidget(self._jump(kind, f"next frame {words}", "▸", key, True))
         row.addSpacing(8)
         row.addWidget(self.counts, 1)
-        column = QVBoxLayout(self)
+        column = vbox(self.scrubber, row, of=self)
         column.setContentsMargins(6, 4, 6, 4)
         column.setSpacing(4)
-        column.addWidget(self.scrubber)
-        column.addLayout(row)
 
     def _jump(self, kind: str, where: str, sign: str, key: str, forward: bool) -> QToolButton:
         button = self._button(where.capitalize(), f"Go to the {where} ({key})", None)

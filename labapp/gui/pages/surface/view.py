@@ -104,24 +104,19 @@ class SurfacePage(Page):
 
     def _single(self) -> QWidget:
         left, right = QSplitter(Qt.Orientation.Vertical), QSplitter(Qt.Orientation.Vertical)
+        whole = QSplitter(Qt.Orientation.Horizontal)
         below = QWidget()
         vbox(self._section_fields(), (self.profile, 1), of=below)
         for splitter, widgets, sizes in (
             (left, (self.view, below), (5, 3)),
             (right, (self.dots, self.plan), (1, 1)),
+            (whole, (left, right), (5, 3)),
         ):
             for k, (widget, size) in enumerate(zip(widgets, sizes, strict=True)):
                 splitter.addWidget(widget)
                 splitter.setStretchFactor(k, size)
             splitter.setSizes([100 * size for size in sizes])
             splitter.setChildrenCollapsible(False)
-        whole = QSplitter(Qt.Orientation.Horizontal)
-        whole.addWidget(left)
-        whole.addWidget(right)
-        whole.setStretchFactor(0, 5)
-        whole.setStretchFactor(1, 3)
-        whole.setSizes([500, 300])
-        whole.setChildrenCollapsible(False)
         self.canvas_parts = PartsBar(
             "What is seen of the surface",
             {
