@@ -196,7 +196,8 @@ class ToolWindow(QDialog):
 
     def choose_folder(self) -> None:
         """Ask where to write what was found."""
-        if folder := ask_folder(self, f"{self.title}: save in", self.workspace.folder):
+        title = f"{self.save_button.text().removesuffix(' …')} in"
+        if folder := ask_folder(self, title, self.workspace.folder):
             self.save(folder)
 
     def save(self, folder: Path) -> None:
