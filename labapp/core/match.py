@@ -24,9 +24,9 @@ def ways(orientation: Orientation) -> IntArray:
 def missing_share(missed: int, pairs: int) -> float:
     """Share of the dots that are missing, where so many rays amid so many pairs have no dot.
 
-    The mean of its posterior, with a quarter of a dot missing beforehand: never none.
+    The mean of its posterior, with a twentieth of a dot missing beforehand: never none.
     """
-    return (missed + 0.25) / (pairs + missed + 1)
+    return (missed + 0.05) / (pairs + missed + 1)
 
 
 @dataclass(frozen=True)

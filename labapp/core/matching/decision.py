@@ -145,6 +145,9 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
         ``no-match``, ``no-reference``, ``ambiguous-rows`` or ``ambiguous-orientation``.
     """
     best, found, neighbours, fit = _cheapest(observed, found, settings.margin)
+    cheapest = best  # compared with others before what is doubtful in it, as in them, is taken away
+    if fit is FINE_KNOTS:
+        cheapest = _evaluate_twice(observed, best.labels, fit, best.pool) or best
     best = without_doubtful_outermost(observed, without_false_ends(observed, best, fit), fit)
     if fit is FINE_KNOTS:
         best = _evaluate_twice(observed, best.labels, fit, best.pool) or best
@@ -167,7 +170,7 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
         if way != own
     )
     for other in [*found, *neighbours, *_rivals(observed, best, others, fit)]:
-        if _stands_against(observed, best, other, fit, settings):
+        if _stands_against(observed, cheapest, other, fit, settings):
             continue
         differing, shared = _differing(best, other)
         if len(differing) <= MOST_DIFFERING * shared:
@@ -251,7 +254,9 @@ def _stands_against(
     """
     if other.cost_without_marker < best.cost_without_marker:
         return False
-    if other.cost >= best.cost + settings.margin:
+    # With the set-up off and many false dots, wrong rows were ahead by more than one margin.
+    margin = (2 if settings.leaves_much(best) else 1) * settings.margin
+    if other.cost >= best.cost + margin:
         return True
     if fit is not FINE_KNOTS:
         return False
@@ -261,9 +266,7 @@ def _stands_against(
         if own is None or rival is None:
             return False
         ahead.append(rival.cost - own.cost)
-    # With the set-up off and many false dots, wrong rows were ahead by more than one margin.
-    clearly = (2 if settings.leaves_much(best) else 1) * settings.margin
-    return min(ahead) >= 0 and max(ahead) >= clearly
+    return min(ahead) >= 0 and max(ahead) >= margin
 
 
 def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> bool:

@@ -144,7 +144,7 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
         ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
         ResultRow("range", unknown, unit=quantity.unit, note=f"Least and greatest of {frames}"),
         *(
-            [ResultRow("± of the mean", found.mean_sigma, unit=quantity.unit, note=sure)]
+            [ResultRow("mean ±", found.mean_sigma, unit=quantity.unit, decimals=4, note=sure)]
             if math.isfinite(found.mean_sigma)
             else []
         ),
