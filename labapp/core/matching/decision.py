@@ -255,7 +255,8 @@ def _stands_against(
     if other.cost_without_marker < best.cost_without_marker:
         return False
     # With the set-up off and many false dots, wrong rows were ahead by more than one margin.
-    margin = (2 if settings.leaves_much(best) else 1) * settings.margin
+    many_false = best.stray_count > settings.most_strays(best)
+    margin = (2 if many_false else 1) * settings.margin
     if other.cost >= best.cost + margin:
         return True
     if fit is not FINE_KNOTS:
