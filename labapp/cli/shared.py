@@ -56,7 +56,7 @@ Warm = Annotated[
     typer.Option(
         "--warm",
         help="Measure each frame from the one before: some ten times as fast where frames follow "
-        "on each other quickly. On all cores.",
+        "on each other quickly.",
     ),
 ]
 

@@ -46,8 +46,8 @@ so many wait at most."""
 STRETCH = 1000
 """Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
 
-HALFWAY = 500
-"""This frame of a stretch is measured by itself, too: then its rows can be held against others'."""
+BY_THEMSELVES = frozenset({0, 1, 2, 500})
+"""These frames of a stretch are measured by themselves, so that they can vote on its rows."""
 
 BATCH = 20
 """Frames that a process returns at a time."""
@@ -130,13 +130,18 @@ def _agreeing(
         return replace(result, measurement=vote.judged(result.measurement, at))
 
     with closing(measured):
-        for result in measured:
-            found = result.measurement
-            followed = warm and result.track_lost is None and found.correction is None
-            at = None if found.reconstruction is None else vote.add(found, followed)
-            waiting.append((result, at))
-            while waiting and is_due():
+        try:
+            for result in measured:
+                found = result.measurement
+                followed = warm and result.track_lost is None and found.correction is None
+                at = None if found.reconstruction is None else vote.add(found, followed)
+                waiting.append((result, at))
+                while waiting and is_due():
+                    yield judged()
+        except (Exception, KeyboardInterrupt):
+            while waiting:
                 yield judged()
+            raise
         while waiting:
             yield judged()
 
@@ -235,7 +240,7 @@ class WarmMeasurer:
 
         given = (self.setup.rig, self.setup.calibration, self.settings)
         for place, number in enumerate(frames):
-            if place in {0, HALFWAY}:
+            if place in BY_THEMSELVES:
                 warm = WarmChain(*given)
             frame = _read(self.read, number, self.settings)
             if isinstance(frame, FrameResult):

@@ -86,10 +86,23 @@ def test_rows_that_an_operator_gave_are_binding() -> None:
 
 
 def test_what_follows_a_frame_has_its_rows() -> None:
-    """Followed frames vote with the one that they were followed from, unlooked at."""
-    measured = [slipped(each, (1, 0)) if 1 <= k < 4 else each for k, each in enumerate(frames(5))]
+    """Followed frames have the rows of the one that they follow, and no vote of their own."""
+    right = frames(8)
+    measured = [slipped(each, (1, 0)) if 3 <= k < 7 else each for k, each in enumerate(right)]
     vote = RowVote(BENCH_RIG, SETTINGS)
-    at = [vote.add(each, followed=k in {2, 3}) for k, each in enumerate(measured)]
-    assert at == [(0, 0), (1, 0), (1, 0), (1, 0), (0, 0)]
+    at = [vote.add(each, followed=k in {4, 5, 6}) for k, each in enumerate(measured)]
+    assert at == [*[(0, 0)] * 3, *[(1, 0)] * 4, (0, 0)]
     told = [vote.judged(*each).status for each in zip(measured, at, strict=True)]
-    assert told == ["ambiguous-rows", "ok", "ok", "ok", "ambiguous-rows"]  # most may be wrong
+    assert told == [*["ok"] * 3, *["ambiguous-rows"] * 4, "ok"]
+
+
+def test_what_follows_a_corrected_frame_was_not_followed_from_it() -> None:
+    right = frames(6)
+    corrected = replace(
+        slipped(right[3], (1, 0)), correction=Correction.of(Dots(*np.empty((7, 0))), None)
+    )
+    measured = [*right[:3], corrected, *right[4:]]
+    vote = RowVote(BENCH_RIG, SETTINGS)
+    at = [vote.add(each, followed=k > 3) for k, each in enumerate(measured)]
+    assert at == [*[(0, 0)] * 3, (1, 0), *[(0, 0)] * 2]
+    assert [vote.judged(*each).status for each in zip(measured, at, strict=True)] == ["ok"] * 6

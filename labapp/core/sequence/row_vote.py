@@ -50,24 +50,29 @@ class RowVote:
         self._votes: Counter[tuple[int, int]] = Counter()
         """How many frames are so many rows and columns off the first."""
         self._at = (0, 0)
+        """How far the frames are off the first that follow now."""
         self._usual: tuple[Reconstruction, tuple[int, int]] | None = None
         """The last frame that agrees with most, and how far it is off the first."""
 
     def add(self, measured: Measurement, followed: bool = False) -> tuple[int, int]:
         """Count the next frame that has a surface; returns how far it is off the first's rows.
 
-        One that was followed from the frame before has that one's rows.
+        One that was followed from those before has their rows, and no vote of its own. One that was
+        corrected by hand has a vote, but those after it were not followed from it.
         """
-        surface = measured.reconstruction
+        surface, at = measured.reconstruction, self._at
         assert surface is not None
-        if not followed and self._usual is not None:
-            usual, (row, column) = self._usual
-            slip = self._slip(measured, usual)
-            self._at = row + int(slip[0]), column + int(slip[1])
-        self._votes[self._at] += 1
-        if self._votes[self._at] == max(self._votes.values()):
-            self._usual = surface, self._at
-        return self._at
+        if not followed:
+            if self._usual is not None:
+                usual, (row, column) = self._usual
+                slip = self._slip(measured, usual)
+                at = row + int(slip[0]), column + int(slip[1])
+            if measured.correction is None:
+                self._at = at
+            self._votes[at] += 1
+        if self._votes[at] == max(self._votes.values()):
+            self._usual = surface, at
+        return at
 
     def judged(self, measured: Measurement, at: tuple[int, int]) -> Measurement:
         """Return what is to be told of a frame that `add` found so far off the first.
@@ -77,7 +82,7 @@ class RowVote:
         agree, of = self._votes[at], self._votes.total()
         if measured.correction is not None or 2 * agree > of:
             return measured
-        reason = f"{of - agree} of {of} frames so far have their rows and columns elsewhere"
+        reason = f"{of - agree} of {of} frames measured by themselves have their rows elsewhere"
         kept = replace(measured, match=None, reconstruction=None, measures=None)
         return replace(kept, status="ambiguous-rows", reason=reason)
 
