@@ -70,7 +70,7 @@ class RowVote:
             if measured.correction is None:
                 self._at = at
             self._votes[at] += 1
-        if self._votes[at] == max(self._votes.values()):
+        if self._votes[at] == max(self._votes.values(), default=0):
             self._usual = surface, at
         return at
 
