@@ -1,6 +1,6 @@
 """Frames of a recording vote on the rows: one that is a row off the others is not answered.
 
-A pool that is told a row off lies a ray's spacing aside and is tilted: its surface is 50 µm from
+A pool whose rays are a row off lies a ray's spacing aside and is tilted: its surface is 50 µm from
 that of the frame before, where waves and a boundary that wanders by 2 % make 5 to 20. With its rays
 moved back by that row it is as near again as frames are to each other.
 """
@@ -75,7 +75,7 @@ class RowVote:
         return at
 
     def judged(self, measured: Measurement, at: tuple[int, int]) -> Measurement:
-        """Return what is to be told of a frame that `add` found so far off the first.
+        """Return the measurement of a frame that `add` found so far off the first, if it stands.
 
         Without a majority for its rows it is ``ambiguous-rows``; not if an operator gave them.
         """
