@@ -117,7 +117,7 @@ def test_labels_next_to_a_dot_without_a_ray_are_in_doubt() -> None:
     crowded = Observation(
         np.vstack([observed.plane_mm, beside]),
         np.concatenate([observed.covariance_mm2, observed.covariance_mm2[dot][None]]),
-        1e-3,
+        np.append(observed.size_mm, observed.size_mm[dot]),
         observed.rig,
         observed.calibration,
         observed.frame_shape,

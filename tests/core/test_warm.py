@@ -174,6 +174,22 @@ def test_missing_and_false_dots_are_told_apart_from_the_others() -> None:
     assert len(rays) >= frame.shown.sum() - 6
 
 
+@pytest.mark.parametrize("beside", [(5.0, 0.0), (0.0, 5.0)])
+def test_a_dot_that_a_false_one_runs_into_has_no_ray_in_either_chain(
+    beside: tuple[float, float],
+) -> None:
+    frame, follower = frames()[WARMED], chain()
+    image = with_dots(frame.image, frame.dot_px[8, 8][None] + beside)
+    followed, cold = follower.measure(image), measure(image, RIG, CALIBRATION, Settings())
+    assert follower.track_lost is None
+    for result in (followed, cold):
+        assert wrong_rays(result, frame) == 0
+        assert result.match is not None
+        rays = {tuple(ray) for ray in result.match.ray.tolist()}
+        assert (9, 9) not in rays
+        assert {(8, 9), (10, 9), (9, 8)} <= rays
+
+
 @pytest.mark.slow
 def test_a_dot_where_the_absent_one_should_be_dark_breaks_the_track() -> None:
     frame, follower = frames()[WARMED], chain()

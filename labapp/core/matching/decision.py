@@ -28,6 +28,8 @@ from labapp.core.matching.hypothesis import (
     without_false_ends,
 )
 from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
+from labapp.core.matching.outliers import unsupported
+from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import CannotMeasure, IntArray, median
 
@@ -163,7 +165,7 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
         raise CannotMeasure(
             "no-reference", "the absent centre dot is not amid dots that have their ray"
         )
-    doubtful: list[int] = contested(observed, best).tolist()
+    doubtful: list[int] = [*contested(observed, best), *_unsupported(observed, best, fit)]
     others = (
         reoriented_labels(observed, best.labels, own, way)
         for way in settings.orientations
@@ -189,6 +191,15 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
         witness = np.where(certain == best.labels, best.witness, 0)
         best = replace(evaluate(observed, certain, fit, initial=best.pool) or best, witness=witness)
     return best
+
+
+def _unsupported(observed: Observation, best: Hypothesis, fit: FitSettings) -> IntArray:
+    """Labelled dots that the hypothesis's surface does not support (`outliers.unsupported`)."""
+    pool, dot = best.pool, best.labels[best.labels != UNLABELLED]
+    plane = observed.plane_mm[dot] + pool.residual_mm
+    at = observed.rig, pool.surface.basis, pool.factor, pool.points_mm, plane
+    made = pool.residual_mm, covariance_of_dots(*at), fit.floor_mm
+    return unsupported(observed, best.labels, *made)
 
 
 def _cheapest(

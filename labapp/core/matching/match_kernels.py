@@ -61,3 +61,24 @@ def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, Float
             elif value < next_in_column[m]:
                 next_in_column[m] = value
     return column, next_in_row, row, next_in_column
+
+
+@compiled(_f2)
+def medians_around(values: FloatArray) -> FloatArray:
+    """Median of those within two rows and columns of each value, without it; NaN stands for none.
+
+    Values have shape (rows, columns), medians the same.
+    """
+    rows, columns = values.shape
+    medians, around = np.full((rows, columns), np.nan), np.empty(24)
+    for i in range(rows):
+        for j in range(columns):
+            count = 0
+            for k in range(max(i - 2, 0), min(i + 3, rows)):
+                for m in range(max(j - 2, 0), min(j + 3, columns)):
+                    if (k != i or m != j) and not np.isnan(values[k, m]):
+                        around[count] = values[k, m]
+                        count += 1
+            if count:
+                medians[i, j] = np.median(around[:count])
+    return medians

@@ -61,8 +61,8 @@ class Observation(ReadOnlyArrays):
         Dots, IPCS (X′, Z′), shape (n, 2), mm.
     covariance_mm2
         Their covariance, shape (n, 2, 2), mm².
-    resolution_mm
-        How near another dot may be before the two run into each other, mm.
+    size_mm
+        Standard deviation of the light of each, shape (n,), mm.
     rig, calibration
         The bench, and how the camera sees the plane.
     frame_shape
@@ -73,7 +73,7 @@ class Observation(ReadOnlyArrays):
 
     plane_mm: FloatArray
     covariance_mm2: FloatArray
-    resolution_mm: float
+    size_mm: FloatArray
     rig: Rig
     calibration: ImageCalibration
     frame_shape: tuple[int, int]
@@ -88,8 +88,12 @@ class Observation(ReadOnlyArrays):
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
         plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, dots.image_px, sigma)
-        resolution = RESOLVED_SIZES * median(dots.size_px * scale)
-        return cls(plane, covariance, resolution, rig, calibration, frame_shape)
+        return cls(plane, covariance, dots.size_px * scale, rig, calibration, frame_shape)
+
+    @cached_property
+    def resolution_mm(self) -> float:
+        """How near another dot may be before the two run into each other, mm."""
+        return RESOLVED_SIZES * median(self.size_mm)
 
     @cached_property
     def rays(self) -> FloatArray:

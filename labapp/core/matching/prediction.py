@@ -10,6 +10,7 @@ import numpy as np
 from labapp.core.geometry.rig import Rig
 from labapp.core.matching.observation import Observation
 from labapp.core.surface.pool_fit import FittedPool
+from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 GATE_SIGMA2, RIVAL_MARGIN = 20.0, 6.0
@@ -71,12 +72,8 @@ class Prediction:
 
     def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
         """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
-        from labapp.core.surface import kernels
-
-        laser, axes = rig.laser.position_mm, rig.imaging_plane.pose_mm[1:3]
-        dots = rig.imaging_plane.to_universal(self.plane_mm)
-        grid = pool.surface.basis.grid
-        return kernels.covariance_of_dots(grid, pool.factor, laser, axes, self.points_mm, dots)
+        basis = pool.surface.basis
+        return covariance_of_dots(rig, basis, pool.factor, self.points_mm, self.plane_mm)
 
     def blocked(self, observed: Observation) -> BoolArray:
         """Whether the torch may hide the dots, shape (m,) (`kernels.behind_torch`)."""
@@ -84,6 +81,29 @@ class Prediction:
 
         rays, tip = observed.rays[tuple(self.at.T)], observed.rig.electrode.height_mm
         return kernels.behind_torch(self.points_mm, rays, self.slopes, tip)
+
+
+def covariance_of_dots(
+    rig: Rig, basis: SplineBasis, factor: FloatArray, points_mm: FloatArray, plane_mm: FloatArray
+) -> FloatArray:
+    """Covariance of computed dots, as far as the surface is uncertain, shape (n, 2, 2), mm².
+
+    Parameters
+    ----------
+    rig
+        The bench.
+    basis, factor
+        The surface's splines, and the Cholesky factor of their normal matrix
+        (`solver.normal_factor`).
+    points_mm, plane_mm
+        Reflection points, shape (n, 3), and the dots that the surface makes there, IPCS, shape
+        (n, 2), mm.
+    """
+    from labapp.core.surface import kernels
+
+    laser, axes = rig.laser.position_mm, rig.imaging_plane.pose_mm[1:3]
+    dots_mm = rig.imaging_plane.to_universal(plane_mm)
+    return kernels.covariance_of_dots(basis.grid, factor, laser, axes, points_mm, dots_mm)
 
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:

@@ -25,6 +25,7 @@ from labapp.core.images.dots import Image
 from labapp.core.match import Match, Trial, missing_share
 from labapp.core.matching.correspondence import lattice_of_match, match_of_pairs
 from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.matching.outliers import unsupported
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.track import MEMORY, Track, TrackLost, begin, found_again, rms
@@ -36,7 +37,13 @@ from labapp.core.sequence.warm_fit import (
     fit_slopes_to,
     intersect_and_reflect,
 )
-from labapp.core.sequence.warm_match import RayClasses, beyond, classify_rays, widened
+from labapp.core.sequence.warm_match import (
+    RayClasses,
+    beyond,
+    classify_rays,
+    covariance_of,
+    widened,
+)
 from labapp.core.surface import kernels, measures
 from labapp.core.surface.boundary_trace import retrace_boundary
 from labapp.core.surface.level import Level, find_level
@@ -252,7 +259,26 @@ def _fitted(
         if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
             break
     pool, lower = _settled(geometry, pool, slopes, factor)
+    off = _unsupported(geometry, observed, pool, lower, labels)
+    if len(off):
+        labels = np.where(np.isin(labels, off), UNLABELLED, labels)
+        pool, lower = _settled(geometry, pool, _slopes(geometry, observed, labels))
     return pool, labels, lower
+
+
+def _unsupported(
+    geometry: SequenceGeometry,
+    observed: Observation,
+    pool: WarmPool,
+    lower: FloatArray,
+    labels: IntArray,
+) -> IntArray:
+    """Labelled dots that the surface does not support (`outliers.unsupported`)."""
+    ray, every = np.flatnonzero(labels != UNLABELLED), np.full(observed.absent.shape, UNLABELLED)
+    every[tuple(geometry.at.T)] = labels
+    residual = pool.plane_mm[ray] - observed.plane_mm[labels[ray]]
+    computed = covariance_of(geometry, pool, lower, ray)
+    return unsupported(observed, every, residual, computed, geometry.settings.floor_mm)
 
 
 def _settled(

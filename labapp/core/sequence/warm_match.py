@@ -20,6 +20,7 @@ from labapp.core.matching.prediction import (
     MODEL_ERROR_MM,
     RIVAL_MARGIN,
     SIGMA_INFLATION,
+    covariance_of_dots,
     lines_out_of_view,
 )
 from labapp.core.sequence.warm_fit import SequenceGeometry, WarmPool, evaluate_at_landing_points
@@ -167,7 +168,7 @@ def _deviance(
     dot: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
     """What `match_kernels.pair_deviances` says of rays making dots, shapes (rays, dots)."""
-    spread = _covariance_of_dots(geometry, pool, lower, ray)
+    spread = covariance_of(geometry, pool, lower, ray)
     made = match_kernels.pair_deviances(
         observed.plane_mm[dot],
         observed.covariance_mm2[dot],
@@ -177,15 +178,12 @@ def _deviance(
     return made[0].T, made[1].T
 
 
-def _covariance_of_dots(
+def covariance_of(
     geometry: SequenceGeometry, pool: WarmPool, lower: FloatArray, ray: IntArray
 ) -> FloatArray:
     """Covariance of some rays' dots, as far as the surface is uncertain, shape (n, 2, 2), mm²."""
-    dots_mm = geometry.rig.imaging_plane.to_universal(pool.plane_mm[ray])
-    laser, axes = geometry.laser_mm, geometry.plane[1:3]
-    return kernels.covariance_of_dots(
-        geometry.basis.grid, lower, laser, axes, pool.points_mm[ray], dots_mm
-    )
+    at = pool.points_mm[ray], pool.plane_mm[ray]
+    return covariance_of_dots(geometry.rig, geometry.basis, lower, *at)
 
 
 @dataclass(frozen=True)
@@ -230,7 +228,7 @@ def classify_rays(
         observed,
         geometry.at[rim],
         pool.plane_mm[rim],
-        lambda some: _covariance_of_dots(geometry, pool, lower, rim[some]),
+        lambda some: covariance_of(geometry, pool, lower, rim[some]),
     )
     witness[lost[tuple(geometry.at.T)]] = 0
     witness[lit] = 1
