@@ -23,7 +23,7 @@ from labapp.core.geometry.optics import (
     surface_normal,
 )
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.images import dot_kernels, dot_size, dots
+from labapp.core.images import centroid_kernels, dot_kernels, dot_size, dots
 from labapp.core.matching import match_kernels
 from labapp.core.sequence.track import recurrence
 from labapp.core.surface import kernels, level_kernels
@@ -327,10 +327,59 @@ def test_centroids_are_those_of_the_blurred_picture_over_what_is_around_it(sigma
     around = dot_size.blur(image, 4.0) if sigma else np.zeros_like(image)
     taps = dot_size.kernel(sigma)
     light = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT) - around
-    offset, moment = dot_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
+    offset, moment = centroid_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
     for k in range(len(u)):
         wanted = centroids_by_hand(light, u[k], v[k], 6, width[k])
         np.testing.assert_allclose([*offset[:, k], moment[k]], wanted, atol=1e-5)
+
+
+def test_summits_are_those_of_gaussians_between_the_pixels_of_a_smaller_picture() -> None:
+    places = random().uniform(20.0, 80.0, (30, 2))
+    v, u = np.mgrid[:100, :100]
+    for u_px, v_px in places:
+        square = (u - u_px) ** 2 + (v - v_px) ** 2
+        image = (40.0 * np.exp(-square / (2 * 2.5**2))).astype(np.float32)
+        for step in (1, 2):
+            band = dot_kernels.halved(image) if step == 2 else image
+            at = np.unravel_index(np.argmax(band), band.shape)
+            x, y = (np.array([one]) for one in at[::-1])
+            column, row, height = dot_kernels.summits(band, x, y, step)
+            assert abs(column[0] - u_px) < 0.51
+            assert abs(row[0] - v_px) < 0.51
+            lost = 1 + (step**2 - 1) / 12 / 2.5**2  # what a pixel's area blurs
+            assert height[0] == pytest.approx(40.0 / lost, rel=2e-3)
+
+
+def test_a_halved_picture_has_the_means_of_four_pixels() -> None:
+    image = random().integers(0, 256, (40, 60)).astype(np.uint8)
+    wanted = image.reshape(20, 2, 30, 2).mean(axis=(1, 3))
+    np.testing.assert_array_equal(dot_kernels.halved(image), wanted)
+    np.testing.assert_array_equal(dot_kernels.halved(image.astype(np.float32)), wanted)
+
+
+def test_the_next_of_places_is_the_nearest_but_itself() -> None:
+    places = random().uniform(0, 10, (50, 2))
+    wanted = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
+    np.testing.assert_allclose(dot_kernels.next_apart(places), wanted)
+    np.testing.assert_array_equal(dot_kernels.next_apart(places[:1]), [np.inf])
+    assert dot_kernels.next_apart(places[:0]).shape == (0,)
+
+
+def test_places_in_view_have_all_their_corners_on_the_plane_and_in_the_image() -> None:
+    rng = random()
+    places, margin = rng.uniform(-5, 25, (200, 2)), rng.uniform(0, 3, (200, 2))
+    to_image = np.array([[10.0, 1.0, 5.0], [-1.0, 9.0, 20.0], [1e-3, 2e-3, 1.0]])
+    plane, image = np.array([[0.5, 1.0], [19.0, 18.0]]), np.array([[4.0, 4.0], [170.0, 150.0]])
+    wanted = np.ones(200, bool)
+    for way in ([1, 1], [1, -1], [-1, 1], [-1, -1]):
+        corner = places + way * margin
+        u, v, w = to_image @ np.column_stack([corner, np.ones(200)]).T
+        pixel = np.stack([u / w, v / w], axis=1)
+        wanted &= ((corner > plane[0]) & (corner < plane[1])).all(axis=1)
+        wanted &= ((pixel > image[0]) & (pixel < image[1])).all(axis=1)
+    made = match_kernels.within_view(places, margin, to_image, plane, image)
+    np.testing.assert_array_equal(made, wanted)
+    assert 10 < made.sum() < 190
 
 
 def test_noise_is_that_of_each_tile() -> None:
@@ -397,7 +446,7 @@ def test_the_finer_band_is_that_of_the_whole_picture() -> None:
     fine -= cv2.GaussianBlur(image, (11, 11), 1.3, borderType=cv2.BORDER_REFLECT)
     most = np.pad(fine, 1, "symmetric")  # beyond the edge the filters see the mirrored picture
     most = np.array([most[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)])
-    np.testing.assert_allclose(dot_kernels.finest(image, u, v, narrow, wide), most, atol=1e-4)
+    np.testing.assert_allclose(centroid_kernels.finest(image, u, v, narrow, wide), most, atol=1e-4)
 
 
 def test_bytes_are_read_as_they_are() -> None:
@@ -407,8 +456,8 @@ def test_bytes_are_read_as_they_are() -> None:
     taps, width = cv2.getGaussianKernel(9, 1.1, cv2.CV_32F).ravel(), np.full(len(u), 2.0)
     narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
     for made in (
-        lambda own: dot_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
-        lambda own: dot_kernels.finest(own, u, v, narrow, wide),
+        lambda own: centroid_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
+        lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
         lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
         lambda own: dot_kernels.tile_noise(own, 2, 3),
     ):
@@ -425,7 +474,7 @@ def test_pictures_lower_than_the_filters_are_mirrored_again_and_again(rows: int)
     blurred = cv2.sepFilter2D(blurred, -1, own, own)[15 : 17 + rows, 15:57]
     u, v = np.array([0, 20, 39]), np.array([0, rows - 1, 0])
     most = [blurred[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)]
-    made = dot_kernels.finest(image, u, v, filters, np.zeros_like(filters))
+    made = centroid_kernels.finest(image, u, v, filters, np.zeros_like(filters))
     np.testing.assert_allclose(made, most, rtol=1e-5)
 
 

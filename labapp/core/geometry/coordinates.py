@@ -77,10 +77,11 @@ class ImageCalibration(ReadOnlyArrays):
 
     def to_image(self, plane_mm: FloatArray) -> FloatArray:
         """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
-        return _apply(self._to_image, plane_mm)
+        return _apply(self.from_plane, plane_mm)
 
     @cached_property
-    def _to_image(self) -> FloatArray:
+    def from_plane(self) -> FloatArray:
+        """Homography from the plane to the image, shape (3, 3)."""
         return _inverse(self.matrix)
 
     def jacobian(self, image_px: FloatArray) -> FloatArray:

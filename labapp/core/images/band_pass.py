@@ -7,7 +7,7 @@ pixels is worked out for these alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 
 import cv2
@@ -31,8 +31,8 @@ from labapp.core.images.dot_size import (
 from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
-Part = tuple[slice, slice]
-"""Rows and columns of a picture."""
+Peaks = tuple[IntArray, IntArray, FloatArray]
+"""Columns and rows of pixels, and the height of the band there."""
 
 HOT_RATIO = 1.6
 """What a cluster of hot pixels answers to a band of a third of the dots' size, over its answer to
@@ -60,15 +60,8 @@ MOST_SURROUNDINGS = 0.3
 """Where the dots' surroundings are a larger share of the picture, all of it is blurred at once."""
 
 HALVED_PX, NEARLY = 1.5, 0.75
-"""Dots of this size are seen at half the size, too: where the band there is under so much of the
-floor, no peak is over it."""
-
-SURROUNDINGS = 10.0
-"""How far beyond what may be dots a picture is looked at, in dots' sizes: farther off light moves
-none."""
-
-GRID_PX = 16
-"""A part of a picture begins and ends at a multiple: smaller pictures of it are those of all."""
+"""Dots of this size are sought at half the size: a peak over the floor has a pixel there that is
+over so much of it."""
 
 PEAK_GAIN = 1 / 1.64 - 1 / 3.56
 """What a Gaussian dot of the band's own size keeps of its height: 1/(1 + 0.8²) − 1/(1 + 1.6²)."""
@@ -104,22 +97,8 @@ class DetectorTuning(ReadOnlyArrays):
 
     @cached_property
     def coarse(self) -> Grey:
-        """What of every second pixel's floor its square's band is over if a peak may be there."""
+        """What a pixel of the band at half the size is over if a peak may be there."""
         return np.asarray(np.float32(NEARLY) * self.floor[::2, ::2])
-
-    def part(self, of: Part, inner: Part) -> DetectorTuning:
-        """That of a part of the picture where peaks are asked for in an inner part alone.
-
-        It stands until this thread asks for the next one.
-        """
-        own = self.floor[of]
-        floor = scratch("floor", (own.shape[0], own.shape[1]))
-        floor[:] = own
-        for axis in range(2):
-            lines = floor if axis == 0 else floor.T
-            lines[: inner[axis].start - of[axis].start] = np.inf
-            lines[inner[axis].stop - of[axis].start :] = np.inf
-        return DetectorTuning(self.size_px, self.noise[of], floor)
 
 
 def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
@@ -165,44 +144,7 @@ def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings)
     if frame.shape != tuning.noise.shape:
         raise ValueError(f"a frame of {frame.shape}, a tuning of {tuning.noise.shape}")
     picture = mended(as_picture(frame), tuning.noise, tuning.size_px)
-    part, inner = _lit(picture, tuning)
-    seen = _BandPassed(as_picture(picture[part]), tuning.size_px)
-    dots = _found(tuning.part(part, inner), seen, settings)
-    rows, columns = part
-    return replace(dots, u_px=dots.u_px + columns.start, v_px=dots.v_px + rows.start)
-
-
-def _lit(picture: Picture, tuning: DetectorTuning) -> tuple[Part, Part]:
-    """Part of a picture that its dots are described in, and the part of that their peaks are in.
-
-    Both are told by the picture at half its size.
-
-    Raises
-    ------
-    CannotMeasure
-        ``no-dots`` if nothing stands out of the noise.
-    """
-    (height, width), size = picture.shape, tuning.size_px
-    whole = slice(0, height), slice(0, width)
-    if size < HALVED_PX or height % 2 or width % 2:
-        return whole, whole
-    shape, lost = (height // 2, width // 2), (1 - 2**-2) / 12
-    half = as_picture(cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_AREA))
-    narrow, wide = scratch("half", shape), scratch("half wide", shape)
-    blur(half, float(np.sqrt((0.4 * size) ** 2 - lost)), narrow)
-    widen(narrow, wide, (0.8**2 - 0.4**2) * size**2)
-    lit = cv2.subtract(narrow, wide, dst=narrow) > tuning.coarse
-    part, inner = [], []
-    for axis, end in enumerate(picture.shape):
-        at = np.flatnonzero(lit.any(axis=1 - axis))
-        if len(at) == 0:
-            raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
-        first, last = 2 * int(at[0]) - 2, 2 * int(at[-1]) + 4
-        inner.append(slice(max(first, 0), min(last, end)))
-        away = int(np.ceil(SURROUNDINGS * size))
-        first, last = (first - away) // GRID_PX * GRID_PX, -(-(last + away) // GRID_PX) * GRID_PX
-        part.append(slice(max(first, 0), min(last, end)))
-    return (part[0], part[1]), (inner[0], inner[1])
+    return _found(tuning, _BandPassed(picture, tuning.size_px), settings)
 
 
 def dot_at(
@@ -231,7 +173,7 @@ def dot_at(
     like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.speckle_px)
     tuning, seen = _tuned(as_picture(frame), like)
     size = tuning.size_px
-    u, v = seen.peaks(tuning)
+    u, v, _ = seen.peaks(tuning)
     away = np.hypot(u - u_px, v - v_px)
     taken = np.full(len(u), np.inf)
     if len(others) and len(u):
@@ -241,7 +183,7 @@ def dot_at(
     away[taken < max(1.5, size)] = np.inf
     if not (away <= 2.0 * size).any():
         at = round(v_px), round(u_px)
-        peak = max(float(seen.band[at]), 0.0) / PEAK_GAIN
+        peak = max(float(seen.band[at[0] // seen.step, at[1] // seen.step]), 0.0) / PEAK_GAIN
         snr = peak / max(float(tuning.noise[at]), 1e-3 * peak, 1e-9)
         unsure = max(size, 1.0)
         return Dots(*(np.array([x]) for x in (u_px, v_px, unsure, unsure, size, peak, snr)))
@@ -249,7 +191,8 @@ def dot_at(
     limit = np.array(frame.shape[::-1]) - 1
     known = np.clip(np.rint(others.image_px), 0, limit).astype(np.int64)
     u, v = np.append(known[:, 0], u[k]), np.append(known[:, 1], v[k])
-    every = _described(seen, u, v, tuning.noise, settings.speckle_px)
+    bright = seen.band[v // seen.step, u // seen.step].astype(float)
+    every = _described(seen, (u, v, bright), tuning.noise, settings.speckle_px)
     return Dots(*(getattr(every, column.name)[-1:] for column in fields(every)))
 
 
@@ -266,7 +209,8 @@ def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning
     size = settings.size_px or size_of(picture, noise)
     seen = _BandPassed(mended(picture, noise, size), size)
     white = float(np.median(noise[::8, ::8])) / noise_gain(size)
-    grain = with_grain(seen.band[::4, ::4], white) / max(white, 1e-9)
+    every = 4 // seen.step
+    grain = with_grain(seen.band[::every, ::every], white) / max(white, 1e-9)
     least = 1e-3 * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
     floor = noise * np.float32(settings.threshold * grain / noise_gain(size))
     np.maximum(floor, np.float32(settings.threshold * least), out=floor)
@@ -274,101 +218,142 @@ def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning
 
 
 class _BandPassed:
-    """A picture and its band at the dots' size, on this thread's scratch pictures."""
+    """A picture and its band at the dots' size, on this thread's scratch pictures.
+
+    The band is that of the picture at half its size where the dots are large enough; ``step`` is
+    how many times smaller it is.
+    """
 
     def __init__(self, picture: Picture, size: float) -> None:
-        self.picture, self.size = picture, size
-        names = ("narrow", "wide", "band")
-        self._narrow, self.wide, self.band = (scratch(name, picture.shape) for name in names)
+        (height, width), self.picture, self.size = picture.shape, picture, size
+        self.step = 2 if size >= HALVED_PX and height % 2 == width % 2 == 0 else 1
+        shape = height // self.step, width // self.step
+        self._narrow, self._wide, self.band = (scratch(f"{k} band", shape) for k in range(3))
         self._pass()
 
     def _pass(self) -> None:
-        blur(self.picture, 0.8 * self.size, self._narrow)
-        self._small = widen(self._narrow, self.wide, (1.6**2 - 0.8**2) * self.size**2)
-        cv2.subtract(self._narrow, self.wide, dst=self.band)
+        from labapp.core.images import dot_kernels
 
-    def peaks(self, tuning: DetectorTuning) -> tuple[IntArray, IntArray]:
-        """Columns and rows of the peaks over the floor that may be dots'.
+        size, lost = self.size / self.step, (1 - self.step**-2) / 12
+        seen = dot_kernels.halved(self.picture) if self.step == 2 else self.picture
+        blur(seen, float(np.sqrt((0.8 * size) ** 2 - lost)), self._narrow)
+        widen(self._narrow, self._wide, (1.6**2 - 0.8**2) * size**2)
+        cv2.subtract(self._narrow, self._wide, dst=self.band)
+
+    def peaks(self, tuning: DetectorTuning) -> Peaks:
+        """Peaks over the floor that may be dots'.
 
         Where some may not, for they are as sharp as hot pixels or as long as lines of them, these
         pixels are mended, as there may be a dot under them: one as bright as others are.
         """
         from labapp.core.images import dot_kernels
 
-        disc = peak_disc(self.size)
-        u, v = dot_kernels.peaks(self.band, tuning.floor, disc)
-        good = self._dot_like(u, v)
+        u, v, bright = self._over(tuning)
+        good = self._dot_like(u, v, bright)
         if good.all():
-            return u, v
+            return u, v, bright
         suspects = u[~good], v[~good]
         whole = mended(self.picture, tuning.noise, self.size, suspects)
         if whole is not self.picture:
-            usual = typical(self.band[v, u][good].astype(float)) if good.any() else 0.0
+            usual = typical(bright[good]) if good.any() else 0.0
             self.picture = whole
             self._pass()
-            u, v = dot_kernels.peaks(self.band, tuning.floor, disc)
+            u, v, bright = self._over(tuning)
             near = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
-            good = self._dot_like(u, v)
-            good &= (near > 2.0 * self.size) | (self.band[v, u] >= REMAINS_SHARE * usual)
-        return u[good], v[good]
+            good = self._dot_like(u, v, bright)
+            good &= (near > 2.0 * self.size) | (bright >= REMAINS_SHARE * usual)
+        return u[good], v[good], bright[good]
 
-    def _dot_like(self, u: IntArray, v: IntArray) -> BoolArray:
-        """Whether peaks are round, and answer no more to a much finer band than to the dots'."""
+    def _over(self, tuning: DetectorTuning) -> Peaks:
+        """Peaks over the floor."""
         from labapp.core.images import dot_kernels
+
+        disc = peak_disc(self.size / self.step)
+        if self.step == 2 and len(disc) == 3:
+            disc = np.ones((3, 3), bool)
+        low = tuning.coarse if self.step == 2 else tuning.floor
+        x, y = dot_kernels.peaks(self.band, low, disc)
+        u, v, bright = dot_kernels.summits(self.band, x, y, self.step)
+        over = bright > tuning.floor[v, u]
+        return u[over], v[over], bright[over]
+
+    def _dot_like(self, u: IntArray, v: IntArray, bright: FloatArray) -> BoolArray:
+        """Whether peaks are round, and answer no more to a much finer band than to the dots'."""
+        from labapp.core.images import centroid_kernels, dot_kernels
 
         scale = max(0.4, self.size / 3.0)
         narrow, wide = (_nine(sigma * scale, 1.6 * scale) for sigma in (0.8, 1.6))
-        sharp = dot_kernels.finest(self.picture, u, v, narrow, wide) >= HOT_RATIO * self.band[v, u]
-        return np.asarray(~sharp & ~dot_kernels.ridges(self.band, u, v, SLENDER))
+        sharp = centroid_kernels.finest(self.picture, u, v, narrow, wide) >= HOT_RATIO * bright
+        ridges = dot_kernels.ridges(self.band, u // self.step, v // self.step, SLENDER)
+        return np.asarray(~sharp & ~ridges)
 
     def light(
         self, u: IntArray, v: IntArray, width: FloatArray, reach: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Centroids and moments of the light over its surroundings (`dot_kernels.centroids`)."""
-        from labapp.core.images import dot_kernels
+        """Centroids, (u, v), and moments of the light over its surroundings.
 
-        widen(self._small, self.wide, ((3.0 * CENTROID_WIDENING) ** 2 - 0.8**2) * self.size**2)
+        A dot is in the middle of the square that is weighed, wherever its peak is.
+        """
+        from labapp.core.images import centroid_kernels
+
+        variance = ((3.0 * CENTROID_WIDENING) ** 2 - 0.8**2) * (self.size / self.step) ** 2
+        around = smaller_blurred(self._narrow, variance)
         margin, taps, picture = margin_of(reach), kernel(0.5 * self.size), self.picture
         if len(u) * (2 * margin + 1) ** 2 > MOST_SURROUNDINGS * picture.size:
-            picture, taps = blur(picture, 0.5 * self.size, self._narrow), kernel(0.0)
-        return dot_kernels.centroids(picture, self.wide, taps, u, v, margin, width, reach)
+            into = scratch("picture", picture.shape)
+            picture, taps = blur(picture, 0.5 * self.size, into), kernel(0.0)
+        (x, y), moment = centroid_kernels.centroids(
+            picture, around, taps, u, v, margin, width, reach
+        )
+        off = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) > 0.5)
+        place = np.stack([u + x, v + y])
+        if len(off):
+            height, wide = picture.shape
+            u = np.clip(np.rint(place[0, off]), 0, wide - 1).astype(np.int64)
+            v = np.clip(np.rint(place[1, off]), 0, height - 1).astype(np.int64)
+            (x, y), moment[off] = centroid_kernels.centroids(
+                picture, around, taps, u, v, margin, width[off], reach
+            )
+            place[:, off] = u + x, v + y
+        return place, moment
 
 
-def widen(image: Grey, into: Grey, variance_px2: float) -> Grey:
-    """Blur by a Gaussian of some variance, px² of ``into``, by way of a smaller picture.
+def widen(image: Grey, into: Grey, variance_px2: float) -> None:
+    """Blur by a Gaussian of some variance, px², by way of a smaller picture."""
+    cv2.resize(smaller_blurred(image, variance_px2), image.shape[::-1], dst=into)
 
-    Returns the smaller picture of the image; it can be given to be widened further. Where the
-    blur is narrow, or the picture's sides cannot be divided, that is the image itself.
+
+def smaller_blurred(image: Grey, variance_px2: float) -> Grey:
+    """A smaller picture of an image that is blurred by a Gaussian of some variance, px².
+
+    Where the blur is narrow, or the picture's sides cannot be divided, it is no smaller.
     """
-    height, width = into.shape
-    scale = 1
+    (height, width), scale = image.shape, 1
     while (
         variance_px2 / (2 * scale) ** 2 - ROUND_PX2 > LEAST_PX2
         and height % (2 * scale) == width % (2 * scale) == 0
     ):
         scale *= 2
-    if scale == 1:
-        blur(image, float(np.sqrt(variance_px2)), into)
-        return image
-    shape = height // scale, width // scale
+    shape, variance = (height // scale, width // scale), variance_px2 / scale**2
     small, blurred = (scratch(f"{name} {scale}", shape) for name in ("small", "small blurred"))
-    cv2.resize(image, shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
-    blur(small, float(np.sqrt(variance_px2 / scale**2 - ROUND_PX2)), blurred)
-    cv2.resize(blurred, (width, height), dst=into)
-    return small
+    if scale > 1:
+        image = np.asarray(cv2.resize(image, shape[::-1], small, 0, 0, cv2.INTER_AREA), np.float32)
+        variance -= ROUND_PX2
+    return blur(image, float(np.sqrt(variance)), blurred)
 
 
 def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Dots:
     from labapp.core.images import dot_kernels
 
-    u, v = seen.peaks(tuning)
+    u, v, bright = seen.peaks(tuning)
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
-    bright = seen.band[v, u].astype(float)
-    keep = bright >= settings.contrast * typical(bright)
-    u, v = u[keep], v[keep]
-    first = dot_kernels.first_of_each(u, v, max(1.5, seen.size))  # the top of a dot may be flat
-    return _described(seen, u[first], v[first], tuning.noise, settings.speckle_px)
+    keep = np.flatnonzero(bright >= settings.contrast * typical(bright))
+    # The top of a dot may be flat.
+    keep = keep[dot_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
+    dots = _described(seen, (u[keep], v[keep], bright[keep]), tuning.noise, settings.speckle_px)
+    order = np.argsort(dots.v_px)
+    return Dots(*(values[order] for values in vars(dots).values()))
 
 
 @lru_cache(maxsize=8)
@@ -394,21 +379,21 @@ def margin_of(reach: float) -> int:
     return int(np.ceil(2.2 * reach)) + 1
 
 
-def _described(seen: _BandPassed, u: IntArray, v: IntArray, noise: Grey, speckle_px: float) -> Dots:
+def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) -> Dots:
     """Centroid, its uncertainty, size, peak and signal-to-noise of each peak."""
     from labapp.core.images import dot_kernels
 
-    place, size = np.stack([u, v], axis=1).astype(float), seen.size
-    width = window_widths(dot_kernels.two_nearest(place, place)[0][:, 1], CENTROID_WIDENING * size)
-    offset, moment = seen.light(u, v, width, CENTROID_WIDENING * size)
+    (u, v, bright), size = peaks, seen.size
+    width = window_widths(dot_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
+    (u_px, v_px), moment = seen.light(u, v, width, CENTROID_WIDENING * size)
     moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
     spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / WIDTH_KEPT**2
-    peak = seen.band[v, u].astype(float) / PEAK_GAIN
+    peak = bright / PEAK_GAIN
     snr = peak / np.maximum(noise[v, u], 1e-3 * np.max(peak))
     sigma = np.hypot(0.8 / snr, speckle_px)
     return Dots(
-        u_px=u + offset[0],
-        v_px=v + offset[1],
+        u_px=u_px,
+        v_px=v_px,
         u_sigma_px=sigma,
         v_sigma_px=sigma.copy(),
         size_px=np.sqrt(np.clip(spread, (0.3 * size) ** 2, (3.0 * size) ** 2)),

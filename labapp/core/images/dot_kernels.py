@@ -6,6 +6,7 @@ Arrays may be read-only, and of any layout but for pictures.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from numba import types
 
 from labapp.core.compiled import compiled as _compiled
@@ -14,9 +15,11 @@ from labapp.core.compiled import inner as _inner
 from labapp.core.images.dots import Grey, Picture
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
+Line = npt.NDArray[np.float32] | npt.NDArray[np.int16]
+
 _f, _i = types.float64, types.int64
 _f1, _f2 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2))
-_taps, _grey = (types.Array(types.float32, n, "C", readonly=True) for n in (1, 2))
+_grey = types.Array(types.float32, 2, "C", readonly=True)
 _byte = types.Array(types.uint8, 2, "C", readonly=True)
 _ints = types.Array(_i, 1, "A", readonly=True)
 _mask = types.Array(types.boolean, 2, "C", readonly=True)
@@ -73,6 +76,22 @@ def two_nearest(places: FloatArray, among: FloatArray) -> tuple[FloatArray, IntA
         distance[k, 0], distance[k, 1] = np.sqrt(first), np.sqrt(second)
         number[k, 0], number[k, 1] = one, other
     return distance, number
+
+
+@_compiled(_f2)
+def next_apart(places: FloatArray) -> FloatArray:
+    """Distance of each place, shape (n, 2), from the next one, shape (n,); infinite of one."""
+    count = len(places)
+    x, y, least = places[:, 0].copy(), places[:, 1].copy(), np.full(count, np.inf)
+    for k in range(count):
+        own_x, own_y = x[k], y[k]
+        for first, last in ((0, k), (k + 1, count)):
+            to_x, to_y, next_one = x[first:last], y[first:last], least[first:last]
+            for m in range(len(next_one)):
+                away_x, away_y = own_x - to_x[m], own_y - to_y[m]
+                square = away_x * away_x + away_y * away_y
+                next_one[m] = square if square < next_one[m] else next_one[m]
+    return np.asarray(np.sqrt(least))
 
 
 @_inner
@@ -144,108 +163,50 @@ def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
     return made
 
 
-@_inner
-def _mirrored(at: int, count: int) -> int:
-    """A pixel's number where a picture goes on beyond its edge as in a mirror."""
-    at %= 2 * count
-    return 2 * count - 1 - at if at >= count else at
+@_compiled(_grey, _ints, _ints, _i)
+def summits(
+    band: Grey, u: IntArray, v: IntArray, step: int
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Columns, rows and heights of peaks of a picture that is ``step`` times as large as the band.
 
-
-@_inner
-def _blurred(
-    image: Picture, taps: Grey, u: int, v: int, raw: Grey, rows: Grey, patch: Grey, reach: int
-) -> None:
-    """Blur a square round a pixel by a filter along rows and columns; rows may be longer."""
-    side = 2 * reach + 1
-    inside = reach <= v < image.shape[0] - reach and reach <= u < image.shape[1] - reach
-    for y in range(side):
-        at_y = v + y - reach if inside else _mirrored(v + y - reach, image.shape[0])
-        for x in range(side):
-            at_x = u + x - reach
-            raw[y, x] = image[at_y, at_x if inside else _mirrored(at_x, image.shape[1])]
-        for x in range(rows.shape[1]):
-            rows[y, x] = 0.0
-        for k in range(len(taps)):
-            for x in range(rows.shape[1]):
-                rows[y, x] += taps[k] * raw[y, x + k]
-    for y in range(len(patch)):
-        for x in range(rows.shape[1]):
-            patch[y, x] = 0.0
-        for k in range(len(taps)):
-            for x in range(rows.shape[1]):
-                patch[y, x] += taps[k] * rows[y + k, x]
-
-
-@_inner
-def _bell(center: float, width: float, values: FloatArray) -> None:
-    """A Gaussian at whole numbers round 0: each value is the last times what shrinks evenly."""
-    away = -(len(values) // 2) - center
-    value = np.exp(-0.5 * (away / width) ** 2)
-    ratio, shrinks = np.exp(-(away + 0.5) / width**2), np.exp(-1.0 / width**2)
-    for k in range(len(values)):
-        values[k] = value
-        value *= ratio
-        ratio *= shrinks
-
-
-@_compiled_for(*((own, _grey, _taps, _ints, _ints, _i, _f1, _f) for own in (_grey, _byte)))
-def centroids(
-    image: Picture,
-    around: Grey,
-    taps: Grey,
-    u: IntArray,
-    v: IntArray,
-    margin: int,
-    width: FloatArray,
-    reach: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Centroids and second moments of light round pixels: see `band_pass._described`.
-
-    Light is the image, blurred by a filter, over what is around it, another picture.
+    Both are those of Gaussians through a pixel of the band and those beside it; edges are mirrors.
     """
-    count, side, rim = len(u), 2 * margin + 1, len(taps) // 2
-    even = (side + 7) // 8 * 8  # numbers are added eight at a time
-    offset, moment, patch = np.zeros((2, count)), np.empty(count), np.zeros((side, even))
-    raw = np.zeros((side + 2 * rim, even + 2 * rim), np.float32)
-    rows = np.empty((side + 2 * rim, even), np.float32)
-    blurred = np.empty((side, even), np.float32)
-    along_u, along_v = np.empty(even), np.empty(side)
-    pull_u, pull_v = np.zeros(even), np.empty(side)
+    (height, width), count = band.shape, len(u)
+    columns, rows, heights = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count)
     for k in range(count):
-        _blurred(image, taps, u[k], v[k], raw, rows, blurred, margin + rim)
-        patch[:] = 0.0
-        first_y, last_y = max(margin - v[k], 0), min(side, image.shape[0] - v[k] + margin)
-        first_x, last_x = max(margin - u[k], 0), min(side, image.shape[1] - u[k] + margin)
-        for y in range(first_y, last_y):
-            for x in range(first_x, last_x):
-                light = blurred[y, x] - around[v[k] + y - margin, u[k] + x - margin]
-                patch[y, x] = max(light, 0.0)
-        for _ in range(4):
-            _bell(offset[0, k], width[k], pull_u[:side])
-            _bell(offset[1, k], width[k], pull_v)
-            along_u[:] = 0.0
-            for y in range(side):
-                row = 0.0
-                for x in range(even):
-                    weighed = patch[y, x] * pull_u[x]
-                    row += weighed
-                    along_u[x] += pull_v[y] * weighed
-                along_v[y] = pull_v[y] * row
-            total, mean_u, mean_v, square = 1e-12, 0.0, 0.0, 0.0
-            for at in range(side):
-                away = at - margin
-                total += along_u[at]
-                mean_u += along_u[at] * away
-                mean_v += along_v[at] * away
-                square += (along_u[at] + along_v[at]) * away * away
-            mean_u, mean_v = mean_u / total, mean_v / total
-            moment[k] = square / total - mean_u * mean_u - mean_v * mean_v
-            # The window holds the mean back; half as much again brings it home in a few steps.
-            offset[0, k] += 1.5 * (mean_u - offset[0, k])
-            offset[1, k] += 1.5 * (mean_v - offset[1, k])
-            offset[0, k] = min(max(offset[0, k], -reach), reach)
-            offset[1, k] = min(max(offset[1, k], -reach), reach)
-    return offset, moment
+        own = band[v[k], u[k]]
+        heights[k] = own
+        for axis in range(2):
+            if axis == 0:
+                low, high = band[v[k], abs(u[k] - 1)], band[v[k], width - 1 - abs(width - 2 - u[k])]
+            else:
+                low = band[abs(v[k] - 1), u[k]]
+                high = band[height - 1 - abs(height - 2 - v[k]), u[k]]
+            off = 0.0
+            if min(low, high) > 0.0 and own > 0.0:
+                rise, bend = np.log(high / low), np.log(own / low) + np.log(own / high)
+                if bend > abs(rise):
+                    off = 0.5 * rise / bend
+                    heights[k] *= np.exp(0.25 * rise * off)
+            place = ((u[k] if axis == 0 else v[k]) + off + 0.5) * step - 0.5
+            if axis == 0:
+                columns[k] = min(max(round(place), 0), step * width - 1)
+            else:
+                rows[k] = min(max(round(place), 0), step * height - 1)
+    return columns, rows, heights
+
+
+@_compiled_for(*((own,) for own in (_grey, _byte)))
+def halved(image: Picture) -> Grey:
+    """Means of squares of two by two pixels; of bytes they are not rounded."""
+    made = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.float32)
+    for v in range(made.shape[0]):
+        above, below, own = image[2 * v], image[2 * v + 1], made[v]
+        for u in range(made.shape[1]):
+            one = np.float32(above[2 * u]) + np.float32(above[2 * u + 1])
+            other = np.float32(below[2 * u]) + np.float32(below[2 * u + 1])
+            own[u] = np.float32(0.25) * (one + other)
+    return made
 
 
 @_inner
@@ -265,38 +226,38 @@ def _beside(image: Picture, v: int, u: int, away: int) -> float:
 
 
 @_inner
-def _falls(image: Picture, v: int, falls: Grey) -> None:
-    """How far the light falls from each pixel of a row to what is beside it, grey levels."""
+def _falls(image: Picture, v: int, near: Line, far: Line, falls: Line) -> None:
+    """Twice how far the light falls from each pixel of a row to what is beside it, grey levels.
+
+    ``near`` and ``far`` are memory to write on, each as long as a row.
+    """
     (height, width), first, last = image.shape, 0, 0
     if 2 <= v < height - 2 and width > 4:  # no edge between these: several are taken at once
         first, last = 2, width - 2
         row, inner = image[v], falls[first:last]
-        rows = image[v - 2, 2:], image[v - 1, 2:], image[v + 1, 2:], image[v + 2, 2:]
-        _falls_amid(row[first:last], row, row[1:], row[3:], row[4:], rows, inner)
+        _least_sum(image[v - 1, 2:], image[v + 1, 2:], row[1:], row[3:], inner, near)
+        _least_sum(image[v - 2, 2:], image[v + 2, 2:], row, row[4:], inner, far)
+        own = row[2:]
+        for u in range(len(inner)):
+            least = near[u] if near[u] < far[u] else far[u]
+            inner[u] = 2 * own[u] - least
     for k in range(first + width - last):
         u = k if k < first else last + k - first
-        falls[u] = float(image[v, u]) - min(_beside(image, v, u, 1), _beside(image, v, u, 2))
+        least = min(_beside(image, v, u, 1), _beside(image, v, u, 2))
+        falls[u] = 2.0 * float(image[v, u]) - 2.0 * least
 
 
 @_inner
-def _falls_amid(
-    own: Picture,
-    before: Picture,
-    left: Picture,
-    right: Picture,
-    after: Picture,
-    rows: tuple[Picture, Picture, Picture, Picture],
-    falls: Grey,
+def _least_sum(
+    above: Picture, below: Picture, left: Picture, right: Picture, other: Line, least: Line
 ) -> None:
-    """Do what `_falls` does where no edge is near, of pixels and those beside them, shape (n,)."""
-    single, half = np.float32, np.float32(0.5)
-    top, above, below, bottom = rows
-    for u in range(len(falls)):
-        one, other = single(above[u]) + single(below[u]), single(left[u]) + single(right[u])
-        near = one if one < other else other
-        one, other = single(top[u]) + single(bottom[u]), single(before[u]) + single(after[u])
-        far = one if one < other else other
-        falls[u] = single(own[u]) - half * (near if near < far else far)
+    """Put the lesser of two sums into ``least``; one sum a loop takes the most pixels at once."""
+    for u in range(len(other)):
+        least[u] = above[u] + below[u]
+    for u in range(len(other)):
+        other[u] = left[u] + right[u]
+    for u in range(len(other)):
+        least[u] = least[u] if least[u] < other[u] else other[u]
 
 
 @_inner
@@ -336,9 +297,14 @@ def spikes(
     found, told, count = np.empty((2, 64), np.int64), np.empty((2, 64)), 0
     near, far = np.exp(0.5 / size**2), np.exp(2.0 / size**2)
     far = far if far < 4.0 else np.inf  # dots so small have no light so far off
-    falls, floor = np.empty(width, np.float32), np.full(width, np.float32(over))
+    # Of bytes these are integers of two bytes.
+    falls, floor = image[0] * np.int16(0), image[0] * np.int16(0)
+    sums, others = falls.copy(), falls.copy()
+    floor[:] = 2.0 * over
     for v in range(height):
-        _falls(image, v, falls)
+        _falls(image, v, sums, others, falls)
+        if not _any_over(falls, floor):
+            continue
         for first in range(0, width, BLOCK):
             last = min(first + BLOCK, width)
             for u in range(
@@ -385,33 +351,6 @@ def hanging_together(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
             if not made[k] and abs(u[k] - u[own]) <= 1 and abs(v[k] - v[own]) <= 1:
                 made[k], next_ones[count] = True, k
                 count += 1
-    return made
-
-
-@_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))
-def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
-    """Largest difference of two filters among nine pixels round each (`band_pass._nine`)."""
-    side, made = narrow.shape[1], np.empty(len(u))
-    patch, across = np.empty((side, side)), np.empty((2, side, 3))
-    for k in range(len(u)):
-        for y in range(side):
-            at_y = _mirrored(v[k] + y - side // 2, image.shape[0])
-            for x in range(side):
-                patch[y, x] = image[at_y, _mirrored(u[k] + x - side // 2, image.shape[1])]
-        for y in range(side):
-            for j in range(3):
-                across[0, y, j] = across[1, y, j] = 0.0
-                for x in range(side):
-                    across[0, y, j] += narrow[j, x] * patch[y, x]
-                    across[1, y, j] += wide[j, x] * patch[y, x]
-        most = -np.inf
-        for i in range(3):
-            for j in range(3):
-                value = 0.0
-                for y in range(side):
-                    value += narrow[i, y] * across[0, y, j] - wide[i, y] * across[1, y, j]
-                most = max(most, value)
-        made[k] = most
     return made
 
 

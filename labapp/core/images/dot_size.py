@@ -87,7 +87,7 @@ def mended(
     from labapp.core.images import dot_kernels
 
     least = 1e-3 * float(cv2.minMaxLoc(picture)[1])
-    over = SPIKE * max(float(cv2.minMaxLoc(noise)[0]), least)
+    over = SPIKE * max(float(noise[::8, ::8].min()), least)
     reach = max(2, round(2.5 * size))
     (u, v), (times, beside) = dot_kernels.spikes(picture, over, size, DOUBTED, reach)
     sharp = picture[v, u] - beside > SPIKE * noise[v, u]

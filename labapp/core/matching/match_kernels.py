@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (2, 3))
 
@@ -37,6 +37,33 @@ def pair_deviances(
             deviance[n, m] = area
     deviance[:] = distance + np.log(deviance)
     return distance, deviance
+
+
+@compiled(_f2, _f2, _f2, _f2, _f2)
+def within_view(
+    places: FloatArray,
+    margin: FloatArray,
+    to_image: FloatArray,
+    plane: FloatArray,
+    image: FloatArray,
+) -> BoolArray:
+    """Which of n places on the plane are in view, also where they are off by margins.
+
+    Places and margins along either axis have shape (n, 2), mm; the homography from there to the
+    image shape (3, 3); the least and the largest places and pixels in view shape (2, 2), the least
+    first.
+    """
+    made = np.ones(len(places), np.bool_)
+    for k in range(len(places)):
+        for corner in range(4):
+            x = places[k, 0] + (1.0 if corner < 2 else -1.0) * margin[k, 0]
+            z = places[k, 1] + (1.0 if corner % 2 else -1.0) * margin[k, 1]
+            w = to_image[2, 0] * x + to_image[2, 1] * z + to_image[2, 2]
+            u = (to_image[0, 0] * x + to_image[0, 1] * z + to_image[0, 2]) / w
+            v = (to_image[1, 0] * x + to_image[1, 1] * z + to_image[1, 2]) / w
+            made[k] &= plane[0, 0] < x < plane[1, 0] and plane[0, 1] < z < plane[1, 1]
+            made[k] &= image[0, 0] < u < image[1, 0] and image[0, 1] < v < image[1, 1]
+    return made
 
 
 @compiled(_f2)

@@ -190,16 +190,23 @@ class Observation(ReadOnlyArrays):
         reaches as far as its size says, and as far as dots are seen on it: O′ need not be its very
         corner.
         """
+        from labapp.core.matching import match_kernels
+
+        margin = np.broadcast_to(np.asarray(margin_mm, float), plane_mm.shape)
+        made = match_kernels.within_view(
+            plane_mm.reshape(-1, 2), margin.reshape(-1, 2), self.calibration.from_plane, *self._view
+        )
+        return made.reshape(plane_mm.shape[:-1])
+
+    @cached_property
+    def _view(self) -> tuple[FloatArray, FloatArray]:
+        """Least and largest places on the plane, mm, and pixels in view, shapes (2, 2)."""
         plane = self.rig.imaging_plane
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
-        limit = np.array(self.frame_shape[::-1]) - 1 - EDGE_PX
-        ways = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]] if np.any(margin_mm) else [[0, 0]])
-        corners = np.stack([plane_mm + way * margin_mm for way in ways])
-        image = self.calibration.to_image(corners)
-        on_plane = (corners > low) & (corners < high)
-        in_frame = (image > EDGE_PX) & (image < limit)
-        return np.asarray((on_plane & in_frame).all(axis=(0, -1)))
+        height, width = self.frame_shape
+        limit = [width - 1 - EDGE_PX, height - 1 - EDGE_PX]
+        return np.array([low, high]), np.array([[EDGE_PX, EDGE_PX], limit])
 
 
 def try_fit(

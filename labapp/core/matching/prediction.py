@@ -123,10 +123,7 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
     )
     sane = np.isfinite(plane[:, 0])
     at, points, slopes, plane = at[sane], points[sane], slopes[sane], plane[sane]
-    spacing = np.full(len(plane), np.inf)
-    if len(plane) > 1:
-        spacing = dot_kernels.two_nearest(plane, plane)[0][:, 1]
-    return Prediction(at, points, slopes, plane, spacing)
+    return Prediction(at, points, slopes, plane, dot_kernels.next_apart(plane))
 
 
 def pair_deviances(

@@ -49,9 +49,7 @@ def apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
 def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
     """Distance of some rays' dots from the next of them; infinite for other rays, shape (R,)."""
     distance = np.full(len(plane_mm), np.inf)
-    if len(ray) > 1:
-        places = plane_mm[ray]
-        distance[ray] = dot_kernels.two_nearest(places, places)[0][:, 1]
+    distance[ray] = dot_kernels.next_apart(plane_mm[ray])
     return distance
 
 
@@ -105,7 +103,7 @@ def tracked(
     if len(near) < 2 or len(observed.plane_mm) < 2:
         return labels, np.empty(0)
     plane = pool.plane_mm[near]
-    step = dot_kernels.two_nearest(plane, plane)[0][:, 1]
+    step = dot_kernels.next_apart(plane)
     off, ray = dot_kernels.two_nearest(observed.plane_mm, plane)
     other, dot = dot_kernels.two_nearest(plane, observed.plane_mm)
     own, off_own = ray[:, 0], off[:, 0]

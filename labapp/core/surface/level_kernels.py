@@ -15,6 +15,9 @@ _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
 EPS = 1e-12
 """1 plus less than this is taken for 1: a thousand such factors change no level."""
 
+FARTHEST = -np.log(EPS)
+"""A factor whose logarithm is farther below 0 is such a one."""
+
 FACTORS = 1000
 """So many factors of at most 2 have a product that does not overflow."""
 
@@ -66,10 +69,10 @@ def _accumulate(
     begins, ends = (0, turn) if slope > 0.0 else (turn, count)
     starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
     starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
-    if turn < count:
-        _multiply(factors, turn, 1, np.exp(-abs(start + turn * slope)), shrinks)
-    if turn > 0:
-        _multiply(factors, turn - 1, -1, np.exp(-abs(start + (turn - 1) * slope)), shrinks)
+    for at, way in ((turn, 1), (turn - 1, -1)):
+        away = abs(start + at * slope)
+        if 0 <= at < count and away < FARTHEST:
+            _multiply(factors, at, way, np.exp(-away), shrinks)
 
 
 @_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f, _f, _f, _i, _f1)
