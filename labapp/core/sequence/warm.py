@@ -41,7 +41,7 @@ from labapp.core.sequence.warm_match import (
     RayClasses,
     beyond,
     classify_rays,
-    covariance_of,
+    covariance_around,
     widened,
 )
 from labapp.core.surface import kernels, measures
@@ -194,15 +194,16 @@ def follow(
     observed = Observation.of(dots, geometry.rig, calibration, (image.shape[0], image.shape[1]))
     pool, labels, off = found_again(track, observed)
     passed("match")
-    pool, labels, lower = _fitted(geometry, observed, pool, labels)
+    pool, labels, lower, spread = _fitted(geometry, observed, pool, labels)
     passed("fit")
-    classes = classify_rays(geometry, observed, pool, lower, labels)
+    classes = classify_rays(geometry, observed, pool, spread, labels)
     level, open_mm = _level(track, pool, classes, labels)
     outside = beyond(geometry, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
         pool, lower = _settled(geometry, _shifted(pool, level), _slopes(geometry, observed, labels))
-        classes = classify_rays(geometry, observed, pool, lower, labels)
+        spread = covariance_around(geometry, pool, lower, labels)
+        classes = classify_rays(geometry, observed, pool, spread, labels)
         level, open_mm = _level(track, pool, classes, labels)
     pool = intersect_and_reflect(geometry, pool.coefficients + level.shift_mm, pool.points_mm, 1)
     passed("level")
@@ -246,8 +247,12 @@ def _shifted(pool: WarmPool, level: Level) -> WarmPool:
 
 def _fitted(
     geometry: SequenceGeometry, observed: Observation, pool: WarmPool, labels: IntArray
-) -> tuple[WarmPool, IntArray, FloatArray]:
-    """Fit the surface, roughly first, and then with the labels that it bears out."""
+) -> tuple[WarmPool, IntArray, FloatArray, FloatArray]:
+    """Fit the surface, roughly first, and then with the labels that it bears out.
+
+    Returns the surface and the labels, the factor of the normal matrix, and the covariance of the
+    dots that follows from it (`covariance_around`).
+    """
     slopes, factor = _slopes(geometry, observed, labels), None
     for _ in range(WIDENINGS):
         pool, lower, moved = fit_slopes_to(geometry, pool, slopes, until_mm=ROUGHLY_MM)
@@ -259,26 +264,27 @@ def _fitted(
         if np.sum(labels != UNLABELLED) < np.sum(before != UNLABELLED) + MANY:
             break
     pool, lower = _settled(geometry, pool, slopes, factor)
-    off = _unsupported(geometry, observed, pool, lower, labels)
+    spread = covariance_around(geometry, pool, lower, labels)
+    off = _unsupported(geometry, observed, pool, spread, labels)
     if len(off):
         labels = np.where(np.isin(labels, off), UNLABELLED, labels)
         pool, lower = _settled(geometry, pool, _slopes(geometry, observed, labels))
-    return pool, labels, lower
+        spread = covariance_around(geometry, pool, lower, labels)
+    return pool, labels, lower, spread
 
 
 def _unsupported(
     geometry: SequenceGeometry,
     observed: Observation,
     pool: WarmPool,
-    lower: FloatArray,
+    spread: FloatArray,
     labels: IntArray,
 ) -> IntArray:
     """Labelled dots that the surface does not support (`outliers.unsupported`)."""
     ray, every = np.flatnonzero(labels != UNLABELLED), np.full(observed.absent.shape, UNLABELLED)
     every[tuple(geometry.at.T)] = labels
     residual = pool.plane_mm[ray] - observed.plane_mm[labels[ray]]
-    computed = covariance_of(geometry, pool, lower, ray)
-    return unsupported(observed, every, residual, computed, geometry.settings.floor_mm)
+    return unsupported(observed, every, residual, spread[ray], geometry.settings.floor_mm)
 
 
 def _settled(

@@ -166,7 +166,7 @@ def _deviance(
     dot: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
     """What `match_kernels.pair_deviances` says of rays making dots, shapes (rays, dots)."""
-    spread = covariance_of(geometry, pool, lower, ray)
+    spread = _covariance_of(geometry, pool, lower, ray)
     made = match_kernels.pair_deviances(
         observed.plane_mm[dot],
         observed.covariance_mm2[dot],
@@ -176,12 +176,22 @@ def _deviance(
     return made[0].T, made[1].T
 
 
-def covariance_of(
+def _covariance_of(
     geometry: SequenceGeometry, pool: WarmPool, lower: FloatArray, ray: IntArray
 ) -> FloatArray:
     """Covariance of some rays' dots, as far as the surface is uncertain, shape (n, 2, 2), mm²."""
     at = pool.points_mm[ray], pool.plane_mm[ray]
     return covariance_of_dots(geometry.rig, geometry.basis, lower, *at)
+
+
+def covariance_around(
+    geometry: SequenceGeometry, pool: WarmPool, lower: FloatArray, labels: IntArray
+) -> FloatArray:
+    """Covariance of the dots of lit rays and those beside them, NaN of others, (R, 2, 2), mm²."""
+    where = around(geometry, labels != UNLABELLED, 1) & np.isfinite(pool.plane_mm[:, 0])
+    ray, made = np.flatnonzero(where), np.full((len(labels), 2, 2), np.nan)
+    made[ray] = _covariance_of(geometry, pool, lower, ray)
+    return made
 
 
 @dataclass(frozen=True)
@@ -205,10 +215,13 @@ def classify_rays(
     geometry: SequenceGeometry,
     observed: Observation,
     pool: WarmPool,
-    lower: FloatArray,
+    spread: FloatArray,
     labels: IntArray,
 ) -> RayClasses:
-    """Classify every ray, as `hypothesis` does; ``lower`` is the factor of the pool's fit."""
+    """Classify every ray, as `hypothesis` does.
+
+    ``spread`` is the covariance of the dots of lit rays and those beside them, shape (R, 2, 2).
+    """
     lit = labels != UNLABELLED
     known = np.isfinite(pool.plane_mm[:, 0])
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
@@ -226,7 +239,7 @@ def classify_rays(
         observed,
         geometry.at[rim],
         pool.plane_mm[rim],
-        lambda some: covariance_of(geometry, pool, lower, rim[some]),
+        lambda some: spread[rim[some]],
     )
     witness[lost[tuple(geometry.at.T)]] = 0
     witness[lit] = 1
