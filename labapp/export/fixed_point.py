@@ -37,12 +37,12 @@ def format_fixed(values: FloatArray, digits: IntArray) -> tuple[npt.NDArray[np.u
         Buffer of ASCII bytes, and how many are used; −1 if a number may be rounded wrongly.
     """
     text, own = np.empty(values.size * LONGEST, np.uint8), np.empty(LONGEST, np.uint8)
-    at = 0
+    at, scale = 0, 10.0**digits
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
             value = values[row, column]
             if np.isfinite(value):
-                scaled = abs(value) * 10.0 ** digits[column]
+                scaled = abs(value) * scale[column]
                 off_tie = abs(scaled - np.floor(scaled) - 0.5)
                 if scaled >= LARGEST or off_tie <= ROUNDED * scaled:
                     return text, -1

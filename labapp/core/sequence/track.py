@@ -205,6 +205,7 @@ def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArr
     """
     gram, right = np.zeros((order, order)), np.zeros(order)
     own = np.empty(len(slopes))
+    next_ones = own[order:]
     for ray in rays:
         for axis in range(2):
             mean = 0.0
@@ -214,12 +215,14 @@ def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArr
             for m in range(len(slopes)):
                 own[m] -= mean
             for k in range(order):
-                for m in range(order, len(slopes)):
-                    right[k] += own[m - 1 - k] * own[m]
+                one, product = own[order - 1 - k :], 0.0
+                for m in range(len(next_ones)):
+                    product += one[m] * next_ones[m]
+                right[k] += product
                 for other in range(k + 1):
-                    product = 0.0
-                    for m in range(order, len(slopes)):
-                        product += own[m - 1 - k] * own[m - 1 - other]
+                    two, product = own[order - 1 - other :], 0.0
+                    for m in range(len(next_ones)):
+                        product += one[m] * two[m]
                     gram[k, other] += product
     for k in range(order):
         for other in range(k):

@@ -431,26 +431,49 @@ def covariance_of_dots(
     inverse = _inverse_band(lower, first.min())
     by_u, by_v = np.empty(16), np.empty(16)
     for k in range(pairs):
-        (a, b), (c, d) = _slope_jacobian(laser, axes, points[k], dots[k])
-        area = a * d - b * c
+        (xu, xv), (yu, yv) = _slope_jacobian(laser, axes, points[k], dots[k])
+        area = xu * yv - xv * yu
         _cubic_splines(grid[0], points[k, 0], work[0], work[1])
         _cubic_splines(grid[1], points[k, 1], work[2], work[3])
         for own in range(16):
             by_x = work[1, own // 4] * work[2, own % 4]
             by_y = work[0, own // 4] * work[3, own % 4]
-            by_u[own] = (d * by_x - b * by_y) / area
-            by_v[own] = (a * by_y - c * by_x) / area
+            by_u[own] = (yv * by_x - xv * by_y) / area
+            by_v[own] = (xu * by_y - yu * by_x) / area
         for own in range(16):
-            row = inverse[first[k] + own // 4 * many + own % 4]
+            row = inverse[first[k] + own // 4 * many + own % 4, first[k] :]
             along_u, along_v = 0.0, 0.0
-            for other in range(16):
-                entry = row[first[k] + other // 4 * many + other % 4]
-                along_u += entry * by_u[other]
-                along_v += entry * by_v[other]
+            for a in range(4):
+                for b in range(4):
+                    entry = row[a * many + b]
+                    along_u += entry * by_u[4 * a + b]
+                    along_v += entry * by_v[4 * a + b]
             out[k, 0, 0] += by_u[own] * along_u
             out[k, 0, 1] += by_u[own] * along_v
             out[k, 1, 1] += by_v[own] * along_v
         out[k, 1, 0] = out[k, 0, 1]
+    return out
+
+
+@_compiled(_f2, _f2)
+def variances(lower: FloatArray, gradients: FloatArray) -> FloatArray:
+    """Diagonal of G (LLᵀ)⁻¹ Gᵀ, shape (m,).
+
+    L is the factor of the normal matrix, shape (width + 1, p); G has shape (m, p).
+    """
+    (height, count), out = lower.shape, np.empty(len(gradients))
+    left, columns = np.empty(count), lower.T.copy()
+    for m in range(len(gradients)):
+        left[:count] = gradients[m]
+        total = 0.0
+        for j in range(count):
+            column, rest = columns[j], left[j:]
+            value = rest[0] / column[0]
+            total += value * value
+            if value != 0.0:
+                for k in range(min(height, count - j)):
+                    rest[k] -= value * column[k]
+        out[m] = total
     return out
 
 

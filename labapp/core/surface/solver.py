@@ -156,10 +156,11 @@ def propagate_sigma(
     level_sigma_mm
         Standard uncertainty of the level, mm.
     """
+    from labapp.core.surface import kernels
+
     by_level = gradients.sum(axis=1)
     free = gradients - by_level[:, None] * mean_splines
-    half = scipy.linalg.lapack.dtbtrs(factor, np.asfortranarray(free.T), uplo="L")[0]
-    return np.asarray(np.sqrt((half * half).sum(axis=0) + (level_sigma_mm * by_level) ** 2))
+    return np.asarray(np.sqrt(kernels.variances(factor, free) + (level_sigma_mm * by_level) ** 2))
 
 
 @dataclass(frozen=True)
