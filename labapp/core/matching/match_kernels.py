@@ -94,12 +94,14 @@ def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, Float
 def medians_around(values: FloatArray) -> FloatArray:
     """Median of those within two rows and columns of each value, without it; NaN stands for none.
 
-    Values have shape (rows, columns), medians the same.
+    Values have shape (rows, columns), medians the same: NaN where there is no value, too.
     """
     rows, columns = values.shape
     medians, around = np.full((rows, columns), np.nan), np.empty(24)
     for i in range(rows):
         for j in range(columns):
+            if np.isnan(values[i, j]):
+                continue
             count = 0
             for k in range(max(i - 2, 0), min(i + 3, rows)):
                 for m in range(max(j - 2, 0), min(j + 3, columns)):

@@ -74,6 +74,7 @@ def _studentised(residual: FloatArray, dot: FloatArray, computed: FloatArray) ->
     (x, y), rest = residual.T, dot - computed
     xx, xy, yy = rest[:, 0, 0], rest[:, 0, 1], rest[:, 1, 1]
     area = xx * yy - xy * xy
-    free = (xx > 0.0) & (area > LEAST_FREE * np.linalg.det(dot))
+    known = dot[:, 0, 0] * dot[:, 1, 1] - dot[:, 0, 1] ** 2
+    free = (xx > 0.0) & (area > LEAST_FREE * known)
     chi2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / np.where(free, area, np.inf)
     return np.asarray(np.sqrt(chi2))

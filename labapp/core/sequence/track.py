@@ -183,7 +183,7 @@ def predictions(track: Track) -> Iterator[FloatArray]:
     if order > 2:
         teachers = np.flatnonzero(track.lit)[::TEACHERS]
         gram, right = recurrence(track.slopes, teachers, order)
-        gram[np.diag_indices(order)] += 1e-4 * np.trace(gram)
+        gram.flat[:: order + 1] += 1e-4 * np.trace(gram)
         ratio = np.linalg.solve(gram, right)
         mean = past.mean(axis=0)
         yield mean + ratio @ (past[: -order - 1 : -1] - mean)

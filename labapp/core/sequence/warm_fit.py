@@ -7,6 +7,7 @@ from which rays came back and which did not.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -65,6 +66,11 @@ class SequenceGeometry(ReadOnlyArrays):
     plane: FloatArray
     stiffness: FloatArray
     settings: FitSettings
+
+    @cached_property
+    def flat(self) -> IntArray:
+        """Numbers of the rays in the pattern's arrays, row by row, shape (R,)."""
+        return np.asarray(self.at @ np.array([self.rig.pattern.columns, 1]))
 
     @classmethod
     def of(cls, rig: Rig, basis: SplineBasis, settings: FitSettings) -> SequenceGeometry:

@@ -40,6 +40,9 @@ ASTRAY = 0.25
 """A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
 
 
+_RING = np.ones((3, 3), np.uint8)
+
+
 def apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
     """Distances, shape (len(one), len(other))."""
     x, y = one[:, 0, None] - other[:, 0], one[:, 1, None] - other[:, 1]
@@ -55,21 +58,26 @@ def next_of(plane_mm: FloatArray, ray: IntArray) -> FloatArray:
 
 def around(geometry: SequenceGeometry, lit: BoolArray, rings: int) -> BoolArray:
     """Rays in a mask, shape (R,), and their neighbours, so many rings of them."""
-    wide = cv2.dilate(on_pattern(geometry, lit), np.ones((3, 3), np.uint8), iterations=rings)
-    return np.asarray(wide[tuple(geometry.at.T)], bool)
+    wide = cv2.dilate(on_pattern(geometry, lit), _RING, iterations=rings)
+    return _of_rays(geometry, np.asarray(wide, np.uint8).view(bool))
 
 
 def on_pattern(geometry: SequenceGeometry, lit: BoolArray) -> npt.NDArray[np.uint8]:
     """A mask of rays, shape (R,), over the whole pattern, shape (rows, columns)."""
     pattern = geometry.rig.pattern
-    grid = np.zeros((pattern.rows, pattern.columns), np.uint8)
-    grid[tuple(geometry.at.T)] = lit
-    return grid
+    grid = np.zeros(pattern.rows * pattern.columns, np.uint8)
+    grid[geometry.flat] = lit
+    return grid.reshape(pattern.rows, pattern.columns)
+
+
+def _of_rays(geometry: SequenceGeometry, mask: BoolArray) -> BoolArray:
+    """What a mask over the pattern says of the rays, shape (R,)."""
+    return mask.ravel()[geometry.flat]
 
 
 def filled(geometry: SequenceGeometry, lit: BoolArray) -> BoolArray:
     """Lit rays and those amid them, whose dots may have been missed: a surface is sure of both."""
-    among = amid(on_pattern(geometry, lit).view(bool))[tuple(geometry.at.T)]
+    among = _of_rays(geometry, amid(on_pattern(geometry, lit).view(bool)))
     return np.asarray((lit | among) & ~geometry.absent)
 
 
@@ -231,7 +239,7 @@ def classify_rays(
     )
     seen = known & ~hidden & ~merged
     seen[seen] = observed.in_view(pool.plane_mm[seen])
-    among = amid(on_pattern(geometry, lit).view(bool))[tuple(geometry.at.T)]
+    among = _of_rays(geometry, amid(on_pattern(geometry, lit).view(bool)))
     missed = int(np.sum(among & ~geometry.absent & ~lit & seen))
     witness = np.where(seen & ~among & ~geometry.absent, -1, 0)
     rim = np.flatnonzero((witness < 0) & around(geometry, lit, 1))
@@ -241,7 +249,7 @@ def classify_rays(
         pool.plane_mm[rim],
         lambda some: spread[rim[some]],
     )
-    witness[lost[tuple(geometry.at.T)]] = 0
+    witness[_of_rays(geometry, lost)] = 0
     witness[lit] = 1
     stray = unlabelled(len(observed.plane_mm), labels)
     if len(stray):
