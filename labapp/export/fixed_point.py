@@ -37,7 +37,7 @@ def format_fixed(values: FloatArray, digits: IntArray) -> tuple[npt.NDArray[np.u
         Buffer of ASCII bytes, and how many are used; −1 if a number may be rounded wrongly.
     """
     text, own = np.empty(values.size * LONGEST, np.uint8), np.empty(LONGEST, np.uint8)
-    at, scale = 0, 10.0**digits
+    at, scale, ten = 0, 10.0**digits, np.uint64(10)
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
             value = values[row, column]
@@ -46,15 +46,15 @@ def format_fixed(values: FloatArray, digits: IntArray) -> tuple[npt.NDArray[np.u
                 off_tie = abs(scaled - np.floor(scaled) - 0.5)
                 if scaled >= LARGEST or off_tie <= ROUNDED * scaled:
                     return text, -1
-                left = np.int64(np.rint(scaled))
+                left = np.uint64(np.rint(scaled))
                 if value < 0.0 and left > 0:
                     text[at] = 45  # the sign
                     at += 1
                 count = 0
                 while left > 0 or count <= digits[column]:
-                    own[count] = 48 + left % 10
-                    left //= 10
-                    count += 1
+                    tenth = left // ten
+                    own[count] = 48 + np.uint8(left - ten * tenth)
+                    left, count = tenth, count + 1
                 for k in range(count - 1, -1, -1):
                     text[at] = own[k]
                     at += 1

@@ -10,6 +10,7 @@ import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -141,13 +142,15 @@ TABLES: dict[str, tuple[Column, ...]] = {
 }
 """The tables and their columns, in the order in which a frame is written to them."""
 
+_NAMES = {name: [column.name for column in columns] for name, columns in TABLES.items()}
 _MEASURED = {field.name for field in fields(Measures)}
 SIZES = [c.name for c in TABLES["measures"] if c.name in _MEASURED and not c.is_part]
 
 
-def columns_of(name: str, sigma_parts: bool = False) -> list[Column]:
+@cache
+def columns_of(name: str, sigma_parts: bool = False) -> tuple[Column, ...]:
     """Columns of a table's CSV file, with or without the parts of standard uncertainties."""
-    return [column for column in TABLES[name] if sigma_parts or not column.is_part]
+    return tuple(column for column in TABLES[name] if sigma_parts or not column.is_part)
 
 
 def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Table]:
@@ -172,8 +175,7 @@ def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str
     for name, values in columns.items():
         rows = len(values[0]) if values else 0
         filled = values or [np.empty(0)] * (len(TABLES[name]) - 1)
-        names = [column.name for column in TABLES[name]]
-        tables[name] = dict(zip(names, [np.full(rows, result.frame), *filled], strict=True))
+        tables[name] = dict(zip(_NAMES[name], [np.full(rows, result.frame), *filled], strict=True))
     return tables
 
 
@@ -220,9 +222,9 @@ def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.N
     site = np.full((len(dots), 2), np.nan)
     blocked = np.full(len(dots), np.nan)
     if lattice is not None:
-        number = np.column_stack([lattice.row, lattice.column])
+        number = np.array([lattice.row, lattice.column]).T
         site = np.where(number > 0, number, np.nan)
-        hidden = np.isin(lattice.row, list(lattice.blocked_rows))
+        hidden = np.isin(lattice.row, list(lattice.blocked_rows)) if lattice.blocked_rows else 0
         blocked = np.where(lattice.row > 0, hidden, np.nan)
     source = np.full(len(dots), "auto", object)
     if measurement.correction is not None:
@@ -293,8 +295,8 @@ def _numeric_rows(columns: Sequence[Column], table: Table) -> str | None:
     if any(column.digits is None for column in columns):
         return None
     digits = np.array([column.digits for column in columns])
-    values = np.column_stack([table[column.name] for column in columns]).astype(float)
-    text, length = format_fixed(values, digits)
+    values = np.array([table[column.name] for column in columns], float)
+    text, length = format_fixed(values.T, digits)
     if length < 0:
         return None
     return text[:length].tobytes().decode("ascii").replace("\n", end)
