@@ -333,21 +333,19 @@ def test_centroids_are_those_of_the_blurred_picture_over_what_is_around_it(sigma
         np.testing.assert_allclose([*offset[:, k], moment[k]], wanted, atol=1e-5)
 
 
-def test_summits_are_those_of_gaussians_between_the_pixels_of_a_smaller_picture() -> None:
-    places = random().uniform(20.0, 80.0, (30, 2))
-    v, u = np.mgrid[:100, :100]
-    for u_px, v_px in places:
-        square = (u - u_px) ** 2 + (v - v_px) ** 2
-        image = (40.0 * np.exp(-square / (2 * 2.5**2))).astype(np.float32)
-        for step in (1, 2):
-            band = dot_kernels.halved(image) if step == 2 else image
-            at = np.unravel_index(np.argmax(band), band.shape)
-            x, y = (np.array([one]) for one in at[::-1])
-            column, row, height = dot_kernels.summits(band, x, y, step)
-            assert abs(column[0] - u_px) < 0.51
-            assert abs(row[0] - v_px) < 0.51
-            lost = 1 + (step**2 - 1) / 12 / 2.5**2  # what a pixel's area blurs
-            assert height[0] == pytest.approx(40.0 / lost, rel=2e-3)
+def test_an_enlarged_band_is_that_of_the_whole_picture_where_it_is_over_a_floor() -> None:
+    v, u = np.mgrid[:120, :160]
+    image = np.zeros((120, 160))
+    for u_px, v_px in random().uniform(0.0, 120.0, (30, 2)):
+        image += 40.0 * np.exp(-((u - u_px) ** 2 + (v - v_px) ** 2) / (2 * 3.2**2))
+    band, large = dot_kernels.halved(image.astype(np.float32)), np.empty((120, 160), np.float32)
+    low = np.full(band.shape, 10.0, np.float32)
+    dot_kernels.enlarge_above(band, low, large)
+    lit = np.kron(band > low, np.ones((2, 2), bool))
+    blurred = cv2.blur(image, (3, 3)) * 0.375 + image * 0.625  # as far as a pixel's area blurs
+    inner = np.s_[6:-6, 6:-6]
+    assert np.abs(large - blurred)[inner][lit[inner]].max() < 0.02 * image.max()
+    assert not large[~lit].any()
 
 
 def test_a_halved_picture_has_the_means_of_four_pixels() -> None:

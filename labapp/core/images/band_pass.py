@@ -268,14 +268,12 @@ class _BandPassed:
         """Peaks over the floor."""
         from labapp.core.images import dot_kernels
 
-        disc = peak_disc(self.size / self.step)
-        if self.step == 2 and len(disc) == 3:
-            disc = np.ones((3, 3), bool)
-        low = tuning.coarse if self.step == 2 else tuning.floor
-        x, y = dot_kernels.peaks(self.band, low, disc)
-        u, v, bright = dot_kernels.summits(self.band, x, y, self.step)
-        over = bright > tuning.floor[v, u]
-        return u[over], v[over], bright[over]
+        band = self.band
+        if self.step == 2:
+            band = scratch("large band", self.picture.shape)
+            dot_kernels.enlarge_above(self.band, tuning.coarse, band)
+        u, v = dot_kernels.peaks(band, tuning.floor, peak_disc(self.size))
+        return u, v, band[v, u].astype(float)
 
     def _dot_like(self, u: IntArray, v: IntArray, bright: FloatArray) -> BoolArray:
         """Whether peaks are round, and answer no more to a much finer band than to the dots'."""

@@ -196,14 +196,13 @@ def follow(
     passed("match")
     pool, labels, lower, spread = _fitted(geometry, observed, pool, labels)
     passed("fit")
-    classes = classify_rays(geometry, observed, pool, spread, labels)
+    classes = classify_rays(geometry, observed, pool, lower, labels, spread)
     level, open_mm = _level(track, pool, classes, labels)
     outside = beyond(geometry, _shifted(pool, level), level, labels, track.lit)
     if len(outside) or abs(level.shift_mm) > RAISED_MM:
         labels[outside] = UNLABELLED
         pool, lower = _settled(geometry, _shifted(pool, level), _slopes(geometry, observed, labels))
-        spread = covariance_around(geometry, pool, lower, labels)
-        classes = classify_rays(geometry, observed, pool, spread, labels)
+        classes = classify_rays(geometry, observed, pool, lower, labels)
         level, open_mm = _level(track, pool, classes, labels)
     pool = intersect_and_reflect(geometry, pool.coefficients + level.shift_mm, pool.points_mm, 1)
     passed("level")

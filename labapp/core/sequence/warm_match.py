@@ -223,13 +223,16 @@ def classify_rays(
     geometry: SequenceGeometry,
     observed: Observation,
     pool: WarmPool,
-    spread: FloatArray,
+    lower: FloatArray,
     labels: IntArray,
+    spread: FloatArray | None = None,
 ) -> RayClasses:
-    """Classify every ray, as `hypothesis` does.
+    """Classify every ray, as `hypothesis` does; ``lower`` is the factor of the pool's fit.
 
-    ``spread`` is the covariance of the dots of lit rays and those beside them, shape (R, 2, 2).
+    ``spread`` is what `covariance_around` gives, where that is known.
     """
+    if spread is None:
+        spread = covariance_around(geometry, pool, lower, labels)
     lit = labels != UNLABELLED
     known = np.isfinite(pool.plane_mm[:, 0])
     next_mm = next_of(pool.plane_mm, np.flatnonzero(known))
