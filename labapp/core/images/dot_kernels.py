@@ -167,13 +167,13 @@ def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
 def enlarge_above(band: Grey, low: Grey, large: Grey) -> None:
     """Write a band over ``low``, of the same shape, to a picture of twice its size; 0 elsewhere.
 
-    Between the band's pixels it is interpolated by cubics (Catmull-Rom).
+    Between the band's pixels it is interpolated by polynomials through six of them (Lagrange).
     """
     (height, width), single = band.shape, np.float32
-    # A quarter of the way from the second of four pixels to the third.
-    taps = (single(-9 / 128), single(111 / 128), single(29 / 128), single(-3 / 128))
+    # A quarter of the way from the third of six pixels to the fourth.
+    taps = np.array([77, -693, 6930, 2310, -495, 63], single) / single(8192)
     large[:] = single(0.0)
-    columns, rows = np.empty(5, np.int64), np.empty((5, 2), np.float32)
+    columns, rows = np.empty(7, np.int64), np.empty((7, 2), np.float32)
     for v in range(height):
         for first in range(0, width, BLOCK):
             last = min(first + BLOCK, width)
@@ -182,18 +182,18 @@ def enlarge_above(band: Grey, low: Grey, large: Grey) -> None:
             for u in range(first, last):
                 if not band[v, u] > low[v, u]:
                     continue
-                for k in range(5):
-                    columns[k] = min(max(u + k - 2, 0), width - 1)
-                for k in range(5):
-                    row = band[min(max(v + k - 2, 0), height - 1)]
+                for k in range(7):
+                    columns[k] = min(max(u + k - 3, 0), width - 1)
+                for k in range(7):
+                    row = band[min(max(v + k - 3, 0), height - 1)]
                     rows[k, 0] = rows[k, 1] = single(0.0)
-                    for m in range(4):
-                        rows[k, 0] += taps[3 - m] * row[columns[m]]
+                    for m in range(6):
+                        rows[k, 0] += taps[5 - m] * row[columns[m]]
                         rows[k, 1] += taps[m] * row[columns[m + 1]]
                 for x in range(2):
                     above, below = single(0.0), single(0.0)
-                    for m in range(4):
-                        above += taps[3 - m] * rows[m, x]
+                    for m in range(6):
+                        above += taps[5 - m] * rows[m, x]
                         below += taps[m] * rows[m + 1, x]
                     large[2 * v, 2 * u + x], large[2 * v + 1, 2 * u + x] = above, below
 
