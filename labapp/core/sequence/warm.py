@@ -216,7 +216,7 @@ def follow(
         raise TrackLost(f"{classes.missed} rays amid the others have no dot")
     if not rms(residual) < WORSE * track.residual_mm:
         raise TrackLost("the surface no longer has the dots")
-    unseen = 0 if _datum_seen(geometry, observed, pool, labels, off) else track.unseen + 1
+    unseen = 0 if _datum_seen(geometry, observed, pool, off) else track.unseen + 1
     if unseen > HELD:
         raise TrackLost("the dots beside the absent one have not been seen for long")
     match = _match(track, observed, classes, ray, dot, rms(residual))
@@ -327,9 +327,11 @@ def _level(
 
 
 def _datum_seen(
-    geometry: SequenceGeometry, observed: Observation, pool: WarmPool, labels: IntArray, off: float
+    geometry: SequenceGeometry, observed: Observation, pool: WarmPool, off: float
 ) -> bool:
     """Whether all four neighbours of the absent ray are lit.
+
+    A dot too far off for the fit (`_unsupported`) is still light in its place.
 
     Raises
     ------
@@ -339,17 +341,18 @@ def _datum_seen(
     """
     if geometry.hole is None:
         raise TrackLost("the absent ray is at the pool's edge")
-    hole, beside = geometry.hole[0], geometry.hole[1:]
-    lit = labels[beside] != UNLABELLED
+    beside = geometry.hole[1:]
     reach = min(
         float(np.linalg.norm(pool.plane_mm[a] - pool.plane_mm[b])) / 2
         for a, b in beside.reshape(2, 2)
     )
-    if not np.linalg.norm(observed.plane_mm - pool.plane_mm[hole], axis=-1).min() > reach / 2:
+    between = observed.plane_mm - pool.plane_mm[geometry.hole][:, None]
+    dark = np.linalg.norm(between, axis=-1).min(axis=1) > reach / 2
+    if not dark[0]:
         raise TrackLost("a dot is where the absent one should be dark")
-    if lit.sum() < (2 if off < FORESEEN else 4):
+    if sum(dark[1:]) > (2 if off < FORESEEN else 0):
         raise TrackLost("the dots beside the absent one are not seen")
-    return bool(lit.all())
+    return not dark[1:].any()
 
 
 # --- what is told of it -------------------------------------------------------------------------
