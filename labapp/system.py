@@ -41,14 +41,16 @@ def sync_folder(path: Path) -> None:
 
 @contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C: processes started meanwhile ignore it; this one receives it afterwards.
+    """Block Ctrl-C and SIGTERM while processes are started; this one receives them afterwards.
 
-    Windows has no such mask: a process that is started there calls `ignore_interrupts` itself.
+    A process that is started half tells of the other half that it lacks. Those that are started
+    ignore Ctrl-C from then on, and heed SIGTERM when they call `ignore_interrupts`. Windows has no
+    such mask: there that call does it.
     """
     if IS_WINDOWS:
         yield
         return
-    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:
@@ -56,9 +58,11 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 def ignore_interrupts() -> None:
-    """Ignore Ctrl-C from now on, where `interrupts_blocked` has no effect; in the main thread."""
+    """Ignore Ctrl-C from now on, but heed SIGTERM; in the main thread (`interrupts_blocked`)."""
     if IS_WINDOWS:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    else:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
 
 def lower_priority(nice: int) -> None:

@@ -107,6 +107,9 @@ def read_scenario(
     if isinstance(calibration, dict) and "homography" in calibration:
         expected = "the three points: no other camera is simulated"
         problems.append(InputError(path, "image_calibration", "a homography", expected))
+    if "focal_px" in bench.get("camera_lens", {}):
+        expected = "none: no distortion is simulated"
+        problems.append(InputError(path, "camera_lens", "a lens", expected))
     if problems:
         raise InputError.gather(problems)
     recording = dict(values["recording"])

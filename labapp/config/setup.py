@@ -13,10 +13,11 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
-from labapp.config.setup_keys import SECTIONS, rules_for
+from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
 from labapp.errors import InputError
 from labapp.files import write_atomically
 
@@ -68,6 +69,7 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
         *(
             problem
             for section in SECTIONS
+            if section in values or section not in OPTIONAL
             for problem in check_keys(
                 path, section, values.get(section), rules_for(section, values.get(section))
             )
@@ -77,7 +79,8 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
     problems = problems or _contradictions(path, values)
     if problems:
         raise InputError.gather(problems)
-    return Setup(_rig(values), _calibration(values["image_calibration"]), text)
+    calibration = _calibration(values)
+    return Setup(_rig(values, calibration), calibration, text)
 
 
 def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]) -> None:
@@ -138,6 +141,8 @@ def pattern_values(pattern: DotPattern) -> dict[str, object]:
         "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
         "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
     }
+    if pattern.rotation_deg:
+        values["rotation_deg"] = pattern.rotation_deg
     return values if pattern.kind == DotPattern.kind else values | {"kind": pattern.kind}
 
 
@@ -145,7 +150,7 @@ def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
     """Pattern of the keys of a setup file; inverse of `pattern_values`."""
     absent = keys.get("absent")
     rays = None if absent is None else frozenset((i, j) for i, j in absent)
-    return DotPattern(**{**keys, "absent": rays})
+    return DotPattern(**{**_without_sigmas(keys), "absent": rays})
 
 
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
@@ -183,8 +188,15 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
                 "rays above that never reach the work piece",
             )
         )
+    lens = {"focal_px", "center_px", "distortion"}
+    lacking = sorted(lens - values.get("camera_lens", {}).keys())
+    if 0 < len(lacking) < len(lens):
+        problems.append(
+            InputError(path, f"camera_lens.{lacking[0]}", "missing", "all of the lens, or none")
+        )
+        return problems
     try:
-        _calibration(values["image_calibration"])
+        _calibration(values)
     except ValueError as error:
         problems.append(
             InputError(path, "image_calibration", error, "three points that span the plane")
@@ -214,13 +226,29 @@ def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
     ]
 
 
-def _rig(values: dict[str, Any]) -> Rig:
+def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
+    laser = _without_sigmas(values["laser"])
+    correlation = laser.pop("angle_distance_correlation", 0.0)
+    plane, points = values["imaging_plane"], values["image_calibration"]
+    axes = AxisPoints(
+        calibration,
+        points.get("x_axis_mm", plane["width_mm"] / 2),
+        points.get("z_axis_mm", plane["height_mm"] / 2),
+    )
+    told = {
+        f"{section}.{key}": sigma for section in values for key, sigma in values[section].items()
+    }
     return Rig(
-        Laser(**values["laser"]),
+        Laser(**laser),
         dot_pattern(values["pattern"]),
         Electrode(**values["electrode"]),
-        _imaging_plane(**values["imaging_plane"]),
+        _imaging_plane(**_without_sigmas(plane)),
+        RigUncertainty(axes, *covariance_of(told, correlation)),
     )
+
+
+def _without_sigmas(keys: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in keys.items() if not key.endswith("_sigma")}
 
 
 def _imaging_plane(
@@ -231,20 +259,16 @@ def _imaging_plane(
     height_mm: float,
     pitch_deg: float = 0.0,
     yaw_deg: float = 0.0,
+    roll_deg: float = 0.0,
 ) -> ImagingPlane:
-    """The plane at O′ (−s, −distance, h), its axes turned about X by pitch, then about Z by yaw."""
-    pitch, yaw = np.radians([pitch_deg, yaw_deg])
-    z_axis = np.array([np.sin(yaw) * np.sin(pitch), -np.cos(yaw) * np.sin(pitch), np.cos(pitch)])
-    return ImagingPlane(
-        origin_mm=np.array([-s_mm, -distance_mm, h_mm], float),
-        x_axis=np.array([np.cos(yaw), np.sin(yaw), 0.0]),
-        z_axis=z_axis,
-        width_mm=width_mm,
-        height_mm=height_mm,
-    )
+    origin = np.array([-s_mm, -distance_mm, h_mm], float)
+    return ImagingPlane.of_angles(origin, (pitch_deg, yaw_deg, roll_deg), width_mm, height_mm)
 
 
-def _calibration(keys: dict[str, Any]) -> ImageCalibration:
+def _calibration(values: dict[str, Any]) -> ImageCalibration:
+    lens_keys = _without_sigmas(values.get("camera_lens", {}))
+    lens = Lens(**{key: tuple(pair) for key, pair in lens_keys.items()}) if lens_keys else None
+    keys = _without_sigmas(values["image_calibration"])
     if "homography" in keys:
-        return ImageCalibration(np.array(keys["homography"], float))
-    return ImageCalibration.from_three_points(**keys)
+        return ImageCalibration(np.array(keys["homography"], float), lens)
+    return ImageCalibration.from_three_points(**keys, lens=lens)

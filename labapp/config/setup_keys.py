@@ -6,6 +6,7 @@ import numpy as np
 
 from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number, within
 from labapp.core.geometry.patterns import PATTERNS
+from labapp.core.geometry.uncertainty import QUANTITIES
 
 _LENGTH = between(0, LARGEST_MM, "mm")
 _PLACE = between(-LARGEST_MM, LARGEST_MM, "mm")
@@ -14,6 +15,17 @@ _COUNT = Rule(
     lambda value: type(value) is int and 3 <= value <= 99 and value % 2 == 1,
 )
 _TILT = between(-90, 90, "degrees", required=False)
+_AIM = within(-LARGEST_MM, LARGEST_MM, "mm", required=False)
+_LARGEST_SIGMA = {"mm": LARGEST_MM, "°": 90.0, "px": 1e4, "%": 100.0}
+
+
+def _sigmas(section: str) -> dict[str, Rule]:
+    """Keys of standard uncertainties in a section; where one is not given, a usual one is taken."""
+    own = (one for one in QUANTITIES if one.key.startswith(f"{section}."))
+    return {
+        one.sigma_key.partition(".")[2]: within(0, _LARGEST_SIGMA[one.unit], one.unit)
+        for one in own
+    }
 
 
 def _is_rays(value: object) -> bool:
@@ -38,6 +50,14 @@ _ON_AXIS = Rule(
     lambda value: is_number(value) and 0 < abs(value) <= LARGEST_MM,
 )
 
+
+def _two_numbers(expected: str, above_zero: bool = False) -> Rule:
+    def accepts(value: object) -> bool:
+        return are_numbers(value, 2) and (min(value) > 0 or not above_zero)
+
+    return Rule(expected, accepts, required=False)
+
+
 THREE_POINTS = {
     "origin_px": _PIXEL,
     "x_axis_px": _PIXEL,
@@ -52,6 +72,11 @@ SECTIONS = {
     "laser": {
         "projection_angle_deg": between(0, 90, "degrees"),
         "distance_mm": _LENGTH,
+        "azimuth_deg": _TILT,
+        "aim_x_mm": _AIM,
+        "aim_y_mm": _AIM,
+        "angle_distance_correlation": within(-1, 1, "correlation"),
+        **_sigmas("laser"),
     },
     "pattern": {
         "rows": _COUNT,
@@ -67,6 +92,8 @@ SECTIONS = {
             lambda value: isinstance(value, str) and value in PATTERNS,
             required=False,
         ),
+        "rotation_deg": _TILT,
+        **_sigmas("pattern"),
     },
     "electrode": {
         "height_mm": within(0, LARGEST_MM, "mm", required=True),
@@ -79,14 +106,30 @@ SECTIONS = {
         "height_mm": _LENGTH,
         "pitch_deg": _TILT,
         "yaw_deg": _TILT,
+        "roll_deg": _TILT,
+        **_sigmas("imaging_plane"),
     },
-    "image_calibration": {**THREE_POINTS, **HOMOGRAPHY},
+    "image_calibration": {**THREE_POINTS, **HOMOGRAPHY, **_sigmas("image_calibration")},
+    "camera_lens": {
+        "focal_px": _two_numbers("[fu, fv], two numbers above 0 (px)", above_zero=True),
+        "center_px": _two_numbers("[u, v], two numbers (px)"),
+        "distortion": Rule(
+            "[k1, k2, p1, p2, k3], five numbers as OpenCV has them",
+            lambda value: are_numbers(value, 5),
+            required=False,
+        ),
+        **_sigmas("camera_lens"),
+    },
 }
 """Every section and key; `image_calibration` holds the keys of one of its two forms."""
+
+OPTIONAL = ("camera_lens",)
+"""Sections that need not be there."""
 
 
 def rules_for(section: str, keys: object) -> dict[str, Rule]:
     """Rules of a section, given the keys it holds: a homography replaces the three points."""
     if section != "image_calibration":
         return SECTIONS[section]
-    return HOMOGRAPHY if isinstance(keys, dict) and "homography" in keys else THREE_POINTS
+    form = HOMOGRAPHY if isinstance(keys, dict) and "homography" in keys else THREE_POINTS
+    return form | _sigmas(section)

@@ -6,10 +6,11 @@ of the rig's pattern, with nothing of the code that measures.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match, Orientation
@@ -202,15 +203,19 @@ def seen_orientation(reflections: Reflections) -> Orientation:
 
 def _rays(rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Laser position, shape (3,), and unit ray directions, shape (rows, columns, 3)."""
-    alpha = np.radians(rig.laser.projection_angle_deg)
-    beam = np.array([0.0, -np.cos(alpha), -np.sin(alpha)])
-    up = np.array([0.0, -np.sin(alpha), np.cos(alpha)])
+    laser, pattern = rig.laser, rig.pattern
+    # A lamp that shines along +Z with X to its right is leaned over, and then turned about Z.
+    leaned = Rotation.from_euler("X", 90.0 + laser.projection_angle_deg, degrees=True)
+    placed = Rotation.from_euler("Z", laser.azimuth_deg, degrees=True) * leaned
     # Row 1 is the topmost of the fan as the laser sends it, so it lands farthest, at the tail.
-    h, v = np.moveaxis(rig.pattern.tangents, -1, 0)
-    direction = beam + v[..., None] * up
-    direction[..., 0] = h
+    fan = np.ones((pattern.rows, pattern.columns, 3))
+    fan[..., :2] = replace(pattern, rotation_deg=0.0).tangents
+    turned = Rotation.from_euler("Z", pattern.rotation_deg, degrees=True)
+    fan = turned.apply(fan.reshape(-1, 3))
+    direction = placed.apply(fan).reshape(pattern.rows, pattern.columns, 3)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    return -rig.laser.distance_mm * beam, direction
+    aim = np.array([laser.aim_x_mm, laser.aim_y_mm, 0.0])
+    return aim - laser.distance_mm * placed.apply([0.0, 0.0, 1.0]), direction
 
 
 def _first_hit(

@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from labapp.config.setup import read_setup, update_setup
+from labapp.core.geometry.rig import Laser
+from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, QUANTITIES
 from labapp.errors import InputError
 
 SETUP = """\
@@ -300,3 +302,81 @@ def test_an_update_keeps_permissions_and_links(path: Path, tmp_path: Path) -> No
     assert link.is_symlink()
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
     assert read_setup(path).rig.laser.distance_mm == 40.0
+
+
+FULL = {
+    "[pattern]": """azimuth_deg = 0.5
+aim_y_mm = -0.2
+projection_angle_deg_sigma = 0.25
+angle_distance_correlation = 0.9
+[pattern]
+rotation_deg = 1.5""",
+    "[image_calibration]": """roll_deg = 0.4
+s_mm_sigma = 0.05
+[camera_lens]
+focal_px = [1500.0, 1490.0]
+center_px = [310.0, 300.0]
+distortion = [-0.1, 0.0, 0.001, 0.0, 0.0]
+distortion_percent_sigma = 0.1
+[image_calibration]
+origin_px_sigma = 0.04""",
+}
+
+
+def test_a_bench_that_is_not_ideal_is_read_with_its_uncertainty(path: Path) -> None:
+    for old, new in FULL.items():
+        change(path, old, new)
+    setup = read_setup(path)
+    rig, known = setup.rig, setup.rig.uncertainty
+    assert known is not None
+    assert (rig.laser.azimuth_deg, rig.laser.aim_x_mm, rig.laser.aim_y_mm) == (0.5, 0.0, -0.2)
+    assert rig.pattern.rotation_deg == 1.5
+    assert rig.imaging_plane.angles_deg == pytest.approx((0, 0, 0.4))
+    assert setup.calibration.lens is not None
+    assert setup.calibration.lens.focal_px == (1500.0, 1490.0)
+    sigma = dict(zip([one.key for one in QUANTITIES], known.sigma, strict=True))
+    assert sigma["laser.projection_angle_deg"] == pytest.approx(0.25)
+    assert sigma["imaging_plane.s_mm"] == pytest.approx(0.05)
+    assert sigma["image_calibration.origin_px[u]"] == pytest.approx(0.04)
+    assert sigma["image_calibration.origin_px[v]"] == pytest.approx(0.04)
+    assert sigma["camera_lens.distortion_percent"] == pytest.approx(0.1)
+    assert known.correlation[ANGLE, DISTANCE] == pytest.approx(0.9)
+    assert "laser.distance_mm" in known.assumed
+    assert not {"imaging_plane.s_mm", "image_calibration.origin_px[v]"} & known.assumed
+
+
+def test_a_setup_of_before_is_the_ideal_bench_with_usual_uncertainties(path: Path) -> None:
+    setup = read_setup(path)
+    known = setup.rig.uncertainty
+    assert setup.rig.laser == Laser(31.14, 31.48)
+    assert setup.calibration.lens is None
+    assert known is not None
+    assert known.assumed == {one.key for one in QUANTITIES}
+    np.testing.assert_allclose(known.sigma, [one.assumed for one in QUANTITIES])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("[pattern]", "distance_mm_sigma = -1.0\n[pattern]", "laser.distance_mm_sigma"),
+        ("[pattern]", "angle_distance_correlation = 2\n[pattern]", "angle_distance_correlation"),
+        ("[pattern]", "rows_sigma = 2\n[pattern]", "laser.rows_sigma"),
+        ("[pattern]", "[camera_lens]\nfocal_px = [1.0, 1.0]\n[pattern]", "camera_lens.center_px"),
+        ("[pattern]", "[camera_lens]\nfocal_px = [0.0, 1.0]\n[pattern]", "camera_lens.focal_px"),
+    ],
+)
+def test_wrong_uncertainties_and_lenses_are_refused(
+    path: Path, old: str, new: str, field: str
+) -> None:
+    with pytest.raises(InputError) as refused:
+        read_setup(change(path, old, new))
+    assert field in str(refused.value)
+
+
+def test_a_lens_may_be_known_by_its_uncertainty_alone(path: Path) -> None:
+    setup = read_setup(
+        change(path, "[pattern]", "[camera_lens]\ndistortion_percent_sigma = 0\n[pattern]")
+    )
+    assert setup.calibration.lens is None
+    assert setup.rig.uncertainty is not None
+    assert setup.rig.uncertainty.sigma[-1] == 0.0

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 
 pixels = st.tuples(st.floats(0.0, 640.0), st.floats(0.0, 480.0)).map(np.array)
 
@@ -80,3 +81,28 @@ def test_axes_that_coincide_are_refused():
 def test_a_calibration_cannot_be_written_to():
     with pytest.raises(ValueError, match="read-only"):
         ImageCalibration(np.eye(3)).matrix[0, 0] = 2.0
+
+
+LENS = Lens((1500.0, 1490.0), (310.0, 250.0), (-0.12, 0.03, 1e-3, -2e-3, 0.01))
+
+
+def test_a_lens_distorts_as_opencv_has_it():
+    places = np.random.default_rng(3).uniform(0.0, 640.0, (50, 2))
+    at_one = (places - LENS.center_px) / LENS.focal_px
+    camera = np.array([[1500.0, 0.0, 310.0], [0.0, 1490.0, 250.0], [0.0, 0.0, 1.0]])
+    ahead = np.column_stack([at_one, np.ones(50)])
+    seen, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), camera, np.array(LENS.distortion))
+    np.testing.assert_allclose(LENS.distorted(places), seen[:, 0], atol=1e-9)
+    assert np.abs(LENS.distorted(places) - places).max() > 1.0
+    np.testing.assert_allclose(LENS.ideal(LENS.distorted(places)), places, atol=1e-5)
+    assert LENS.ideal(np.empty((0, 2))).shape == (0, 2)
+
+
+def test_a_calibration_from_a_distorted_picture_is_that_of_the_plane():
+    plane = np.random.default_rng(4).uniform(0.0, 100.0, (40, 2))
+    ideal = ImageCalibration.from_three_points((44, 590), (440, 590), 69.85, (44, 410), 31.75)
+    seen = LENS.distorted(ideal.to_image(np.array([[0, 0], [69.85, 0], [0, 31.75]])))
+    found = ImageCalibration.from_three_points(seen[0], seen[1], 69.85, seen[2], 31.75, LENS)
+    dots = LENS.distorted(ideal.to_image(plane))
+    np.testing.assert_allclose(found.to_plane(dots), plane, atol=1e-5)
+    np.testing.assert_allclose(found.to_image(plane), dots, atol=1e-5)

@@ -48,3 +48,27 @@ def test_the_vertical_plane_is_eq_4_5():
     plane = ImagingPlane.vertical(50.0, s_mm=45.0, h_mm=3.0)
     np.testing.assert_allclose(plane.to_universal(np.array([50.0, 20.0])), [5.0, -50.0, 23.0])
     np.testing.assert_allclose(plane.normal, [0.0, -1.0, 0.0])
+
+
+@given(*[st.floats(-40.0, 40.0)] * 3)
+def test_the_angles_of_a_plane_are_those_it_was_built_with(pitch, yaw, roll):
+    plane = ImagingPlane.of_angles(np.array([-45.0, -50.0, 3.0]), (pitch, yaw, roll))
+    assert plane.angles_deg == pytest.approx((pitch, yaw, roll), abs=1e-9)
+    assert plane.normal[1] < 0
+    assert np.vecdot(plane.x_axis, plane.z_axis) == pytest.approx(0, abs=1e-12)
+
+
+def test_each_angle_of_a_plane_turns_it_its_own_way():
+    upright = np.zeros(3)
+    assert ImagingPlane.of_angles(upright, (5.0, 0.0, 0.0)).z_axis[1] < 0
+    assert ImagingPlane.of_angles(upright, (0.0, 5.0, 0.0)).x_axis[1] > 0
+    assert ImagingPlane.of_angles(upright, (0.0, 0.0, 5.0)).x_axis[2] > 0
+
+
+def test_a_laser_stands_at_its_distance_from_where_it_aims():
+    laser = Laser(30.0, 40.0, azimuth_deg=10.0, aim_x_mm=0.5, aim_y_mm=-0.25)
+    x, y, z = laser.position_mm - [0.5, -0.25, 0.0]
+    assert np.hypot(np.hypot(x, y), z) == pytest.approx(40.0)
+    assert np.degrees(np.arctan2(z, np.hypot(x, y))) == pytest.approx(30.0)
+    assert np.degrees(np.arctan2(-x, y)) == pytest.approx(10.0)
+    np.testing.assert_allclose(laser.position_mm + 40.0 * laser.axes[0], [0.5, -0.25, 0.0])

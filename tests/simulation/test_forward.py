@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from labapp.core.geometry.optics import intersect_imaging_plane, ray_directions
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.simulation import forward
 from labapp.simulation.forward import exact_match, trace
@@ -335,3 +336,20 @@ def test_truth_never_comes_from_the_code_that_measures():
     assert {"labapp.simulation.recording", "labapp.simulation.render"} <= used
     assert "labapp.core.geometry.rig" in core
     assert core <= allowed
+
+
+def test_rays_of_a_bench_that_is_nowhere_ideal_are_those_of_the_core():
+    laser = Laser(31.14, 31.48, azimuth_deg=3.0, aim_x_mm=0.5, aim_y_mm=-0.7)
+    plane = ImagingPlane.of_angles(np.array([-45.0, -50.0, 3.0]), (3.0, -4.0, 5.0))
+    rig = Rig(laser, DotPattern(rotation_deg=2.0), Electrode(5.0), plane)
+    seen = trace(spherical_cap(3.0, 0.3), rig)
+    np.testing.assert_allclose(seen.incident, ray_directions(laser, rig.pattern), atol=1e-12)
+    met = seen.hit
+    away = seen.point_mm[met] - laser.position_mm
+    away /= np.linalg.norm(away, axis=-1, keepdims=True)
+    np.testing.assert_allclose(away, seen.incident[met], atol=1e-9)
+    np.testing.assert_allclose(
+        intersect_imaging_plane(seen.point_mm[met], seen.reflected[met], plane),
+        seen.plane_mm[met],
+        atol=1e-9,
+    )

@@ -9,6 +9,58 @@ import numpy as np
 
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
+UNDISTORTED_PX = 1e-6
+"""To so much of a pixel a place is freed of a lens's distortion."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How a camera's lens distorts its picture: OpenCV's model with five coefficients.
+
+    Parameters
+    ----------
+    focal_px
+        Focal length along u and v, px.
+    center_px
+        (u, v) of the principal point, px.
+    distortion
+        k₁, k₂, p₁, p₂, k₃.
+    """
+
+    focal_px: tuple[float, float]
+    center_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+
+    def distorted(self, ideal_px: FloatArray) -> FloatArray:
+        """Where the lens puts what a pinhole would have at (u, v), shape (…, 2), px."""
+        x, y = np.moveaxis((np.asarray(ideal_px, float) - self.center_px) / self.focal_px, -1, 0)
+        k1, k2, p1, p2, k3 = self.distortion
+        square = x * x + y * y
+        radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+        bent = np.stack(
+            [
+                x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
+                y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+        return np.asarray(bent * self.focal_px + self.center_px)
+
+    def ideal(self, image_px: FloatArray) -> FloatArray:
+        """Where a pinhole would have what the picture has at (u, v), shape (…, 2), px."""
+        import cv2
+
+        image_px = np.asarray(image_px, float)
+        if not image_px.size:
+            return image_px
+        (fu, fv), (u, v) = self.focal_px, self.center_px
+        camera = np.array([[fu, 0.0, u], [0.0, fv, v], [0.0, 0.0, 1.0]])
+        until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, UNDISTORTED_PX)
+        flat = image_px.reshape(-1, 1, 2)
+        bent = np.array(self.distortion)
+        found = cv2.undistortPoints(flat, camera, bent, None, np.eye(3), camera, until)
+        return np.asarray(found, np.float64).reshape(image_px.shape)
+
 
 @dataclass(frozen=True)
 class ImageCalibration(ReadOnlyArrays):
@@ -17,7 +69,10 @@ class ImageCalibration(ReadOnlyArrays):
     Parameters
     ----------
     matrix
-        Shape (3, 3): homogeneous (u, v, 1) in px to (X′, Z′, 1) in mm.
+        Shape (3, 3): homogeneous (u, v, 1) in px, freed of the lens's distortion, to (X′, Z′, 1)
+        in mm.
+    lens
+        The lens's distortion; None where there is none.
 
     Raises
     ------
@@ -26,6 +81,7 @@ class ImageCalibration(ReadOnlyArrays):
     """
 
     matrix: FloatArray
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         matrix = np.array(self.matrix, float)
@@ -44,6 +100,7 @@ class ImageCalibration(ReadOnlyArrays):
         x_axis_mm: float,
         z_axis_px: tuple[float, float],
         z_axis_mm: float,
+        lens: Lens | None = None,
     ) -> ImageCalibration:
         """Build from O′ and one point on each axis (§5.1.2, Eq. 4-6 … 4-13).
 
@@ -56,38 +113,47 @@ class ImageCalibration(ReadOnlyArrays):
             (u, v) of O′, of a point on O′X′ and of a point on O′Z′, px.
         x_axis_mm, z_axis_mm
             X′ of the former, Z′ of the latter, mm.
+        lens
+            The distortion of the picture that the three points are in.
 
         Raises
         ------
         ValueError
             If the three points lie on one line.
         """
-        origin = np.asarray(origin_px, float)
+        seen = np.array([origin_px, x_axis_px, z_axis_px], float)
+        origin, on_x, on_z = seen if lens is None else lens.ideal(seen)
         to_image = np.eye(3)
-        to_image[:2, 0] = (np.asarray(x_axis_px, float) - origin) / x_axis_mm
-        to_image[:2, 1] = (np.asarray(z_axis_px, float) - origin) / z_axis_mm
+        to_image[:2, 0] = (on_x - origin) / x_axis_mm
+        to_image[:2, 1] = (on_z - origin) / z_axis_mm
         to_image[:2, 2] = origin
         if abs(np.linalg.det(to_image)) < 1e-9:
             raise ValueError("O′ and the points on O′X′ and O′Z′ lie on one line")
-        return cls(_inverse(to_image))
+        return cls(_inverse(to_image), lens)
+
+    def ideal_px(self, image_px: FloatArray) -> FloatArray:
+        """(u, v), shape (…, 2), px, freed of the lens's distortion."""
+        return image_px if self.lens is None else self.lens.ideal(image_px)
 
     def to_plane(self, image_px: FloatArray) -> FloatArray:
         """(u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
-        return _apply(self.matrix, image_px)
+        return _apply(self.matrix, self.ideal_px(image_px))
 
     def to_image(self, plane_mm: FloatArray) -> FloatArray:
         """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
-        return _apply(self.from_plane, plane_mm)
+        ideal = _apply(self.from_plane, plane_mm)
+        return ideal if self.lens is None else self.lens.distorted(ideal)
 
     @cached_property
     def from_plane(self) -> FloatArray:
-        """Homography from the plane to the image, shape (3, 3)."""
+        """Homography from the plane to the image without distortion, shape (3, 3)."""
         return _inverse(self.matrix)
 
     def jacobian(self, image_px: FloatArray) -> FloatArray:
-        """∂(X′, Z′)/∂(u, v) at (u, v), shape (…, 2, 2), mm/px."""
+        """∂(X′, Z′)/∂(u, v) at (u, v), shape (…, 2, 2), mm/px, the lens taken as ideal."""
         image_px = np.asarray(image_px, float)
         plane = self.to_plane(image_px)
+        image_px = self.ideal_px(image_px)
         w = image_px @ self.matrix[2, :2] + self.matrix[2, 2]
         return np.asarray(
             (self.matrix[:2, :2] - plane[..., :, None] * self.matrix[2, :2]) / w[..., None, None]

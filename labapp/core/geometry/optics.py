@@ -20,10 +20,7 @@ def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
         Shape (rows, columns, 3), not to be written to; ray (i, j), counted from 1, is at
         ``[i - 1, j - 1]``. i grows towards the head of the pool (+Y), j with X.
     """
-    angle = np.radians(laser.projection_angle_deg)
-    axis = np.array([0.0, -np.cos(angle), -np.sin(angle)])
-    across = np.array([1.0, 0.0, 0.0])
-    along = np.array([0.0, -np.sin(angle), np.cos(angle)])
+    axis, across, along = laser.axes
     tangents = pattern.tangents
     direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)

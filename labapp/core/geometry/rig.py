@@ -12,29 +12,51 @@ from functools import cached_property
 import numpy as np
 
 from labapp.core.geometry.patterns import PATTERNS
+from labapp.core.geometry.uncertainty import RigUncertainty
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 
 @dataclass(frozen=True)
 class Laser:
-    """The laser diode, in the YOZ plane on the side of the pool's head (§3.1.2).
+    """The laser diode on the side of the pool's head, ideally in the YOZ plane (§3.1.2).
 
     Parameters
     ----------
     projection_angle_deg
         Elevation of the beam axis above the work piece, degrees (Appendix I's α₅).
     distance_mm
-        Distance from the diode to the origin, mm.
+        Distance from the diode to where the beam axis meets the work piece, mm.
+    azimuth_deg
+        By how much the laser is turned out of the YOZ plane, anticlockwise from above, degrees.
+    aim_x_mm, aim_y_mm
+        Where the beam axis meets the work piece, mm; ideally the origin.
     """
 
     projection_angle_deg: float
     distance_mm: float
+    azimuth_deg: float = 0.0
+    aim_x_mm: float = 0.0
+    aim_y_mm: float = 0.0
+
+    @cached_property
+    def axes(self) -> FloatArray:
+        """Beam axis, and across it: to the side (with X) and upwards; unit rows, shape (3, 3)."""
+        angle, azimuth = np.radians([self.projection_angle_deg, self.azimuth_deg])
+        sin, cos = np.sin(angle), np.cos(angle)
+        aside, away = np.sin(azimuth), np.cos(azimuth)
+        return np.array(
+            [
+                [aside * cos, -away * cos, -sin],
+                [away, aside, 0.0],
+                [aside * sin, -away * sin, cos],
+            ]
+        )
 
     @property
     def position_mm(self) -> FloatArray:
         """Position of the diode, shape (3,), mm."""
-        angle = np.radians(self.projection_angle_deg)
-        return np.array([0.0, self.distance_mm * np.cos(angle), self.distance_mm * np.sin(angle)])
+        aim = np.array([self.aim_x_mm, self.aim_y_mm, 0.0])
+        return np.asarray(aim - self.distance_mm * self.axes[0])
 
 
 @dataclass(frozen=True)
@@ -51,6 +73,9 @@ class DotPattern:
         Rays ``(i, j)``, counted from 1, that the lens does not make. None: the centre.
     kind
         How the rays lie to each other, one of `PATTERNS`.
+    rotation_deg
+        By how much the pattern is turned about the beam axis, degrees: where it is positive, rays
+        of a row go the higher the larger their j.
     """
 
     rows: int = 19
@@ -58,6 +83,7 @@ class DotPattern:
     inter_beam_angle_deg: float = 0.77
     absent: frozenset[tuple[int, int]] | None = None
     kind: str = "square"
+    rotation_deg: float = 0.0
 
     def __post_init__(self) -> None:
         if self.absent is None:
@@ -81,7 +107,13 @@ class DotPattern:
     @property
     def tangents(self) -> FloatArray:
         """Tangents of the rays to the beam axis, see `Tangents`, shape (rows, columns, 2)."""
-        return PATTERNS[self.kind](self.rows, self.columns, np.radians(self.inter_beam_angle_deg))
+        step = np.radians(self.inter_beam_angle_deg)
+        tangents = PATTERNS[self.kind](self.rows, self.columns, step)
+        if not self.rotation_deg:
+            return tangents
+        turn = np.radians(self.rotation_deg)
+        sin, cos = np.sin(turn), np.cos(turn)
+        return np.asarray(tangents @ np.array([[cos, sin], [-sin, cos]]))
 
     @property
     def absent_rays(self) -> frozenset[tuple[int, int]]:
@@ -129,6 +161,34 @@ class ImagingPlane(ReadOnlyArrays):
         """Build the plane y = −distance_mm with O′ at X = −s, Z = h (Fig. 4-5, Eq. 4-5)."""
         return cls(np.array([-s_mm, -distance_mm, h_mm]), width_mm=width_mm, height_mm=height_mm)
 
+    @classmethod
+    def of_angles(
+        cls,
+        origin_mm: FloatArray,
+        angles_deg: tuple[float, float, float],
+        width_mm: float = 101.6,
+        height_mm: float = 101.6,
+    ) -> ImagingPlane:
+        """Build the plane at O′, shape (3,), mm, from its pitch, yaw and roll, degrees.
+
+        The vertical plane is turned about its own normal by roll (O′X′ rises), then about X by
+        pitch (its top leans to the camera), then about Z by yaw (O′X′ turns towards +Y).
+        """
+        sin, cos = np.sin(np.radians(angles_deg)), np.cos(np.radians(angles_deg))
+        rolled = np.array([[cos[2], -sin[2]], [0.0, 0.0], [sin[2], cos[2]]])
+        about_x = np.array([[1.0, 0.0, 0.0], [0.0, cos[0], -sin[0]], [0.0, sin[0], cos[0]]])
+        about_z = np.array([[cos[1], -sin[1], 0.0], [sin[1], cos[1], 0.0], [0.0, 0.0, 1.0]])
+        x_axis, z_axis = (about_z @ about_x @ rolled).T
+        return cls(np.asarray(origin_mm, float), x_axis, z_axis, width_mm, height_mm)
+
+    @property
+    def angles_deg(self) -> tuple[float, float, float]:
+        """Pitch, yaw and roll (`of_angles`), degrees."""
+        x, y, z = self.normal.tolist()
+        pitch, yaw = np.arcsin(np.clip(-z, -1.0, 1.0)), np.arctan2(x, -y)
+        roll = np.arctan2(self.x_axis[2], self.z_axis[2])
+        return float(np.degrees(pitch)), float(np.degrees(yaw)), float(np.degrees(roll))
+
     @cached_property
     def normal(self) -> FloatArray:
         """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
@@ -152,9 +212,18 @@ class ImagingPlane(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Rig:
-    """Everything on the bench whose place must be known to measure."""
+    """Everything on the bench whose place must be known to measure.
+
+    Parameters
+    ----------
+    laser, pattern, electrode, imaging_plane
+        What it is made of.
+    uncertainty
+        How well it is known; None: exactly.
+    """
 
     laser: Laser
     pattern: DotPattern
     electrode: Electrode
     imaging_plane: ImagingPlane
+    uncertainty: RigUncertainty | None = None

@@ -87,7 +87,8 @@ class Observation(ReadOnlyArrays):
         from labapp.core.images import dot_kernels
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
-        plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, dots.image_px, sigma)
+        image_px = calibration.ideal_px(dots.image_px)
+        plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, image_px, sigma)
         return cls(plane, covariance, dots.size_px * scale, rig, calibration, frame_shape)
 
     @cached_property
@@ -205,8 +206,16 @@ class Observation(ReadOnlyArrays):
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
         height, width = self.frame_shape
-        limit = [width - 1 - EDGE_PX, height - 1 - EDGE_PX]
-        return np.array([low, high]), np.array([[EDGE_PX, EDGE_PX], limit])
+        corner = np.array([width - 1.0, height - 1.0])
+        share = np.array([0.0, 0.5, 1.0])
+        # A distorting lens bends the frame's edges: the rectangle is the one within them.
+        left, right, top, bottom = (
+            self.calibration.ideal_px(np.stack(np.broadcast_arrays(*at), axis=-1) * corner)
+            for at in ((0.0, share), (1.0, share), (share, 0.0), (share, 1.0))
+        )
+        first = np.array([left[:, 0].max(), top[:, 1].max()]) + EDGE_PX
+        last = np.array([right[:, 0].min(), bottom[:, 1].min()]) - EDGE_PX
+        return np.array([low, high]), np.array([first, last])
 
 
 def try_fit(

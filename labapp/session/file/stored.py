@@ -15,8 +15,9 @@ import numpy as np
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty
 from labapp.core.images import dots, find_dots, threshold_dots
 from labapp.core.match import Match, Trial
 from labapp.core.matching.decision import MatchSettings
@@ -103,7 +104,10 @@ STORED = {
     "Electrode": Stored(Electrode),
     "ImagingPlane": Stored(ImagingPlane, shapes={"origin_mm": "3", "x_axis": "3", "z_axis": "3"}),
     "Rig": Stored(Rig),
+    "RigUncertainty": Stored(RigUncertainty, shapes={"covariance": "q q"}),
+    "AxisPoints": Stored(AxisPoints),
     "ImageCalibration": Stored(ImageCalibration, shapes={"matrix": "3 3"}),
+    "Lens": Stored(Lens),
     "LaserReadings": Stored(LaserReadings),
     "LaserCalibration": Stored(LaserCalibration),
     "PlanePicture": Stored(PlanePicture),

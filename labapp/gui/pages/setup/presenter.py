@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from labapp.config.setup import parse_setup, updated_setup
-from labapp.config.setup_keys import SECTIONS
+from labapp.config.setup_keys import SECTIONS, THREE_POINTS
 from labapp.core.geometry.rig import Rig
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
@@ -172,7 +172,7 @@ def _number(sections: dict[str, Any], key: str) -> float | None:
 def rig(session: Session) -> Rig | None:
     """The rig, as soon as it is complete; the image calibration may still be missing."""
     anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
-    points = dict.fromkeys(SECTIONS["image_calibration"])
+    points = dict.fromkeys(THREE_POINTS)
     try:
         text = updated_setup(
             session.setup_text, session.path, {"image_calibration": points | anything}

@@ -1,0 +1,137 @@
+"""How well a bench is known: the quantities that place it, and their covariance (JCGM 100).
+
+Reflections alone do not tell a wrong bench from a right one, so what is not known of it goes into
+the ± of every result (`core.surface.setup_uncertainty`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.values import FloatArray, ReadOnlyArrays
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of the bench that is known with some uncertainty.
+
+    Parameters
+    ----------
+    key
+        ``section.key`` of the setup file; ``[u]`` or ``[v]`` follows for a point in the picture.
+    name, unit
+        What it is called, and what it is measured in.
+    assumed
+        Its standard uncertainty where nobody tells one: tape, protractor and a look at the picture.
+    """
+
+    key: str
+    name: str
+    unit: str
+    assumed: float
+
+    @property
+    def sigma_key(self) -> str:
+        """``section.key`` of its standard uncertainty in the setup file."""
+        return f"{self.key.partition('[')[0]}_sigma"
+
+
+def _point(key: str, name: str) -> tuple[Quantity, Quantity]:
+    u, v = (Quantity(f"image_calibration.{key}[{at}]", f"{name}, {at}", "px", 0.3) for at in "uv")
+    return u, v
+
+
+QUANTITIES = (
+    Quantity("laser.projection_angle_deg", "laser, projection angle", "°", 0.5),
+    Quantity("laser.distance_mm", "laser, distance", "mm", 0.5),
+    Quantity("laser.azimuth_deg", "laser, azimuth", "°", 0.5),
+    Quantity("laser.aim_x_mm", "laser, aim along X", "mm", 0.5),
+    Quantity("laser.aim_y_mm", "laser, aim along Y", "mm", 0.5),
+    Quantity("pattern.inter_beam_angle_deg", "pattern, inter-beam angle", "°", 0.004),
+    Quantity("pattern.rotation_deg", "pattern, rotation", "°", 1.0),
+    Quantity("imaging_plane.distance_mm", "imaging plane, distance", "mm", 0.5),
+    Quantity("imaging_plane.s_mm", "imaging plane, s", "mm", 0.5),
+    Quantity("imaging_plane.h_mm", "imaging plane, h", "mm", 0.5),
+    Quantity("imaging_plane.pitch_deg", "imaging plane, pitch", "°", 0.5),
+    Quantity("imaging_plane.yaw_deg", "imaging plane, yaw", "°", 0.5),
+    Quantity("imaging_plane.roll_deg", "imaging plane, roll", "°", 0.5),
+    *_point("origin_px", "image calibration, O′"),
+    *_point("x_axis_px", "image calibration, point on O′X′"),
+    *_point("z_axis_px", "image calibration, point on O′Z′"),
+    Quantity("camera_lens.distortion_percent", "lens, distortion in the plane's corner", "%", 0.5),
+)
+"""All of them, in the order of vectors and matrices."""
+
+INDEX = {quantity.key: k for k, quantity in enumerate(QUANTITIES)}
+
+ANGLE, DISTANCE = INDEX["laser.projection_angle_deg"], INDEX["laser.distance_mm"]
+
+
+@dataclass(frozen=True)
+class AxisPoints:
+    """Image calibration, and where on the axes the points lie that it was made from (§5.1).
+
+    Parameters
+    ----------
+    calibration
+        Pixel ↔ imaging plane.
+    x_mm, z_mm
+        X′ of the point on O′X′, Z′ of that on O′Z′.
+    """
+
+    calibration: ImageCalibration
+    x_mm: float
+    z_mm: float
+
+
+@dataclass(frozen=True)
+class RigUncertainty(ReadOnlyArrays):
+    """How well a rig and its image calibration are known.
+
+    Parameters
+    ----------
+    axes
+        The image calibration and its points.
+    covariance
+        Of `QUANTITIES`, shape (q, q), in the squares of their units.
+    assumed
+        Keys of the quantities whose uncertainty nobody told.
+    """
+
+    axes: AxisPoints
+    covariance: FloatArray
+    assumed: frozenset[str] = frozenset()
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard uncertainty of each of `QUANTITIES`, shape (q,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Their correlation, shape (q, q); 0 where one is known exactly."""
+        sigma = np.where(self.sigma > 0.0, self.sigma, 1.0)
+        return np.asarray(self.covariance / np.outer(sigma, sigma))
+
+
+def covariance_of(
+    told: Mapping[str, float], laser_correlation: float = 0.0
+) -> tuple[FloatArray, frozenset[str]]:
+    """Covariance of `QUANTITIES`, shape (q, q), and the keys of those that are assumed.
+
+    Parameters
+    ----------
+    told
+        Standard uncertainties by `Quantity.sigma_key`, in their units.
+    laser_correlation
+        Of projection angle and distance, which Appendix I takes from the same lengths.
+    """
+    sigma = np.array([told.get(one.sigma_key, one.assumed) for one in QUANTITIES], float)
+    covariance = np.diag(sigma**2)
+    shared = laser_correlation * sigma[ANGLE] * sigma[DISTANCE]
+    covariance[ANGLE, DISTANCE] = covariance[DISTANCE, ANGLE] = shared
+    return covariance, frozenset(one.key for one in QUANTITIES if one.sigma_key not in told)

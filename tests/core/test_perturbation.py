@@ -1,0 +1,73 @@
+"""A bench that is a little off: what moves with which quantity."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.perturbation import moved_calibration, moved_dots, moved_rig
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES, AxisPoints, covariance_of
+
+RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
+AXES = AxisPoints(
+    ImageCalibration.from_three_points((44, 590), (440, 590), 69.85, (44, 410), 31.75), 69.85, 31.75
+)
+DOTS = np.random.default_rng(5).uniform(5.0, 95.0, (30, 2))
+
+
+def offset(**by: float) -> np.ndarray:
+    made = np.zeros(len(QUANTITIES))
+    for name, value in by.items():
+        (key,) = [key for key in INDEX if key.replace(".", "_") == name]
+        made[INDEX[key]] = value
+    return made
+
+
+def test_every_quantity_of_the_bench_moves_what_it_names():
+    rig = moved_rig(
+        RIG,
+        offset(
+            laser_distance_mm=0.5,
+            laser_azimuth_deg=1.0,
+            laser_aim_y_mm=-0.3,
+            pattern_rotation_deg=2.0,
+            pattern_inter_beam_angle_deg=0.01,
+            imaging_plane_distance_mm=0.7,
+            imaging_plane_s_mm=0.2,
+            imaging_plane_h_mm=0.1,
+            imaging_plane_roll_deg=0.6,
+            imaging_plane_pitch_deg=-0.4,
+        ),
+    )
+    assert rig.laser == Laser(31.14, 31.98, 1.0, 0.0, -0.3)
+    assert rig.pattern.rotation_deg == 2.0
+    assert rig.pattern.inter_beam_angle_deg == pytest.approx(0.78)
+    np.testing.assert_allclose(rig.imaging_plane.origin_mm, [-45.2, -50.7, 3.1])
+    assert rig.imaging_plane.angles_deg == pytest.approx((-0.4, 0.0, 0.6))
+    assert moved_rig(RIG, offset()).imaging_plane is RIG.imaging_plane
+
+
+def test_dots_follow_the_points_of_the_image_calibration():
+    """A dot stays in the picture; a calibration with moved points has it elsewhere."""
+    by = offset(**{"image_calibration_x_axis_px[u]": 3.0, "image_calibration_origin_px[v]": -2.0})
+    moved = moved_dots(DOTS, RIG, AXES, by)
+    again = moved_calibration(AXES, by).to_plane(AXES.calibration.to_image(DOTS))
+    np.testing.assert_allclose(moved, again, atol=1e-9)
+    assert np.abs(moved - DOTS).max() > 0.3
+
+
+def test_distortion_moves_the_corner_by_its_share_and_the_centre_not_at_all():
+    by = offset(camera_lens_distortion_percent=1.0)
+    corner, center = np.array([101.6, 101.6]), np.array([50.8, 50.8])
+    moved = moved_dots(np.array([corner, center]), RIG, AXES, by)
+    np.testing.assert_allclose(moved, [corner + 0.01 * center, center])
+
+
+def test_angle_and_distance_of_the_laser_may_be_correlated():
+    told = {"laser.projection_angle_deg_sigma": 0.2, "laser.distance_mm_sigma": 0.4}
+    covariance, assumed = covariance_of(told, 0.5)
+    assert covariance[0, 1] == covariance[1, 0] == pytest.approx(0.04)
+    assert np.count_nonzero(covariance - np.diag(np.diag(covariance))) == 2
+    assert len(assumed) == len(QUANTITIES) - 2
