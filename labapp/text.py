@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from datetime import datetime
 
-SIGMA_OF = "noise and level only"
-"""What the ± of a measured pool covers; an error of the set-up is not in it."""
+SIGMA_OF = "noise, level and set-up"
+"""What the ± of a pool's sizes covers."""
+
+HEIGHT_SIGMA_OF = "noise and level only"
+"""What the ± of single heights covers; so did those of sizes before the set-up was in them."""
 
 
 def now() -> str:

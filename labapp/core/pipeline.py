@@ -78,6 +78,8 @@ class Measurement:
         None before that, too: rays can be told without.
     correction
         The operator's dots and rows; None if they are as they were found.
+    setup_status
+        How far the set-up can be relied on (`RigUncertainty.status`); empty where it is exact.
     """
 
     status: str
@@ -89,6 +91,12 @@ class Measurement:
     reconstruction: Reconstruction | None = None
     measures: measures.Measures | None = None
     correction: Correction | None = None
+    setup_status: str = ""
+
+
+def setup_status(rig: Rig) -> str:
+    """How far a rig can be relied on (`Measurement`)."""
+    return "" if rig.uncertainty is None else rig.uncertainty.status
 
 
 def measure(
@@ -112,7 +120,9 @@ def measure(
         The frame's dots and rows as the operator has them; they are measured in place of what would
         be found, and of the image only the shape counts.
     """
-    result = Measurement("ok", "", settings.scheme, correction=correction)
+    result = Measurement(
+        "ok", "", settings.scheme, correction=correction, setup_status=setup_status(rig)
+    )
     height, width = image.shape
     match_settings = replace(settings.match, correspondence=settings.correspondence)
     bench = (rig, calibration, (height, width), match_settings)

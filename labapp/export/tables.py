@@ -18,11 +18,12 @@ import numpy.typing as npt
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
+from labapp.core.surface import measures
 from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
-from labapp.text import SIGMA_OF, as_cell
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, as_cell
 
 PX_DIGITS, MM_DIGITS = 4, 6
 
@@ -61,9 +62,8 @@ class Column:
         return end if end in UNITS else NO_UNIT
 
 
-WITH_SIGMA = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
-PARTS = ("noise", "level")
-"""What has a standard uncertainty, and the parts of that, which are independent."""
+PARTS = ("noise", "level", "setup")
+"""The parts of a size's standard uncertainty, which are independent."""
 
 FRAME = Column("frame", "number of the frame in its recording, from 0", 0)
 
@@ -89,7 +89,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("y_mm", "Y of the reflection point, along the welding direction"),
         Column("z_mm", "height of the reflection point above the work piece"),
         Column("residual_mm", "distance of computed and captured dot on the imaging plane"),
-        Column("sigma_mm", f"standard uncertainty of the height, {SIGMA_OF}"),
+        Column("sigma_mm", f"standard uncertainty of the height, {HEIGHT_SIGMA_OF}"),
         Column("residual_x_mm", "computed minus captured dot on the imaging plane, along X′"),
         Column("residual_z_mm", "computed minus captured dot on the imaging plane, along Z′"),
         Column("error_x_mm", "reflection error on the work piece, along X"),
@@ -133,10 +133,11 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("own_are_mm", "irs, ers: average reflection error of the scheme's own points"),
         Column("sigma_of", "what is in the standard uncertainties, where there are any", None),
         Column("reason", "why there is no surface, in a sentence", None),
+        Column("setup_status", "entered, calibrated, checked against a mirror, or doubtful", None),
         *(
             Column(sigma_name(size, part), f"part of {sigma_name(size)}: {part}", is_part=True)
             for part in PARTS
-            for size in WITH_SIGMA
+            for size in measures.SIZES
         ),
     ),
 }
@@ -191,6 +192,7 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
         *(getattr(measurement.measures, name, math.nan) for name in SIZES),
         sigma_of(measurement),
         measurement.reason,
+        measurement.setup_status,
         *_sigma_parts(measurement.measures),
     ]
     return [np.array([cell], object if isinstance(cell, str) else None) for cell in row]
@@ -198,17 +200,23 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
 
 def sigma_of(measurement: Measurement) -> str:
     """Contributions to the standard uncertainties of a frame; empty where it has none."""
-    sigma = (getattr(measurement.measures, sigma_name(size), math.nan) for size in WITH_SIGMA)
-    return SIGMA_OF if any(map(math.isfinite, sigma)) else ""
+    total, setup = (_sigmas(measurement.measures, part) for part in ("", "setup"))
+    if not np.isfinite(total).any():
+        return ""
+    return SIGMA_OF if np.isfinite(setup).any() else HEIGHT_SIGMA_OF
 
 
-def _sigma_parts(measures: Measures | None) -> list[float]:
-    """Noise and level, the two parts of each size's standard uncertainty."""
-    total, level = (
-        np.array([getattr(measures, sigma_name(size, part), math.nan) for size in WITH_SIGMA])
-        for part in ("", "level")
-    )
-    return [*np.sqrt(np.maximum(total**2 - level**2, 0.0)).tolist(), *level.tolist()]
+def _sigma_parts(measured: Measures | None) -> list[float]:
+    """Noise, level and set-up: the parts of each size's standard uncertainty."""
+    total, level, setup = (_sigmas(measured, part) for part in ("", "level", "setup"))
+    noise = np.sqrt(np.maximum(total**2 - level**2 - np.nan_to_num(setup) ** 2, 0.0))
+    return [*noise.tolist(), *level.tolist(), *setup.tolist()]
+
+
+def _sigmas(measured: Measures | None, part: str) -> FloatArray:
+    """Standard uncertainty of each of `measures.SIZES`, or a part of it; NaN where unknown."""
+    names = (sigma_name(size, part) for size in measures.SIZES)
+    return np.array([getattr(measured, name, math.nan) for name in names])
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:

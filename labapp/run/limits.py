@@ -15,7 +15,7 @@ from labapp.errors import InputError
 CHANCE = 2.0
 """Beyond a limit by no more than so many σ, a size may be there by chance: that is no alarm.
 
-σ covers noise and level only: an error of the set-up moves all frames one way and is not in it.
+σ covers noise, level and set-up.
 """
 
 UNMEASURED = 3
@@ -41,7 +41,7 @@ class Size(NamedTuple):
     name
         ``width``, ``length``, ``height``; of a hollow pool ``depth``.
     value_mm, sigma_mm
-        NaN where they are not known; σ: noise and level only.
+        NaN where they are not known; σ: noise, level and set-up.
     """
 
     name: str

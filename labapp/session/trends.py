@@ -120,8 +120,7 @@ class Spread:
         In the measure's unit; the deviation is the root of the mean square, divided by n as in the
         text. NaN without a frame.
     mean_sigma
-        Standard uncertainty of the mean, noise and level only (`sigma_of_mean`); NaN where the
-        measure has none.
+        Standard uncertainty of the mean (`sigma_of_mean`); NaN where the measure has none.
     """
 
     count: int

@@ -19,6 +19,7 @@ from labapp.config.scenario import read_scenario
 from labapp.config.setup import Setup, read_setup
 from labapp.core.pipeline import Settings, measure
 from labapp.core.sequence.warm import WarmChain
+from labapp.core.surface.measures import sigma_name
 from labapp.core.values import FloatArray, IntArray
 from labapp.export.results import ResultsWriter
 from labapp.files import atomic_file
@@ -229,7 +230,7 @@ class Run:
     wrong, labelled
         Dots with a wrong ray; share of the visible dots with the right one.
     normalized_error
-        Root mean square of the height's error over its σ.
+        Root mean square of the height's error over its σ by noise and level.
     frequency_hz, true_hz
         Frequency of the height's largest oscillation, measured and true.
     """
@@ -263,7 +264,8 @@ def run_video(
         await_loaded(pools)
         measurer = RecordingMeasurer(video.path, None, video.setup, Settings(), pools=pools)
         start_s = time.perf_counter() - begun
-        with ResultsWriter(out, video.setup.calibration, {"benchmark": "chain"}, False) as results:
+        made = {"benchmark": "chain"}
+        with ResultsWriter(out, video.setup.calibration, made, False, sigma_parts=True) as results:
             for result in run(range(frames), measurer, [results.write]):
                 lost += result.track_lost is not None
                 progress()
@@ -273,7 +275,9 @@ def run_video(
     for row in _rows(out / "measures.csv"):
         if row["status"] == "ok":
             frame = int(row["frame"])
-            heights[frame], sigma[frame] = float(row["height_mm"]), float(row["height_sigma_mm"])
+            # Its set-up is exactly that of the simulated bench.
+            own = (float(row[sigma_name("height_mm", part)]) for part in ("noise", "level"))
+            heights[frame], sigma[frame] = float(row["height_mm"]), np.hypot(*own)
     normalized_error = (heights - video.height_mm) / sigma
     right = wrong = 0
     for row in _rows(out / "dots.csv"):

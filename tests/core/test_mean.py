@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from labapp.core.schemes import fit
-from labapp.core.sequence.mean import MOST, series_of, sigma_of_mean
+from labapp.core.sequence.mean import (
+    MOST,
+    series_of,
+    setup_sigma_of_mean,
+    sigma_of_mean,
+)
 from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import FloatArray
@@ -17,13 +22,16 @@ from tests.benchmarks.dips import matched
 from tests.scenes import BENCH_RIG, see
 
 
-def course(width: FloatArray, sigma: float, level: float) -> dict[str, FloatArray]:
+def course(
+    width: FloatArray, sigma: float, level: float, setup: float = 0.0
+) -> dict[str, FloatArray]:
     """Measures of a pool of these widths, else unchanged; σ of width and length are ``sigma``."""
     series = {field.name: np.full(len(width), 1.0) for field in fields(Measures)}
     series["width_mm"] = width
     for size in ("width", "length", "height"):
         series[f"{size}_sigma_mm"] = np.full(len(width), sigma)
         series[f"{size}_sigma_level_mm"] = np.full(len(width), level)
+        series[f"{size}_sigma_setup_mm"] = np.full(len(width), setup)
     return series
 
 
@@ -46,6 +54,15 @@ def test_the_levels_of_boundaries_far_from_each_other_do() -> None:
 def test_what_no_version_kept_is_taken_for_the_levels() -> None:
     series = course(np.full(25, 6.0), 0.05, np.nan)
     assert sigma_of_mean("height_mm", series) == pytest.approx(0.05)
+
+
+def test_the_setup_errs_alike_in_every_frame() -> None:
+    series = course(np.full(25, 6.0), np.hypot(0.05, 0.02), 0.0, 0.02)
+    assert sigma_of_mean("height_mm", series) == pytest.approx(np.hypot(0.05 / 5, 0.02))
+    assert setup_sigma_of_mean("height_mm", series) == pytest.approx(0.02)
+    older = course(np.full(25, 6.0), 0.05, 0.0, np.nan)
+    assert sigma_of_mean("height_mm", older) == pytest.approx(0.05 / 5)
+    assert setup_sigma_of_mean("height_mm", older) == 0
 
 
 def test_without_an_uncertainty_the_mean_has_none() -> None:

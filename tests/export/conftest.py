@@ -54,6 +54,7 @@ def dots(count: int) -> Dots:
 def measured() -> Measurement:
     """Three dots: two with rays, one in doubt; row 2 blocked."""
     sizes = dict.fromkeys(Measures.__dataclass_fields__, 1.25)
+    sizes |= {name: 0.0 for name in sizes if "_setup_" in name}
     return Measurement(
         status="ok",
         reason="",
@@ -70,7 +71,7 @@ def measured() -> Measurement:
             witness=np.zeros((19, 19), int),
         ),
         reconstruction=pool(),
-        measures=Measures(**{**sizes, "depth_mm": -0.0, "volume_sigma_mm3": np.nan}),
+        measures=Measures(**sizes | {"depth_mm": -0.0, "volume_sigma_mm3": np.nan}),
     )
 
 

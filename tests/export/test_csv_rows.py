@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 
 import numpy as np
@@ -11,10 +12,10 @@ from hypothesis import strategies as st
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
-from labapp.core.surface.measures import Measures, sigma_name
+from labapp.core.surface.measures import SIZES, Measures, sigma_name
 from labapp.export.fixed_point import format_fixed
 from labapp.export.frame_result import FrameResult
-from labapp.export.tables import TABLES, WITH_SIGMA, Table, csv_header, csv_rows, number, table_rows
+from labapp.export.tables import TABLES, Table, csv_header, csv_rows, number, table_rows
 
 NUMBERS = st.one_of(
     st.floats(-1e7, 1e7),
@@ -71,8 +72,9 @@ def test_a_number_of_many_digits_is_written_the_slow_way() -> None:
 def test_parts_of_an_uncertainty_are_written_where_they_are_asked_for() -> None:
     measures = Measures(
         *[1.0] * 14,
-        *[0.05] * 6,
-        **{sigma_name(size, "level"): 0.04 for size in WITH_SIGMA},
+        *[0.13] * 6,
+        **{sigma_name(size, "level"): 0.04 for size in SIZES},
+        **{sigma_name(size, "setup"): 0.12 for size in SIZES},
     )
     found = Measurement("ok", "", "fit", measures=measures)
     made = FrameResult(0, 0.0, found)
@@ -81,11 +83,11 @@ def test_parts_of_an_uncertainty_are_written_where_they_are_asked_for() -> None:
     ]
     heads = [csv_header("measures", parts) for parts in (False, True)]
     plain, whole = (
-        dict(zip(head.strip().split(","), row.strip("\n").split(","), strict=True))
-        for head, row in zip(heads, rows, strict=True)
+        next(csv.DictReader((head, row))) for head, row in zip(heads, rows, strict=True)
     )
     assert plain.items() <= whole.items()
     more = {name: float(whole[name]) for name in whole.keys() - plain.keys()}
-    assert len(more) == 12
+    assert len(more) == 18
     for name, value in more.items():
-        assert value == (0.04 if "_level_" in name else 0.03), name
+        expected = 0.04 if "_level_" in name else 0.12 if "_setup_" in name else 0.03
+        assert value == expected, name

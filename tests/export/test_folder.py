@@ -27,6 +27,7 @@ from labapp.export import folder as module
 from labapp.export.folder import ExportChoice, ExportedFile, export, verify_export
 from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
+from labapp.text import SIGMA_OF
 
 ALL = ExportChoice(
     surfaces=frozenset({"csv", "stl", "stl-ascii", "ply", "vtp"}),
@@ -84,7 +85,7 @@ def test_the_manifest_lists_every_file(run: Run, tmp_path: Path) -> None:
     assert manifest["provenance"] == ABOUT
     assert manifest["version"]
     assert manifest["created"]
-    assert manifest["sigma_of"] == "noise and level only"
+    assert manifest["sigma_of"] == SIGMA_OF
     assert manifest["files"] == [vars(file) for file in written]
     there = contents(out)
     for file in written:
@@ -121,7 +122,7 @@ def test_hdf5_holds_what_the_tables_hold(run: Run, tmp_path: Path) -> None:
         assert file.attrs["setup"] == "[laser]\n"
         assert json.loads(file.attrs["source"]) == {"path": "v.avi"}
         assert file.attrs["program"] == "labapp"
-        assert file.attrs["sigma_of"] == "noise and level only"
+        assert file.attrs["sigma_of"] == SIGMA_OF
 
 
 def test_what_is_not_chosen_is_not_written(run: Run, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from labapp.export.results import ResultsWriter
 from labapp.export.tables import TABLES
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
-from labapp.text import SIGMA_OF
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF
 from tests.export.conftest import dots
 
 Writer = Callable[[Path], ResultsWriter]
@@ -69,7 +69,7 @@ def test_every_frame_has_its_row_in_measures(written: Path) -> None:
     assert (ok["dots"], ok["rows"]) == ("3", "2")
     assert (ok["width_mm"], ok["area_mm2"], ok["width_sigma_mm"]) == ("1.250000",) * 3
     assert ok["depth_mm"] == "0.000000"
-    assert ok["sigma_of"] == "noise and level only"
+    assert ok["sigma_of"] == SIGMA_OF
     assert ok["volume_sigma_mm3"] == ""
     assert {key: value for key, value in other.items() if value} == {
         "frame": "7",
@@ -111,9 +111,10 @@ def test_points_carry_residual_and_sigma(written: Path) -> None:
 def test_what_is_in_sigma_is_said_beside_the_tables(written: Path) -> None:
     assert json.loads((written / "run.json").read_text("utf-8"))["sigma_of"] == SIGMA_OF
     sigmas = [c for name in TABLES for c in TABLES[name] if "_sigma_" in f"_{c.name}_" and c.digits]
-    assert len(sigmas) == 7 + 12
+    assert len(sigmas) == 7 + 18
     for column in sigmas:  # the total says what is in it, a part of which total it is one
-        assert ("part of" if column.is_part else SIGMA_OF) in column.description
+        whole = HEIGHT_SIGMA_OF if column.name == "sigma_mm" else SIGMA_OF
+        assert ("part of" if column.is_part else whole) in column.description
 
 
 @pytest.mark.parametrize("scheme", ["fit", "ers", "irs"])

@@ -15,6 +15,7 @@ RATE_HZ = 60.0
 def overview(height: np.ndarray, time_s: np.ndarray | None = None, **sizes) -> Overview:
     count = len(height)
     measures = {name: np.full(count, 1.0) for name in MEASURES}
+    measures |= {name: np.zeros(count) for name in MEASURES if "_setup_" in name}
     measures["height_mm"] = np.asarray(height, float)
     measures.update(sizes)
     return Overview(

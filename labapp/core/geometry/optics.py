@@ -69,6 +69,8 @@ def intersect_imaging_plane(
     return plane.from_universal(origin_mm + distance[..., None] * direction)
 
 
-def intersect_level(origin_mm: FloatArray, direction: FloatArray, z_mm: float = 0.0) -> FloatArray:
-    """Where rays meet the horizontal plane z = z_mm, shape (…, 3), mm."""
+def intersect_level(
+    origin_mm: FloatArray, direction: FloatArray, z_mm: FloatArray | float = 0.0
+) -> FloatArray:
+    """Where rays meet the horizontal plane z = z_mm, one or one each (…, 1), shape (…, 3), mm."""
     return np.asarray(origin_mm + ((z_mm - origin_mm[..., 2:]) / direction[..., 2:]) * direction)

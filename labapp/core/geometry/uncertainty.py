@@ -68,6 +68,14 @@ QUANTITIES = (
 
 INDEX = {quantity.key: k for k, quantity in enumerate(QUANTITIES)}
 
+CALIBRATED = frozenset(
+    one.key
+    for one in QUANTITIES
+    if one.key.startswith("image_calibration.")
+    or one.key in ("laser.projection_angle_deg", "laser.distance_mm")
+)
+"""Keys of what steps 2 and 3 calibrate (Appendix I, §5.1)."""
+
 ANGLE, DISTANCE = INDEX["laser.projection_angle_deg"], INDEX["laser.distance_mm"]
 
 
@@ -110,6 +118,11 @@ class RigUncertainty(ReadOnlyArrays):
     def sigma(self) -> FloatArray:
         """Standard uncertainty of each of `QUANTITIES`, shape (q,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def status(self) -> str:
+        """``calibrated`` where laser and image calibration told their own ±, or ``entered``."""
+        return "entered" if self.assumed & CALIBRATED else "calibrated"
 
     @property
     def correlation(self) -> FloatArray:

@@ -9,6 +9,7 @@ from labapp.core.match import Match
 from labapp.core.surface.boundary_trace import trace_boundary
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.setup_uncertainty import Fitted, setup_sigma
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.values import CannotMeasure
 
@@ -50,6 +51,8 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
     sizes = sizes_and_gradients(
         surface.basis, surface.coefficients, level, boundary, boundary_slope
     )
+    fitted = Fitted(match, rig, settings, surface, pool.points_mm, level)
+    by_setup = setup_sigma(rig, fitted.setup_changes(sizes.gradient))
     return Reconstruction(
         scheme="fit",
         surface=surface,
@@ -58,6 +61,7 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         points_mm=pool.points_mm,
         residual_mm=pool.residual_mm,
         sigma_mm=pool.sigma_of(surface.basis.matrix(x, y)),
-        size_sigma=pool.sigma_of(sizes.gradient),
+        size_sigma=np.hypot(pool.sigma_of(sizes.gradient), by_setup),
         size_sigma_level=np.abs(sizes.by_level) * level.sigma_mm,
+        size_sigma_setup=by_setup,
     )

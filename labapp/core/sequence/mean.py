@@ -1,10 +1,11 @@
 """How uncertain the mean of a size over the frames of a recording is.
 
-The noise of one frame says nothing of the next one's. The level does: it comes from which rays land
-inside the boundary, and while the boundary stays where it is, the same rays put it at the same
-wrong place. In simulated recordings the errors of two frames' levels are correlated by
-exp(−D²/2ℓ²), with D the distance of their outlines in standard uncertainties: 1 for a pool that
-swings within its boundary, and nothing where that has moved by three of them.
+The noise of one frame says nothing of the next one's. What is not known of the set-up is the same
+error in all of them. So is the level's, in part: it comes from which rays land inside the boundary,
+and while the boundary stays where it is, the same rays put it at the same wrong place. In simulated
+recordings the errors of two frames' levels are correlated by exp(−D²/2ℓ²), with D the distance of
+their outlines in standard uncertainties: 1 for a pool that swings within its boundary, and nothing
+where that has moved by three of them.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def series_of(measured: Sequence[Measures]) -> dict[str, FloatArray]:
 
 
 def sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
-    """Standard uncertainty of a size's mean over n frames with a surface, noise and level only.
+    """Standard uncertainty of a size's mean over n frames with a surface.
 
     Parameters
     ----------
@@ -42,7 +43,8 @@ def sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
         Of the size, as in `Measures`.
     series
         The measures of these frames by their names, each of shape (n,). Where the level's part of
-        an uncertainty is NaN, as versions before did not keep it, it is taken for all of it.
+        an uncertainty is NaN, as versions before did not keep it, it is taken for all of it; where
+        the set-up's is, for none.
 
     Returns
     -------
@@ -51,7 +53,7 @@ def sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
     """
     if sigma_name(name) not in series or not len(series[name]):
         return math.nan
-    sigma, level = series[sigma_name(name)], series[sigma_name(name, "level")]
+    sigma, level = _without_setup(series, name), series[sigma_name(name, "level")]
     level = np.where(np.isfinite(level), level, sigma)
     count = len(sigma)
     variance = (np.sum(np.maximum(sigma**2 - level**2, 0.0)) + np.sum(level**2)) / count**2
@@ -60,13 +62,29 @@ def sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
         together = level[some] @ level_correlation(series, some) @ level[some]
         pairs = len(some) * (len(some) - 1)
         variance += (together - np.sum(level[some] ** 2)) / pairs * (count - 1) / count
-    return float(np.sqrt(variance))
+    return float(np.sqrt(variance + setup_sigma_of_mean(name, series) ** 2))
+
+
+def setup_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
+    """The set-up's part of `sigma_of_mean`: frames do not average it out. 0 where it is unknown."""
+    return float(_setup(series, name).mean())
+
+
+def _setup(series: Mapping[str, FloatArray], name: str) -> FloatArray:
+    """The set-up's part of a size's uncertainty, shape (n,); 0 where it is unknown."""
+    return np.nan_to_num(series.get(sigma_name(name, "setup"), np.zeros(len(series[name]))))
+
+
+def _without_setup(series: Mapping[str, FloatArray], name: str) -> FloatArray:
+    """Uncertainty of a size by noise and level, shape (n,)."""
+    total, setup = series[sigma_name(name)], _setup(series, name)
+    return np.asarray(np.sqrt(np.maximum(total**2 - setup**2, 0.0)))
 
 
 def level_correlation(series: Mapping[str, FloatArray], frames: slice | np.ndarray) -> FloatArray:
     """Correlation of the errors of some frames' levels, shape (m, m)."""
     moved = [
-        series[name][frames] / np.median(series[sigma_name(size)][frames]) * share
+        series[name][frames] / np.median(_without_setup(series, size)[frames]) * share
         for size, center in (("width_mm", "center_x_mm"), ("length_mm", "center_y_mm"))
         for name, share in ((size, 1.0), (center, 2.0))  # a width has two ends that move
     ]

@@ -77,6 +77,8 @@ class Track:
     free_mm
         Uncertainty of the height where each ray meets the surface, its level apart, as it was last
         worked out, shape (R,), mm; NaN where it never was. It changes slowly.
+    size_sigma_setup
+        Uncertainty of the sizes by the set-up (`Reconstruction`), as it was last worked out.
     unseen
         Frames since the absent ray's place was last seen dark amid four lit ones.
     count
@@ -95,6 +97,7 @@ class Track:
     slopes: FloatArray
     open_mm: float
     free_mm: FloatArray
+    size_sigma_setup: FloatArray
     unseen: int = 0
     count: int = 0
 
@@ -144,6 +147,7 @@ def begin(
         slopes=np.concatenate([before, pool.slopes[None]]),
         open_mm=level.sigma_mm,
         free_mm=np.full(len(geometry.at), np.nan),
+        size_sigma_setup=made.size_sigma_setup,
     )
 
 

@@ -26,7 +26,7 @@ from labapp.core.match import Match, Trial, missing_share
 from labapp.core.matching.correspondence import lattice_of_match, match_of_pairs
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.matching.outliers import unsupported
-from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.pipeline import Measurement, Settings, measure, setup_status
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.track import MEMORY, Track, TrackLost, begin, found_again, rms
 from labapp.core.sequence.warm_fit import (
@@ -49,6 +49,7 @@ from labapp.core.surface.boundary_trace import retrace_boundary
 from labapp.core.surface.level import Level, find_level
 from labapp.core.surface.measures import scaled_errors
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.setup_uncertainty import Fitted, setup_sigma
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.surface.solver import REUSE_MM, propagate_sigma
 from labapp.core.surface.spline import SplineSurface
@@ -72,6 +73,9 @@ WINDOW = 0.4
 
 POINTS_EVERY = 8
 """Every so many frames the uncertainty of the reflection points is worked out anew."""
+
+SETUP_EVERY = 64
+"""Every so many frames the sizes' uncertainty by the set-up is worked out anew."""
 
 ROUGHLY_MM = 0.03
 """Where no reflection point moved by more, what is left to move does not change which dots have
@@ -228,6 +232,7 @@ def follow(
         lit=labels != UNLABELLED,
         boundary=reconstruction.boundary,
         level=level,
+        size_sigma_setup=reconstruction.size_sigma_setup,
         past=np.vstack([track.past[1 - MEMORY :], pool.coefficients]),
         slopes=np.concatenate([track.slopes[1 - MEMORY :], pool.slopes[None]]),
         open_mm=open_mm,
@@ -235,7 +240,8 @@ def follow(
         count=track.count + 1,
     )
     lattice = lattice_of_match(match, geometry.rig, len(dots))
-    told = Measurement("ok", "", "fit", dots, lattice, match, reconstruction, size)
+    found = dots, lattice, match, reconstruction, size
+    told = Measurement("ok", "", "fit", *found, setup_status=setup_status(geometry.rig))
     passed("measures")
     return told, after
 
@@ -407,18 +413,24 @@ def _sized(
     sizes = sizes_and_gradients(geometry.basis, coefficients, level, boundary, boundary_slope)
     if not sizes.holds:
         raise TrackLost("the surface comes down to the work piece within its boundary")
+    surface, by_setup = SplineSurface(geometry.basis, coefficients), track.size_sigma_setup
+    if track.count % SETUP_EVERY == SETUP_EVERY - 1:
+        fitted = Fitted(match, geometry.rig, geometry.settings, surface, points, level)
+        by_setup = setup_sigma(geometry.rig, fitted.setup_changes(sizes.gradient))
     share = np.full(len(ray), 1 / len(ray))
     level_at = kernels.gradient_of_sum(geometry.basis.grid, len(coefficients), points[:, :2], share)
+    by_rays = propagate_sigma(lower, sizes.gradient, level_at, level.sigma_mm)
     made = Reconstruction(
         scheme="fit",
-        surface=SplineSurface(geometry.basis, coefficients),
+        surface=surface,
         boundary=boundary,
         ray=match.ray,
         points_mm=points,
         residual_mm=residual,
         sigma_mm=np.hypot(track.free_mm[ray], level.sigma_mm),
-        size_sigma=propagate_sigma(lower, sizes.gradient, level_at, level.sigma_mm),
+        size_sigma=np.hypot(by_rays, by_setup),
         size_sigma_level=np.abs(sizes.by_level) * level.sigma_mm,
+        size_sigma_setup=by_setup,
     )
     # As `measures.reflection_scale` has it; where the rays land is known.
     scale = np.ptp(geometry.landing_mm[ray, :2], axis=0) / np.ptp(match.plane_mm, axis=0)

@@ -71,11 +71,13 @@ class Measures:
         Where the surface is farthest from the work piece: the highest point of a convex pool,
         the lowest of a concave one.
     width_sigma_mm, length_sigma_mm, height_sigma_mm, depth_sigma_mm
-        Standard uncertainties, noise and level only; NaN where the scheme gives none.
+        Standard uncertainties, by noise, level and set-up; NaN where the scheme gives none.
     area_sigma_mm2, volume_sigma_mm3
         The same of area and volume.
     width_sigma_level_mm … volume_sigma_level_mm3
         The level's part of these six; NaN also in results of versions that did not keep it.
+    width_sigma_setup_mm … volume_sigma_setup_mm3
+        The set-up's part; NaN in results of versions whose ± were those of noise and level only.
     own_are_mm
         See `Reconstruction`; NaN where the scheme gives none.
     scale_x, scale_z
@@ -112,6 +114,16 @@ class Measures:
     depth_sigma_level_mm: float = math.nan
     area_sigma_level_mm2: float = math.nan
     volume_sigma_level_mm3: float = math.nan
+    width_sigma_setup_mm: float = math.nan
+    length_sigma_setup_mm: float = math.nan
+    height_sigma_setup_mm: float = math.nan
+    depth_sigma_setup_mm: float = math.nan
+    area_sigma_setup_mm2: float = math.nan
+    volume_sigma_setup_mm3: float = math.nan
+
+
+SIZES = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
+"""The sizes that have a standard uncertainty, in the order of arrays."""
 
 
 def sigma_name(name: str, part: str = "") -> str:
@@ -137,36 +149,29 @@ def assemble_measures(
     reconstruction: Reconstruction,
 ) -> Measures:
     """Put errors, the result of `surface_sizes`, the centre and the sizes' σ together."""
-    sigma, by_level = reconstruction.size_sigma, reconstruction.size_sigma_level
+    sigmas = {
+        "": reconstruction.size_sigma,
+        "level": reconstruction.size_sigma_level,
+        "setup": reconstruction.size_sigma_setup,
+    }
+    told = {
+        sigma_name(name, part): float(sigma[k])
+        for part, sigma in sigmas.items()
+        for k, name in enumerate(SIZES)
+    }
     return Measures(
         are_mm=errors.are_mm,
         mre_mm=errors.mre_mm,
         are_inner_mm=errors.are_inner_mm,
         mre_inner_mm=errors.mre_inner_mm,
-        width_mm=float(size[0]),
-        length_mm=float(size[1]),
-        height_mm=float(size[2]),
-        depth_mm=float(size[3]),
-        area_mm2=float(size[4]),
-        volume_mm3=float(size[5]),
         center_x_mm=float(center_mm[0]),
         center_y_mm=float(center_mm[1]),
         peak_x_mm=float(peak_mm[0]),
         peak_y_mm=float(peak_mm[1]),
-        width_sigma_mm=float(sigma[0]),
-        length_sigma_mm=float(sigma[1]),
-        height_sigma_mm=float(sigma[2]),
-        depth_sigma_mm=float(sigma[3]),
-        area_sigma_mm2=float(sigma[4]),
-        volume_sigma_mm3=float(sigma[5]),
         scale_x=float(errors.scale[0]),
         scale_z=float(errors.scale[1]),
-        width_sigma_level_mm=float(by_level[0]),
-        length_sigma_level_mm=float(by_level[1]),
-        height_sigma_level_mm=float(by_level[2]),
-        depth_sigma_level_mm=float(by_level[3]),
-        area_sigma_level_mm2=float(by_level[4]),
-        volume_sigma_level_mm3=float(by_level[5]),
+        **{name: float(size[k]) for k, name in enumerate(SIZES)},
+        **told,
     )
 
 

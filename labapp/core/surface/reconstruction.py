@@ -69,11 +69,13 @@ class Reconstruction(ReadOnlyArrays):
         Standard uncertainty of each reflection point's height, noise and level only, shape (n,),
         mm; NaN where the scheme gives none.
     size_sigma
-        Standard uncertainty of width, length, height, depth, area and volume, noise and level
-        only, shape (6,), mm, mm², mm³; NaN where the scheme gives none.
+        Standard uncertainty of width, length, height, depth, area and volume, shape (6,), mm, mm²,
+        mm³; NaN where the scheme gives none.
     size_sigma_level
         The level's part of that, shape (6,). In frames that follow on each other it is much the
         same error (`core.sequence.mean`).
+    size_sigma_setup
+        The set-up's part, shape (6,): the same error in all frames of a recording.
     own_are_mm
         ARE of the points as the scheme has them, with the surface through nothing else (step 4 of
         §6.3.1 and §7.1), mm: what the text tells. NaN for fit, whose points are the surface's.
@@ -88,6 +90,7 @@ class Reconstruction(ReadOnlyArrays):
     sigma_mm: FloatArray
     size_sigma: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     size_sigma_level: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
+    size_sigma_setup: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     own_are_mm: float = math.nan
 
     def __post_init__(self) -> None:

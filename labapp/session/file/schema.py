@@ -10,7 +10,7 @@ from __future__ import annotations
 APPLICATION_ID = 0x4C414250
 """“LABP”, in SQLite's header: what makes a database a session."""
 
-VERSION = 2
+VERSION = 3
 """Of the tables below. A change to them adds 1, and a step to `MIGRATIONS`."""
 
 NO_FRAME = -1
@@ -21,7 +21,9 @@ MEASURES = (
     "volume_mm3 center_x_mm center_y_mm peak_x_mm peak_y_mm width_sigma_mm length_sigma_mm "
     "height_sigma_mm depth_sigma_mm area_sigma_mm2 volume_sigma_mm3 "
     "width_sigma_level_mm length_sigma_level_mm height_sigma_level_mm depth_sigma_level_mm "
-    "area_sigma_level_mm2 volume_sigma_level_mm3"
+    "area_sigma_level_mm2 volume_sigma_level_mm3 "
+    "width_sigma_setup_mm length_sigma_setup_mm height_sigma_setup_mm depth_sigma_setup_mm "
+    "area_sigma_setup_mm2 volume_sigma_setup_mm3"
 ).split()
 """Columns of `result` that repeat `Measures`, so that trends need not unpack every frame."""
 
@@ -93,5 +95,6 @@ TABLES = (
 
 MIGRATIONS: dict[int, tuple[str, ...]] = {
     1: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[20:26]),
+    2: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[26:32]),
 }
 """From each earlier version, the statements that lead to the next."""

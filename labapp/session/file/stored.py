@@ -165,6 +165,7 @@ STORED = {
             "sigma_mm": "n",
             "size_sigma": "6",
             "size_sigma_level": "6",
+            "size_sigma_setup": "6",
         },
     ),
     "Measures": Stored(Measures),

@@ -15,7 +15,7 @@ from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.widgets.labels import wrapping_label
-from labapp.text import SIGMA_OF
+from labapp.text import HEIGHT_SIGMA_OF
 
 BAND_ALPHA = 70
 
@@ -199,7 +199,7 @@ class ProfileChart(Chart):
         self._low.setData(along, height - sigma)
         self._high.setData(along, height + sigma)
         self._edge.setData(pos=cut.edge_mm)
-        band = f"; band: ±, {SIGMA_OF}" if sigma.any() else "; this scheme gives no ±"
+        band = f"; band: ±, {HEIGHT_SIGMA_OF}" if sigma.any() else "; this scheme gives no ±"
         self.say(f"Height along the section; ◆ boundary{band}")
         self.plot.autoRange()
 
