@@ -10,6 +10,14 @@ SIGMA_OF = "noise, level and set-up"
 HEIGHT_SIGMA_OF = "noise and level only"
 """What the ± of single heights covers; so did those of sizes before the set-up was in them."""
 
+SETUP_WORDS = {
+    "entered": "The set-up was entered, not calibrated: usual uncertainties are assumed.",
+    "calibrated": "Laser and imaging plane were calibrated, and no known mirror was measured.",
+    "checked": "The set-up was checked against a known mirror.",
+    "doubtful": "The set-up is doubtful: dots lie off in the same way in frame after frame.",
+}
+"""What `setup_status` means to the operator."""
+
 
 def now() -> str:
     """Present time, ISO 8601 with the time zone, to the second."""

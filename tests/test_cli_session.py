@@ -68,6 +68,7 @@ def measure(
     if settings.scheme == "ers":
         return replace(found, status="no-match", reason="for the test")
     sizes = dict.fromkeys(Measures.__dataclass_fields__, 1.0)
+    sizes |= {name: 0.0 for name in sizes if "_setup_" in name}
     sizes["height_mm"] = float(len(dots) + 100 * len(lattice.blocked_rows))
     sizes["own_are_mm"] = np.nan
     return replace(found, measures=Measures(**sizes))

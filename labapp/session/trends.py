@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from labapp.core.sequence.mean import sigma_of_mean
+from labapp.core.sequence.mean import setup_sigma_of_mean, sigma_of_mean
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.session.measured import Overview
 
@@ -121,6 +121,8 @@ class Spread:
         text. NaN without a frame.
     mean_sigma
         Standard uncertainty of the mean (`sigma_of_mean`); NaN where the measure has none.
+    mean_setup_sigma
+        The set-up's part of that (`setup_sigma_of_mean`).
     """
 
     count: int
@@ -129,6 +131,7 @@ class Spread:
     lowest: float
     highest: float
     mean_sigma: float = math.nan
+    mean_setup_sigma: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -236,15 +239,15 @@ def spread(course: Trend) -> Spread:
     value = course.value[course.counts]
     if not len(value):
         return Spread(0, *(4 * (float("nan"),)))
+    key, counted = course.quantity.key, {k: v[course.counts] for k, v in course.measures.items()}
     return Spread(
         len(value),
         float(value.mean()),
         float(value.std()),
         float(value.min()),
         float(value.max()),
-        sigma_of_mean(
-            course.quantity.key, {k: v[course.counts] for k, v in course.measures.items()}
-        ),
+        sigma_of_mean(key, counted),
+        setup_sigma_of_mean(key, counted),
     )
 
 

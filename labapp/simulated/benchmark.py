@@ -276,8 +276,8 @@ def run_video(
         if row["status"] == "ok":
             frame = int(row["frame"])
             # Its set-up is exactly that of the simulated bench.
-            own = (float(row[sigma_name("height_mm", part)]) for part in ("noise", "level"))
-            heights[frame], sigma[frame] = float(row["height_mm"]), np.hypot(*own)
+            noise, level = (float(row[sigma_name("height_mm", p)]) for p in ("noise", "level"))
+            heights[frame], sigma[frame] = float(row["height_mm"]), np.hypot(noise, level)
     normalized_error = (heights - video.height_mm) / sigma
     right = wrong = 0
     for row in _rows(out / "dots.csv"):

@@ -12,15 +12,14 @@ import pytest
 
 import labapp
 from labapp.config.setup import Setup, parse_setup
-from labapp.core.calibration.laser_calibration import calibrate_laser
-from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.rig import Laser
-from labapp.core.match import Trial
+from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import QUANTITIES, AxisPoints, RigUncertainty
+from labapp.core.match import Match, Trial
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows import correction
 from labapp.core.schemes import ers
-from labapp.core.surface.measures import measure_surface
+from labapp.core.surface.measures import SIZES, measure_surface
 from labapp.errors import InputError
 from labapp.export.summary import format_ranges
 from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
@@ -32,7 +31,7 @@ from labapp.session.report.results import add_corrections, add_example, add_resu
 from labapp.session.session import Session
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap
-from labapp.studies.error_budget import SIZES, Contribution, calibration_budget, root_sum_of_squares
+from labapp.studies.error_budget import Contribution, setup_budget, total
 from tests.scenes import FRAME_SHAPE, as_dots
 
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
@@ -243,65 +242,78 @@ def test_the_rig_is_told_with_units(setup: Setup):
 # --- error budget -----------------------------------------------------------------------------
 
 
+def sizes(match: Match, rig: Rig) -> np.ndarray:
+    size = measure_surface(ers.reconstruct(match, rig, ERS.ers), match, rig)
+    return np.array([getattr(size, name) for name in SIZES])
+
+
 def test_the_budget_is_what_measuring_with_other_values_gives(seen: Measurement, setup: Setup):
-    found = calibration_budget(seen, setup, ERS, None, None)
-    assert [one.name.split(",")[0] for one in found] == [
-        *["laser"] * 2,
-        *["imaging plane"] * 3,
-        *["image calibration"] * 3,
-    ]
-    assert all(one.nominal for one in found)
-    moved = replace(setup.rig, laser=replace(setup.rig.laser, distance_mm=31.58))
+    found = {one.name: one for one in setup_budget(seen, setup, ERS)}
+    assert len(found) == len(QUANTITIES)
+    assert all(one.assumed for one in found.values())
     assert seen.match is not None
-    assert seen.measures is not None
-    size = measure_surface(ers.reconstruct(seen.match, moved, ERS.ers), seen.match, moved)
-    change = [abs(getattr(size, name) - getattr(seen.measures, name)) for name in SIZES]
-    np.testing.assert_allclose(found[1].change, change, atol=1e-12)
-    assert found[1].change[0] > 0.005
+    farther, nearer = (
+        replace(setup.rig, laser=replace(setup.rig.laser, distance_mm=31.48 + step))
+        for step in (0.5, -0.5)
+    )
+    change = (sizes(seen.match, farther) - sizes(seen.match, nearer)) / 2
+    distance = found["laser, distance"]
+    assert (distance.sigma, distance.unit) == (0.5, "mm")
+    np.testing.assert_allclose(distance.change, change, atol=1e-9)
+    assert change[0] > 0.02
 
 
-def test_a_moved_point_of_the_picture_is_another_image_calibration(seen: Measurement, setup: Setup):
-    points = ((44.0, 590.0), (242.01, 587.93), 34.925, (43.06, 499.99), 15.875)
-    plane = PlaneCalibration(*points, sigma_px=(0.2, 0.1, 0.3), threshold=50.0)
-    found = calibration_budget(seen, setup, ERS, None, plane)[5]
+def test_a_moved_point_of_the_picture_is_another_image_calibration(seen: Measurement):
+    setup = parse_setup(SETUP + "origin_px_sigma = 0.2\n", "setup.toml")
+    found = {one.name: one for one in setup_budget(seen, setup, ERS)}
     assert seen.match is not None
-    assert seen.measures is not None
     image = setup.calibration.to_image(seen.match.plane_mm)
-    heights = []
-    for origin in ((44.2, 590.0), (44.0, 590.2)):
-        other = ImageCalibration.from_three_points(origin, *points[1:])
-        match = replace(seen.match, plane_mm=other.to_plane(image))
-        size = measure_surface(ers.reconstruct(match, setup.rig, ERS.ers), match, setup.rig)
-        heights.append(size.height_mm - seen.measures.height_mm)
-    assert (found.name, found.sigma, found.nominal) == ("image calibration, O′", 0.2, False)
-    np.testing.assert_allclose(found.change[2], np.hypot(*heights), rtol=1e-6)
-    assert found.change[2] > 1e-4
+    points = (242.01, 587.93), 34.925, (43.06, 499.99), 15.875
+    right, left = (
+        sizes(
+            replace(
+                seen.match,
+                plane_mm=ImageCalibration.from_three_points((u, 590.0), *points).to_plane(image),
+            ),
+            setup.rig,
+        )
+        for u in (44.2, 43.8)
+    )
+    origin = found["image calibration, O′, u"]
+    assert (origin.sigma, origin.assumed) == (0.2, False)
+    np.testing.assert_allclose(origin.change, (right - left) / 2, rtol=1e-6, atol=1e-12)
+    assert np.abs(origin.change).max() > 1e-4
 
 
-def test_a_calibration_tells_its_own_uncertainty_while_it_is_in_use(
-    seen: Measurement, setup: Setup
-):
-    laser = calibrate_laser([4.6, 4.7, 4.65], [6.2, 6.3, 6.2], [2.75, 2.76, 2.75])
-    other = calibration_budget(seen, setup, ERS, laser, None)
-    assert other[0].nominal
-    used = replace(setup, rig=replace(setup.rig, laser=Laser(laser.angle_deg, laser.distance_mm)))
-    found = calibration_budget(seen, used, ERS, laser, None)
-    assert [one.nominal for one in found[:3]] == [False, False, True]
-    assert (found[0].sigma, found[1].sigma) == (laser.angle_sigma_deg, laser.distance_sigma_mm)
+def test_correlated_quantities_count_together(seen: Measurement, setup: Setup):
+    laser = "angle_distance_correlation = {}\n[pattern]"
+    apart, together, against = (
+        parse_setup(SETUP.replace("[pattern]", laser.format(share)), "setup.toml")
+        for share in (0.0, 0.9, -0.9)
+    )
+    changes = setup_budget(seen, setup, ERS)
+    widths = [total(np.zeros(6), changes, one.rig)[0] for one in (apart, together, against)]
+    squares = np.sqrt(np.sum(np.square([one.change[0] for one in changes])))
+    assert widths[0] == pytest.approx(squares)
+    assert len({round(width, 6) for width in widths}) == 3
+    assert widths[1] ** 2 + widths[2] ** 2 == pytest.approx(2 * widths[0] ** 2)
 
 
-def test_the_total_is_the_root_of_the_sum_of_squares(seen: Measurement):
+def test_the_budget_has_what_is_not_the_setups_once(seen: Measurement, setup: Setup):
     assert seen.measures is not None
-    line = FrameLine(0, 0.0, "ok", measures=replace(seen.measures, width_sigma_mm=0.03))
+    measures = replace(seen.measures, width_sigma_mm=0.05, width_sigma_setup_mm=0.04)
+    line = FrameLine(0, 0.0, "ok", measures=measures)
     changes = np.array([0.04, 0.1, np.nan, 0.0, 0.0, 0.0])
     parts = [
-        Contribution("a", 0.1, "mm", True, changes),
+        Contribution("a", 0.1, "mm", True, -changes),
         Contribution("b", 0.1, "mm", False, np.zeros(6)),
     ]
-    cells = data.budget_cells([line], parts)
+    exact = RigUncertainty(AxisPoints(setup.calibration, 1.0, 1.0), np.eye(2))
+    cells = data.budget_cells([line], parts, replace(setup.rig, uncertainty=exact))
+    assert cells[1][2] == "0.0300"
     assert [row[0] for row in cells[2:4]] == ["a*", "b"]
+    assert cells[2][2] == "0.0400"
     assert cells[-1][2:5] == ["0.0500", "0.1000", "0.0000"]
-    np.testing.assert_allclose(root_sum_of_squares(changes, changes)[:2], np.sqrt(2) * changes[:2])
 
 
 # --- the pages --------------------------------------------------------------------------------

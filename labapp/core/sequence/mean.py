@@ -22,6 +22,9 @@ from labapp.core.values import FloatArray
 DISTANCE = 0.6
 """ℓ: from recordings of the twin, pools that swing or whose boundary wanders by 0.2 to 2 %."""
 
+TINY_MM = 1e-9
+"""No outline is known better."""
+
 MOST = 1000
 """From so many frames at most, evenly spaced, the correlation is worked out."""
 
@@ -84,7 +87,7 @@ def _without_setup(series: Mapping[str, FloatArray], name: str) -> FloatArray:
 def level_correlation(series: Mapping[str, FloatArray], frames: slice | np.ndarray) -> FloatArray:
     """Correlation of the errors of some frames' levels, shape (m, m)."""
     moved = [
-        series[name][frames] / np.median(_without_setup(series, size)[frames]) * share
+        series[name][frames] / max(np.median(_without_setup(series, size)[frames]), TINY_MM) * share
         for size, center in (("width_mm", "center_x_mm"), ("length_mm", "center_y_mm"))
         for name, share in ((size, 1.0), (center, 2.0))  # a width has two ends that move
     ]

@@ -10,6 +10,10 @@ import cv2
 import numpy as np
 import scipy
 
+from labapp.core.calibration.laser_calibration import LaserCalibration
+from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import Rig
 from labapp.errors import InputError
 from labapp.media.base import format_frame_rate
 from labapp.session.contents import SessionContents
@@ -22,7 +26,6 @@ from labapp.session.report.results import (
     add_example,
     add_results,
 )
-from labapp.studies.error_budget import laser_in_use, plane_in_use
 from labapp.version import VERSION
 
 POOL_MM = (7.0, 0.3)
@@ -236,7 +239,7 @@ def _laser(story: Story, report: ReportData) -> None:
             *(("warning", warning) for warning in found.warnings),
         ]
     )
-    if report.setup is not None and not laser_in_use(found, report.setup.rig):
+    if report.setup is not None and not _is_laser(found, report.setup.rig):
         story.text("The rig's laser was changed after this calibration: other values are in use.")
 
 
@@ -272,7 +275,7 @@ def _plane(story: Story, report: ReportData) -> None:
     )
     if found.fits is not None:
         story.text("; ".join(" ".join(line.split()) for line in found.fit_lines()) + ".")
-    if report.setup is not None and not plane_in_use(found, report.setup.calibration):
+    if report.setup is not None and not _is_calibration(found, report.setup.calibration):
         story.text("The image calibration was changed after this one: other values are in use.")
     try:
         picture = report.session.picture(plane.picture_sha256)
@@ -283,3 +286,16 @@ def _plane(story: Story, report: ReportData) -> None:
         "The calibration picture with O′ and both axes as found.",
         figures.target_picture(picture, found),
     )
+
+
+def _is_laser(found: LaserCalibration, rig: Rig) -> bool:
+    """Whether the rig's laser is where this calibration found it."""
+    laser = rig.laser
+    known = [found.angle_deg, found.distance_mm], [laser.projection_angle_deg, laser.distance_mm]
+    return bool(np.allclose(*known, rtol=1e-6))
+
+
+def _is_calibration(found: PlaneCalibration, calibration: ImageCalibration) -> bool:
+    """Whether the image calibration is the one that was found in the picture."""
+    matrix = found.image_calibration.matrix
+    return bool(np.allclose(matrix, calibration.matrix, rtol=1e-6, atol=1e-9))

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 
 from labapp.config.setup import Setup
-from labapp.core.geometry.rig import ImagingPlane
+from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.sequence.mean import series_of, sigma_of_mean
-from labapp.core.surface.measures import Measures, sigma_name
+from labapp.core.surface.measures import SIZES, Measures, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.summary import format_ranges
 from labapp.session.contents import SessionContents
 from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
-from labapp.studies.error_budget import SIZES, Contribution, root_sum_of_squares
+from labapp.studies.error_budget import Contribution, total
 
 DOUBTFUL_MARGIN = 5.0
 """A frame is doubtful where another correspondence comes within this factor of the residual."""
@@ -305,23 +305,38 @@ def frame_cells(lines: Sequence[FrameLine]) -> Cells:
     return [head, *rows]
 
 
-def budget_cells(lines: Sequence[FrameLine], contributions: Sequence[Contribution]) -> Cells:
-    """± of dots and fit, of each calibrated quantity, and their root sum of squares."""
+def budget_cells(
+    lines: Sequence[FrameLine], contributions: Sequence[Contribution], rig: Rig
+) -> Cells:
+    """± of dots and fit, of each quantity of the set-up, and of all together."""
     digits = [STATISTICS[name][1] for name in SIZES]
-    own = [values(lines, sigma_name(name)) for name in SIZES]
-    noise = np.array([np.median(sigma) if len(sigma) else math.nan for sigma in own])
+    noise = np.array([_median_without_setup(lines, name) for name in SIZES])
     rows = [["dots and fit (median)", "", *_row(noise, digits)]]
     rows += [
         [
-            f"{one.name}{'*' if one.nominal else ''}",
+            f"{one.name}{'*' if one.assumed else ''}",
             f"{one.sigma:.2g} {one.unit}",
-            *_row(one.change, digits),
+            *_row(np.abs(one.change), digits),
         ]
         for one in contributions
     ]
-    total = root_sum_of_squares(noise, *(one.change for one in contributions))
-    rows.append(["root of the sum of squares", "", *_row(total, digits)])
+    rows.append(["all together", "", *_row(total(noise, contributions, rig), digits)])
     return [["source", "±", *(STATISTICS[name][0] for name in SIZES)], *rows]
+
+
+def _median_without_setup(lines: Sequence[FrameLine], name: str) -> float:
+    """Median ± of a size by noise and level; NaN where there is none."""
+    each = np.array(
+        [
+            [line.size(sigma_name(name, part)) for part in ("", "setup")]
+            for line in lines
+            if line.counts and math.isfinite(line.size(sigma_name(name)))
+        ]
+    )
+    if not len(each):
+        return math.nan
+    whole, setup = each.T**2
+    return float(np.sqrt(np.median(np.maximum(whole - np.nan_to_num(setup), 0.0))))
 
 
 def _row(figures: FloatArray, digits: Sequence[int]) -> list[str]:

@@ -15,8 +15,7 @@ from labapp.errors import InputError
 from labapp.session.report import data, figures
 from labapp.session.report.data import FrameLine, ReportData
 from labapp.session.report.layout import Story
-from labapp.studies.error_budget import calibration_budget
-from labapp.studies.parameter_deviation import NOMINAL_DEG, NOMINAL_MM, NOMINAL_PX
+from labapp.studies.error_budget import setup_budget
 from labapp.text import SIGMA_OF
 
 LATEST_CHANGES = 40
@@ -24,9 +23,9 @@ LATEST_CHANGES = 40
 
 NOT_COVERED = (
     "Not in it: that the pool is taken for a mirror and the imaging plane for a perfectly "
-    "diffuse, flat one; a wrong correspondence (a row or a column more or less); the tilt of the "
-    "plane; the length of the calibration target's unit; distortion by the lens; the pool's motion "
-    "during the exposure. Quantities are moved one by one, as if independent, to first order."
+    "diffuse, flat one; a wrong correspondence (a row or a column more or less); the length of the "
+    "calibration target's unit; the pool's motion during the exposure. Quantities are moved one by "
+    "one, to first order."
 )
 
 
@@ -168,19 +167,13 @@ def add_budget(story: Story, report: ReportData) -> None:
     session = report.session
     result = session.result(line.frame, report.scheme)
     assert result is not None
-    laser, plane = session.laser_calibration, session.plane_calibration
-    contributions = calibration_budget(
-        result.measurement,
-        parse_setup(result.setup, session.path),
-        result.settings,
-        None if laser is None else laser.found,
-        None if plane is None else plane.found,
-    )
+    setup = parse_setup(result.setup, session.path)
+    contributions = setup_budget(result.measurement, setup, result.settings)
     story.table(
-        f"What each ± (one σ) changes in the sizes. Calibration: frame {line.frame}, measured "
-        "anew with the quantity moved by its ±, the correspondence kept. *: no ± is known; a "
-        f"nominal {NOMINAL_MM:g} mm, {NOMINAL_DEG:g}° or {NOMINAL_PX:g} px is taken.",
-        data.budget_cells(report.lines, contributions),
+        f"What each ± (one σ) changes in the sizes. Set-up: frame {line.frame}, measured anew with "
+        "the quantity moved by its ± either way, the correspondence kept. *: nobody told the ±; a "
+        "usual one is assumed. Correlations of the quantities count in the last row.",
+        data.budget_cells(report.lines, contributions, setup.rig),
         "lrrrrrrr",
         (0.31, 0.1, *[0.0983] * 6),
     )

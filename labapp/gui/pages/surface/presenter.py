@@ -13,7 +13,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.schemes import scheme_words
-from labapp.core.surface.measures import Measures
+from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
@@ -21,7 +21,7 @@ from labapp.export.scene import Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
-from labapp.text import SIGMA_OF
+from labapp.text import HEIGHT_SIGMA_OF, SETUP_WORDS, SIGMA_OF
 
 SCHEMES = scheme_words()
 """Name that results are kept under → words for the operator."""
@@ -57,7 +57,7 @@ ERRORS = (
 )
 """Words, value in `Measures`, and what it is; the last is shown where the scheme gives it."""
 
-SIGMA, NO_SIGMA = f"±: one σ, {SIGMA_OF}", "This scheme gives no ±"
+NO_SIGMA = "This scheme gives no ±"
 
 
 def with_scheme(settings: Settings, name: str) -> Settings:
@@ -170,7 +170,8 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
     if result.stale:
         was = words if failed else "These figures no longer stand."
         return "stale", f"{was} Since then {' and '.join(result.stale)}."
-    return ("failed" if failed else "measured"), words
+    about = SETUP_WORDS.get(measurement.setup_status, "")
+    return ("failed" if failed else "measured"), words if failed else f"{words} {about}".strip()
 
 
 def provenance(result: Result) -> str:
@@ -187,14 +188,30 @@ def size_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
     if measures is None:
         return ()
     return tuple(
-        ResultRow(name, getattr(measures, value), sigma, unit, note=_noted(note, sigma))
+        ResultRow(
+            name,
+            getattr(measures, value),
+            getattr(measures, of_sigma),
+            unit,
+            note=f"{note}. {_sigma_words(measures, value, unit)}",
+        )
         for name, value, of_sigma, unit, note in SIZES
-        for sigma in (getattr(measures, of_sigma),)
     )
 
 
-def _noted(note: str, sigma: float) -> str:
-    return f"{note}. {SIGMA if np.isfinite(sigma) else NO_SIGMA}"
+def _sigma_words(measures: Measures, value: str, unit: str) -> str:
+    """What is in the ± of a size, and how much of it."""
+    total, level, setup = (
+        getattr(measures, sigma_name(value, part), np.nan) for part in ("", "level", "setup")
+    )
+    if not np.isfinite(total):
+        return NO_SIGMA
+    if not np.isfinite(setup):
+        return f"±: one σ, {HEIGHT_SIGMA_OF}"
+    noise = np.sqrt(max(total**2 - np.nan_to_num(level) ** 2 - setup**2, 0.0))
+    parts = (("noise", noise), ("level", level), ("set-up", setup))
+    told = ", ".join(f"{name} {part:.2g}" for name, part in parts)
+    return f"±: one σ, {SIGMA_OF} ({told} {unit})"
 
 
 def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:

@@ -138,7 +138,10 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
     ends = [f"{end:.{len(place)}f}" for end in (found.lowest, found.highest)]
     frames = f"{found.count} frame{'s' * (found.count != 1)}"
     note = f"Mean and standard deviation (divided by n, Eq. 7-2 … 7-4) of {frames}"
-    sure = f"± of the mean, {SIGMA_OF}: levels of frames whose outline is the same err together"
+    sure = (
+        f"± of the mean, {SIGMA_OF}: levels of frames whose outline is the same err together, "
+        f"and the set-up ({found.mean_setup_sigma:.2g} {quantity.unit}) errs alike in all frames"
+    )
     unknown = None if not found.count else " … ".join(ends).replace("-", "−")
     return (
         ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
