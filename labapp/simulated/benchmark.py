@@ -262,7 +262,9 @@ def run_video(
     begun, used = time.perf_counter(), sum(os.times()[:4])
     with stretch_pools(frames, workers) as pools:
         await_loaded(pools)
-        measurer = RecordingMeasurer(video.path, None, video.setup, Settings(), pools=pools)
+        measurer = RecordingMeasurer(
+            video.path, None, video.setup, Settings(), sigma_parts=True, pools=pools
+        )
         start_s = time.perf_counter() - begun
         made = {"benchmark": "chain"}
         with ResultsWriter(out, video.setup.calibration, made, False, sigma_parts=True) as results:

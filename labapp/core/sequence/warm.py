@@ -24,6 +24,7 @@ from labapp.core.images.dot_size import estimate_size
 from labapp.core.images.dots import Image
 from labapp.core.match import Match, Trial, missing_share
 from labapp.core.matching.correspondence import lattice_of_match, match_of_pairs
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.matching.outliers import unsupported
 from labapp.core.pipeline import Measurement, Settings, measure, setup_status
@@ -213,11 +214,7 @@ def follow(
     ray = np.flatnonzero(labels != UNLABELLED)
     dot = labels[ray]
     residual = pool.plane_mm[ray] - observed.plane_mm[dot]
-    limits = settings.match
-    if classes.stray > limits.stray[0] + limits.stray[1] * len(dots):
-        raise TrackLost(f"{classes.stray} dots have no ray")
-    if classes.missed > limits.missed[0] + limits.missed[1] * len(ray):
-        raise TrackLost(f"{classes.missed} rays amid the others have no dot")
+    _check_explained(classes, settings.match, len(dots), len(ray))
     if not rms(residual) < WORSE * track.residual_mm:
         raise TrackLost("the surface no longer has the dots")
     unseen = 0 if _datum_seen(geometry, observed, pool, off) else track.unseen + 1
@@ -244,6 +241,13 @@ def follow(
     told = Measurement("ok", "", "fit", *found, setup_status=setup_status(geometry.rig))
     passed("measures")
     return told, after
+
+
+def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays: int) -> None:
+    if classes.stray > limits.stray[0] + limits.stray[1] * dots:
+        raise TrackLost(f"{classes.stray} dots have no ray")
+    if classes.missed > limits.missed[0] + limits.missed[1] * rays:
+        raise TrackLost(f"{classes.missed} rays amid the others have no dot")
 
 
 def _shifted(pool: WarmPool, level: Level) -> WarmPool:
