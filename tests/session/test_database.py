@@ -337,5 +337,19 @@ def test_a_migration_that_fails_leaves_the_file_as_it_was(
     assert path.read_bytes() == before
 
 
+@pytest.mark.usefixtures("next_version")
+@pytest.mark.parametrize("read_only", [False, True])
+def test_an_older_version_with_other_tables_is_refused_unchanged(path: Path, read_only: bool):
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("CREATE TABLE more (text)")
+        connection.commit()
+    before, files = path.read_bytes(), sorted(path.parent.iterdir())
+    with pytest.raises(InputError) as refused:
+        Database.open(path, read_only)
+    assert (refused.value.field, refused.value.source) == ("tables", str(path))
+    assert path.read_bytes() == before
+    assert sorted(path.parent.iterdir()) == files
+
+
 def test_every_earlier_version_has_a_step():
     assert set(module.MIGRATIONS) == set(range(1, VERSION))

@@ -159,7 +159,7 @@ class Database:
                 shutil.copyfile(journal, _journal_of(copy))
             with _closing(_connect(copy, read_only=False)) as connection:
                 _roll_back(connection)
-            _apply_migrations(copy, _check_header(copy))
+            _apply_migrations(copy, _check_header(copy), path)
             database = cls(copy, read_only=True, lock=None)
             database.path, database._temporary = path, folder
             return database._checked()
@@ -242,11 +242,8 @@ class Database:
     def _checked(self) -> Database:
         """Refuse a file whose tables are not those of this version."""
         try:
-            # Every statement counts, whatever the name: a trigger could rewrite results. Without
-            # one are the indexes of unique columns only.
-            found = self.rows("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL")
-            if sorted(str(sql) for (sql,) in found) != sorted((*TABLES, COUNTERS)):
-                raise InputError(self.path, "tables", "not those of a session", A_SESSION)
+            with _translated_errors(self.path):
+                _check_tables(self._connection, self.path)
         except BaseException:
             self.close()
             raise
@@ -369,23 +366,44 @@ def _roll_back(connection: sqlite3.Connection) -> None:
     connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
+def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse tables that are not those of this version; ``path`` is for the error."""
+    # Every statement counts, whatever the name: a trigger could rewrite results. Without one are
+    # the indexes of unique columns only.
+    found = connection.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
+    if sorted(str(sql) for (sql,) in found) != sorted((*TABLES, COUNTERS)):
+        raise InputError(path, "tables", "not those of a session", A_SESSION)
+
+
 def _migrate(path: Path, version: int) -> None:
-    """Migrate a file to the present version; a copy of the former one stays beside it."""
+    """Migrate a file to the present version; a copy of the former one stays beside it.
+
+    A file that would be refused afterwards is refused before anything is written.
+    """
+    _apply_migrations(path, version, path, end="ROLLBACK")
     kept = path.with_name(f"{path.stem}.version-{version}{SUFFIX}")
     if not kept.exists():
         with atomic_file(kept) as part:
             shutil.copyfile(path, part)
-    _apply_migrations(path, version)
+    _apply_migrations(path, version, path)
 
 
-def _apply_migrations(path: Path, version: int) -> None:
-    with _closing(_connect(path, read_only=False)) as connection:
+def _apply_migrations(file: Path, version: int, path: Path, end: str = "COMMIT") -> None:
+    """Migrate a file in a transaction that ends so; errors name ``path``.
+
+    Raises
+    ------
+    InputError
+        If its tables would not be those of a session; the file is unchanged.
+    """
+    with _closing(_connect(file, read_only=False)) as connection:
         connection.execute("BEGIN IMMEDIATE")
         for earlier in range(version, VERSION):
             for statement in MIGRATIONS[earlier]:
                 connection.execute(statement)
+        _check_tables(connection, path)  # closing the connection rolls back
         connection.execute(f"PRAGMA user_version = {VERSION}")
-        connection.execute("COMMIT")
+        connection.execute(end)
 
 
 def _lock(path: Path) -> FileLock:
