@@ -9,13 +9,14 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 import platformdirs
+from filelock import FileLock
 from numba import types
 from numba.core.caching import _CacheLocator
 
@@ -104,12 +105,23 @@ def _delete_old(folder: Path) -> None:
                 shutil.rmtree(each, ignore_errors=True)
 
 
+def _one_at_a_time(function: Any) -> AbstractContextManager[object]:
+    """Have one process at a time compile the functions of a file.
+
+    What is compiled differs by whether the functions that it calls were compiled before, in their
+    last digits: the processes of a run must all have what one of them compiled.
+    """
+    place = BySource.from_function(function, function.__code__.co_filename)
+    return nullcontext() if place is None else FileLock(Path(place.get_cache_path()) / "lock")
+
+
 def _kept(function: F, *signature: Any) -> F:
     # A numba that does not know the setting keeps what it compiles where it always does.
     usual = getattr(_config, "CACHE_LOCATOR_CLASSES", "")
     _config.CACHE_LOCATOR_CLASSES = f"{__name__}.{BySource.__name__}"
     try:
-        made: F = _njit(*signature, cache=True, **HOW)(function)
+        with _one_at_a_time(function) if signature else nullcontext():
+            made: F = _njit(*signature, cache=True, **HOW)(function)
     except RuntimeError:  # nowhere to keep it
         made = _njit(*signature, **HOW)(function)
     finally:
