@@ -31,8 +31,9 @@ def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
         origin = plane.origin_mm + np.array([-by["s_mm"], -by["distance_mm"], by["h_mm"]])
         turned = [by["pitch_deg"], by["yaw_deg"], by["roll_deg"]]
         pitch, yaw, roll = np.add(plane.angles_deg, turned).tolist()
-        size = plane.width_mm, plane.height_mm
-        plane = ImagingPlane.of_angles(origin, (pitch, yaw, roll), *size)
+        posed = ImagingPlane.of_angles(origin, (pitch, yaw, roll))
+        axes = posed.x_axis, posed.z_axis
+        plane = replace(plane, origin_mm=origin, x_axis=axes[0], z_axis=axes[1])
     return replace(
         rig,
         laser=replace(rig.laser, **laser),

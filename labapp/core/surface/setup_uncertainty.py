@@ -92,7 +92,8 @@ class Fitted:
         rays, ground = pattern[tuple(match.ray.T - 1)], intersect_level(laser, pattern)
         dots = moved_dots(match.plane_mm, self.rig, self.rig.uncertainty.axes, offset)
         dots = rig.imaging_plane.to_universal(dots)
-        equations = NormalEquations(basis, self._stiffness, laser, dots, self._weights)
+        plane = rig.imaging_plane.pose_mm
+        equations = NormalEquations(basis, self._stiffness, laser, plane, dots, self._weights)
         coefficients, moved = self.surface.coefficients, 0.0
         points = intersect_level(laser, rays, self.points_mm[:, 2:])
         for _ in range(ROUNDS):
@@ -102,8 +103,8 @@ class Fitted:
         lit = self._witnesses
         height, *slope = kernels.surface_at(basis.grid, coefficients, ground[lit])
         seen = np.array(slope).T, ground[lit, 1], match.witness[lit], landing_spacing(ground)
-        about, drop = (0.0, self.level.sign, REACH), self.level.rear.drop_mm
-        level = find_level(height, *seen, drop, about, match.missing)
+        about, rear = (0.0, self.level.sign, REACH), (rig.head_sign, self.level.rear.drop_mm)
+        level = find_level(height, *seen, rear, about, match.missing)
         return np.asarray(coefficients + level.shift_mm)
 
     @cached_property
@@ -117,7 +118,7 @@ class Fitted:
 
         plane, match = self.rig.imaging_plane, self.match
         dots = plane.to_universal(match.plane_mm), match.plane_covariance_mm2
-        at = self.rig.laser.position_mm, plane.pose_mm[1:3], self.points_mm
+        at = self.rig.laser.position_mm, plane.pose_mm, self.points_mm
         return kernels.slope_weights(*at, *dots, self.settings.floor_mm)
 
     @cached_property

@@ -162,7 +162,7 @@ class _Model:
         covariance = np.broadcast_to(variance * np.eye(2), (len(self.points), 2, 2))
         laser, pose = rig.laser.position_mm, rig.imaging_plane.pose_mm
         dots = rig.imaging_plane.to_universal(self.plane)
-        self.weights = kernels.slope_weights(laser, pose[1:3], self.points, dots, covariance, 0.0)
+        self.weights = kernels.slope_weights(laser, pose, self.points, dots, covariance, 0.0)
         self.fitted = self.fit(self.points, pool.gradient(*self.points[:, :2].T))
         self.inward = self._inward(ground)
         self.dark = ~seen.hit & ~seen.absent & self.basis.contains(ground[..., 0], ground[..., 1])
