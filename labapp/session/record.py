@@ -55,9 +55,9 @@ class LaserReadings:
     picture_sha256
         The picture of the cross-hair, kept in the session; None where lengths were typed.
     fan_angle_sigma_deg
-        Standard uncertainty of the fan angle, degrees.
+        Standard uncertainty of the fan angle, degrees; None in files of before it was asked for.
     resolution_mm
-        Smallest step of the callipers, mm.
+        Smallest step of the callipers, mm; None likewise.
     """
 
     l1_mm: tuple[float, ...]
@@ -66,8 +66,8 @@ class LaserReadings:
     fan_angle_deg: float
     found: LaserCalibration
     picture_sha256: str | None = None
-    fan_angle_sigma_deg: float = 0.0
-    resolution_mm: float = 0.1
+    fan_angle_sigma_deg: float | None = None
+    resolution_mm: float | None = None
 
 
 @dataclass(frozen=True)
