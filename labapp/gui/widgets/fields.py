@@ -29,6 +29,9 @@ from labapp.gui.widgets.layouts import hbox, vbox
 MOUSE_MS = 20
 """How often it is checked whether the mouse button was released."""
 
+BUTTONS_PX = 26
+"""Room for the step buttons and the frame of a narrow field."""
+
 STEP_PAUSE_MS = 300
 """Steps that follow each other faster than this are one edit."""
 
@@ -435,8 +438,10 @@ class FieldForm(QWidget):
         self._grid.addWidget(field, row, 1)
         if beside is not None:
             beside.unit.hide()
+            digits = beside.editor.fontMetrics().horizontalAdvance("0.0000")
+            beside.editor.setMinimumWidth(digits + BUTTONS_PX)
             self._grid.addWidget(beside, row, 2)
-            self._grid.setColumnStretch(2, 2)
+            self._grid.setColumnStretch(2, 1)
         # Level with the editor's first line.
         height = field.editor.fontMetrics().lineSpacing() + 12
         field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))

@@ -155,7 +155,7 @@ class LaserPage(Page):
             form.add(each)
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
-        readings = wrapping_label("Readings, mm: a line each; three or more tell the ±")
+        readings = wrapping_label("Readings, mm: three lines or more")
         self.use_button = button("Use these", "", self.use)
         self.words = wrapping_label()
         self.result = ResultTable("The laser that follows")

@@ -119,7 +119,7 @@ UNCERTAIN_ONLY = ("Image calibration", (
 ASSUMED = {one.sigma_key: one.assumed for one in QUANTITIES}
 """What is assumed of each quantity where no standard uncertainty is entered."""
 
-TRAVELS = (("+y", "towards the laser, +Y"), ("-y", "away from the laser, −Y"))
+TRAVELS = (("+y", "towards +Y"), ("-y", "towards −Y"))
 
 
 def sigma_entry(entry: Entry) -> Entry | None:

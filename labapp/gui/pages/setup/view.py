@@ -189,7 +189,7 @@ class SetupPage(Page):
             for entry in entries:
                 form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
             if heading == "Torch":
-                tip = "Where the pool's head is; its rear, which may sink, is on the other side"
+                tip = "Where the pool's head is: +Y is the laser's side. The rear may lie low"
                 self.travel = ChoiceField("Welding", TRAVELS, tooltip=tip)
                 self.travel.edited.connect(
                     lambda way: self.workspace.attempt(
