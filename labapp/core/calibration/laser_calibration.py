@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import scipy.special
+import scipy
 
 from labapp.core.geometry.rig import Laser
 from labapp.core.values import FloatArray

@@ -180,6 +180,22 @@ def _in_glass(index: float, tangent2: float) -> float:
 
 
 @_inner
+def _through_glass(
+    x: float, z: float, away: tuple[float, float, float], along: float, plane: FloatArray
+) -> tuple[float, float]:
+    """Dot of a ray in a direction that would meet the plane at (x, z) without its glass.
+
+    ``along`` is what the direction has along the normal.
+    """
+    aside, up = 0.0, 0.0
+    for axis in range(3):
+        aside += away[axis] / abs(along) * plane[1, axis]
+        up += away[axis] / abs(along) * plane[2, axis]
+    shift = plane[4, 0] * (1.0 - _in_glass(plane[4, 1], aside * aside + up * up))
+    return x - shift * aside, z - shift * up
+
+
+@_inner
 def _reflected_dot(
     ray: FloatArray, point: FloatArray, slope_x: float, slope_y: float, plane: FloatArray
 ) -> tuple[float, float]:
@@ -201,12 +217,7 @@ def _reflected_dot(
         x += at * plane[1, axis]
         z += at * plane[2, axis]
     if plane[4, 0] > 0.0:
-        aside, up = 0.0, 0.0
-        for axis in range(3):
-            aside += away[axis] / abs(along) * plane[1, axis]
-            up += away[axis] / abs(along) * plane[2, axis]
-        shift = plane[4, 0] * (1.0 - _in_glass(plane[4, 1], aside * aside + up * up))
-        x, z = x - shift * aside, z - shift * up
+        return _through_glass(x, z, away, along, plane)
     return x, z
 
 
@@ -220,7 +231,7 @@ def _without_glass(
     for axis in range(3):
         gap += (plane[0, axis] - point[axis]) * plane[3, axis]
     air = abs(gap) - glass
-    if not (glass > 0.0 and air > 0.0):
+    if not air > 0.0:
         return dot
     x = dot[0] - point[0] - gap * plane[3, 0]
     y = dot[1] - point[1] - gap * plane[3, 1]
@@ -278,10 +289,9 @@ def intersect_and_reflect(
 
 @_inner
 def _bisecting_slopes(
-    laser: FloatArray, point: FloatArray, dot: tuple[float, float, float], plane: FloatArray
+    laser: FloatArray, point: FloatArray, dot_x: float, dot_y: float, dot_z: float
 ) -> tuple[float, float]:
     """Slopes that turn the ray from the laser at a point to a dot (`optics.bisecting_gradient`)."""
-    dot_x, dot_y, dot_z = _without_glass(point, dot, plane)
     to_x, to_y, to_z = point[0] - laser[0], point[1] - laser[1], point[2] - laser[2]
     on_x, on_y, on_z = dot_x - point[0], dot_y - point[1], dot_z - point[2]
     to = np.sqrt(to_x * to_x + to_y * to_y + to_z * to_z)
@@ -296,13 +306,17 @@ def _slope_jacobian(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Rows of ∂(slopes at a point)/∂(its dot along either axis of the plane), mm⁻¹."""
     step = DOT_STEP_MM
-    base_x, base_y = _bisecting_slopes(laser, point, (dot[0], dot[1], dot[2]), plane)
     by = plane[1]
-    moved = dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
-    x, y = _bisecting_slopes(laser, point, moved, plane)
+    across = dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
     by = plane[2]
-    moved = dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
-    u, v = _bisecting_slopes(laser, point, moved, plane)
+    up = dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
+    own = dot[0], dot[1], dot[2]
+    if plane[4, 0] > 0.0:
+        own, across = _without_glass(point, own, plane), _without_glass(point, across, plane)
+        up = _without_glass(point, up, plane)
+    base_x, base_y = _bisecting_slopes(laser, point, own[0], own[1], own[2])
+    x, y = _bisecting_slopes(laser, point, across[0], across[1], across[2])
+    u, v = _bisecting_slopes(laser, point, up[0], up[1], up[2])
     return (
         ((x - base_x) / step, (u - base_x) / step),
         ((y - base_y) / step, (v - base_y) / step),
@@ -533,14 +547,16 @@ def gradient_rhs(
     are the inverse covariances of these slopes, shape (n, 2, 2).
     """
     out, work = np.zeros(len(coefficients)), np.empty((4, 4))
-    many = int(grid[1, 3]) + 3
+    many, glass = int(grid[1, 3]) + 3, plane[4, 0] > 0.0
     for k in range(len(points)):
         x, y = points[k, 0], points[k, 1]
         _, slope_x, slope_y = _height_and_slopes(grid, coefficients, x, y, work)
         first_x = _cubic_splines(grid[0], x, work[0], work[1])
         first_y = _cubic_splines(grid[1], y, work[2], work[3])
-        dot = dots[k, 0], dots[k, 1], dots[k, 2]
-        asked_x, asked_y = _bisecting_slopes(laser, points[k], dot, plane)
+        at = dots[k, 0], dots[k, 1], dots[k, 2]
+        if glass:
+            at = _without_glass(points[k], at, plane)
+        asked_x, asked_y = _bisecting_slopes(laser, points[k], at[0], at[1], at[2])
         off_x, off_y = asked_x - slope_x, asked_y - slope_y
         pull_x = weights[k, 0, 0] * off_x + weights[k, 0, 1] * off_y
         pull_y = weights[k, 1, 0] * off_x + weights[k, 1, 1] * off_y
@@ -1024,7 +1040,10 @@ def fit_quadrics(
                     for axis in range(3):
                         dot[axis] = plane[0, axis] + place[0] * plane[1, axis]
                         dot[axis] += place[1] * plane[2, axis]
-                    asked = _bisecting_slopes(laser, point, (dot[0], dot[1], dot[2]), plane)
+                    at = dot[0], dot[1], dot[2]
+                    if plane[4, 0] > 0.0:
+                        at = _without_glass(point, at, plane)
+                    asked = _bisecting_slopes(laser, point, at[0], at[1], at[2])
                     x, y = point[0] - center[0], point[1] - center[1]
                     by[0, 0], by[0, 2], by[0, 3] = 1.0, x, y
                     by[1, 1], by[1, 3], by[1, 4] = 1.0, x, y
