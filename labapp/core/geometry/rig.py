@@ -1,7 +1,7 @@
 """What is bolted to the bench: laser, dot pattern, electrode, imaging plane.
 
 All positions are in the universal coordinate system (UCS): origin on the work piece under the
-electrode tip, Y along the welding direction, Z up, X to the right as the camera sees it; mm.
+electrode tip, Y along the weld, towards the laser, Z up, X to the right as the camera sees it; mm.
 """
 
 from __future__ import annotations

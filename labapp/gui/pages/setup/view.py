@@ -181,7 +181,7 @@ class SetupPage(Page):
         hbox(load, save, usual, of=buttons)
         form.add_wide(buttons)
         form.add_wide(self.refused)
-        self.status = wrapping_label()
+        self.status = Message(2)
         form.add_wide(self.status)
         form.add_wide(wrapping_label("Right: ±, one standard uncertainty. In grey: assumed."))
         for heading, entries in RIG:
