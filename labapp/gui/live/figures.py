@@ -126,7 +126,7 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
     told.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
     if age_s <= OLD_S:
         told[-1] += f"; {age_s:.2f} s old"
-    if found.setup_status:
+    if found.setup_status in SETUP_WORDS:
         told[-1] += f". {SETUP_WORDS[found.setup_status]}"
     return " ".join(told)
 

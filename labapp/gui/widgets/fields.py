@@ -440,7 +440,7 @@ class FieldForm(QWidget):
             beside.unit.hide()
             digits = beside.editor.fontMetrics().horizontalAdvance("0.0000")
             beside.editor.setMinimumWidth(digits + BUTTONS_PX)
-            self._grid.addWidget(beside, row, 2)
+            self._grid.addWidget(beside, row, 2, Qt.AlignmentFlag.AlignTop)
             self._grid.setColumnStretch(2, 1)
         # Level with the editor's first line.
         height = field.editor.fontMetrics().lineSpacing() + 12
