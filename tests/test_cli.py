@@ -543,13 +543,31 @@ def test_calibrate_laser_prints_and_writes(labapp: Run, tmp_path: Path) -> None:
     found = [float(number) for number in re.findall(r"([\d.]+) ±", said)]
     assert found == pytest.approx([30, 90, 45], abs=0.01)
     written = tomllib.loads(setup.read_text())
-    assert written == {
-        "laser": {
-            "projection_angle_deg": pytest.approx(30, abs=0.01),
-            "distance_mm": pytest.approx(90, abs=0.01),
-        }
-    }
+    laser = written.pop("laser")
+    assert not written
+    assert (laser["projection_angle_deg"], laser["distance_mm"]) == pytest.approx(
+        (30, 90), abs=0.01
+    )
+    told = [float(number) for number in re.findall(r"± ([\d.]+)", said)][:2]
+    sigmas = [laser["projection_angle_deg_sigma"], laser["distance_mm_sigma"]]
+    assert sigmas == pytest.approx(told, abs=1e-3)
+    shared = laser["angle_distance_correlation"]
+    assert f"correlation      {shared:+.2f}" in said
     assert f"{setup}: pattern: missing" in complained
+
+
+def test_a_setup_of_two_calibrations_is_calibrated(labapp: Run, tmp_path: Path) -> None:
+    from labapp.config.setup import read_setup
+
+    setup = tmp_path / "setup.toml"
+    setup.write_bytes(SETUP.read_bytes())
+    lengths = "--l1 4.64 --l1 4.68 --l2 6.26 --l2 6.21 --l3 2.75 --l3 2.78".split()
+    known = ["--fan-angle-sigma", 0.05, "--resolution", 0.01, "--setup", setup]
+    assert labapp("calibrate", "laser", *lengths, *known)[0] == 0
+    assert read_setup(setup).rig.uncertainty.status == "entered"
+    picture = SAMPLE / "calibration.png"
+    assert labapp("calibrate", "plane", picture, "--unit-mm", 6.35, "--setup", setup)[0] == 0
+    assert read_setup(setup).rig.uncertainty.status == "calibrated"
 
 
 @pytest.mark.parametrize("l1", ["nan", "-1", "3", "x"])

@@ -139,7 +139,8 @@ def budget(
 ) -> None:
     """Work out the error budget of a set-up for a kind of pool: predicted and simulated.
 
-    The calibration is taken to be known to 0.1 mm, 0.1 degrees and 0.1 px, a dot to 0.3 px.
+    The set-up is known as its file says, or as is assumed; that of §8.3.1 to 0.1 mm, 0.1 degrees
+    and 0.1 px. A dot is known to 0.3 px.
     """
     from labapp.config.setup import read_setup
 

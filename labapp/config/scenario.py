@@ -96,7 +96,11 @@ def read_scenario(
     path = Path(path)
     text = read_text(path, A_SCENARIO)
     values = parse_toml(text, path, A_SCENARIO)
-    bench = {table: keys for table, keys in values.items() if table in SECTIONS}
+    values, torch = _without_travel(values)
+    bench = {
+        table: keys for table, keys in values.items() if table in SECTIONS and table != "torch"
+    }
+    bench |= torch
     setup = tomlkit.dumps(bench)
     problems = _check(path, values)
     try:
@@ -117,6 +121,16 @@ def read_scenario(
     recording |= {} if seed is None else {"seed": seed}
     made = _recording(path, {**values, "recording": recording}, rig)
     return Scenario(made, setup, text)
+
+
+def _without_travel(values: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Split [torch] into what hides rays, the simulation's, and how it moves, the set-up's."""
+    keys = values.get("torch")
+    if not isinstance(keys, dict) or "travel" not in keys:
+        return values, {}
+    rest = {key: value for key, value in keys.items() if key != "travel"}
+    others = {table: keys for table, keys in values.items() if table != "torch"}
+    return others | ({"torch": rest} if rest else {}), {"torch": {"travel": keys["travel"]}}
 
 
 # --- what is wrong ------------------------------------------------------------------------------
@@ -181,7 +195,7 @@ def _recording(path: Path, values: dict[str, Any], rig: Rig) -> Recording:
         rig=rig,
         view=_view(path, values["image_calibration"], values.get("camera", {})),
         look=look,
-        pools=_pools(path, values["pool"], times_s, wanted["seed"]),
+        pools=_pools(path, values["pool"], times_s, wanted["seed"], rig.head_sign),
         seed=wanted["seed"],
         frame_rate_hz=float(rate),
         exposure_s=exposure_s,
@@ -202,6 +216,7 @@ def _view(path: Path, calibration: dict[str, Any], camera: dict[str, Any]) -> Ca
     points: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in calibration.items()
+        if not key.endswith("_sigma")
     }
     try:
         return CameraView(**points, **size, lens=Lens(**bent) if bent else None)
@@ -210,7 +225,7 @@ def _view(path: Path, calibration: dict[str, Any], camera: dict[str, Any]) -> Ca
 
 
 def _pools(
-    path: Path, keys: dict[str, Any], times_s: FloatArray, seed: int
+    path: Path, keys: dict[str, Any], times_s: FloatArray, seed: int, head_sign: int
 ) -> tuple[TruePool, ...]:
     """The pool of every frame."""
     if keys["shape"] == "surface":
@@ -222,7 +237,8 @@ def _pools(
         )
         return (surface,) * len(times_s)
     try:
-        pool = Pool(_footprint(keys), keys["height_mm"], _terms(keys), keys.get("fullness"))
+        terms = _terms(keys, head_sign)
+        pool = Pool(_footprint(keys, head_sign), keys["height_mm"], terms, keys.get("fullness"))
         sizes = 1 + keys.get("wander_percent", 0) / 100 * _course(times_s, seed)
         return tuple(
             _sized(pool, *size).after(time)
@@ -232,14 +248,16 @@ def _pools(
         raise InputError(path, "pool", error, "a pool that can be") from error
 
 
-def _footprint(keys: dict[str, Any]) -> Footprint:
+def _footprint(keys: dict[str, Any], head_sign: int) -> Footprint:
+    """Area of a pool; `Footprint` takes its ends by +Y and −Y, whatever the head is."""
     width = keys["diameter_mm"] if keys["shape"] == "cap" else keys["width_mm"]
     half = keys.get("length_mm", width) / 2
     head, tail = keys.get("head_mm", half), keys.get("tail_mm", half)
-    return Footprint(width, head, tail, tuple(keys.get("center_mm", (0.0, 0.0))))
+    ahead, behind = (head, tail)[::head_sign]
+    return Footprint(width, ahead, behind, tuple(keys.get("center_mm", (0.0, 0.0))))
 
 
-def _terms(keys: dict[str, Any]) -> tuple[Term, ...]:
+def _terms(keys: dict[str, Any], head_sign: int) -> tuple[Term, ...]:
     dents = [
         Dent(**{**dent, "offset_mm": tuple(dent.get("offset_mm", (0.0, 0.0)))})
         for dent in _several(keys.get("dent"))
@@ -249,7 +267,8 @@ def _terms(keys: dict[str, Any]) -> tuple[Term, ...]:
         given = {key: wave[key] for key in wave if key not in ("kind", "mode")}
         travelling = wave.get("kind") == "travelling"
         waves.append(Wave(tuple(wave["mode"]), **given, travelling=travelling))
-    return (*dents, *(LowRear(**rear) for rear in _several(keys.get("low_rear"))), *waves)
+    rears = [LowRear(**rear, towards=-head_sign) for rear in _several(keys.get("low_rear"))]
+    return (*dents, *rears, *waves)
 
 
 def _sized(pool: Pool, width: float, length: float, height: float) -> Pool:

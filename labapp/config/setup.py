@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,12 @@ from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.geometry.uncertainty import (
+    CALIBRATED,
+    AxisPoints,
+    RigUncertainty,
+    covariance_of,
+)
 from labapp.errors import InputError
 from labapp.files import write_atomically
 
@@ -114,7 +119,11 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
 def updated_setup(
     text: str, path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]
 ) -> str:
-    """Text of a setup with keys set; ``path`` is for errors. See `update_setup`."""
+    """Text of a setup with keys set; ``path`` is for errors. See `update_setup`.
+
+    A calibrated value that is changed without its standard uncertainty loses it: what a
+    calibration found is not known of another value.
+    """
     try:
         document = tomlkit.parse(text)
     except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
@@ -126,11 +135,21 @@ def updated_setup(
         if not isinstance(table, Table):
             raise InputError(path, section, shown(table), f"a table: [{section}]")
         for key, value in keys.items():
+            if table.get(key) == value:
+                continue
+            if f"{section}.{key}" in _CALIBRATED_KEYS:
+                for known in (f"{key}_sigma", *_SHARED.get(section, ())):
+                    if known in table and known not in keys:
+                        table.remove(known)
             if value is not None:
                 table[key] = value
             elif key in table:
                 table.remove(key)
     return tomlkit.dumps(document)
+
+
+_CALIBRATED_KEYS = frozenset(key.partition("[")[0] for key in CALIBRATED)
+_SHARED = {"laser": ("angle_distance_correlation",)}
 
 
 def pattern_values(pattern: DotPattern) -> dict[str, object]:
@@ -168,6 +187,11 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
         for i, j in pattern.get("absent", [])
         if not (1 <= i <= rows and 1 <= j <= columns)
     ]
+    plane = values["imaging_plane"]
+    if plane.get("glass_mm", 0.0) >= plane["distance_mm"]:
+        expected = f"a number below the plane's distance, {plane['distance_mm']:g} (mm)"
+        glass = plane["glass_mm"]
+        problems.append(InputError(path, "imaging_plane.glass_mm", glass, expected))
     steps = max(rows, columns) - 1
     if steps * step >= 90:
         problems.append(
@@ -236,14 +260,15 @@ def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
         points.get("z_axis_mm", plane["height_mm"] / 2),
     )
     told = {
-        f"{section}.{key}": sigma for section in values for key, sigma in values[section].items()
+        f"{section}.{key}": given for section in values for key, given in values[section].items()
     }
     return Rig(
         Laser(**laser),
         dot_pattern(values["pattern"]),
         Electrode(**values["electrode"]),
-        _imaging_plane(**_without_sigmas(plane)),
+        _imaging_plane(plane),
         RigUncertainty(axes, *covariance_of(told, correlation)),
+        **values.get("torch", {}),
     )
 
 
@@ -251,18 +276,16 @@ def _without_sigmas(keys: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in keys.items() if not key.endswith("_sigma")}
 
 
-def _imaging_plane(
-    distance_mm: float,
-    s_mm: float,
-    h_mm: float,
-    width_mm: float,
-    height_mm: float,
-    pitch_deg: float = 0.0,
-    yaw_deg: float = 0.0,
-    roll_deg: float = 0.0,
-) -> ImagingPlane:
-    origin = np.array([-s_mm, -distance_mm, h_mm], float)
-    return ImagingPlane.of_angles(origin, (pitch_deg, yaw_deg, roll_deg), width_mm, height_mm)
+def _imaging_plane(keys: Mapping[str, Any]) -> ImagingPlane:
+    origin = np.array([-keys["s_mm"], -keys["distance_mm"], keys["h_mm"]], float)
+    pitch, yaw, roll = (keys.get(f"{turn}_deg", 0.0) for turn in ("pitch", "yaw", "roll"))
+    size = keys["width_mm"], keys["height_mm"]
+    plane = ImagingPlane.of_angles(origin, (pitch, yaw, roll), *size)
+    return replace(
+        plane,
+        glass_mm=keys.get("glass_mm", plane.glass_mm),
+        glass_index=keys.get("glass_index", plane.glass_index),
+    )
 
 
 def _calibration(values: dict[str, Any]) -> ImageCalibration:

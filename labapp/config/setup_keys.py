@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 
 from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number, within
 from labapp.core.geometry.patterns import PATTERNS
+from labapp.core.geometry.rig import Travel
 from labapp.core.geometry.uncertainty import QUANTITIES
 
 _LENGTH = between(0, LARGEST_MM, "mm")
@@ -107,6 +110,8 @@ SECTIONS = {
         "pitch_deg": _TILT,
         "yaw_deg": _TILT,
         "roll_deg": _TILT,
+        "glass_mm": within(0, 100, "mm"),
+        "glass_index": within(1, 4, "refractive index"),
         **_sigmas("imaging_plane"),
     },
     "image_calibration": {**THREE_POINTS, **HOMOGRAPHY, **_sigmas("image_calibration")},
@@ -120,10 +125,17 @@ SECTIONS = {
         ),
         **_sigmas("camera_lens"),
     },
+    "torch": {
+        "travel": Rule(
+            " or ".join(f'"{way}"' for way in get_args(Travel)),
+            lambda value: value in get_args(Travel),
+            required=False,
+        ),
+    },
 }
 """Every section and key; `image_calibration` holds the keys of one of its two forms."""
 
-OPTIONAL = ("camera_lens",)
+OPTIONAL = ("camera_lens", "torch")
 """Sections that need not be there."""
 
 

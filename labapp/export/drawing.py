@@ -230,7 +230,7 @@ class Drawing:
             return
         axes = self._axes_actor = self._axes_actor or self.plotter.show_bounds(
             xtitle="X (mm)",
-            ytitle="Y, welding direction (mm)",
+            ytitle="Y, along the weld (mm)",
             ztitle="Z (mm)",
             n_zlabels=2,
             fmt="%.1f",

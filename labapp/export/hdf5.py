@@ -41,7 +41,7 @@ LIBRARY = ("v108", "v108")
 
 AXES = (
     Column("x_mm", "X of the grid's columns"),
-    Column("y_mm", "Y of the grid's rows, along the welding direction"),
+    Column("y_mm", "Y of the grid's rows, along the weld"),
     Column("z_mm", "height above the work piece, [row, column]; NaN outside the boundary"),
 )
 

@@ -12,6 +12,7 @@ from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
+from labapp.text import SETUP_WORDS
 
 MEANS = {
     "width": "width_mm",
@@ -71,6 +72,8 @@ class Summary:
             if len(values) > 1:
                 words += [f"(mean; standard deviation {np.std(values):.4f} mm)"]
             lines.append(f"{label:7}{np.mean(values):z8.4f} {' '.join(words)}")
+        if self.example is not None and self.example.measurement.setup_status:
+            lines.append(SETUP_WORDS[self.example.measurement.setup_status])
         return "\n".join(lines)
 
 

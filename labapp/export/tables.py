@@ -86,7 +86,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("ray_row", "row i of the ray, from 1", 0),
         Column("ray_column", "column j of the ray, from 1", 0),
         Column("x_mm", "X of the reflection point"),
-        Column("y_mm", "Y of the reflection point, along the welding direction"),
+        Column("y_mm", "Y of the reflection point, along the weld"),
         Column("z_mm", "height of the reflection point above the work piece"),
         Column("residual_mm", "distance of computed and captured dot on the imaging plane"),
         Column("sigma_mm", f"standard uncertainty of the height, {HEIGHT_SIGMA_OF}"),

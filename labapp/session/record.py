@@ -54,6 +54,10 @@ class LaserReadings:
         What follows from them.
     picture_sha256
         The picture of the cross-hair, kept in the session; None where lengths were typed.
+    fan_angle_sigma_deg
+        Standard uncertainty of the fan angle, degrees; None in files of before it was asked for.
+    resolution_mm
+        Smallest step of the callipers, mm; None likewise.
     """
 
     l1_mm: tuple[float, ...]
@@ -62,6 +66,8 @@ class LaserReadings:
     fan_angle_deg: float
     found: LaserCalibration
     picture_sha256: str | None = None
+    fan_angle_sigma_deg: float | None = None
+    resolution_mm: float | None = None
 
 
 @dataclass(frozen=True)

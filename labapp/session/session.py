@@ -17,7 +17,10 @@ from labapp.session.file.schema import NO_FRAME
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from labapp.core.calibration.laser_calibration import LaserCalibration
+    from labapp.core.calibration.laser_calibration import (
+        LaserCalibration,
+        LaserCalibrationSettings,
+    )
     from labapp.core.calibration.plane_calibration import PlaneCalibration
     from labapp.core.pipeline import Measurement, Settings
     from labapp.core.rows.correction import Correction
@@ -104,25 +107,32 @@ class Session(SessionContents):
         l3_mm: Sequence[float],
         fan_angle_deg: float = 10.0,
         picture: GreyImage | None = None,
+        settings: LaserCalibrationSettings | None = None,
     ) -> LaserCalibration:
         """Calibrate the laser from its cross-hair (Appendix I), update the rig, store the picture.
+
+        Values, standard uncertainties and their correlation go into the set-up.
 
         Raises
         ------
         ValueError
             If no laser can have drawn such a cross.
         """
-        from labapp.core.calibration.laser_calibration import calibrate_laser
+        from labapp.core.calibration.laser_calibration import (
+            LaserCalibrationSettings,
+            calibrate_laser,
+        )
         from labapp.session.record import LaserReadings
 
-        found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg)
+        settings = settings or LaserCalibrationSettings()
+        found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg, settings)
         kept = None if picture is None else self._pictures.add("cross-hair", picture)
         lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
-        readings = LaserReadings(*lengths, fan_angle_deg, found, kept)
-        laser = {"projection_angle_deg": found.angle_deg, "distance_mm": found.distance_mm}
+        known = settings.fan_angle_sigma_deg, settings.resolution_mm
+        readings = LaserReadings(*lengths, fan_angle_deg, found, kept, *known)
         values: dict[Key, Any] = {
             ("laser-calibration", NO_FRAME): readings,
-            ("setup", NO_FRAME): self._updated_setup({"laser": laser}),
+            ("setup", NO_FRAME): self._updated_setup({"laser": found.setup_keys}),
         }
         self._documents.change("laser calibration", values)
         return found

@@ -274,7 +274,29 @@ def _hits_again(pool: PoolSurface, point: FloatArray, direction: FloatArray) -> 
 def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> FloatArray:
     """Where the reflected rays meet the plane, (X′, Z′), shape (…, 2), mm; NaN where never.
 
-    Solves ``O′ + X′·x + Z′·z = P + t·d`` for X′, Z′ and t, ray by ray.
+    Before glass they are followed to its face, and refracted there by Snell's law for vectors.
+    """
+    plane = rig.imaging_plane
+    if not plane.glass_mm:
+        return _meet(np.asarray(plane.origin_mm), point, direction, rig)[0]
+    inwards = np.cross(plane.x_axis, plane.z_axis)
+    inwards *= np.sign(np.nanmean((plane.origin_mm - point) @ inwards))
+    face, t = _meet(plane.origin_mm - plane.glass_mm * inwards, point, direction, rig)
+    cosine = direction @ inwards
+    ratio = 1.0 / plane.glass_index
+    with np.errstate(invalid="ignore"):
+        root = np.sqrt(1.0 - ratio**2 * (1.0 - cosine**2))
+    refracted = ratio * direction + (root - ratio * cosine)[..., None] * inwards
+    entered = np.where(np.isfinite(face[..., :1]), point + t[..., None] * direction, np.nan)
+    return _meet(np.asarray(plane.origin_mm), entered, refracted, rig)[0]
+
+
+def _meet(
+    origin: FloatArray, point: FloatArray, direction: FloatArray, rig: Rig
+) -> tuple[FloatArray, FloatArray]:
+    """Where rays meet a plane parallel to the imaging plane, (X′, Z′) from its origin, and t.
+
+    Solves ``O + X′·x + Z′·z = P + t·d`` for X′, Z′ and t, ray by ray.
     """
     plane = rig.imaging_plane
     axes = np.stack([plane.x_axis, plane.z_axis], axis=-1)
@@ -284,9 +306,9 @@ def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> Flo
     with np.errstate(invalid="ignore"):
         meets = np.abs(np.linalg.det(system)) > 1e-12
     solution = np.full(point.shape, np.nan)
-    offset = point - np.asarray(plane.origin_mm)
+    offset = point - origin
     solution[meets] = np.linalg.solve(system[meets], offset[meets][..., None])[..., 0]
-    return np.where(solution[..., 2:] > 0, solution[..., :2], np.nan)
+    return np.where(solution[..., 2:] > 0, solution[..., :2], np.nan), solution[..., 2]
 
 
 def _reflected_numbers(ray: IntArray, orientation: Orientation) -> IntArray:

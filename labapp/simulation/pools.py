@@ -148,18 +148,23 @@ class Dent:
 
 @dataclass(frozen=True)
 class LowRear:
-    """A tail that sinks smoothly to ``drop_mm`` below the work piece at its end (§7.2)."""
+    """A tail that sinks smoothly to ``drop_mm`` below the work piece at its end (§7.2).
+
+    ``towards`` is −1 for a tail at −Y, +1 for one at +Y.
+    """
 
     drop_mm: float
+    towards: int = -1
 
     def height(self, place: Place) -> FloatArray:
         """Height that it adds, mm."""
-        return -self.drop_mm * np.maximum(-place.q, 0) ** 3
+        return -self.drop_mm * np.maximum(self.towards * place.q, 0) ** 3
 
     def gradient(self, place: Place) -> FloatArray:
         """Gradient that it adds, shape (…, 2)."""
         return place.gradient(
-            np.zeros_like(place.q), 3 * self.drop_mm * np.maximum(-place.q, 0) ** 2
+            np.zeros_like(place.q),
+            -3 * self.towards * self.drop_mm * np.maximum(self.towards * place.q, 0) ** 2,
         )
 
 

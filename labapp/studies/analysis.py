@@ -6,7 +6,7 @@ A part consists of tables and pictures by file name: the command writes them, th
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from labapp.errors import InputError
@@ -155,6 +155,9 @@ def _images(options: AnalysisOptions, progress: Progress | None) -> AnalysisPart
 
 
 def _parameters(options: AnalysisOptions, progress: Progress | None) -> AnalysisPart:
+    import numpy as np
+
+    from labapp.core.geometry.uncertainty import QUANTITIES
     from labapp.simulation.pools import spherical_cap
     from labapp.studies import image_error, pictures
     from labapp.studies import parameter_deviation as deviation
@@ -166,8 +169,12 @@ def _parameters(options: AnalysisOptions, progress: Progress | None) -> Analysis
             found[surface, scheme] = deviation.parameter_deviation(
                 known, scheme, draws=options.draws, progress=progress
             )
-        names = [quantity.name for quantity in deviation.QUANTITIES]
-        values = {str(one): 100 * found[surface, one].contribution[:, 0] for one in options.schemes}
+        uncertain = np.flatnonzero(known.uncertainty.sigma)
+        names = [QUANTITIES[k].name for k in uncertain]
+        values = {
+            str(one): 100 * np.abs(found[surface, one].contribution[uncertain, 0])
+            for one in options.schemes
+        }
         label = f"standard uncertainty of the height, {surface} 6 mm × 0.3 mm (%)"
         drawn[f"parameter_deviation_{surface}"] = pictures.bars_picture(names, values, label)
     table = deviation.deviation_table(found)
@@ -191,7 +198,7 @@ def analyze_budget(
     Parameters
     ----------
     setup
-        None: that of §8.3.1 with a 4″ plane.
+        None: that of §8.3.1 with a 4″ plane, known to `parameter_deviation.NOMINAL`.
     pool
         The kind: see `expected_pool`.
     progress
@@ -213,13 +220,12 @@ def analyze_budget(
 
 def _bench(setup: Setup | None) -> Bench:
     from labapp.studies.image_error import BENCH, VIEW, axes_of
-    from labapp.studies.parameter_deviation import AxisPoints
+    from labapp.studies.parameter_deviation import nominal
     from labapp.studies.setup_budget import Bench
 
-    if setup is None:
-        return Bench(BENCH, axes_of(VIEW))
-    plane = setup.rig.imaging_plane
-    return Bench(setup.rig, AxisPoints(setup.calibration, plane.width_mm / 2, plane.height_mm / 2))
+    if setup is None or setup.rig.uncertainty is None:
+        return Bench(BENCH, nominal(axes_of(VIEW)))
+    return Bench(replace(setup.rig, uncertainty=None), setup.rig.uncertainty)
 
 
 def expected_pool(width: float, length: float, height: float) -> Pool:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.config.setup import Setup
-from labapp.core.geometry.perturbation import moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.pipeline import Measurement, Settings, reconstruct
 from labapp.core.surface.measures import SIZES, measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
+from labapp.studies.parameter_deviation import move
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,10 @@ def setup_budget(
     if known is None:
         return ()
 
+    exact = replace(setup.rig, uncertainty=None)
+
     def sizes(offset: FloatArray) -> FloatArray:
-        dots = moved_dots(match.plane_mm, setup.rig, known.axes, offset)
-        moved, rig = replace(match, plane_mm=dots), moved_rig(setup.rig, offset)
+        moved, rig = move(match, exact, known.axes, offset)
         try:
             size = measure_surface(reconstruct(moved, rig, settings), moved, rig)
         except CannotMeasure:
@@ -84,8 +85,8 @@ def setup_budget(
 
 def total(own: FloatArray, contributions: Sequence[Contribution], rig: Rig) -> FloatArray:
     """± of sizes, shape (6,), by what they have of their own and the set-up; NaN counts as 0."""
-    variance = np.nan_to_num(own) ** 2
-    if rig.uncertainty is not None and contributions:
-        changes = np.nan_to_num([one.change for one in contributions])
-        variance += np.einsum("qs,qr,rs->s", changes, rig.uncertainty.correlation, changes)
-    return np.asarray(np.sqrt(variance))
+    own = np.nan_to_num(own)
+    if rig.uncertainty is None or not contributions:
+        return own
+    changes = np.nan_to_num([one.change for one in contributions])
+    return np.hypot(own, rig.uncertainty.combined(changes.T))

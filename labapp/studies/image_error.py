@@ -13,6 +13,7 @@ import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import AxisPoints
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.pipeline import measure as measure_frame
 from labapp.core.surface.measures import measure_surface
@@ -29,7 +30,7 @@ from labapp.studies.error_analysis import (
     relative_errors,
     trace_once,
 )
-from labapp.studies.parameter_deviation import AxisPoints, KnownPool
+from labapp.studies.parameter_deviation import KnownPool, nominal
 from labapp.studies.tables import Table
 from labapp.text import pluralize
 
@@ -107,7 +108,7 @@ def axes_of(view: CameraView) -> AxisPoints:
 
 def exactly_seen(cap: Pool, rig: Rig, view: CameraView = VIEW) -> KnownPool:
     """A known pool with its dots where they truly are; those that miss the plane are lost."""
-    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, axes_of(view))
+    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, nominal(axes_of(view)))
 
 
 def frame_errors(
@@ -142,7 +143,9 @@ def _frame_errors(task: tuple[Pool, Rig, int, tuple[str, ...]]) -> FrameErrors:
     known = exactly_seen(cap, rig)
     exact = np.array([_sizes(known, scheme) for scheme in schemes])
     frame = rendered(cap, rig, number)
-    seen = measure_frame(frame.image, rig, known.axes.calibration, circle_settings(schemes[-1]))
+    seen = measure_frame(
+        frame.image, rig, known.uncertainty.axes.calibration, circle_settings(schemes[-1])
+    )
     off, missed = _off(seen, frame)
     errors = np.full_like(exact, np.nan)
     if seen.match is not None:

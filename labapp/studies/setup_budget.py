@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import QUANTITIES, RigUncertainty
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
@@ -20,16 +21,7 @@ from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool
 from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, PredictedError, predict_error
 from labapp.studies.error_analysis import relative_errors
-from labapp.studies.parameter_deviation import (
-    NOMINAL,
-    OFFSETS,
-    QUANTITIES,
-    AxisPoints,
-    KnownPool,
-    by_quantity,
-    moved_errors,
-    spread,
-)
+from labapp.studies.parameter_deviation import KnownPool, moved_errors
 from labapp.studies.tables import Table
 
 POOLS, MOVED_POOLS = 24, 6
@@ -45,17 +37,14 @@ class Bench:
 
     Parameters
     ----------
-    rig, axes
-        The set-up.
-    sigma
-        Standard uncertainties of `QUANTITIES`.
+    rig, uncertainty
+        The set-up, and how well it is known.
     dot_sigma_mm
         Standard uncertainty of a dot's place on the plane.
     """
 
     rig: Rig
-    axes: AxisPoints
-    sigma: tuple[float, ...] = NOMINAL
+    uncertainty: RigUncertainty
     dot_sigma_mm: float = DOT_SIGMA_MM
 
 
@@ -65,19 +54,20 @@ class SetupBudget(ReadOnlyArrays):
 
     Parameters
     ----------
-    pool
-        The pool that is expected.
+    pool, uncertainty
+        The pool that is expected, and how well the bench is known.
     predicted
         The error of each of the m pools, predicted.
     random
         Relative height error of each, simulated without calibration errors, shape (m,); NaN
         where there was no surface.
     parameters
-        Relative height error from each of `QUANTITIES`, simulated: root mean square over some of
-        the pools, shape (8,).
+        Relative change of the height by the standard uncertainty of each of `QUANTITIES`,
+        simulated: of some of the pools, shape (k, q).
     """
 
     pool: Pool
+    uncertainty: RigUncertainty
     predicted: tuple[PredictedError, ...]
     random: FloatArray
     parameters: FloatArray
@@ -94,9 +84,10 @@ def setup_budget(
     moved = np.array([changes for _, _, changes in found[:MOVED_POOLS]])
     return SetupBudget(
         pool=pool,
+        uncertainty=bench.uncertainty,
         predicted=tuple(predicted for predicted, _, _ in found),
         random=np.array([error for _, error, _ in found]),
-        parameters=np.sqrt(np.nanmean(moved**2, axis=0)),
+        parameters=moved,
     )
 
 
@@ -119,7 +110,7 @@ def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, Fl
     bench, pool, number = task
     rig, rng = bench.rig, np.random.default_rng([831, number])
     predicted = predict_error(
-        pool, rig, dot_sigma_mm=bench.dot_sigma_mm, sigma=bench.sigma, axes=bench.axes
+        pool, rig, dot_sigma_mm=bench.dot_sigma_mm, uncertainty=bench.uncertainty
     )
     match = exact_match(trace(pool, rig), rig, sigma_mm=bench.dot_sigma_mm, rng=rng)
     changes = np.full(len(QUANTITIES), np.nan)
@@ -129,12 +120,12 @@ def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, Fl
     except CannotMeasure:
         return predicted, float("nan"), changes
     if number < MOVED_POOLS:
-        known = KnownPool(pool, match, rig, bench.axes)
-        half = np.zeros(OFFSETS)
-        for k, step in enumerate(np.diag(spread(bench.sigma))):
+        known = KnownPool(pool, match, rig, bench.uncertainty)
+        changes[:] = 0.0
+        for k in np.flatnonzero(bench.uncertainty.sigma):
+            step = np.diag(bench.uncertainty.sigma)[k]
             both = [moved_errors((known, way * step, "fit"))[0] for way in (1, -1)]
-            half[k] = (both[0] - both[1]) / 2
-        changes = by_quantity(half)
+            changes[k] = (both[0] - both[1]) / 2
     return predicted, error, changes
 
 
@@ -151,11 +142,12 @@ def budget_table(budget: SetupBudget) -> Table:
         rows.append((name, _rms([getattr(p, part) for p in budget.predicted]) / height, None))
     random = [one.random_mm for one in budget.predicted]
     rows.append(("these together", _rms(random) / height, _rms(budget.random)))
-    for k, quantity in enumerate(QUANTITIES):
+    for k in np.flatnonzero(budget.uncertainty.sigma):
         each = [one.parameters_mm[k] for one in budget.predicted]
-        rows.append((quantity.name, _rms(each) / height, float(budget.parameters[k])))
+        rows.append((QUANTITIES[k].name, _rms(each) / height, _rms(budget.parameters[:, k])))
     total = [one.total_mm for one in budget.predicted]
-    simulated = float(np.hypot(_rms(budget.random), np.linalg.norm(budget.parameters)))
+    by_setup = budget.uncertainty.combined(budget.parameters)
+    simulated = float(np.hypot(_rms(budget.random), _rms(by_setup)))
     rows.append(("everything", _rms(total) / height, simulated))
     percent = [(n, *(None if v is None else 100 * float(v) for v in values)) for n, *values in rows]
     lost = int(np.isnan(budget.random).sum())

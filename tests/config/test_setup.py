@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from labapp.config.setup import read_setup, update_setup
 from labapp.core.geometry.rig import Laser
-from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, QUANTITIES
+from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, QUANTITIES
 from labapp.errors import InputError
 
 SETUP = """\
@@ -380,3 +380,53 @@ def test_a_lens_may_be_known_by_its_uncertainty_alone(path: Path) -> None:
     assert setup.calibration.lens is None
     assert setup.rig.uncertainty is not None
     assert setup.rig.uncertainty.sigma[-1] == 0.0
+
+
+def test_glass_and_welding_direction_are_read(path: Path) -> None:
+    plain = read_setup(path).rig
+    assert (plain.imaging_plane.glass_mm, plain.travel) == (0.0, "+y")
+    update_setup(path, {"imaging_plane": {"glass_mm": 3.0}, "torch": {"travel": "-y"}})
+    rig = read_setup(path).rig
+    assert (rig.imaging_plane.glass_mm, rig.imaging_plane.glass_index) == (3.0, 1.5)
+    assert (rig.travel, rig.head_sign) == ("-y", -1)
+    update_setup(path, {"imaging_plane": {"glass_index": 1.46}})
+    assert read_setup(path).rig.imaging_plane.glass_index == 1.46
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "field"),
+    [
+        ("torch", "travel", "+x", "torch.travel"),
+        ("torch", "travel", ["-y"], "torch.travel"),
+        ("torch", "speed", 3.0, "torch.speed"),
+        ("imaging_plane", "glass_mm", -1.0, "imaging_plane.glass_mm"),
+        ("imaging_plane", "glass_mm", 60.0, "imaging_plane.glass_mm"),
+        ("imaging_plane", "glass_index", 0.9, "imaging_plane.glass_index"),
+    ],
+)
+def test_wrong_glass_and_directions_are_refused(
+    path: Path, section: str, key: str, value: object, field: str
+) -> None:
+    update_setup(path, {section: {key: value}})
+    with pytest.raises(InputError) as refused:
+        read_setup(path)
+    assert refused.value.field == field
+
+
+def test_a_calibrated_value_that_is_changed_loses_its_uncertainty(path: Path) -> None:
+    calibrated = {
+        "projection_angle_deg": 31.0,
+        "projection_angle_deg_sigma": 0.2,
+        "distance_mm": 31.5,
+        "distance_mm_sigma": 0.3,
+        "angle_distance_correlation": 0.9,
+        "azimuth_deg_sigma": 0.1,
+    }
+    update_setup(path, {"laser": calibrated})
+    update_setup(path, {"laser": {"distance_mm": 31.5}})  # the same
+    assert read_setup(path).rig.uncertainty.sigma[DISTANCE] == 0.3
+    update_setup(path, {"laser": {"distance_mm": 32.0, "azimuth_deg": 1.0}})
+    known = read_setup(path).rig.uncertainty
+    assert known.sigma[[ANGLE, DISTANCE]].tolist() == [0.2, 0.5]
+    assert known.correlation[ANGLE, DISTANCE] == 0.0
+    assert known.sigma[INDEX["laser.azimuth_deg"]] == 0.1

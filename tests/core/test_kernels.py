@@ -127,7 +127,7 @@ def test_slopes_weigh_as_the_covariance_of_their_dots_has_it() -> None:
     half = rng.normal(0.0, 0.05, (len(landing), 2, 2))
     covariance, floor = half @ half.swapaxes(1, 2), 0.02
     made = kernels.slope_weights(
-        LASER, PLANE.pose_mm[1:3], landing, PLANE.to_universal(seen), covariance, floor
+        LASER, PLANE.pose_mm, landing, PLANE.to_universal(seen), covariance, floor
     )
     jacobian = slopes_of_dots(landing, seen)
     spread = jacobian @ (covariance + floor**2 * np.eye(2)) @ jacobian.swapaxes(1, 2)
@@ -142,7 +142,7 @@ def test_dots_are_uncertain_by_what_the_coefficients_are() -> None:
     lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
     at, seen = points[:7], rng.uniform([10.0, 10.0], [80.0, 60.0], (7, 2))
     made = kernels.covariance_of_dots(
-        BASIS.grid, factor, LASER, PLANE.pose_mm[1:3], at, PLANE.to_universal(seen)
+        BASIS.grid, factor, LASER, PLANE.pose_mm, at, PLANE.to_universal(seen)
     )
     slopes = np.stack([BASIS.matrix(*at[:, :2].T, 1, 0), BASIS.matrix(*at[:, :2].T, 0, 1)], axis=1)
     parts = np.linalg.inv(slopes_of_dots(at, seen)) @ slopes
@@ -201,7 +201,9 @@ def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
     asked = bisecting_gradient(points - LASER, dots_mm - points)
     off = asked - surface().gradient(*points[:, :2].T)
     np.testing.assert_allclose(
-        kernels.gradient_rhs(BASIS.grid, surface().coefficients, points, weights, LASER, dots_mm),
+        kernels.gradient_rhs(
+            BASIS.grid, surface().coefficients, points, weights, LASER, PLANE.pose_mm, dots_mm
+        ),
         np.einsum("nap,nab,nb->p", by, weights, off),
         atol=1e-9,
     )

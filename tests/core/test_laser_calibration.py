@@ -27,7 +27,7 @@ def cross_hair(angle_deg: float, distance_mm: float, fan_deg: float = 10.0) -> n
 def test_the_example_of_the_conventions() -> None:
     l1, l2, l3 = cross_hair(30.0, 90.0)
     assert (l3, l2) == pytest.approx((7.874, 18.561), abs=5e-4)
-    found = calibrate_laser(l1, 18.561, 7.874)
+    found = calibrate_laser(2 * [l1], 2 * [18.561], 2 * [7.874])
     assert found.angle_deg == pytest.approx(30.0, abs=2e-3)
     assert found.distance_mm == pytest.approx(90.0, abs=2e-3)
     assert found.height_mm == pytest.approx(45.0, abs=4e-3)
@@ -43,7 +43,7 @@ def test_the_example_of_the_conventions() -> None:
 )
 def test_any_laser_is_found_again(angle: float, distance: float, fan: float) -> None:
     l1, l2, l3 = cross_hair(angle, distance, fan)
-    found = calibrate_laser(l1, l2, l3, fan)
+    found = calibrate_laser(2 * [l1], 2 * [l2], 2 * [l3], fan)
     assert found.angle_deg == pytest.approx(angle, abs=1e-6)
     assert found.distance_mm == pytest.approx(distance, rel=1e-9)
     assert found.expected_l1_mm == pytest.approx(l1, rel=1e-9)
@@ -57,35 +57,70 @@ def test_a_square_beam_has_three_equal_lengths() -> None:
     assert found.distance_mm == pytest.approx(5.0 / np.tan(np.radians(5.0)))
 
 
-def test_the_uncertainty_is_that_of_repeated_calibrations() -> None:
+@pytest.mark.parametrize("count", [3, 5, 10])
+@pytest.mark.parametrize("fan_sigma", [0.0, 0.1])
+def test_intervals_cover_the_laser_with_few_readings(count: int, fan_sigma: float) -> None:
     rng = np.random.default_rng(7)
-    truth = cross_hair(31.0, 60.0)
-    settings = LaserCalibrationSettings(resolution_mm=1e-6)
-    runs = [
-        calibrate_laser(*(truth[:, None] + rng.normal(0.0, 0.08, (3, 8))), settings=settings)
-        for _ in range(400)
-    ]
-    for value, sigma, true in [
-        ("angle_deg", "angle_sigma_deg", 31.0),
-        ("distance_mm", "distance_sigma_mm", 60.0),
-        ("height_mm", "height_sigma_mm", 60.0 * np.sin(np.radians(31.0))),
-        ("horizontal_mm", "horizontal_sigma_mm", 60.0 * np.cos(np.radians(31.0))),
-    ]:
-        errors = np.array([getattr(run, value) for run in runs]) - true
-        published = np.array([getattr(run, sigma) for run in runs])
-        assert errors.std() == pytest.approx(np.sqrt(np.mean(published**2)), rel=0.15)
-        assert abs(errors.mean()) < 0.2 * errors.std()
+    settings = LaserCalibrationSettings(
+        resolution_mm=0.01, fan_angle_sigma_deg=fan_sigma, refuse_sigma=np.inf
+    )
+    truth = np.array([31.14, 31.48, 31.48 * np.sin(np.radians(31.14))])
+    covered, apart = [], []
+    for _ in range(1500):
+        drawn = cross_hair(31.14, 31.48, 10.0 + fan_sigma * rng.normal())
+        readings = np.round(drawn[:, None] + rng.normal(0.0, 0.1, (3, count)), 2)
+        found = calibrate_laser(*readings, settings=settings)
+        values = np.array([found.angle_deg, found.distance_mm, found.height_mm])
+        sigma = [found.angle_sigma_deg, found.distance_sigma_mm, found.height_sigma_mm]
+        covered.append(np.abs(values - truth) < 1.96 * np.array(sigma))
+        apart.append(values - truth)
+    share = np.mean(covered, axis=0)
+    assert (share > 0.93).all(), share
+    assert (share < 0.97).all(), share
+    if not fan_sigma:
+        seen = np.corrcoef(np.array(apart)[:, :2].T)[0, 1]
+        assert seen > 0.85
+        exact = calibrate_laser(*cross_hair(31.14, 31.48), settings=settings)
+        assert exact.correlation == pytest.approx(seen, abs=0.02)
+
+
+def test_few_readings_count_with_students_factor() -> None:
+    truth, off = cross_hair(31.14, 31.48), np.array([-0.1, 0.0, 0.1])
+    settings = LaserCalibrationSettings(resolution_mm=1e-6, fan_angle_sigma_deg=0.0)
+    found = calibrate_laser(*(truth[:, None] + off), settings=settings)
+    # Only l3 is in the distance: t of two degrees of freedom, 4.303, over 1.96.
+    expected = 0.1 / np.sqrt(3) / np.tan(np.radians(5.0)) * 4.3027 / 1.95996
+    assert found.distance_sigma_mm == pytest.approx(expected, rel=1e-4)
+
+
+def test_equal_readings_are_known_to_the_resolution() -> None:
+    readings = np.tile(cross_hair(31.14, 31.48)[:, None], 50)
+    settings = LaserCalibrationSettings(resolution_mm=0.05, fan_angle_sigma_deg=0.0)
+    found = calibrate_laser(*readings, settings=settings)
+    least = 0.05 / np.sqrt(12) / np.tan(np.radians(5.0))
+    assert found.distance_sigma_mm == pytest.approx(least, rel=0.03)
+
+
+def test_the_setup_gets_all_that_is_known() -> None:
+    found = calibrate_laser(*cross_hair(31.14, 31.48))
+    assert found.setup_keys == {
+        "projection_angle_deg": found.angle_deg,
+        "projection_angle_deg_sigma": found.angle_sigma_deg,
+        "distance_mm": found.distance_mm,
+        "distance_mm_sigma": found.distance_sigma_mm,
+        "angle_distance_correlation": found.correlation,
+    }
 
 
 def test_the_resolution_counts_for_a_single_reading() -> None:
     lengths = cross_hair(31.0, 60.0)
-    coarse = calibrate_laser(*lengths, settings=LaserCalibrationSettings(resolution_mm=1.0))
+    coarse = calibrate_laser(*lengths, settings=LaserCalibrationSettings(1.0, 0.1, 0.0))
     expected = 1.0 / np.sqrt(12.0) / np.tan(np.radians(5.0))
     assert coarse.distance_sigma_mm == pytest.approx(expected)
 
 
 def test_the_fan_angle_counts() -> None:
-    settings = LaserCalibrationSettings(resolution_mm=1e-9, fan_angle_sigma_deg=0.1)
+    settings = LaserCalibrationSettings(1e-9, 1e-9, 0.1)
     lengths = cross_hair(31.0, 60.0)
     found = calibrate_laser(*lengths, settings=settings)
     wider = calibrate_laser(*lengths, fan_angle_deg=10.01)
@@ -115,7 +150,9 @@ def test_contradictions_are_named(l1: float, l2: float, l3: float, fan: float, w
 
 def test_a_mild_disagreement_is_a_warning() -> None:
     l1, l2, l3 = cross_hair(31.0, 60.0)
-    (warning,) = calibrate_laser(l1 + 0.25, l2, l3).warnings
+    settings = LaserCalibrationSettings(fan_angle_sigma_deg=0.0)
+    often = ([length - 0.01, length, length + 0.01] for length in (l1 + 0.25, l2, l3))
+    (warning,) = calibrate_laser(*often, settings=settings).warnings
     assert "l1_mm" in warning
     assert f"{l1:.4g}" in warning
 

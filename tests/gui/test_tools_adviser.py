@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
@@ -51,8 +52,12 @@ def click(button: QPushButton) -> None:
 
 def test_the_question_is_the_sessions_pool_and_rig(copy_sample: CopySample):
     with Session.open(copy_sample("gtaw")) as session:
+        session.calibrate_laser([4.64, 4.68], [6.26, 6.21], [2.75, 2.78])
         values = advising.question(session)
         expected, limits = parse_request(values, "here")
+        known = session.setup.rig.uncertainty
+    # One model: how well the session's set-up is known, correlation and all.
+    np.testing.assert_allclose(limits.uncertainty.covariance, known.covariance, rtol=1e-9)
     assert expected.width_mm == pytest.approx((0.9 * 6.7, 1.1 * 6.7))
     assert expected.kind == "convex"
     assert limits.angle_deg == (25.0, 35.0)

@@ -15,11 +15,15 @@ from labapp.studies.adviser.expected_pools import ExpectedPools
 from labapp.studies.adviser.height_error import Trial, predicted_errors, simulated_errors
 from labapp.studies.adviser.report import cost_table
 from labapp.studies.adviser.search import Advice, Effort, Sweep, advise, constraint_text
+from labapp.studies.parameter_deviation import NOMINAL
 
 EXPECTED = ExpectedPools((6.0, 7.0), (6.5, 8.0), (0.12, 0.2))
 # A roughly calibrated bench: what its plane's distance is worth shows on few pools.
 LIMITS = BenchLimits(
-    angle_deg=(28.0, 32.0), distance_mm=(26.0, 32.0), plane_mm=(60.0, 80.0), sigma=(0.3,) * 8
+    angle_deg=(28.0, 32.0),
+    distance_mm=(26.0, 32.0),
+    plane_mm=(60.0, 80.0),
+    sigma={key: 3 * sigma for key, sigma in NOMINAL.items()},
 )
 EFFORT = Effort(grid=(2, 2, 1), pools=(2, 3, 8), steps=3, finalists=2, sweep=2)
 LITTLE = Effort(grid=(2, 1, 1), pools=(1, 1, 2), steps=1, finalists=1, sweep=2)
@@ -122,7 +126,8 @@ def test_broken_margins_are_seen_by_tracing() -> None:
 
 def test_an_exact_bench_is_better_than_an_uncertain_one() -> None:
     place = LaserPlace(EXPECTED, LIMITS, 28.0, 30.0).place(70.0)
-    rough = replace(LIMITS, sigma=(1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+    known = {key: 0.0 if key.startswith("image") else 10 * NOMINAL[key] for key in NOMINAL}
+    rough = replace(LIMITS, sigma=known)
     trial = Trial(rough, place, EXPECTED.sample(4, 1), 0, 4)
     exact = replace(trial, calibrated=False)
     assert simulated_errors(trial)[:, 0].mean() > 2 * simulated_errors(exact)[:, 0].mean()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.rig import Electrode, ImagingPlane
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES, RigUncertainty, covariance_of
 from labapp.core.schemes import fit
 from labapp.core.surface.measures import measure_surface
 from labapp.core.surface.pool_fit import FitSettings
@@ -18,8 +19,8 @@ from labapp.studies import error_analysis, image_error, parameter_deviation
 from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, predict_error
 from labapp.studies.error_analysis import ErrorSurvey, aside, error_table, survey
 from labapp.studies.image_error import BENCH, TACK, TACK_RIG, VIEW, axes_of, exactly_seen
-from labapp.studies.parameter_deviation import NOMINAL, OFFSETS, QUANTITIES, move
-from labapp.studies.setup_budget import Bench, SetupBudget, budget_table, similar_pool
+from labapp.studies.parameter_deviation import move, nominal
+from labapp.studies.setup_budget import SetupBudget, budget_table, similar_pool
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +107,18 @@ def test_the_thumb_tack_of_8_2() -> None:
 def test_a_bench_that_is_off_is_told_by_its_dots() -> None:
     """Dots of the true bench, taken for another's: moved back, they are the true ones."""
     known = exactly_seen(spherical_cap(6.0, 0.3), BENCH)
-    offset = np.array([0.3, -0.2, 0.5, -0.4, 0.6, 0.8, -0.5, 0.3, 0.7, -0.2, 0.4])
-    match, rig = move(known.match, known.rig, known.axes, offset)
+    offset = np.zeros(len(QUANTITIES))
+    moved = {
+        "laser.projection_angle_deg": 0.3,
+        "laser.distance_mm": -0.2,
+        "imaging_plane.distance_mm": 0.5,
+        "imaging_plane.s_mm": -0.4,
+        "imaging_plane.h_mm": 0.6,
+    }
+    for key, value in moved.items():
+        offset[INDEX[key]] = value
+    offset[INDEX["image_calibration.origin_px[u]"] :][:6] = 0.8, -0.5, 0.3, 0.7, -0.2, 0.4
+    match, rig = move(known.match, known.rig, known.uncertainty.axes, offset)
     assert rig.laser.projection_angle_deg == pytest.approx(31.44)
     assert rig.laser.distance_mm == pytest.approx(31.28)
     plane = ImagingPlane.vertical(50.5, 50.4, 0.6)
@@ -122,19 +133,25 @@ def test_a_bench_that_is_off_is_told_by_its_dots() -> None:
     np.testing.assert_allclose(match.plane_mm, axes_of(view).calibration.to_plane(image))
 
 
+def doubtful(known: RigUncertainty) -> RigUncertainty:
+    """Twice as uncertain."""
+    return replace(known, covariance=4 * known.covariance)
+
+
 @pytest.mark.slow
 def test_parts_add_up_to_what_the_draws_scatter_by() -> None:
     # JCGM 101, 8: a bench that is well known acts linearly.
     known = exactly_seen(spherical_cap(6.0, 0.3), BENCH)
     found = parameter_deviation.parameter_deviation(known, "ers", draws=150, workers=1)
     assert found.contribution.shape == (len(QUANTITIES), 2)
+    assert ((found.contribution == 0).all(axis=1) == (found.uncertainty.sigma == 0)).all()
     np.testing.assert_allclose(found.linear, found.standard, rtol=0.3)
     low, high = found.interval[0]
     within = (found.draws[:, 0] >= low) & (found.draws[:, 0] <= high)
     assert low < 0 < high
     assert within.mean() == pytest.approx(0.95, abs=0.01)
-    doubled = tuple(2 * sigma for sigma in NOMINAL)
-    twice = parameter_deviation.parameter_deviation(known, "ers", doubled, draws=2, workers=1)
+    doubled = replace(known, uncertainty=doubtful(known.uncertainty))
+    twice = parameter_deviation.parameter_deviation(doubled, "ers", draws=2, workers=1)
     np.testing.assert_allclose(twice.contribution[1], 2 * found.contribution[1], rtol=0.1)
 
 
@@ -180,14 +197,26 @@ def test_a_prediction_counts_what_is_lost() -> None:
 
 def test_a_calibration_known_worse_makes_the_prediction_worse() -> None:
     pool = spherical_cap(6.0, 0.3)
-    axes = axes_of(VIEW)
-    once = predict_error(pool, BENCH, sigma=NOMINAL, axes=axes)
-    twice = predict_error(pool, BENCH, sigma=[2 * sigma for sigma in NOMINAL], axes=axes)
+    known = nominal(axes_of(VIEW))
+    once = predict_error(pool, BENCH, uncertainty=known)
+    twice = predict_error(pool, BENCH, uncertainty=doubtful(known))
     np.testing.assert_allclose(twice.parameters_mm, 2 * once.parameters_mm, rtol=0.2, atol=2e-5)
     assert once.total_mm > once.random_mm == predict_error(pool, BENCH).random_mm
-    without = predict_error(pool, BENCH, sigma=NOMINAL)
-    assert without.parameters_mm[4] == once.parameters_mm[4] > 0
-    assert (without.parameters_mm[5:] == 0).all()
+    assert once.setup_mm == pytest.approx(np.linalg.norm(once.parameters_mm))
+    assert ((once.parameters_mm == 0) == (known.sigma == 0)).all()
+
+
+def test_the_prediction_of_the_setups_part_is_what_the_fit_propagates() -> None:
+    """All quantities of the one model, and their correlation: predicted without, found by fits."""
+    pool = spherical_cap(6.0, 0.3)
+    known = RigUncertainty(axes_of(VIEW), *covariance_of({}, 0.9))
+    rig = replace(BENCH, uncertainty=known)
+    match = exact_match(trace(pool, BENCH), BENCH, sigma_mm=0.02, rng=np.random.default_rng(2))
+    made = fit.reconstruct(match, rig, FitSettings())
+    predicted = predict_error(pool, BENCH, uncertainty=known)
+    assert predicted.setup_mm == pytest.approx(made.size_sigma_setup[2], rel=0.25)
+    alone = replace(known, covariance=np.diag(np.diag(known.covariance)))
+    assert predict_error(pool, BENCH, uncertainty=alone).setup_mm != predicted.setup_mm
 
 
 def test_a_budget_table_adds_up_in_squares() -> None:
@@ -195,16 +224,18 @@ def test_a_budget_table_adds_up_in_squares() -> None:
     pool = spherical_cap(6.0, 0.3)
     pools = [similar_pool(pool, rng) for _ in range(3)]
     assert all(abs(one.footprint.width_mm / 6.0 - 1) <= 0.05 for one in pools)
-    bench = Bench(BENCH, axes_of(VIEW))
-    predicted = tuple(
-        predict_error(one, BENCH, sigma=bench.sigma, axes=bench.axes) for one in pools
-    )
+    known = nominal(axes_of(VIEW))
+    predicted = tuple(predict_error(one, BENCH, uncertainty=known) for one in pools)
     random = np.array([0.003, np.nan, -0.004])
-    made = budget_table(SetupBudget(pool, predicted, random, np.full(8, 0.01)))
+    made = budget_table(
+        SetupBudget(pool, known, predicted, random, np.full((2, len(QUANTITIES)), 0.01))
+    )
     rows = {row[0]: row[1:] for row in made.rows}
     assert rows["these together"][1] == pytest.approx(100 * np.sqrt(12.5e-6))
-    assert rows["everything"][1] == pytest.approx(100 * np.sqrt(12.5e-6 + 8e-4))
-    parts = [rows[quantity.name][0] for quantity in QUANTITIES] + [rows["these together"][0]]
+    assert rows["everything"][1] == pytest.approx(100 * np.sqrt(12.5e-6 + 1.1e-3))
+    uncertain = [QUANTITIES[k].name for k in np.flatnonzero(known.sigma)]
+    assert len(uncertain) == 11
+    parts = [rows[name][0] for name in uncertain] + [rows["these together"][0]]
     assert rows["everything"][0] == pytest.approx(np.linalg.norm(parts))
     assert "1 without a surface" in made.caption
 
@@ -220,9 +251,3 @@ def test_results_keep_the_order_of_the_tasks(workers: int) -> None:
     assert told[0] == ("all", 0, 10)
     assert told[-1] == ("all", 10, 10)
     assert in_parallel(abs, [], workers=workers) == []
-
-
-def test_offsets_are_as_many_as_the_quantities_have_parts() -> None:
-    parts = [part for quantity in QUANTITIES for part in quantity.parts]
-    assert parts == list(range(OFFSETS))
-    assert len(NOMINAL) == len(QUANTITIES)

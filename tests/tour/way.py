@@ -183,7 +183,7 @@ def _look_on(hands: Hands, page: CapturePage) -> None:
     hands.wait(lambda: canvas.surface.view.scene, "a live surface")
     hands.picture("live-surface")
     canvas.tabs.setCurrentIndex(list(PARTS).index("trends"))
-    hands.enter("Width, highest", "6.5")
+    hands.enter("Width, highest", "6")
     hands.wait(canvas.alarms.isVisible, "an alarm")
     hands.picture("live-alarm", trouble=True)
     hands.press("Acknowledge")

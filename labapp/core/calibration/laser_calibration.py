@@ -8,17 +8,26 @@ half lengths of the cross are, by the law of sines in the beam's plane,
     l₃ = x·tan α                    across the beam, each side
 
 for a laser at distance x from the centre of the cross, its beam at elevation α₅.
+
+Every ± is a standard uncertainty u such that ±1.96·u covers 95 %, also from few readings: it is
+Student's factor over 1.96 times what their scatter gives, with the effective degrees of freedom of
+Welch and Satterthwaite (JCGM 100, G.4).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from labapp.core.geometry.rig import Laser
 from labapp.core.values import FloatArray
+
+COVERAGE_FACTOR = 1.959964
+"""Half width of an interval that covers 95 % of a normal distribution, over its σ."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,10 @@ class LaserCalibration:
     expected_l1_mm
         The l₁ that follows from l₂, l₃ and the fan angle, mm: the check on the measured one.
     warnings
-        Sentences for the operator about lengths that fit each other badly.
+        Sentences for the operator about lengths that fit each other badly, and about what was
+        assumed.
+    correlation
+        Of angle and distance, which follow from the same l₃ and fan angle.
     """
 
     angle_deg: float
@@ -51,11 +63,23 @@ class LaserCalibration:
     horizontal_sigma_mm: float
     expected_l1_mm: float
     warnings: tuple[str, ...] = ()
+    correlation: float = 0.0
 
     @property
     def laser(self) -> Laser:
         """The laser as the rig wants it."""
         return Laser(projection_angle_deg=self.angle_deg, distance_mm=self.distance_mm)
+
+    @property
+    def setup_keys(self) -> dict[str, object]:
+        """The same as keys of ``[laser]``, with their uncertainties."""
+        return {
+            "projection_angle_deg": self.angle_deg,
+            "projection_angle_deg_sigma": self.angle_sigma_deg,
+            "distance_mm": self.distance_mm,
+            "distance_mm_sigma": self.distance_sigma_mm,
+            "angle_distance_correlation": self.correlation,
+        }
 
 
 @dataclass(frozen=True)
@@ -65,9 +89,13 @@ class LaserCalibrationSettings:
     Parameters
     ----------
     resolution_mm
-        Smallest step of the caliper or ruler; a reading is uniform within it, mm.
+        Smallest step of the callipers or ruler, mm. A length is known no better than a reading
+        that is uniform within it, however many there are.
+    reading_sigma_mm
+        Standard deviation of a reading, mm, assumed where there is only one.
     fan_angle_sigma_deg
-        Standard uncertainty of the lens's fan angle, degrees.
+        Standard uncertainty of the lens's fan angle, degrees; the default is assumed, as makers
+        seldom say.
     doubt_sigma
         Lengths that disagree by more than this many standard uncertainties give a warning.
     refuse_sigma, refuse_fraction
@@ -75,8 +103,9 @@ class LaserCalibrationSettings:
         part of the length are refused.
     """
 
-    resolution_mm: float = 0.1
-    fan_angle_sigma_deg: float = 0.0
+    resolution_mm: float = 0.05
+    reading_sigma_mm: float = 0.1
+    fan_angle_sigma_deg: float = 0.1
     doubt_sigma: float = 2.0
     refuse_sigma: float = 4.0
     refuse_fraction: float = 0.05
@@ -115,20 +144,33 @@ def calibrate_laser(
         raise ValueError(
             f"fan_angle_deg = {fan_angle_deg:g}: the fan angle lies between 0 and 90 degrees"
         )
-    l1, u1 = _mean(l1_mm, "l1_mm", settings)
-    l2, u2 = _mean(l2_mm, "l2_mm", settings)
-    l3, u3 = _mean(l3_mm, "l3_mm", settings)
-    warnings: list[str] = []
-    _check_order("l1_mm", l1, l2, float(np.hypot(u1, u2)), settings, warnings)
-    _check_order("l3_mm", l3, l2, float(np.hypot(u2, u3)), settings, warnings)
+    names = ("l1_mm", "l2_mm", "l3_mm")
+    l1, l2, l3 = (
+        _length(readings, name, settings)
+        for readings, name in zip((l1_mm, l2_mm, l3_mm), names, strict=True)
+    )
+    once = [name for name, one in zip(names, (l1, l2, l3), strict=True) if one.readings == 1]
+    warnings = (
+        [
+            f"One reading of {', '.join(once)}: it is taken to be known to "
+            f"±{settings.reading_sigma_mm:g} mm; read three times or more."
+        ]
+        if once
+        else []
+    )
+    for name, length in (("l1_mm", l1), ("l3_mm", l3)):
+        apart = float(np.hypot(length.expanded, l2.expanded))
+        _check_order(name, length.mean_mm, l2.mean_mm, apart, settings, warnings)
 
-    half = np.radians(fan_angle_deg / 2.0)
-    values, jacobian = _appendix_i(l2, l3, float(half))
-    sigmas = np.array([u2, u3, np.radians(settings.fan_angle_sigma_deg / 2.0)])
-    covariance = jacobian @ np.diag(sigmas**2) @ jacobian.T
-    sigma = np.sqrt(np.diag(covariance))
+    values, jacobian = _appendix_i(l2.mean_mm, l3.mean_mm, float(np.radians(fan_angle_deg / 2.0)))
+    half_sigma = np.radians(settings.fan_angle_sigma_deg / 2.0)
+    inputs = np.array([l2.sigma_mm, l3.sigma_mm, half_sigma])
+    parts = jacobian * inputs
+    freedom = np.array([l2.freedom, l3.freedom, np.inf])
+    sigma = np.array([_expanded(own, freedom) for own in parts])
+    shared, alone = parts[0] @ parts[1], np.linalg.norm(parts[:2], axis=1).prod()
     angle, distance, height, horizontal, expected_l1 = (float(v) for v in values)
-    _check_l1(l1, expected_l1, float(np.hypot(u1, sigma[4])), settings, warnings)
+    _check_l1(l1.mean_mm, expected_l1, float(np.hypot(l1.expanded, sigma[4])), settings, warnings)
     return LaserCalibration(
         angle_deg=float(np.degrees(angle)),
         angle_sigma_deg=float(np.degrees(sigma[0])),
@@ -140,6 +182,7 @@ def calibrate_laser(
         horizontal_sigma_mm=float(sigma[3]),
         expected_l1_mm=expected_l1,
         warnings=tuple(warnings),
+        correlation=float(shared / alone) if alone else 0.0,
     )
 
 
@@ -172,19 +215,54 @@ def _appendix_i(l2: float, l3: float, half: float) -> tuple[FloatArray, FloatArr
     )
 
 
-def _mean(
-    readings: npt.ArrayLike, name: str, settings: LaserCalibrationSettings
-) -> tuple[float, float]:
-    """Mean of repeated readings and its standard uncertainty (scatter and resolution), mm."""
+class _Length(NamedTuple):
+    """Mean of so many readings, its standard uncertainty and the degrees of freedom of that."""
+
+    mean_mm: float
+    sigma_mm: float
+    freedom: float
+    readings: int
+
+    @property
+    def expanded(self) -> float:
+        """Standard uncertainty with Student's factor, mm."""
+        return self.sigma_mm * _student(self.freedom)
+
+
+def _length(readings: npt.ArrayLike, name: str, settings: LaserCalibrationSettings) -> _Length:
     values = np.atleast_1d(np.asarray(readings, float)).ravel()
     if values.size == 0:
         raise ValueError(f"{name} is empty: give at least one reading in mm")
     for value in values:
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"{name} = {value:g}: a reading is a positive number of mm")
-    resolution = settings.resolution_mm / np.sqrt(12.0)
-    scatter = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
-    return float(values.mean()), float(np.hypot(scatter, resolution))
+    mean, count = float(values.mean()), values.size
+    # Readings that scatter by more than the resolution are rounded either way: their mean is not.
+    least = settings.resolution_mm / np.sqrt(12.0)
+    if count == 1:
+        return _Length(mean, max(settings.reading_sigma_mm, least), np.inf, count)
+    scatter = float(values.std(ddof=1)) / np.sqrt(count)
+    return _Length(mean, max(scatter, least), count - 1, count)
+
+
+def _expanded(parts: FloatArray, freedom: FloatArray) -> float:
+    """Standard uncertainty of a sum of independent parts, shape (n,), with Student's factor.
+
+    The factor, with the effective degrees of freedom, is that of the parts that scatter gives;
+    what is known otherwise is added in squares, as it has none.
+    """
+    squares = parts**2
+    scatter = float(squares[np.isfinite(freedom)].sum())
+    spread = float(np.sum(squares**2 / freedom))
+    factor = _student(scatter**2 / spread) if spread > 0.0 else 1.0
+    return float(np.sqrt(scatter * factor**2 + squares.sum() - scatter))
+
+
+def _student(freedom: float) -> float:
+    """Student's factor for 95 % over that of a normal distribution."""
+    if np.isinf(freedom):
+        return 1.0
+    return float(scipy.special.stdtrit(freedom, 0.975)) / COVERAGE_FACTOR
 
 
 def _check_order(

@@ -187,14 +187,20 @@ class PlaneCalibration:
 
     @property
     def setup_keys(self) -> dict[str, object]:
-        """The same as keys of ``[image_calibration]``; None for one that must not be there."""
+        """The same as keys of ``[image_calibration]``, with the points' standard uncertainties.
+
+        None for a key that must not be there.
+        """
         names = ("origin_px", "x_axis_px", "z_axis_px")
         lengths = {"x_axis_mm": self.x_axis_mm, "z_axis_mm": self.z_axis_mm}
+        sigmas = {
+            f"{name}_sigma": own for name, own in zip(names, self.points_sigma_px, strict=True)
+        }
         if self.model == "homography":
             rows = self.image_calibration.matrix.tolist()
-            return {**dict.fromkeys((*names, *lengths)), "homography": rows}
+            return {**dict.fromkeys((*names, *lengths)), "homography": rows, **sigmas}
         points = dict(zip(names, self.points_px.tolist(), strict=True))
-        return {**points, **lengths, "homography": None}
+        return {**points, **lengths, "homography": None, **sigmas}
 
     def fit_lines(self) -> list[str]:
         """What the fits to the marks leave over, which is used and why, in words."""

@@ -18,7 +18,7 @@ def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
     -------
     FloatArray
         Shape (rows, columns, 3), not to be written to; ray (i, j), counted from 1, is at
-        ``[i - 1, j - 1]``. i grows towards the head of the pool (+Y), j with X.
+        ``[i - 1, j - 1]``. i grows with Y on the work piece, j with X.
     """
     axis, across, along = laser.axes
     tangents = pattern.tangents
@@ -59,14 +59,61 @@ def intersect_imaging_plane(
 ) -> FloatArray:
     """Where rays meet the imaging plane, as IPCS (X′, Z′), shape (…, 2), mm.
 
-    A ray that runs away from the plane or along it gives NaN. The plane is taken as unbounded.
+    A ray that runs away from the plane or along it gives NaN. The plane is taken as unbounded. In
+    its glass a ray is nearer to the normal: the dot is shifted back along the ray's way aside.
     """
     normal = plane.normal
     along = np.asarray(direction @ normal)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = ((plane.origin_mm - origin_mm) @ normal) / along
     distance = np.where((distance > 0) & np.isfinite(distance), distance, np.nan)
-    return plane.from_universal(origin_mm + distance[..., None] * direction)
+    dot = plane.from_universal(origin_mm + distance[..., None] * direction)
+    if not plane.glass_mm:
+        return dot
+    with np.errstate(divide="ignore", invalid="ignore"):
+        aside = direction @ np.array([plane.x_axis, plane.z_axis]).T / np.abs(along)[..., None]
+    share = _in_glass(plane.glass_index, np.vecdot(aside, aside))
+    return np.asarray(dot - plane.glass_mm * (1.0 - share)[..., None] * aside)
+
+
+def direction_to_dots(
+    point_mm: FloatArray, plane_mm: FloatArray, plane: ImagingPlane
+) -> FloatArray:
+    """Directions in which rays leave points for their dots, shape (…, 3), not normalised.
+
+    Through glass Snell's law is solved for the angle at which the ray reaches it, by Newton's
+    method for the tangent of that angle.
+
+    Parameters
+    ----------
+    point_mm, plane_mm
+        Where they start, UCS, shape (…, 3), and their dots, IPCS, shape (…, 2), mm.
+    plane
+        The imaging plane.
+    """
+    way = plane.to_universal(plane_mm) - point_mm
+    if not plane.glass_mm:
+        return way
+    along = (way @ plane.normal)[..., None] * plane.normal
+    aside, gap = np.linalg.norm(way - along, axis=-1), np.linalg.norm(along, axis=-1)
+    glass, index = plane.glass_mm, plane.glass_index
+    air = np.maximum(gap - glass, 0.0)
+    tangent = aside / (air + glass / index)
+    for _ in range(_SNELL_STEPS):
+        share = _in_glass(index, tangent**2)
+        off = (air + glass * share) * tangent - aside
+        tangent -= off / (air + glass * index**2 * share**3)
+    farther = gap * tangent / np.maximum(aside, 1e-12)
+    return np.asarray(along + farther[..., None] * (way - along))
+
+
+_SNELL_STEPS = 4
+"""Newton steps to the direction through glass: exact to rounding."""
+
+
+def _in_glass(index: float, tangent2: FloatArray) -> FloatArray:
+    """Tangent of rays' angles to the normal in glass, over those in air, of which the squares."""
+    return np.asarray(1.0 / np.sqrt(index**2 + (index**2 - 1.0) * tangent2))
 
 
 def intersect_level(

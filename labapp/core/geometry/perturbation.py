@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.rig import ImagingPlane, Rig
+from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import INDEX, AxisPoints
 from labapp.core.values import FloatArray
 
@@ -31,14 +31,26 @@ def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
         origin = plane.origin_mm + np.array([-by["s_mm"], -by["distance_mm"], by["h_mm"]])
         turned = [by["pitch_deg"], by["yaw_deg"], by["roll_deg"]]
         pitch, yaw, roll = np.add(plane.angles_deg, turned).tolist()
-        size = plane.width_mm, plane.height_mm
-        plane = ImagingPlane.of_angles(origin, (pitch, yaw, roll), *size)
+        posed = ImagingPlane.of_angles(origin, (pitch, yaw, roll))
+        axes = posed.x_axis, posed.z_axis
+        plane = replace(plane, origin_mm=origin, x_axis=axes[0], z_axis=axes[1])
     return replace(
         rig,
         laser=replace(rig.laser, **laser),
         pattern=replace(rig.pattern, **pattern),
         imaging_plane=plane,
     )
+
+
+def aimed_as(laser: Laser, rig: Rig) -> Rig:
+    """The rig moved along the work piece until its laser aims where another does.
+
+    No size changes by that, and the surface stays where its splines are.
+    """
+    aside = np.array([rig.laser.aim_x_mm - laser.aim_x_mm, rig.laser.aim_y_mm - laser.aim_y_mm, 0])
+    back = replace(rig.laser, aim_x_mm=laser.aim_x_mm, aim_y_mm=laser.aim_y_mm)
+    plane = replace(rig.imaging_plane, origin_mm=rig.imaging_plane.origin_mm - aside)
+    return replace(rig, laser=back, imaging_plane=plane)
 
 
 def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatArray) -> FloatArray:

@@ -1,13 +1,14 @@
 """What is bolted to the bench: laser, dot pattern, electrode, imaging plane.
 
 All positions are in the universal coordinate system (UCS): origin on the work piece under the
-electrode tip, Y along the welding direction, Z up, X to the right as the camera sees it; mm.
+electrode tip, Y along the weld, towards the laser, Z up, X to the right as the camera sees it; mm.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from labapp.core.values import FloatArray, ReadOnlyArrays
 
 @dataclass(frozen=True)
 class Laser:
-    """The laser diode on the side of the pool's head, ideally in the YOZ plane (§3.1.2).
+    """The laser diode, ideally in the YOZ plane on the side of +Y (§3.1.2).
 
     Parameters
     ----------
@@ -133,6 +134,10 @@ class Electrode:
 class ImagingPlane(ReadOnlyArrays):
     """The imaging plane, of any pose: O′ and the directions of O′X′ and O′Z′ in the UCS.
 
+    It is the surface that scatters, a sheet of paper, on which dots and calibration target are
+    seen. A plane-parallel glass may lie on it on the pool's side (§3.1): rays go through the glass
+    to the paper, and the camera sees the paper from its other side.
+
     Parameters
     ----------
     origin_mm
@@ -141,6 +146,8 @@ class ImagingPlane(ReadOnlyArrays):
         Unit vectors along O′X′ and O′Z′, shape (3,).
     width_mm, height_mm
         Size along X′ and Z′, mm.
+    glass_mm, glass_index
+        Thickness of the glass, mm; 0 for none; and its refractive index.
     """
 
     origin_mm: FloatArray
@@ -148,6 +155,8 @@ class ImagingPlane(ReadOnlyArrays):
     z_axis: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     width_mm: float = 101.6
     height_mm: float = 101.6
+    glass_mm: float = 0.0
+    glass_index: float = 1.5
 
     @classmethod
     def vertical(
@@ -196,8 +205,12 @@ class ImagingPlane(ReadOnlyArrays):
 
     @cached_property
     def pose_mm(self) -> FloatArray:
-        """O′, the directions of O′X′ and O′Z′, and the normal, shape (4, 3)."""
-        return np.array([self.origin_mm, self.x_axis, self.z_axis, self.normal])
+        """O′, the directions of O′X′ and O′Z′, the normal, and the glass, for compiled functions.
+
+        Shape (5, 3); the last row is thickness and index of the glass, and 0.
+        """
+        glass = np.array([self.glass_mm, self.glass_index, 0.0])
+        return np.array([self.origin_mm, self.x_axis, self.z_axis, self.normal, glass])
 
     def to_universal(self, plane_mm: FloatArray) -> FloatArray:
         """IPCS (X′, Z′), shape (…, 2), to UCS points, shape (…, 3), mm (Eq. 4-5)."""
@@ -210,6 +223,10 @@ class ImagingPlane(ReadOnlyArrays):
         return np.stack([offset @ self.x_axis, offset @ self.z_axis], axis=-1)
 
 
+Travel = Literal["+y", "-y"]
+"""Which way the torch moves over the work piece: where the head of the pool is."""
+
+
 @dataclass(frozen=True)
 class Rig:
     """Everything on the bench whose place must be known to measure.
@@ -220,6 +237,8 @@ class Rig:
         What it is made of.
     uncertainty
         How well it is known; None: exactly.
+    travel
+        Which way the torch moves: the pool's head is there, and its rear on the other side.
     """
 
     laser: Laser
@@ -227,3 +246,9 @@ class Rig:
     electrode: Electrode
     imaging_plane: ImagingPlane
     uncertainty: RigUncertainty | None = None
+    travel: Travel = "+y"
+
+    @property
+    def head_sign(self) -> int:
+        """+1 where the pool's head lies towards +Y, −1 where it lies towards −Y."""
+        return 1 if self.travel == "+y" else -1

@@ -130,6 +130,20 @@ class RigUncertainty(ReadOnlyArrays):
         sigma = np.where(self.sigma > 0.0, self.sigma, 1.0)
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
+    @property
+    def root(self) -> FloatArray:
+        """Lower root R of the covariance, shape (q, q): offsets R·n of normal deviates n."""
+        root, uncertain = np.zeros_like(self.covariance), np.flatnonzero(self.sigma)
+        some = np.ix_(uncertain, uncertain)
+        correlation = self.correlation[some] + 1e-12 * np.eye(len(uncertain))  # ±1 is singular
+        root[some] = self.sigma[uncertain, None] * np.linalg.cholesky(correlation)
+        return root
+
+    def combined(self, changes: FloatArray) -> FloatArray:
+        """Standard uncertainty, shape (m,), from changes by each quantity's σ, shape (m, q)."""
+        variance = np.einsum("mp,pq,mq->m", changes, self.correlation, changes)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
 
 def covariance_of(
     told: Mapping[str, float], laser_correlation: float = 0.0

@@ -101,9 +101,9 @@ def covariance_of_dots(
     """
     from labapp.core.surface import kernels
 
-    laser, axes = rig.laser.position_mm, rig.imaging_plane.pose_mm[1:3]
+    laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
     dots_mm = rig.imaging_plane.to_universal(plane_mm)
-    return kernels.covariance_of_dots(basis.grid, factor, laser, axes, points_mm, dots_mm)
+    return kernels.covariance_of_dots(basis.grid, factor, laser, plane, points_mm, dots_mm)
 
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from labapp.core.geometry.optics import bisecting_gradient
+from labapp.core.geometry.optics import bisecting_gradient, direction_to_dots
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -119,9 +119,8 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
     """
     observed = window.observed
     laser, plane = observed.rig.laser.position_mm, observed.rig.imaging_plane
-    slope = bisecting_gradient(
-        window.landing_mm - laser, plane.to_universal(hole) - window.landing_mm
-    )
+    landing = window.landing_mm
+    slope = bisecting_gradient(landing - laser, direction_to_dots(landing, hole, plane))
     middle = window.middle
     beside = window.rays[middle[0], middle[1] + 1][None]
     # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.

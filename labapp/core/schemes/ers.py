@@ -50,7 +50,7 @@ def reconstruct(match: Match, rig: Rig, settings: ErsSettings | None = None) -> 
     """
     settings = settings or ErsSettings()
     rays = reflected_rays(match, rig)
-    paths = Paths.along(parents_from(rays.ray, head_left(rays.ray)), rays.direction)
+    paths = Paths.along(parents_from(rays.ray, head_left(rays.ray, rig.head_sign)), rays.direction)
     work_piece = rays.distance_at(0.0)
     best = best_of_loops(
         match,
@@ -68,6 +68,9 @@ def reconstruct(match: Match, rig: Rig, settings: ErsSettings | None = None) -> 
     return reconstruction_within("ers", match, rays, best, boundary)
 
 
-def head_left(ray: IntArray) -> int:
-    """Index of the base point: the leftmost ray of the row nearest the head (largest i)."""
-    return int(np.lexsort((ray[:, 1], -ray[:, 0]))[0])
+def head_left(ray: IntArray, head_sign: int = 1) -> int:
+    """Index of the base point: the leftmost ray of the row nearest the head.
+
+    That is the row of the largest i for a head towards +Y, of the smallest for one towards −Y.
+    """
+    return int(np.lexsort((ray[:, 1], -head_sign * ray[:, 0]))[0])

@@ -21,6 +21,7 @@ import numpy as np
 
 from labapp.core.geometry.optics import (
     bisecting_gradient,
+    direction_to_dots,
     intersect_imaging_plane,
     ray_directions,
     reflect,
@@ -89,8 +90,8 @@ class ReflectedRays(ReadOnlyArrays):
 
     def normals(self, distance_mm: FloatArray) -> FloatArray:
         """Normals (3-D slopes) the reflection law asks for at those points, shape (n, 3)."""
-        target = self.imaging_plane.to_universal(self.plane_mm)
-        return surface_normal(bisecting_gradient(self.direction, target - self.points(distance_mm)))
+        reflected = direction_to_dots(self.points(distance_mm), self.plane_mm, self.imaging_plane)
+        return surface_normal(bisecting_gradient(self.direction, reflected))
 
     def reflected(self, point_mm: FloatArray, gradient: FloatArray) -> FloatArray:
         """Dots that points of that gradient would make, IPCS, shape (n, 2), mm (step 4)."""

@@ -127,9 +127,8 @@ def begin(
     surface = SplineSurface(geometry.basis, pool.coefficients)
     x, y = geometry.landing_mm[witnesses, :2].T
     height, slope = surface.height_and_gradient(x, y)
-    level = find_level(
-        height, slope, y, witness[witnesses], geometry.spacing_mm, missing=match.missing
-    )
+    seen = height, slope, y, witness[witnesses], geometry.spacing_mm
+    level = find_level(*seen, (geometry.rig.head_sign, None), missing=match.missing)
     if former is None:
         past, before = np.empty((0, len(pool.coefficients))), np.empty((0, *pool.slopes.shape))
     else:

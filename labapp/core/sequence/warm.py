@@ -331,7 +331,8 @@ def _level(
     y, about = geometry.landing_mm[witnesses, 1], (0.0, before.sign, WINDOW)
     at_witnesses = height[witnesses], slope[witnesses], y, witness[witnesses]
     missing = missing_share(classes.missed, int(np.sum(labels != UNLABELLED)))
-    level = find_level(*at_witnesses, geometry.spacing_mm, drop, about, missing)
+    rear = geometry.rig.head_sign, drop
+    level = find_level(*at_witnesses, geometry.spacing_mm, rear, about, missing)
     open_mm = level.sigma_mm if free else track.open_mm
     return replace(level, sigma_mm=max(level.sigma_mm, open_mm)), open_mm
 

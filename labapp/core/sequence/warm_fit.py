@@ -46,8 +46,7 @@ class SequenceGeometry(ReadOnlyArrays):
     spacing_mm
         Between neighbouring landing points along X and along Y, shape (2,), mm.
     laser_mm, plane
-        Where the laser is, shape (3,); origin, axes along X′ and Z′ and normal of the imaging
-        plane, shape (4, 3).
+        Where the laser is, shape (3,), and the imaging plane (`ImagingPlane.pose_mm`).
     stiffness
         Weight of the roughness times its matrix, lower band, shape (width + 1, p).
     settings
@@ -161,7 +160,7 @@ class Slopes:
     ) -> Slopes:
         """Weigh dots on the plane, shape (n, 2), of the covariance given, shape (n, 2, 2)."""
         dots = geometry.rig.imaging_plane.to_universal(plane_mm)
-        at = geometry.laser_mm, geometry.plane[1:3], geometry.landing_mm[ray], dots
+        at = geometry.laser_mm, geometry.plane, geometry.landing_mm[ray], dots
         return cls(ray, dots, kernels.slope_weights(*at, covariance, geometry.settings.floor_mm))
 
 
@@ -193,9 +192,8 @@ def fit_slopes_to(
         ``no-surface`` if the slopes do not settle the surface.
     """
     grid, rays = geometry.basis.grid, geometry.rays[slopes.ray]
-    equations = NormalEquations(
-        geometry.basis, geometry.stiffness, geometry.laser_mm, slopes.dots_mm, slopes.weights, lower
-    )
+    bench = geometry.laser_mm, geometry.plane, slopes.dots_mm
+    equations = NormalEquations(geometry.basis, geometry.stiffness, *bench, slopes.weights, lower)
     coefficients, points, moved = pool.coefficients, pool.points_mm[slopes.ray], 0.0
     for _ in range(rounds):
         coefficients = equations.step(coefficients, points, moved, rest)

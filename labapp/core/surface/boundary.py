@@ -108,7 +108,7 @@ def boundary_on_work_piece(match: Match, rig: Rig, model: BoundaryModel) -> Boun
         ``no-boundary`` if there are fewer than two rows, or the model runs away from its points.
     """
     edges = edge_points(match, rig)
-    return circle(edges) if model == "circle" else piecewise(edges)
+    return circle(edges) if model == "circle" else piecewise(edges, rig.head_sign)
 
 
 def edge_points(match: Match, rig: Rig) -> EdgePoints:
@@ -156,13 +156,21 @@ def circle(edges: EdgePoints) -> Boundary:
     return Boundary.polar(edges.center_mm, np.full(POINTS, radius))
 
 
-def piecewise(edges: EdgePoints) -> Boundary:
+def piecewise(edges: EdgePoints, head_sign: int = 1) -> Boundary:
     """Three cubic pieces r(θ) — left, right and head — and two transitions (Eq. 6-13 … 6-19).
 
     θ runs clockwise from +X here, as in Fig. 6-8 (b): the head is at −90°, the rear at 90°. A
     piece with fewer than five points gets a polynomial of lower order: 2 for four points, 1 for
     three, the mean for fewer. Where left and right piece do not cross at the rear, one goes over
     into the other linearly between the rearmost points instead of at β₃.
+
+    Parameters
+    ----------
+    edges
+        The rows' ends.
+    head_sign
+        +1 where the head lies towards +Y, −1 where it lies towards −Y: then θ runs the other way
+        round, so that the head is at −90° again.
 
     Raises
     ------
@@ -171,7 +179,7 @@ def piecewise(edges: EdgePoints) -> Boundary:
     """
     center = edges.center_mm
     dx, dy = (edges.all_mm - center).T
-    theta, radius = np.degrees(np.arctan2(-dy, dx)), np.hypot(dx, dy)
+    theta, radius = np.degrees(np.arctan2(-head_sign * dy, dx)), np.hypot(dx, dy)
     # A pair level with the centre lies at 0° and 180° but for rounding.
     theta = np.where(np.abs(np.abs(theta) - 180) < 1e-9, 180.0, theta)
     left, right = np.abs(theta) >= 90, np.abs(theta) < 90
@@ -209,8 +217,8 @@ def piecewise(edges: EdgePoints) -> Boundary:
     )
     if not (model > 0).all() or model.max() > LARGEST_STRETCH * radius.max():
         raise CannotMeasure("no-boundary", "the boundary model runs away from the rows' ends")
-    # Counter-clockwise from +X is the other way round: θ of the text is −θ of ours.
-    return Boundary.polar(center, np.roll(model[::-1], 1))
+    # Ours is counter-clockwise from +X: with the head at +Y, θ of the text is −θ of ours.
+    return Boundary.polar(center, np.roll(model[::-1], 1) if head_sign > 0 else model)
 
 
 def _share_of_left(

@@ -9,8 +9,8 @@ Five arguments mean the same everywhere, all in the UCS and mm:
 * ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
   (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
 * ``rays``: unit directions from the laser, shape (n, 3); ``points``: where they meet the surface.
-* ``plane``: O′, the directions of O′X′ and O′Z′, and the normal of the imaging plane, shape (4, 3)
-  (`ImagingPlane.pose_mm`); ``axes``: the two directions alone, shape (2, 3).
+* ``plane``: O′, the directions of O′X′ and O′Z′ and the normal of the imaging plane, and thickness
+  and index of its glass, shape (5, 3) (`ImagingPlane.pose_mm`).
 * ``work``: memory to write on, which holds values and slopes of the four splines along x, then
   those along y, shape (4, 4).
 """
@@ -41,6 +41,9 @@ QUADRIC_STEPS = 3
 
 TIP_MARGIN_MM = 0.3
 """A ray that passes less than this below the electrode's tip may be hidden."""
+
+SNELL_STEPS = 4
+"""Newton steps to the direction that leads through the glass to a dot: exact to rounding."""
 
 DOT_STEP_MM = 1e-3
 """Step of the finite differences by the place of a dot."""
@@ -171,6 +174,28 @@ def _newton_step(
 
 
 @_inner
+def _in_glass(index: float, tangent2: float) -> float:
+    """Tangent of a ray's angle to the normal in glass, over that in air; of which the square."""
+    return float(1.0 / np.sqrt(index * index + (index * index - 1.0) * tangent2))
+
+
+@_inner
+def _through_glass(
+    x: float, z: float, away: tuple[float, float, float], along: float, plane: FloatArray
+) -> tuple[float, float]:
+    """Dot of a ray in a direction that would meet the plane at (x, z) without its glass.
+
+    ``along`` is what the direction has along the normal.
+    """
+    aside, up = 0.0, 0.0
+    for axis in range(3):
+        aside += away[axis] / abs(along) * plane[1, axis]
+        up += away[axis] / abs(along) * plane[2, axis]
+    shift = plane[4, 0] * (1.0 - _in_glass(plane[4, 1], aside * aside + up * up))
+    return x - shift * aside, z - shift * up
+
+
+@_inner
 def _reflected_dot(
     ray: FloatArray, point: FloatArray, slope_x: float, slope_y: float, plane: FloatArray
 ) -> tuple[float, float]:
@@ -191,7 +216,34 @@ def _reflected_dot(
         at = point[axis] + distance * away[axis] - plane[0, axis]
         x += at * plane[1, axis]
         z += at * plane[2, axis]
+    if plane[4, 0] > 0.0:
+        return _through_glass(x, z, away, along, plane)
     return x, z
+
+
+@_inner
+def _without_glass(
+    point: FloatArray, dot: tuple[float, float, float], plane: FloatArray
+) -> tuple[float, float, float]:
+    """Where a ray from a point to a dot would meet the plane without its glass, UCS, mm."""
+    glass, index = plane[4, 0], plane[4, 1]
+    gap = 0.0
+    for axis in range(3):
+        gap += (plane[0, axis] - point[axis]) * plane[3, axis]
+    air = abs(gap) - glass
+    if not air > 0.0:
+        return dot
+    x = dot[0] - point[0] - gap * plane[3, 0]
+    y = dot[1] - point[1] - gap * plane[3, 1]
+    z = dot[2] - point[2] - gap * plane[3, 2]
+    aside = np.sqrt(x * x + y * y + z * z)
+    tangent = aside / (air + glass / index)
+    for _ in range(SNELL_STEPS):
+        share = _in_glass(index, tangent * tangent)
+        off = (air + glass * share) * tangent - aside
+        tangent -= off / (air + glass * index * index * share**3)
+    farther = abs(gap) * tangent / aside - 1.0 if aside > 0.0 else 0.0
+    return dot[0] + farther * x, dot[1] + farther * y, dot[2] + farther * z
 
 
 @_compiled(_f2, _f1, _f2, _f2, _i, _f2)
@@ -250,19 +302,21 @@ def _bisecting_slopes(
 
 @_inner
 def _slope_jacobian(
-    laser: FloatArray, axes: FloatArray, point: FloatArray, dot: FloatArray
+    laser: FloatArray, plane: FloatArray, point: FloatArray, dot: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Rows of ∂(slopes at a point)/∂(its dot along either axis of the plane), mm⁻¹."""
     step = DOT_STEP_MM
-    base_x, base_y = _bisecting_slopes(laser, point, dot[0], dot[1], dot[2])
-    by = axes[0]
-    x, y = _bisecting_slopes(
-        laser, point, dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
-    )
-    by = axes[1]
-    u, v = _bisecting_slopes(
-        laser, point, dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
-    )
+    by = plane[1]
+    across = dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
+    by = plane[2]
+    up = dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
+    own = dot[0], dot[1], dot[2]
+    if plane[4, 0] > 0.0:
+        own, across = _without_glass(point, own, plane), _without_glass(point, across, plane)
+        up = _without_glass(point, up, plane)
+    base_x, base_y = _bisecting_slopes(laser, point, own[0], own[1], own[2])
+    x, y = _bisecting_slopes(laser, point, across[0], across[1], across[2])
+    u, v = _bisecting_slopes(laser, point, up[0], up[1], up[2])
     return (
         ((x - base_x) / step, (u - base_x) / step),
         ((y - base_y) / step, (v - base_y) / step),
@@ -272,7 +326,7 @@ def _slope_jacobian(
 @_compiled(_f1, _f2, _f2, _f2, _f3, _f)
 def slope_weights(
     laser: FloatArray,
-    axes: FloatArray,
+    plane: FloatArray,
     points: FloatArray,
     dots: FloatArray,
     covariance: FloatArray,
@@ -285,7 +339,7 @@ def slope_weights(
     """
     out = np.empty(covariance.shape)
     for k in range(len(points)):
-        (a, b), (c, d) = _slope_jacobian(laser, axes, points[k], dots[k])
+        (a, b), (c, d) = _slope_jacobian(laser, plane, points[k], dots[k])
         xx, xy, yy = covariance[k, 0, 0] + floor**2, covariance[k, 0, 1], covariance[k, 1, 1]
         yy += floor**2
         one = a * a * xx + 2.0 * a * b * xy + b * b * yy
@@ -410,7 +464,7 @@ def covariance_of_dots(
     grid: FloatArray,
     lower: FloatArray,
     laser: FloatArray,
-    axes: FloatArray,
+    plane: FloatArray,
     points: FloatArray,
     dots: FloatArray,
 ) -> FloatArray:
@@ -431,7 +485,7 @@ def covariance_of_dots(
     inverse = _inverse_band(lower, first.min())
     by_u, by_v = np.empty(16), np.empty(16)
     for k in range(pairs):
-        (xu, xv), (yu, yv) = _slope_jacobian(laser, axes, points[k], dots[k])
+        (xu, xv), (yu, yv) = _slope_jacobian(laser, plane, points[k], dots[k])
         area = xu * yv - xv * yu
         _cubic_splines(grid[0], points[k, 0], work[0], work[1])
         _cubic_splines(grid[1], points[k, 1], work[2], work[3])
@@ -477,13 +531,14 @@ def variances(lower: FloatArray, gradients: FloatArray) -> FloatArray:
     return out
 
 
-@_compiled(_f2, _f1, _f2, _f3, _f1, _f2)
+@_compiled(_f2, _f1, _f2, _f3, _f1, _f2, _f2)
 def gradient_rhs(
     grid: FloatArray,
     coefficients: FloatArray,
     points: FloatArray,
     weights: FloatArray,
     laser: FloatArray,
+    plane: FloatArray,
     dots: FloatArray,
 ) -> FloatArray:
     """Right-hand side of the normal equations, shape (p,): Σ Jᵀ W (slopes asked for − slopes).
@@ -492,13 +547,16 @@ def gradient_rhs(
     are the inverse covariances of these slopes, shape (n, 2, 2).
     """
     out, work = np.zeros(len(coefficients)), np.empty((4, 4))
-    many = int(grid[1, 3]) + 3
+    many, glass = int(grid[1, 3]) + 3, plane[4, 0] > 0.0
     for k in range(len(points)):
         x, y = points[k, 0], points[k, 1]
         _, slope_x, slope_y = _height_and_slopes(grid, coefficients, x, y, work)
         first_x = _cubic_splines(grid[0], x, work[0], work[1])
         first_y = _cubic_splines(grid[1], y, work[2], work[3])
-        asked_x, asked_y = _bisecting_slopes(laser, points[k], dots[k, 0], dots[k, 1], dots[k, 2])
+        at = dots[k, 0], dots[k, 1], dots[k, 2]
+        if glass:
+            at = _without_glass(points[k], at, plane)
+        asked_x, asked_y = _bisecting_slopes(laser, points[k], at[0], at[1], at[2])
         off_x, off_y = asked_x - slope_x, asked_y - slope_y
         pull_x = weights[k, 0, 0] * off_x + weights[k, 0, 1] * off_y
         pull_y = weights[k, 1, 0] * off_x + weights[k, 1, 1] * off_y
@@ -982,7 +1040,10 @@ def fit_quadrics(
                     for axis in range(3):
                         dot[axis] = plane[0, axis] + place[0] * plane[1, axis]
                         dot[axis] += place[1] * plane[2, axis]
-                    asked = _bisecting_slopes(laser, point, dot[0], dot[1], dot[2])
+                    at = dot[0], dot[1], dot[2]
+                    if plane[4, 0] > 0.0:
+                        at = _without_glass(point, at, plane)
+                    asked = _bisecting_slopes(laser, point, at[0], at[1], at[2])
                     x, y = point[0] - center[0], point[1] - center[1]
                     by[0, 0], by[0, 2], by[0, 3] = 1.0, x, y
                     by[1, 1], by[1, 3], by[1, 4] = 1.0, x, y

@@ -7,7 +7,7 @@ which may lie below it (§7.2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class Rear:
     drop_mm
         Depth at the end, mm; 0 for a boundary on the work piece all round.
     start_mm, end_mm
-        Where the boundary leaves the work piece, and where the pool ends, along Y, mm.
+        Where the boundary leaves the work piece, and where the pool's rear ends, along Y, mm.
     """
 
     drop_mm: float = 0.0
@@ -60,7 +60,10 @@ class Rear:
         return np.array([self.drop_mm, self.start_mm, self.end_mm])
 
     def height(self, y_mm: FloatArray) -> FloatArray:
-        """Height of the boundary at y, of the shape of ``y_mm``, mm: 0, falling as a parabola."""
+        """Height of the boundary at y, of the shape of ``y_mm``, mm: 0, falling as a parabola.
+
+        It falls towards the end, whichever side that is on.
+        """
         share = np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
         return -self.drop_mm * share**2
 
@@ -106,7 +109,7 @@ def find_level(
     y: FloatArray,
     witness: IntArray,
     spacing_mm: FloatArray,
-    drop_mm: float | None = None,
+    rear: tuple[int, float | None] = (1, None),
     about: tuple[float, int, float] | None = None,
     missing: float = 0.0,
 ) -> Level:
@@ -127,8 +130,9 @@ def find_level(
         +1 lit, −1 dark, shape (m,).
     spacing_mm
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
-    drop_mm
-        How deep the rear lies, mm; None: found along with the level.
+    rear
+        +1 where the head lies towards +Y and the rear towards −Y, −1 for the reverse
+        (`Rig.head_sign`); and how deep the rear lies, mm, None: found along with the level.
     about
         A level that is near, as its shift, mm, its sign, and how far from there the level may be,
         in rises: heights by which the surface changes from one ray to the next. Where the grid's
@@ -146,13 +150,15 @@ def find_level(
     near = np.abs(height + shift) < NEAR_RISES * rise
     count = round(STEPS_A_REACH * reach) + 1
     first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
-    lit = y[witness > 0]
+    head_sign, drop_mm = rear
+    lit = head_sign * y[witness > 0]
     start = (lit.max() + lit.min()) / 2
     end = min(lit.min(), start - 1e-6)  # a single row has no rear
+    sunk = Rear(1.0, head_sign * start, head_sign * end)
     # Only a pool that stands above the work piece is seen to sink at its rear.
-    seen = sign > 0 and bool(np.any(near & (witness < 0) & (y < end)))
+    seen = sign > 0 and bool(np.any(near & (witness < 0) & (head_sign * y < end)))
     drops = (_DROPS_MM if seen else _DROPS_MM[:1]) if drop_mm is None else np.array([drop_mm])
-    over = height[near] - drops[:, None] * Rear(1.0, start, end).height(y[near])
+    over = height[near] - drops[:, None] * sunk.height(y[near])
     side = sign * witness[near] / rise[near]
     nats = level_kernels.level_negative_log_likelihood(
         over, side, witness[near] < 0, missing, first, step, count, _BLURS
@@ -161,9 +167,9 @@ def find_level(
     drop, mean, sigma, at_ends = level_kernels.level_posterior(nats, *costs, first, step)
     if about is not None and at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
         about = (shift, sign, 1.0) if reach < 1.0 else None
-        return find_level(height, slope, y, witness, spacing_mm, drop_mm, about, missing)
+        return find_level(height, slope, y, witness, spacing_mm, rear, about, missing)
     least, rays = float(nats.min()), int(near.sum())
-    return Level(mean, sigma, sign, Rear(drop, start, end), least, rays, usual)
+    return Level(mean, sigma, sign, replace(sunk, drop_mm=drop), least, rays, usual)
 
 
 def _scan_levels(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:

@@ -154,9 +154,9 @@ def fit_pool(
     witnesses = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
     stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
     dots = rig.imaging_plane.to_universal(plane_mm)
-    weights = kernels.slope_weights(laser, plane[1:3], points, dots, covariance, settings.floor_mm)
+    weights = kernels.slope_weights(laser, plane, points, dots, covariance, settings.floor_mm)
     reuse = settings.floor_mm / 50
-    equations = NormalEquations(basis, stiffness, laser, dots, weights, reuse_mm=reuse)
+    equations = NormalEquations(basis, stiffness, laser, plane, dots, weights, reuse_mm=reuse)
     from_middle = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
     outer = from_middle > median(from_middle)
     coefficients, moved = np.zeros(basis.count), np.inf
@@ -175,7 +175,7 @@ def fit_pool(
             about = (0.0, level.sign, LEVEL_REACH) if count else None
             before = level
             seen = np.array(slope).T, ground[witnesses, 1], witness[witnesses], spacing
-            level = find_level(height, *seen, drop, about, missing)
+            level = find_level(height, *seen, (rig.head_sign, drop), about, missing)
             if drop is not None:  # a drop that is held leaves the level as open as a free one
                 level = replace(level, sigma_mm=max(level.sigma_mm, before.sigma_mm))
         coefficients += level.shift_mm  # the splines add up to 1

@@ -7,14 +7,14 @@ a size changes by: over the very width that matters, as the level answers few ra
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from labapp.core.geometry.optics import intersect_level, ray_directions
-from labapp.core.geometry.perturbation import moved_dots, moved_rig
-from labapp.core.geometry.rig import Laser, Rig
+from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
+from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.level import Level, find_level
 from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
@@ -87,12 +87,13 @@ class Fitted:
 
         assert self.rig.uncertainty is not None
         match, basis = self.match, self.surface.basis
-        rig = _aimed_as(self.rig.laser, moved_rig(self.rig, offset))
+        rig = aimed_as(self.rig.laser, moved_rig(self.rig, offset))
         laser, pattern = rig.laser.position_mm, ray_directions(rig.laser, rig.pattern)
         rays, ground = pattern[tuple(match.ray.T - 1)], intersect_level(laser, pattern)
         dots = moved_dots(match.plane_mm, self.rig, self.rig.uncertainty.axes, offset)
         dots = rig.imaging_plane.to_universal(dots)
-        equations = NormalEquations(basis, self._stiffness, laser, dots, self._weights)
+        plane = rig.imaging_plane.pose_mm
+        equations = NormalEquations(basis, self._stiffness, laser, plane, dots, self._weights)
         coefficients, moved = self.surface.coefficients, 0.0
         points = intersect_level(laser, rays, self.points_mm[:, 2:])
         for _ in range(ROUNDS):
@@ -102,8 +103,8 @@ class Fitted:
         lit = self._witnesses
         height, *slope = kernels.surface_at(basis.grid, coefficients, ground[lit])
         seen = np.array(slope).T, ground[lit, 1], match.witness[lit], landing_spacing(ground)
-        about, drop = (0.0, self.level.sign, REACH), self.level.rear.drop_mm
-        level = find_level(height, *seen, drop, about, match.missing)
+        about, rear = (0.0, self.level.sign, REACH), (rig.head_sign, self.level.rear.drop_mm)
+        level = find_level(height, *seen, rear, about, match.missing)
         return np.asarray(coefficients + level.shift_mm)
 
     @cached_property
@@ -117,7 +118,7 @@ class Fitted:
 
         plane, match = self.rig.imaging_plane, self.match
         dots = plane.to_universal(match.plane_mm), match.plane_covariance_mm2
-        at = self.rig.laser.position_mm, plane.pose_mm[1:3], self.points_mm
+        at = self.rig.laser.position_mm, plane.pose_mm, self.points_mm
         return kernels.slope_weights(*at, *dots, self.settings.floor_mm)
 
     @cached_property
@@ -131,18 +132,4 @@ class Fitted:
 
 def setup_sigma(rig: Rig, changes: FloatArray) -> FloatArray:
     """Standard uncertainty of sizes, shape (m,), from their `Fitted.setup_changes`."""
-    if rig.uncertainty is None:
-        return np.zeros(len(changes))
-    variance = np.einsum("mp,pq,mq->m", changes, rig.uncertainty.correlation, changes)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _aimed_as(laser: Laser, rig: Rig) -> Rig:
-    """The rig moved along the work piece until its laser aims where another does.
-
-    No size changes by that, and the surface stays where its splines are.
-    """
-    aside = np.array([rig.laser.aim_x_mm - laser.aim_x_mm, rig.laser.aim_y_mm - laser.aim_y_mm, 0])
-    back = replace(rig.laser, aim_x_mm=laser.aim_x_mm, aim_y_mm=laser.aim_y_mm)
-    plane = replace(rig.imaging_plane, origin_mm=rig.imaging_plane.origin_mm - aside)
-    return replace(rig, laser=back, imaging_plane=plane)
+    return np.zeros(len(changes)) if rig.uncertainty is None else rig.uncertainty.combined(changes)

@@ -32,8 +32,8 @@ class NormalEquations:
         The splines.
     stiffness
         Weight of the roughness times its matrix, lower band, shape (width + 1, p).
-    laser_mm
-        The laser, shape (3,), mm.
+    laser_mm, plane
+        The laser, shape (3,), and the imaging plane (`ImagingPlane.pose_mm`), mm.
     dots_mm
         The dots in the UCS, shape (n, 3), mm.
     weights
@@ -48,6 +48,7 @@ class NormalEquations:
     basis: SplineBasis
     stiffness: FloatArray
     laser_mm: FloatArray
+    plane: FloatArray
     dots_mm: FloatArray
     weights: FloatArray
     factor: FloatArray | None = None
@@ -86,7 +87,7 @@ class NormalEquations:
         if self.factor is None or not moved_mm <= self.reuse_mm:
             self.factor = normal_factor(self.basis, self.stiffness, points_mm, self.weights)
         at = self.basis.grid, coefficients, points_mm, self.weights
-        target = kernels.gradient_rhs(*at, self.laser_mm, self.dots_mm)
+        target = kernels.gradient_rhs(*at, self.laser_mm, self.plane, self.dots_mm)
         width = len(self.stiffness) - 1
         target -= scipy.linalg.blas.dsbmv(
             width, 1.0, self.stiffness, coefficients - smooth_about, lower=1

@@ -20,6 +20,7 @@ from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace
+from labapp.text import SETUP_WORDS
 
 DECIMALS = 3
 """Of live figures, mm."""
@@ -125,6 +126,8 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
     told.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
     if age_s <= OLD_S:
         told[-1] += f"; {age_s:.2f} s old"
+    if found.setup_status in SETUP_WORDS:
+        told[-1] += f". {SETUP_WORDS[found.setup_status]}"
     return " ".join(told)
 
 
@@ -135,7 +138,7 @@ class LiveFigures(FollowsTheme, QWidget):
         super().__init__()
         self._grid = QGridLayout()
         self._grid.setColumnStretch(1, 1)
-        self.words = Message(3)
+        self.words = Message(4)
         vbox(self._grid, self.words, of=self)
         self._labels: dict[tuple[int, int], QLabel] = {}
         self._looks: dict[QLabel, tuple[Look, bool]] = {}

@@ -96,24 +96,20 @@ def calibrations_in_use(session: Session) -> tuple[bool, bool]:
     """
     keys = tomllib.loads(session.setup_text)
     laser, plane = session.laser_calibration, session.plane_calibration
-    found = (
-        {}
-        if laser is None
-        else {
-            "projection_angle_deg": laser.found.angle_deg,
-            "distance_mm": laser.found.distance_mm,
-        }
-    )
     return (
-        laser is not None and _entered(keys.get("laser"), found),
+        laser is not None and _entered(keys.get("laser"), laser.found.setup_keys),
         plane is not None and _entered(keys.get("image_calibration"), plane.found.setup_keys),
     )
 
 
 def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
-    """Whether a section of the set-up holds what was found, but for rounding."""
+    """Whether a section of the set-up holds the values found, but for rounding."""
     try:
-        pairs = [(keys[name], value) for name, value in found.items() if value is not None]
+        pairs = [
+            (keys[name], value)
+            for name, value in found.items()
+            if value is not None and not name.endswith(("_sigma", "_correlation"))
+        ]
         return all(np.allclose(one, other, rtol=1e-6) for one, other in pairs)
     except (KeyError, TypeError, ValueError):
         return False

@@ -11,6 +11,7 @@ from labapp.session.session import Session
 from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM
 from labapp.studies.adviser.bench_limits import CONSTRAINTS, BenchLimits
 from labapp.studies.adviser.files import advised_setup
+from labapp.studies.adviser.keys import calibration_values
 from labapp.studies.adviser.report import WORDS
 from labapp.studies.adviser.search import Advice
 
@@ -63,6 +64,8 @@ def question(session: Session | None) -> Values:
         bench["height_mm"] = found.imaging_plane.height_mm
         bench["electrode_height_mm"] = found.electrode.height_mm
         values["pattern"] = pattern_values(found.pattern)
+        if found.uncertainty is not None:
+            values["calibration"] = calibration_values(found.uncertainty)
     return values
 
 

@@ -26,7 +26,7 @@ class BenchView(Sketch):
 
     def __init__(self) -> None:
         self._view: SideView | None = None
-        self.whole = make_plot("Y, welding direction, mm", "Z, mm")
+        self.whole = make_plot("Y, along the weld, mm", "Z, mm")
         self.near = make_plot("enlarged, mm")
         super().__init__("Side view of the bench", (self.whole, 3), (self.near, 2))
         self.follow_theme()

@@ -29,6 +29,9 @@ from labapp.gui.widgets.layouts import hbox, vbox
 MOUSE_MS = 20
 """How often it is checked whether the mouse button was released."""
 
+BUTTONS_PX = 26
+"""Room for the step buttons and the frame of a narrow field."""
+
 STEP_PAUSE_MS = 300
 """Steps that follow each other faster than this are one edit."""
 
@@ -169,6 +172,10 @@ class NumberField(Field):
         if not typing:
             self._show()
             self.set_problem("")
+
+    def set_placeholder(self, words: str) -> None:
+        """Say in grey what holds while the field is empty."""
+        self._box.line.setPlaceholderText(words)
 
     def flush(self) -> None:
         """Finish an edit under way, as leaving the field does."""
@@ -411,7 +418,10 @@ class ChoiceField(Field):
 
 
 class FieldForm(QWidget):
-    """Fields under each other: labels at the left, editors and units in columns."""
+    """Fields under each other: labels at the left, editors and units in columns.
+
+    A field may have another beside it, in a narrow column at the right.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -421,11 +431,17 @@ class FieldForm(QWidget):
         self._grid.setColumnStretch(1, 3)
         self._fields: list[Field] = []
 
-    def add(self, field: Field) -> None:
-        """Put a field below the others."""
+    def add(self, field: Field, beside: Field | None = None) -> None:
+        """Put a field below the others, and perhaps one without label and unit beside it."""
         row = self._grid.rowCount()
         self._grid.addWidget(field.label, row, 0, Qt.AlignmentFlag.AlignTop)
         self._grid.addWidget(field, row, 1)
+        if beside is not None:
+            beside.unit.hide()
+            digits = beside.editor.fontMetrics().horizontalAdvance("0.0000")
+            beside.editor.setMinimumWidth(digits + BUTTONS_PX)
+            self._grid.addWidget(beside, row, 2, Qt.AlignmentFlag.AlignTop)
+            self._grid.setColumnStretch(2, 1)
         # Level with the editor's first line.
         height = field.editor.fontMetrics().lineSpacing() + 12
         field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))
@@ -437,11 +453,11 @@ class FieldForm(QWidget):
 
     def add_heading(self, words: str) -> None:
         """Begin a group of fields."""
-        self._grid.addWidget(heading(words), self._grid.rowCount(), 0, 1, 2)
+        self._grid.addWidget(heading(words), self._grid.rowCount(), 0, 1, 3)
 
     def add_wide(self, widget: QWidget) -> None:
         """Put something else below the fields, over the whole width."""
-        self._grid.addWidget(widget, self._grid.rowCount(), 0, 1, 2)
+        self._grid.addWidget(widget, self._grid.rowCount(), 0, 1, 3)
 
 
 def whole(label: str, lowest: int, tip: str) -> NumberField:

@@ -13,7 +13,7 @@ import numpy as np
 
 from labapp.config.setup import Setup
 from labapp.core.geometry.rig import ImagingPlane, Rig
-from labapp.core.pipeline import Measurement, Settings
+from labapp.core.pipeline import Measurement, Settings, setup_status
 from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import SIZES, Measures, sigma_name
 from labapp.core.values import FloatArray
@@ -372,6 +372,7 @@ def rig_cells(setup: Setup) -> Cells:
     origin = setup.calibration.to_image(np.zeros(2))
     return [
         ["part", "quantity", "value"],
+        ["set-up", "status", setup_status(rig)],
         ["laser", "projection angle α", f"{rig.laser.projection_angle_deg:.6g} °"],
         ["", "distance to the origin", f"{rig.laser.distance_mm:.6g} mm"],
         ["dot pattern", "rows × columns", f"{rig.pattern.rows} × {rig.pattern.columns}"],
@@ -379,16 +380,24 @@ def rig_cells(setup: Setup) -> Cells:
         ["", "inter-beam angle β", f"{rig.pattern.inter_beam_angle_deg:.6g} °"],
         ["", "absent rays (i, j)", absent + (" …" if len(rig.pattern.absent_rays) > 8 else "")],
         ["electrode", "height of the tip", f"{rig.electrode.height_mm:.6g} mm"],
+        ["torch", "moves towards", rig.travel.upper().replace("-", "−")],
         ["imaging plane", "distance D: O′ at Y = −D", f"{-y:.6g} mm"],
         ["", "s: O′ at X = −s", f"{-x:.6g} mm"],
         ["", "h: O′ at Z = h", f"{z:.6g} mm"],
         ["", "width × height", f"{plane.width_mm:.6g} × {plane.height_mm:.6g} mm"],
         *_tilt_rows(plane),
+        ["", "glass on the pool's side", _glass(plane)],
         ["image calibration", "O′ in the picture (u, v)", f"{origin[0]:.2f}, {origin[1]:.2f} px"],
         ["", "scale along O′X′", f"{along_x:.4f} px/mm"],
         ["", "scale along O′Z′", f"{along_z:.4f} px/mm"],
         ["", "angle between the axes", f"{angle:.3f} °"],
     ]
+
+
+def _glass(plane: ImagingPlane) -> str:
+    if not plane.glass_mm:
+        return "none"
+    return f"{plane.glass_mm:.4g} mm, refractive index {plane.glass_index:.4g}"
 
 
 def _tilt_rows(plane: ImagingPlane) -> Cells:

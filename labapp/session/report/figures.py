@@ -83,7 +83,7 @@ def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
         view.plot(laser[1], laser[2], "ks", ms=5)
         _label_rig(view, rig, top)
         view.set(xlim=(low, high), ylim=(floor, roof), aspect="equal")
-        view.set(xlabel="Y, welding direction (mm)", ylabel="Z (mm)")
+        view.set(xlabel="Y, along the weld (mm)", ylabel="Z (mm)")
         return as_bytes(figure, dpi=DPI)
 
 
@@ -272,7 +272,7 @@ def height_map(measurement: Measurement) -> bytes:
         view.plot(points[:, 0], points[:, 1], "o", ms=2.2, mfc="white", mec="k", mew=0.3)
         view.plot(size.center_x_mm, size.center_y_mm, "k+", ms=8, mew=1.1)
         view.plot(size.peak_x_mm, size.peak_y_mm, "^", color="#d02020", ms=5)
-        view.set(aspect="equal", xlabel="X (mm)", ylabel="Y, welding direction (mm)")
+        view.set(aspect="equal", xlabel="X (mm)", ylabel="Y, along the weld (mm)")
         figure.colorbar(heights, ax=view, label="height (mm)", shrink=0.85)
         return as_bytes(figure, dpi=DPI)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,11 +10,12 @@ import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import Pool
 from labapp.studies.adviser.expected_pools import ExpectedPools, Range
-from labapp.studies.parameter_deviation import NOMINAL, AxisPoints
+from labapp.studies.parameter_deviation import NOMINAL
 
 Constraint = Literal["torch", "across", "up", "spacing", "once", "dots"]
 
@@ -75,7 +77,9 @@ class BenchLimits:
     dot_sigma_px
         Standard uncertainty of a dot's place.
     sigma
-        Standard uncertainties of the calibration, of `QUANTITIES`.
+        Standard uncertainties of the bench's quantities, by `Quantity.sigma_key`.
+    angle_distance_correlation
+        Of the laser's projection angle and distance.
     """
 
     angle_deg: Range = (25.0, 35.0)
@@ -90,7 +94,8 @@ class BenchLimits:
     px_per_mm: float = 4.7
     spacing_px: float = 6.0
     dot_sigma_px: float = 0.3
-    sigma: tuple[float, ...] = NOMINAL
+    sigma: Mapping[str, float] = field(default_factory=lambda: dict(NOMINAL))
+    angle_distance_correlation: float = 0.0
 
     @property
     def dot_sigma_mm(self) -> float:
@@ -107,6 +112,13 @@ class BenchLimits:
             (0.0, up / 2 * scale), up / 2,
         )  # fmt: skip
         return AxisPoints(calibration, across / 2, up / 2)
+
+    @property
+    def uncertainty(self) -> RigUncertainty:
+        """How well the bench will be known, wherever laser and plane stand."""
+        return RigUncertainty(
+            self.axes, *covariance_of(self.sigma, self.angle_distance_correlation)
+        )
 
     def rig(self, place: Place) -> Rig:
         """The bench with laser and plane at a place."""

@@ -10,9 +10,9 @@ import numpy as np
 from scipy import special
 from scipy.stats import qmc
 
+from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.pools import Pool, ellipsoidal_cap
-from labapp.studies.parameter_deviation import OFFSETS
 
 Kind = Literal["convex", "concave"]
 Range = tuple[float, float]
@@ -92,9 +92,9 @@ class ExpectedPools:
         pool follow each other.
         """
         rng, total = np.random.default_rng(seed), count * places
-        share = rng.random((total, DRAWN + OFFSETS))
+        share = rng.random((total, DRAWN + len(QUANTITIES)))
         if even:
-            row = qmc.Sobol(DRAWN + OFFSETS, rng=rng)
+            row = qmc.Sobol(DRAWN + len(QUANTITIES), rng=rng)
             share = row.random_base2(max(total - 1, 0).bit_length())[:total]
         share[:, :SIZES] = np.repeat(share[:count, :SIZES], places, axis=0)
         pools = tuple(self.at(one) for one in share[:, :DRAWN])
@@ -112,7 +112,7 @@ class Sample(ReadOnlyArrays):
     pools
         n of them.
     deviate
-        Errors of the calibration, in standard uncertainties, shape (n, 11).
+        Errors of the calibration, in standard uncertainties, shape (n, q).
     seed
         Of the dots' noise.
     """

@@ -15,7 +15,7 @@ from labapp.studies.adviser.bench_limits import BenchLimits, Place
 from labapp.studies.adviser.expected_pools import Sample
 from labapp.studies.adviser.predicted_error import predict_error
 from labapp.studies.error_analysis import relative_errors
-from labapp.studies.parameter_deviation import move, spread
+from labapp.studies.parameter_deviation import move
 
 MEAN_OF_SIGMA = float(np.sqrt(2 / np.pi))
 """Mean distance from 0 of a normal deviate of standard deviation 1."""
@@ -53,8 +53,8 @@ def simulated_errors(trial: Trial) -> FloatArray:
     (`move`, by the sample's errors): dots and rays as they would be on the bench.
     """
     limits, sample = trial.limits, trial.sample
-    rig, axes = limits.rig(trial.place), limits.axes
-    each = spread(limits.sigma)
+    rig, known = limits.rig(trial.place), limits.uncertainty
+    root = known.root
     rows = []
     for number in range(trial.first, trial.last):
         pool = sample.pools[number]
@@ -65,7 +65,7 @@ def simulated_errors(trial: Trial) -> FloatArray:
             match = exact_match(seen, rig, sigma_mm=limits.dot_sigma_mm, rng=rng)
             believed = rig
             if trial.calibrated:
-                match, believed = move(match, rig, axes, each * sample.deviate[number])
+                match, believed = move(match, rig, known.axes, root @ sample.deviate[number])
             measures = measure_surface(reconstruct(match, believed, Settings()), match, believed)
             error = abs(relative_errors(measures, pool)[0] * pool.peak_mm)
         except CannotMeasure:
@@ -85,8 +85,7 @@ def predicted_errors(trial: Trial) -> FloatArray:
             pool,
             rig,
             dot_sigma_mm=limits.dot_sigma_mm,
-            sigma=limits.sigma if trial.calibrated else None,
-            axes=limits.axes,
+            uncertainty=limits.uncertainty if trial.calibrated else None,
         )
         for pool in trial.sample.pools[trial.first : trial.last]
     ]

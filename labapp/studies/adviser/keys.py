@@ -17,25 +17,31 @@ from labapp.config.toml_keys import (
     unknown_key,
     within,
 )
+from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, QUANTITIES, RigUncertainty
 from labapp.errors import InputError
 from labapp.studies.adviser.bench_limits import BenchLimits
 from labapp.studies.adviser.expected_pools import ExpectedPools
-from labapp.studies.parameter_deviation import NOMINAL, QUANTITIES
+from labapp.studies.parameter_deviation import NOMINAL
 
 A_REQUEST = "a file for labapp advise (TOML, UTF-8)"
 
-CALIBRATION = (
-    "projection_angle_deg",
-    "distance_mm",
-    "plane_distance_mm",
-    "s_mm",
-    "h_mm",
-    "origin_px",
-    "x_axis_px",
-    "z_axis_px",
-)
-"""Keys of the calibration's standard uncertainties, in the order of `QUANTITIES`."""
-assert len(CALIBRATION) == len(QUANTITIES)
+CALIBRATION = {
+    one.key.partition("[")[0].partition(".")[2]: one.sigma_key
+    for one in QUANTITIES
+    if one.key != "imaging_plane.distance_mm"
+} | {"plane_distance_mm": "imaging_plane.distance_mm_sigma"}
+"""Keys of standard uncertainties: those of the setup file without their section."""
+
+
+LARGEST_SIGMA = 10.0
+
+
+def calibration_values(known: RigUncertainty) -> dict[str, float]:
+    """How well a bench is known, as the keys of ``[calibration]``: key → value."""
+    sigma = {one.sigma_key: float(own) for one, own in zip(QUANTITIES, known.sigma, strict=True)}
+    values = {name: min(sigma[key], LARGEST_SIGMA) for name, key in CALIBRATION.items()}
+    shared = float(known.correlation[ANGLE, DISTANCE])
+    return {**values, "angle_distance_correlation": shared}
 
 
 def _range(low: float, high: float, unit: str, required: bool = False) -> Rule:
@@ -75,7 +81,10 @@ TABLES: dict[str, dict[str, Rule]] = {
     "bench": BENCH,
     "pattern": SECTIONS["pattern"],
     "camera": CAMERA,
-    "calibration": {name: within(0, 10, "standard uncertainty") for name in CALIBRATION},
+    "calibration": {
+        **{name: within(0, LARGEST_SIGMA, "standard uncertainty") for name in CALIBRATION},
+        "angle_distance_correlation": within(-1, 1, "correlation"),
+    },
 }
 """All tables and keys; only the pools are required."""
 
@@ -145,17 +154,16 @@ def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:
     edge = bench.pop("edge_mm", 1.0)
     for key, value in bench.items():
         given[RANGES.get(key, key)] = _span(value)
-    sigma = [
-        float(tables["calibration"].get(name, usual))
-        for name, usual in zip(CALIBRATION, NOMINAL, strict=True)
-    ]
+    calibration = tables["calibration"]
+    sigma = {key: float(calibration.get(name, NOMINAL[key])) for name, key in CALIBRATION.items()}
     return BenchLimits(
         **given,
         plate_mm=plate,
         edge_mm=edge,
         electrode_mm=electrode,
         pattern=dot_pattern(tables["pattern"]),
-        sigma=tuple(sigma),
+        sigma=sigma,
+        angle_distance_correlation=calibration.get("angle_distance_correlation", 0.0),
         **tables["camera"],
     )
 

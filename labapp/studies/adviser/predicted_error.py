@@ -7,27 +7,25 @@ from that. Some 10 ms a pool, 50 ms with the calibration's part; the fit itself 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.geometry.optics import bisecting_gradient, intersect_level, ray_directions
-from labapp.core.geometry.rig import Laser, Rig
+from labapp.core.geometry.optics import (
+    bisecting_gradient,
+    direction_to_dots,
+    intersect_level,
+    ray_directions,
+)
+from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
+from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import QUANTITIES, AxisPoints, RigUncertainty
 from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings, landing_spacing
 from labapp.core.surface.solver import SlopeFit, fit_slopes
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import FloatArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import Pool
-from labapp.studies.parameter_deviation import (
-    OFFSETS,
-    QUANTITIES,
-    AxisPoints,
-    by_quantity,
-    dots_moved,
-    spread,
-)
 
 DOT_SIGMA_MM = 0.053
 """Standard uncertainty of a dot's place on the plane: 0.3 px of a camera that sees all of it."""
@@ -54,7 +52,10 @@ class PredictedError(ReadOnlyArrays):
     dots_mm
         The dots' uncertainty on the plane.
     parameters_mm
-        The calibration's uncertainties, `QUANTITIES`, shape (8,); zero where not asked for.
+        What each of the bench's `QUANTITIES` changes by its standard uncertainty, shape (q,); zero
+        where not asked for.
+    setup_mm
+        These together, with their correlations.
     dots, blocked, off_plane, lost
         Dots that show; rays from the pool that the torch hides; whose reflection misses the
         plane's edges; that meet the pool again.
@@ -64,6 +65,7 @@ class PredictedError(ReadOnlyArrays):
     shape_mm: float
     dots_mm: float
     parameters_mm: FloatArray
+    setup_mm: float
     dots: int
     blocked: int
     off_plane: int
@@ -77,7 +79,7 @@ class PredictedError(ReadOnlyArrays):
     @property
     def total_mm(self) -> float:
         """Combined standard uncertainty."""
-        return float(np.hypot(self.random_mm, np.linalg.norm(self.parameters_mm)))
+        return float(np.hypot(self.random_mm, self.setup_mm))
 
 
 def predict_error(
@@ -85,8 +87,7 @@ def predict_error(
     rig: Rig,
     *,
     dot_sigma_mm: float = DOT_SIGMA_MM,
-    sigma: Sequence[float] | None = None,
-    axes: AxisPoints | None = None,
+    uncertainty: RigUncertainty | None = None,
 ) -> PredictedError:
     """Predict the error of a pool's height by the fit, as a standard uncertainty.
 
@@ -98,10 +99,8 @@ def predict_error(
         The set-up.
     dot_sigma_mm
         Standard uncertainty of a dot's place on the plane.
-    sigma
-        Standard uncertainties of `QUANTITIES`; None leaves the calibration out.
-    axes
-        The image calibration; without it the axis points' part is zero.
+    uncertainty
+        How well the set-up is known; None: exactly.
 
     Returns
     -------
@@ -114,6 +113,7 @@ def predict_error(
         shape_mm=np.inf,
         dots_mm=np.inf,
         parameters_mm=np.zeros(len(QUANTITIES)),
+        setup_mm=0.0,
         dots=int(seen.visible.sum()),
         blocked=int((seen.lit & seen.blocked).sum()),
         off_plane=int((seen.lit & ~seen.blocked & ~seen.on_plane).sum()),
@@ -122,12 +122,14 @@ def predict_error(
     if counted.dots < LEAST_DOTS:
         return counted
     model = _Model(pool, rig, seen, dot_sigma_mm)
+    changes = counted.parameters_mm if uncertainty is None else model.parameters(uncertainty)
     return replace(
         counted,
         boundary_mm=model.boundary(),
         shape_mm=abs(model.height(model.fitted, model.rim) - abs(model.peak_mm)),
         dots_mm=model.noise(),
-        parameters_mm=(counted.parameters_mm if sigma is None else model.parameters(sigma, axes)),
+        parameters_mm=changes,
+        setup_mm=0.0 if uncertainty is None else float(uncertainty.combined(changes[None])[0]),
     )
 
 
@@ -162,11 +164,12 @@ class _Model:
         covariance = np.broadcast_to(variance * np.eye(2), (len(self.points), 2, 2))
         laser, pose = rig.laser.position_mm, rig.imaging_plane.pose_mm
         dots = rig.imaging_plane.to_universal(self.plane)
-        self.weights = kernels.slope_weights(laser, pose[1:3], self.points, dots, covariance, 0.0)
+        self.weights = kernels.slope_weights(laser, pose, self.points, dots, covariance, 0.0)
         self.fitted = self.fit(self.points, pool.gradient(*self.points[:, :2].T))
         self.inward = self._inward(ground)
         self.dark = ~seen.hit & ~seen.absent & self.basis.contains(ground[..., 0], ground[..., 1])
-        self.level_at = self._deciding()
+        self.deciding = self._deciding()
+        self.level_at = ground[self.deciding]
 
     def fit(self, points: FloatArray, slopes: FloatArray) -> SlopeFit:
         return fit_slopes(self.basis, points[:, :2], slopes, self.weights, self.stiffness)
@@ -200,48 +203,31 @@ class _Model:
         fall = np.sum(self.pool.gradient(*just_inside.T) * (self.rim - center), axis=-1)
         return np.asarray((1 - rho) * np.abs(fall).mean())
 
-    def _deciding(self) -> FloatArray:
-        """Landing points of the rays that place the level: lit and dark ones nearest the rim."""
+    def _deciding(self) -> tuple[IntArray, ...]:
+        """Indices of the rays that place the level: lit and dark ones nearest the rim."""
         sides = []
         for side in (self.seen.visible, self.dark):
             nearest = np.argsort(np.abs(self.inward[side]))[:DECIDING]
-            sides.append(self.ground[side][nearest])
-        return np.concatenate(sides)
+            sides.append(np.argwhere(side)[nearest])
+        return tuple(np.concatenate(sides).T)
 
-    def parameters(self, sigma: Sequence[float], axes: AxisPoints | None) -> FloatArray:
-        """Standard uncertainty of `height` from each of `QUANTITIES`, shape (8,)."""
+    def parameters(self, uncertainty: RigUncertainty) -> FloatArray:
+        """Change of `height` by the standard uncertainty of each of `QUANTITIES`, shape (q,)."""
         base = self.height(self.fitted, self.level_at)
-        change = np.zeros(OFFSETS)
-        for k, step in enumerate(np.diag(spread(sigma))):
-            if step.any() and (axes is not None or not step[5:].any()):
-                change[k] = self._believed(step, axes) - base
-        return by_quantity(change)
+        change = np.zeros(len(QUANTITIES))
+        for k in np.flatnonzero(uncertainty.sigma):
+            step = np.diag(uncertainty.sigma)[k]
+            change[k] = self._believed(step, uncertainty.axes) - base
+        return change
 
-    def _believed(self, offset: FloatArray, axes: AxisPoints | None) -> float:
+    def _believed(self, offset: FloatArray, axes: AxisPoints) -> float:
         """Height that is measured if the bench is taken to be off by ``offset``."""
-        plane, rig = dots_moved(self.plane, self.rig, axes, offset)
-        source = rig.laser.position_mm
-        rays = ray_directions(rig.laser, rig.pattern)[self.seen.visible]
+        plane = moved_dots(self.plane, self.rig, axes, offset)
+        rig = aimed_as(self.rig.laser, moved_rig(self.rig, offset))
+        source, directions = rig.laser.position_mm, ray_directions(rig.laser, rig.pattern)
+        rays = directions[self.seen.visible]
         points = source + (self.points[:, 2:] - source[2]) / rays[:, 2:] * rays
-        dots = rig.imaging_plane.to_universal(plane)
-        slopes = bisecting_gradient(points - source, dots - points)
-        rim = _landing(self.level_at, self.rig.laser, rig.laser)
+        reflected = direction_to_dots(points, plane, rig.imaging_plane)
+        slopes = bisecting_gradient(points - source, reflected)
+        rim = intersect_level(source, directions[self.deciding])[:, :2]
         return self.height(self.fit(points, slopes), rim)
-
-
-def _landing(xy: FloatArray, true: Laser, believed: Laser) -> FloatArray:
-    """Where rays that land at (x, y) on z = 0 are believed to, shape (n, 2), mm."""
-    forward, across, up = _axes(true)
-    ray = np.column_stack([xy, np.zeros(len(xy))]) - true.position_mm
-    p, q = ray @ across / (ray @ forward), ray @ up / (ray @ forward)
-    forward, across, up = _axes(believed)
-    return intersect_level(believed.position_mm, forward + p[:, None] * across + q[:, None] * up)[
-        :, :2
-    ]
-
-
-def _axes(laser: Laser) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Unit vectors along the beam, along X and square to both (Fig. 4-14)."""
-    alpha = np.radians(laser.projection_angle_deg)
-    forward = np.array([0.0, -np.cos(alpha), -np.sin(alpha)])
-    return forward, np.array([1.0, 0.0, 0.0]), np.array([0.0, -np.sin(alpha), np.cos(alpha)])

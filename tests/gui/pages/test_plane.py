@@ -266,7 +266,8 @@ def test_the_operator_may_use_another_model(qtbot: QtBot, page: PlanePage) -> No
     assert chosen.model == "homography"
     page.use_button.click()
     assert "homography = [" in session.setup_text
-    assert "origin_px" not in session.setup_text
+    assert "origin_px =" not in session.setup_text
+    assert "origin_px_sigma" in session.setup_text
     page.workspace.undo()
     assert session.setup_text == before
 

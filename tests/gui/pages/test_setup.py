@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PySide6.QtCore import Qt
 from pytestqt.qtbot import QtBot
 
 from labapp.config.setup import read_setup
+from labapp.config.setup_keys import SECTIONS
+from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, QUANTITIES
 from labapp.gui.pages.setup import SetupPage, presenter
 from labapp.gui.pages.setup.presenter import RIG, SAFETY
 from labapp.gui.workspace import Workspace
@@ -30,7 +33,10 @@ def empty(tmp_path: Path) -> Iterator[Session]:
 
 def test_everything_is_missing_in_a_new_session(empty: Session) -> None:
     shown = presenter.shown(empty)
-    needed = [key for key in KEYS if not key.endswith(("pitch_deg", "yaw_deg"))]
+    rules = {
+        f"{section}.{key}": rule for section in SECTIONS for key, rule in SECTIONS[section].items()
+    }
+    needed = [key for key in KEYS if rules[key].required]
     assert shown.problems == dict.fromkeys(needed, "missing")
     assert set(shown.values.values()) == {None}
     assert shown.others == ("The imaging plane is not calibrated: that is step 3.",)
@@ -51,6 +57,41 @@ def test_usual_values_fill_only_what_is_missing(empty: Session) -> None:
     rig = presenter.rig(empty)
     assert rig is not None
     assert rig.laser.distance_mm == 42.0
+
+
+def test_every_quantity_has_a_field_for_its_uncertainty() -> None:
+    fields = [presenter.sigma_entry(entry) for _, entries in RIG for entry in entries]
+    keys = {entry.key for entry in (*fields, *presenter.UNCERTAIN_ONLY[1]) if entry is not None}
+    assert keys == {one.sigma_key for one in QUANTITIES}
+
+
+def test_calibrations_make_a_setup_calibrated_and_edits_undo_that(empty: Session) -> None:
+    empty.set_setup(read_setup(SAMPLES / "gtaw" / "setup.toml").text)
+    assert empty.setup.rig.uncertainty.status == "entered"
+    cross = [13.66, 13.7, 13.68], [18.52, 18.6, 18.56], [7.86, 7.9, 7.87]
+    found = empty.calibrate_laser(*cross)
+    assert empty.setup.rig.uncertainty.status == "entered"
+    plane = empty.calibrate_plane(SAMPLES / "gtaw" / "calibration.png", 6.35)
+    known = empty.setup.rig.uncertainty
+    assert known.status == "calibrated"
+    assert "calibrated" in presenter.shown(empty).status
+    assert known.sigma[INDEX["laser.distance_mm"]] == found.distance_sigma_mm
+    assert known.correlation[ANGLE, DISTANCE] == pytest.approx(found.correlation)
+    assert known.sigma[INDEX["image_calibration.z_axis_px[v]"]] == plane.points_sigma_px[2]
+    # Another value is not what was calibrated.
+    presenter.put(empty, "laser.distance_mm", 31.0)
+    changed = empty.setup.rig.uncertainty
+    assert changed.status == "entered"
+    assert "laser.distance_mm" in changed.assumed
+    assert "laser.projection_angle_deg" not in changed.assumed
+    assert changed.correlation[ANGLE, DISTANCE] == 0.0
+    empty.undo()
+    assert empty.setup.rig.uncertainty.status == "calibrated"
+    np.testing.assert_array_equal(empty.setup.rig.uncertainty.covariance, known.covariance)
+    # What no calibration found keeps the ± that was entered for it.
+    presenter.put(empty, "imaging_plane.distance_mm_sigma", 0.2)
+    presenter.put(empty, "imaging_plane.distance_mm", 51.0)
+    assert presenter.shown(empty).sigmas["imaging_plane.distance_mm_sigma"] == 0.2
 
 
 def test_what_cannot_be_is_said_at_its_field(empty: Session) -> None:
@@ -125,6 +166,29 @@ def test_an_edit_changes_the_session_and_the_drawing_and_is_undone(
     page.workspace.undo()
     assert field.value() == 5.0
     assert page.bench.words.text() == words
+
+
+def test_an_uncertainty_is_entered_beside_its_value(qtbot: QtBot, page: SetupPage) -> None:
+    session = page.workspace.session
+    assert session is not None
+    field = page.sigma_fields["laser.distance_mm_sigma"]
+    assert field.value() is None
+    retype(qtbot, field, "0,3")
+    assert session.setup.rig.uncertainty.sigma[DISTANCE] == 0.3
+    assert "laser.distance_mm" not in session.setup.rig.uncertainty.assumed
+    page.workspace.undo()
+    assert field.value() is None
+    assert session.setup.rig.uncertainty.sigma[DISTANCE] == 0.5
+
+
+def test_the_welding_direction_is_chosen(page: SetupPage) -> None:
+    session = page.workspace.session
+    assert session is not None
+    page.travel.edited.emit("-y")
+    assert session.setup.rig.travel == "-y"
+    assert page.travel.value() == "-y"
+    page.workspace.undo()
+    assert session.setup.rig.travel == "+y"
 
 
 def test_a_refusal_stays_while_other_fields_are_accepted(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from labapp.core.calibration.laser_calibration import LaserCalibration, calibrate_laser
+from labapp.core.calibration.laser_calibration import (
+    LaserCalibration,
+    LaserCalibrationSettings,
+    calibrate_laser,
+)
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
@@ -44,12 +48,15 @@ class Readings:
         Readings of l₁, l₂, l₃, mm; any number of each.
     fan_angle_deg
         Of the cross-hair lens.
+    settings
+        How well the fan angle and a reading are known.
     wrong
         What was typed and is no length, a sentence each.
     """
 
     lengths_mm: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] = ((), (), ())
     fan_angle_deg: float = FAN_ANGLE_DEG
+    settings: LaserCalibrationSettings = field(default_factory=LaserCalibrationSettings)
     wrong: tuple[str, ...] = ()
 
 
@@ -77,7 +84,11 @@ class LaserResult:
         return () if self.found is None else tuple(map(_spoken, self.found.warnings))
 
 
-def typed(cells: Mapping[tuple[int, int], str], fan_angle_deg: float) -> Readings:
+def typed(
+    cells: Mapping[tuple[int, int], str],
+    fan_angle_deg: float,
+    settings: LaserCalibrationSettings | None = None,
+) -> Readings:
     """Readings from the cells of the table, (row, column) → text."""
     lengths: list[list[float]] = [[], [], []]
     wrong = []
@@ -90,7 +101,8 @@ def typed(cells: Mapping[tuple[int, int], str], fan_angle_deg: float) -> Reading
         else:
             lengths[column].append(value)
     l1, l2, l3 = map(tuple, lengths)
-    return Readings((l1, l2, l3), fan_angle_deg, tuple(wrong))
+    known = settings or LaserCalibrationSettings()
+    return Readings((l1, l2, l3), fan_angle_deg, known, tuple(wrong))
 
 
 def kept(session: Session) -> Readings | None:
@@ -99,7 +111,13 @@ def kept(session: Session) -> Readings | None:
     if calibration is None:
         return None
     lengths = (calibration.l1_mm, calibration.l2_mm, calibration.l3_mm)
-    return Readings(lengths, calibration.fan_angle_deg)
+    known = {
+        "resolution_mm": calibration.resolution_mm,
+        "fan_angle_sigma_deg": calibration.fan_angle_sigma_deg,
+    }
+    given = {name: value for name, value in known.items() if value is not None}
+    settings = LaserCalibrationSettings(**given)
+    return Readings(lengths, calibration.fan_angle_deg, settings)
 
 
 def result(readings: Readings) -> LaserResult:
@@ -114,7 +132,7 @@ def result(readings: Readings) -> LaserResult:
     if missing:
         return LaserResult(None, f"Enter at least one reading of {', '.join(missing)}", spread)
     try:
-        found = calibrate_laser(*readings.lengths_mm, readings.fan_angle_deg)
+        found = calibrate_laser(*readings.lengths_mm, readings.fan_angle_deg, readings.settings)
     except ValueError as error:
         return LaserResult(None, _spoken(str(error)), spread)
     check = ResultRow(
@@ -125,23 +143,26 @@ def result(readings: Readings) -> LaserResult:
         ResultRow("Distance", found.distance_mm, found.distance_sigma_mm, "mm"),
         ResultRow("Height", found.height_mm, found.height_sigma_mm, "mm"),
         ResultRow("Horizontal distance", found.horizontal_mm, found.horizontal_sigma_mm, "mm"),
+        ResultRow("Correlation", found.correlation, decimals=2, note="Of angle and distance"),
     )
     return LaserResult(found, "", (*spread, check, *rows))
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:
     """The laser as the set-up has it."""
-    values = setup_shown(session).values
-    angle, distance = values["laser.projection_angle_deg"], values["laser.distance_mm"]
-    kept = session.laser_calibration
-    if kept is None or not calibrations_in_use(session)[0]:
-        rows = (("Projection angle", angle, None, "°"), ("Distance", distance, None, "mm"))
-        return tuple(ResultRow(*row, 3, "As entered") for row in rows)
-    note, found = "From this session's calibration", kept.found
-    return (
-        ResultRow("Projection angle", angle, found.angle_sigma_deg, "°", note=note),
-        ResultRow("Distance", distance, found.distance_sigma_mm, "mm", note=note),
+    shown = setup_shown(session)
+    calibrated = calibrations_in_use(session)[0]
+    note = "From this session's calibration" if calibrated else "As entered"
+    names = (
+        ("Projection angle", "laser.projection_angle_deg", "°"),
+        ("Distance", "laser.distance_mm", "mm"),
     )
+    rows = []
+    for name, key, unit in names:
+        sigma = shown.sigmas[f"{key}_sigma"]
+        about = note if sigma is not None else f"{note}; its ± is assumed"
+        rows.append(ResultRow(name, shown.values[key], sigma, unit, note=about))
+    return tuple(rows)
 
 
 # --- a picture of the cross -------------------------------------------------------------------

@@ -8,6 +8,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QHeaderView, QStackedWidget, QTableWidget, QTableWidgetItem, QWidget
 
+from labapp.core.calibration.laser_calibration import LaserCalibrationSettings
 from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place, Readings
@@ -72,7 +73,11 @@ class LaserPage(Page):
             for column in range(3)
             if (item := self.table.item(row, column)) is not None
         }
-        return presenter.typed(cells, self.fan.value() or presenter.FAN_ANGLE_DEG)
+        settings = LaserCalibrationSettings(
+            resolution_mm=self.resolution.value() or 0.0,
+            fan_angle_sigma_deg=self.fan_sigma.value() or 0.0,
+        )
+        return presenter.typed(cells, self.fan.value() or presenter.FAN_ANGLE_DEG, settings)
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross, with the points to drag."""
@@ -98,9 +103,13 @@ class LaserPage(Page):
         """Put the laser that follows into the rig."""
         readings = self.readings()
         picture = self._from_picture
-        lengths_mm, fan_deg = readings.lengths_mm, readings.fan_angle_deg
+        lengths_mm, fan_deg, settings = (
+            readings.lengths_mm,
+            readings.fan_angle_deg,
+            readings.settings,
+        )
         if self.workspace.attempt(
-            lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture)
+            lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture, settings)
         ):
             self.workspace.notified.emit(
                 "The laser is in the rig; undo brings the former back", False
@@ -122,12 +131,31 @@ class LaserPage(Page):
             decimals=2,
             tooltip="Fan angle of the cross-hair lens, as its maker says",
         )
-        self.fan.set_value(presenter.FAN_ANGLE_DEG)
-        self.fan.edited.connect(lambda _: self._follow())
-        form.add(self.fan)
+        self.fan_sigma = NumberField(
+            "Fan angle ±",
+            "°",
+            lowest=0,
+            highest=10,
+            step=0.05,
+            decimals=2,
+            tooltip="Standard uncertainty of the fan angle; 0.1° is assumed where its maker says "
+            "nothing",
+        )
+        self.resolution = NumberField(
+            "Resolution",
+            "mm",
+            lowest=0,
+            highest=10,
+            step=0.01,
+            decimals=2,
+            tooltip="Smallest step of the callipers or ruler: no length is known better than that",
+        )
+        for each in (self.fan, self.fan_sigma, self.resolution):
+            each.edited.connect(lambda _: self._follow())
+            form.add(each)
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
-        readings = wrapping_label("Readings, mm: a line each, as often as you like")
+        readings = wrapping_label("Readings, mm: three lines or more")
         self.use_button = button("Use these", "", self.use)
         self.words = wrapping_label()
         self.result = ResultTable("The laser that follows")
@@ -137,7 +165,7 @@ class LaserPage(Page):
             *(form, self._picture_part(), readings, self.table, self.use_button),
             *(self.words, self.result, plain_label("In the rig now"), self.in_use, 1),
         )
-        self.lock_with_session(self.fan, self.table)
+        self.lock_with_session(self.fan, self.fan_sigma, self.resolution, self.table)
 
     def _picture_part(self) -> QWidget:
         self.picture_part = FieldForm()
@@ -182,6 +210,8 @@ class LaserPage(Page):
         self.table.blockSignals(False)
         self.table.fit()
         self.fan.set_value(readings.fan_angle_deg)
+        self.fan_sigma.set_value(readings.settings.fan_angle_sigma_deg)
+        self.resolution.set_value(readings.settings.resolution_mm)
 
     def _put(self, row: int, texts: list[str]) -> None:
         self.table.blockSignals(True)

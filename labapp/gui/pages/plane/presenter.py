@@ -232,7 +232,8 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     names = (("Scale along X′", "px/mm"), ("Scale along Z′", "px/mm"), ("Angle", "°"))
     values, sigmas = [np.nan] * 3, [None] * 3
     kept = session.plane_calibration if calibrations_in_use(session)[1] else None
-    keys = tomllib.loads(session.setup_text).get("image_calibration", {})
+    entered = tomllib.loads(session.setup_text).get("image_calibration", {})
+    keys = {key: value for key, value in entered.items() if not key.endswith("_sigma")}
     try:
         calibration = (
             ImageCalibration(np.array(keys["homography"], float))

@@ -9,11 +9,14 @@ from typing import Any
 from labapp.config.setup import parse_setup, updated_setup
 from labapp.config.setup_keys import SECTIONS, THREE_POINTS
 from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import QUANTITIES
+from labapp.core.pipeline import setup_status
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM, Fate, SideView, side_view
+from labapp.text import SETUP_WORDS
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,9 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
         Entry("pattern.columns", "Columns", "", "Columns of it, odd", 3, 99, 2, 0, 19),
         Entry("pattern.inter_beam_angle_deg", "Inter-beam angle", "°",
               "Angle between neighbouring rays at the centre", 0, 45, 0.01, 2, 0.77),
+        Entry("pattern.rotation_deg", "Rotation", "°",
+              "How far the pattern is turned about the beam; empty: rows lie level",
+              -90, 90, 0.5, 2),
     )),
     ("Laser", (
         Entry("laser.projection_angle_deg", "Projection angle", "°",
@@ -56,6 +62,15 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
         Entry("laser.distance_mm", "Distance", "mm",
               "From the diode to the work piece under the electrode; step 2 measures it",
               0, 10_000, 0.5, 2, 35),
+        Entry("laser.azimuth_deg", "Azimuth", "°",
+              "How far the laser is turned out of the welding plane, anticlockwise from above; "
+              "empty: it stands in it", -90, 90, 0.5, 2),
+        Entry("laser.aim_x_mm", "Aim, X", "mm",
+              "Where the beam meets the work piece, to the right of the electrode; empty: under it",
+              -10_000, 10_000, 0.1, 2),
+        Entry("laser.aim_y_mm", "Aim, Y", "mm",
+              "Where the beam meets the work piece, towards the laser; empty: under the electrode",
+              -10_000, 10_000, 0.1, 2),
     )),
     ("Torch", (
         Entry("electrode.height_mm", "Electrode height", "mm",
@@ -78,9 +93,56 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
         Entry("imaging_plane.yaw_deg", "Yaw", "°",
               "How far it is turned about the upright; empty: square to the welding direction",
               -90, 90, 0.5, 2),
+        Entry("imaging_plane.roll_deg", "Roll", "°",
+              "How far O′X′ rises; empty: it lies level", -90, 90, 0.5, 2),
+        Entry("imaging_plane.glass_mm", "Glass", "mm",
+              "Thickness of a glass before the paper, on the pool's side; empty: none. "
+              "Distances are measured to the paper", 0, 100, 0.5, 2),
+        Entry("imaging_plane.glass_index", "Refractive index", "",
+              "Of that glass; empty: 1.5", 1, 4, 0.01, 3),
     )),
 )  # fmt: skip
 """Of the rig, by headings."""
+
+UNCERTAIN_ONLY = ("Image calibration", (
+    Entry("image_calibration.origin_px_sigma", "O′", "px",
+          "O′ in the picture, along u and along v", 0, 10_000, 0.1, 2),
+    Entry("image_calibration.x_axis_px_sigma", "Point on O′X′", "px",
+          "That point in the picture, along u and along v", 0, 10_000, 0.1, 2),
+    Entry("image_calibration.z_axis_px_sigma", "Point on O′Z′", "px",
+          "That point in the picture, along u and along v", 0, 10_000, 0.1, 2),
+    Entry("camera_lens.distortion_percent_sigma", "Lens distortion", "%",
+          "Of the picture in the plane's corner, of its distance from the middle", 0, 100, 0.1, 2),
+))  # fmt: skip
+"""Whose standard uncertainty alone is entered here: step 3 finds the points."""
+
+ASSUMED = {one.sigma_key: one.assumed for one in QUANTITIES}
+"""What is assumed of each quantity where no standard uncertainty is entered."""
+
+TRAVELS = (("+y", "towards +Y"), ("-y", "towards −Y"))
+
+
+def sigma_entry(entry: Entry) -> Entry | None:
+    """The field of a value's standard uncertainty; None where it has none."""
+    key = f"{entry.key}_sigma"
+    if key not in ASSUMED:
+        return None
+    least = 10.0 ** -max(entry.decimals, 3)
+    return Entry(
+        key,
+        f"{entry.label} ±",
+        entry.unit,
+        f"Standard uncertainty of “{entry.label}”; {_assumed_words(key, entry.unit)}",
+        0,
+        90 if entry.unit == "°" else 10_000,
+        max(entry.step / 10, least),
+        entry.decimals,
+    )
+
+
+def _assumed_words(key: str, unit: str) -> str:
+    return f"empty: {ASSUMED[key]:g} {unit} is assumed"
+
 
 POOL = (
     Entry("expected_width_mm", "Width", "mm", "Of the pool that is expected", 0.1, 100, 0.5, 2),
@@ -125,6 +187,12 @@ class SetupState:
     ----------
     values
         By the keys of `RIG`; None where there is none.
+    sigmas
+        Standard uncertainties by the keys of `ASSUMED`; None where one is assumed.
+    travel
+        Which way the torch moves, of `TRAVELS`.
+    status
+        How far the set-up can be relied on, in words; empty while it is not complete.
     problems
         What is wrong, in words, by the same keys.
     others
@@ -134,6 +202,9 @@ class SetupState:
     """
 
     values: dict[str, float | None]
+    sigmas: dict[str, float | None]
+    travel: str
+    status: str
     problems: dict[str, str]
     others: tuple[str, ...]
     record: Record
@@ -144,13 +215,18 @@ def shown(session: Session) -> SetupState:
     sections: dict[str, Any] = tomllib.loads(session.setup_text)
     keys = [entry.key for _, entries in RIG for entry in entries]
     values = {key: _number(sections, key) for key in keys}
+    sigmas = {key: _number(sections, key) for key in ASSUMED}
+    torch = sections.get("torch")
+    travel = torch.get("travel", "+y") if isinstance(torch, dict) else "+y"
+    found = rig(session)
+    status = "" if found is None else SETUP_WORDS[setup_status(found)]
     problems: dict[str, str] = {}
     others = []
     for problem in session.setup_problems:
         words = "missing"
         if problem.value != words:
             words = f"{problem.value}; expected {problem.expected}"
-        if problem.field in values:
+        if problem.field in values or problem.field in sigmas:
             problems[problem.field] = words
         elif problem.value == "missing" and f"{problem.field}." in " ".join(keys):
             rules = SECTIONS[problem.field]
@@ -159,7 +235,9 @@ def shown(session: Session) -> SetupState:
             others.append("The imaging plane is not calibrated: that is step 3.")
         else:
             others.append(f"{problem.field}: {words}")
-    return SetupState(values, problems, tuple(dict.fromkeys(others)), session.record)
+    return SetupState(
+        values, sigmas, travel, status, problems, tuple(dict.fromkeys(others)), session.record
+    )
 
 
 def _number(sections: dict[str, Any], key: str) -> float | None:
@@ -225,14 +303,18 @@ def bench(session: Session) -> BenchState:
         f"(solid). {tally[Fate.BLOCKED]} are blocked by the torch (dashed red), "
         f"{tally[Fate.PAST]} miss the plane (dotted grey), {tally[Fate.UNUSED]} do not meet the "
         f"pool (thin grey). {'Expected' if given else 'Usual'} pool: {width:g} × {length:g} mm, "
-        f"{f'{height:g} mm high' if height else 'flat'}. Drawn: the central column of the pattern."
+        f"{f'{height:g} mm high' if height else 'flat'}. Drawn: the central column of the pattern. "
+        f"The torch moves {'to the right' if found.head_sign > 0 else 'to the left'}."
     )
+    ends = ("tail", "head")[:: found.head_sign]
     rows = (
         ResultRow("Rays that come back", str(tally[Fate.CAUGHT])),
         ResultRow("Blocked by the torch", str(tally[Fate.BLOCKED])),
         ResultRow("Miss the plane", str(tally[Fate.PAST])),
-        ResultRow("L1", room.l1_mm, unit="mm", decimals=1, note="Longest tail (Eq. 4-14)"),
-        ResultRow("L2", room.l2_mm, unit="mm", decimals=1, note="Longest head (Eq. 4-15 … 4-18)"),
+        ResultRow("L1", room.l1_mm, unit="mm", decimals=1, note=f"Longest {ends[0]} (Eq. 4-14)"),
+        ResultRow(
+            "L2", room.l2_mm, unit="mm", decimals=1, note=f"Longest {ends[1]} (Eq. 4-15 … 4-18)"
+        ),
         ResultRow("Least plane distance", room.least_plane_mm, unit="mm", decimals=1, note=REACH),
         ResultRow("Most plane distance", room.most_plane_mm, unit="mm", decimals=1, note=REACH),
     )
@@ -246,10 +328,21 @@ REACH = "The plane catches the steepest ray that passes the torch between these 
 
 
 def put(session: Session, key: str, value: float | None) -> None:
-    """Put one value of the rig into the setup; None takes it out."""
+    """Put a value of the rig, or its standard uncertainty, into the setup; None takes it out.
+
+    A calibrated value that is changed loses its ± (`config.setup.updated_setup`).
+    """
     section, _, name = key.partition(".")
-    label = next(e.label for _, entries in RIG for e in entries if e.key == key)
+    value_key = key.removesuffix("_sigma")
+    entries = [entry for _, entries in (*RIG, UNCERTAIN_ONLY) for entry in entries]
+    label = next(entry.label for entry in entries if entry.key in (key, value_key))
+    label += " ±" if key in ASSUMED else ""
     session.update_setup({section: {name: value}}, f"set-up, {label}")
+
+
+def put_travel(session: Session, travel: str) -> None:
+    """Say which way the torch moves."""
+    session.update_setup({"torch": {"travel": travel}}, "set-up, welding direction")
 
 
 def put_usual(session: Session) -> None:

@@ -11,10 +11,19 @@ from labapp.config.setup import read_setup
 from labapp.gui.dialogs import EVERYTHING, ask_file, ask_save, write_file
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
-from labapp.gui.pages.setup.presenter import EXPERIMENT, POOL, RIG, SAFETY, Entry
+from labapp.gui.pages.setup.presenter import (
+    ASSUMED,
+    EXPERIMENT,
+    POOL,
+    RIG,
+    SAFETY,
+    TRAVELS,
+    UNCERTAIN_ONLY,
+    Entry,
+)
 from labapp.gui.views.bench import BenchView
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.fields import FieldForm, NumberField, TextField
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
@@ -35,6 +44,7 @@ class SetupPage(Page):
         self.bench = BenchView()
         self.canvas_layout.addWidget(self.bench)
         self.rig_fields: dict[str, NumberField] = {}
+        self.sigma_fields: dict[str, NumberField] = {}
         self.record_fields: dict[str, NumberField | TextField] = {}
         self.ticks: dict[str, QCheckBox] = {}
         self._times: dict[str, QLabel] = {}
@@ -54,8 +64,8 @@ class SetupPage(Page):
         show_tab(EXPERIMENT_TAB)
         self.panel_layout.addWidget(self.tabs)
         self.lock_with_session(
-            *(*self.rig_fields.values(), *self.record_fields.values(), *self.ticks.values()),
-            *self._filling,
+            *(*self.rig_fields.values(), *self.sigma_fields.values(), self.travel),
+            *(*self.record_fields.values(), *self.ticks.values(), *self._filling),
         )
         self.panel_layout.setContentsMargins(0, 0, 0, 0)
 
@@ -66,6 +76,12 @@ class SetupPage(Page):
             field.set_value(shown.values[key])
             if shown.problems.get(key):
                 field.set_problem(shown.problems[key])
+        for key, field in self.sigma_fields.items():
+            field.set_value(shown.sigmas[key])
+            if shown.problems.get(key):
+                field.set_problem(shown.problems[key])
+        self.travel.set_value(shown.travel)
+        self.status.setText(shown.status)
         for name, noted in self.record_fields.items():
             noted.set_value(getattr(shown.record, name))
         ticked = dict(shown.record.safety)
@@ -85,7 +101,8 @@ class SetupPage(Page):
 
     def leave(self) -> None:
         """Finish the edit under way."""
-        for field in (*self.rig_fields.values(), *self.record_fields.values()):
+        numbers = (*self.rig_fields.values(), *self.sigma_fields.values())
+        for field in (*numbers, *self.record_fields.values()):
             field.flush()
 
     def load(self, path: Path) -> None:
@@ -164,10 +181,28 @@ class SetupPage(Page):
         hbox(load, save, usual, of=buttons)
         form.add_wide(buttons)
         form.add_wide(self.refused)
+        self.status = Message(2)
+        form.add_wide(self.status)
+        form.add_wide(wrapping_label("Right: ±, one standard uncertainty. In grey: assumed."))
         for heading, entries in RIG:
             form.add_heading(heading)
             for entry in entries:
-                self._add_rig(form, entry)
+                form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
+            if heading == "Torch":
+                tip = "Where the pool's head is: +Y is the laser's side. The rear may lie low"
+                self.travel = ChoiceField("Welding", TRAVELS, tooltip=tip)
+                self.travel.edited.connect(
+                    lambda way: self.workspace.attempt(
+                        lambda session: presenter.put_travel(session, way)
+                    )
+                )
+                form.add(self.travel)
+        heading, entries = UNCERTAIN_ONLY
+        form.add_heading(f"{heading}, ±")
+        for entry in entries:
+            field = self._sigma_field(entry)
+            assert field is not None
+            form.add(field)
         form.add_heading("Expected pool")
         for entry in POOL:
             self._add_noted(form, entry)
@@ -184,15 +219,23 @@ class SetupPage(Page):
         form.add_wide(self.others)
         return form
 
-    def _add_rig(self, form: FieldForm, entry: Entry) -> None:
-        field = _number(entry)
+    def _rig_field(self, entry: Entry) -> NumberField:
+        field = self.rig_fields[entry.key] = _number(entry)
+        self._put_when_edited(field, entry.key)
+        return field
+
+    def _sigma_field(self, entry: Entry | None) -> NumberField | None:
+        if entry is None:
+            return None
+        field = self.sigma_fields[entry.key] = _number(entry)
+        field.set_placeholder(f"{ASSUMED[entry.key]:g}")
+        self._put_when_edited(field, entry.key)
+        return field
+
+    def _put_when_edited(self, field: NumberField, key: str) -> None:
         field.edited.connect(
-            lambda value: self.workspace.attempt(
-                lambda session: presenter.put(session, entry.key, value)
-            )
+            lambda value: self.workspace.attempt(lambda session: presenter.put(session, key, value))
         )
-        self.rig_fields[entry.key] = field
-        form.add(field)
 
     def _choose_load(self) -> None:
         kinds = f"{SETUP_FILES};;{EVERYTHING}"

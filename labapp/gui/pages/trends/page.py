@@ -73,6 +73,7 @@ class TrendsPage(Page):
         self.plots.setVisible(bool(shown.curves))
         self.nothing.setVisible(not shown.curves)
         self.counted.setText(shown.words)
+        self.setup_words.setText(shown.setup_words)
         self.table.set_rows(shown.rows)
         self.spectrum.setVisible(bool(shown.spectrum))
         self.spectrum.show_curves(shown.spectrum, shown.spectrum_axis)
@@ -160,6 +161,7 @@ class TrendsPage(Page):
         self.canvas_layout.addWidget(self.nothing, 1)
         self.table = ResultTable("Statistics of the measures")
         self.counted = Message(3)
+        self.setup_words = Message(2)
         self.without = check_box(
             "Leave out frames that stand out",
             "Mean, deviation, range and spectrum are of the frames that do not stand out from "
@@ -175,7 +177,7 @@ class TrendsPage(Page):
         fill(
             self.panel_layout,
             *(heading("Shown"), self._make_choice(), heading("Mean ± standard deviation, range")),
-            *(self.table, self.counted, self.without, hbox(values, picture)),
+            *(self.table, self.counted, self.setup_words, self.without, hbox(values, picture)),
         )
         self._make_spectrum()
         self._make_signals()

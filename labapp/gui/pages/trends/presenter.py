@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.pipeline import setup_status
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
@@ -15,7 +16,7 @@ from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
-from labapp.text import SIGMA_OF
+from labapp.text import SETUP_WORDS, SIGMA_OF
 
 MARKS = (
     Mark("●", "measured"),
@@ -63,6 +64,8 @@ class TrendsState:
         Mean ± standard deviation, range, and ± of the mean where it has one: rows of a measure.
     words
         How many frames count, and why others do not.
+    setup_words
+        How far the set-up can be relied on; empty where it is not complete.
     spectrum, spectrum_axis
         Of the measure asked for; no curve where there is none.
     spectrum_words
@@ -76,6 +79,7 @@ class TrendsState:
     places: dict[int, float]
     rows: tuple[ResultRow, ...]
     words: str
+    setup_words: str
     spectrum: tuple[Curve, ...]
     spectrum_axis: Axis
     spectrum_words: str
@@ -106,6 +110,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
         rows=tuple(row for course in courses for row in _rows(course)),
         words=_counted(seen, course_of("height_mm")),
+        setup_words="" if session.setup_problems else SETUP_WORDS[setup_status(session.setup.rig)],
         spectrum=found,
         spectrum_axis=spectrum_axis,
         spectrum_words=told,
