@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.optics import intersect_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, landing_spacing, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
-from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, landing_spacing
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.values import (
     BoolArray,
     CannotMeasure,

@@ -11,11 +11,11 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.geometry.optics import intersect_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, landing_spacing, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.surface import kernels
-from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
-from labapp.core.surface.solver import NormalEquations
+from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings
+from labapp.core.surface.solver import NormalEquations, Rounds
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
@@ -192,20 +192,17 @@ def fit_slopes_to(
     CannotMeasure
         ``no-surface`` if the slopes do not settle the surface.
     """
-    grid, rays = geometry.basis.grid, geometry.rays[slopes.ray]
+    rays = geometry.rays[slopes.ray]
     equations = NormalEquations(
         geometry.basis, geometry.stiffness, geometry.laser_mm, slopes.dots_mm, slopes.weights, lower
     )
-    coefficients, points, moved = pool.coefficients, pool.points_mm[slopes.ray], 0.0
-    for _ in range(rounds):
-        coefficients = equations.step(coefficients, points, moved, rest)
-        points, moved = kernels.newton_along_rays(grid, coefficients, rays, points, 1)
-        if moved < until_mm:
-            break
+    fit = Rounds(equations, rays, pool.coefficients, pool.points_mm[slopes.ray])
+    fit.run(rounds, until_mm, smooth_about=rest)
     every = pool.points_mm.copy()
-    every[slopes.ray] = points
+    every[slopes.ray] = fit.points_mm
     assert equations.factor is not None
-    return intersect_and_reflect(geometry, coefficients, every, 1), equations.factor, moved
+    made = intersect_and_reflect(geometry, fit.coefficients, every, 1)
+    return made, equations.factor, fit.moved_mm
 
 
 def evaluate_at_landing_points(

@@ -12,12 +12,12 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.geometry.optics import intersect_level, ray_directions
+from labapp.core.geometry.optics import intersect_level, landing_spacing, ray_directions
 from labapp.core.geometry.perturbation import moved_dots, moved_rig
 from labapp.core.geometry.rig import Laser, Rig
 from labapp.core.match import Match
 from labapp.core.surface.level import Level, find_level
-from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, landing_spacing
+from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings
 from labapp.core.surface.solver import NormalEquations
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray

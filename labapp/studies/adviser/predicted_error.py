@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.geometry.optics import bisecting_gradient, intersect_level, ray_directions
+from labapp.core.geometry.optics import bisecting_gradient, intersect_level, project_rays
 from labapp.core.geometry.rig import Laser, Rig
-from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings, landing_spacing
+from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings
 from labapp.core.surface.solver import SlopeFit, fit_slopes
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import FloatArray, ReadOnlyArrays
@@ -147,11 +147,9 @@ class _Model:
         self.peak_xy = np.array(size.peak_mm if convex else size.bottom_mm)
         self.peak_mm = size.height_mm if convex else size.depth_mm
         self.rim = pool.boundary_mm(RIM_POINTS)[:, :2]
-        ground = intersect_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))[
-            ..., :2
-        ]
-        self.ground = ground
-        margin = MARGIN_ROWS * landing_spacing(ground).max()
+        rays = project_rays(rig.laser, rig.pattern)
+        self.ground = ground = rays.landing_mm[..., :2]
+        margin = MARGIN_ROWS * rays.spacing_mm.max()
         corners = np.vstack([self.points[:, :2], self.rim, self.peak_xy])
         self.basis = SplineBasis.over(
             corners.min(axis=0) - margin, corners.max(axis=0) + margin, settings.knot_mm
@@ -221,7 +219,7 @@ class _Model:
         """Height that is measured if the bench is taken to be off by ``offset``."""
         plane, rig = dots_moved(self.plane, self.rig, axes, offset)
         source = rig.laser.position_mm
-        rays = ray_directions(rig.laser, rig.pattern)[self.seen.visible]
+        rays = project_rays(rig.laser, rig.pattern).directions[self.seen.visible]
         points = source + (self.points[:, 2:] - source[2]) / rays[:, 2:] * rays
         dots = rig.imaging_plane.to_universal(plane)
         slopes = bisecting_gradient(points - source, dots - points)
