@@ -25,7 +25,7 @@ from labapp.core.geometry.optics import (
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.images import centroid_kernels, dot_kernels, dot_size, dots
 from labapp.core.matching import match_kernels
-from labapp.core.sequence.track import recurrence
+from labapp.core.sequence.prior import recurrence
 from labapp.core.surface import kernels, level_kernels
 from labapp.core.surface.level import Rear
 from labapp.core.surface.solver import normal_factor

@@ -11,7 +11,7 @@ from labapp.core.geometry.rig import DotPattern, ImagingPlane, Laser
 from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
     """Unit direction of every projected ray (Eq. 4-1, Fig. 4-14).
 
@@ -99,7 +99,7 @@ class ProjectedRays(ReadOnlyArrays):
     absent: BoolArray
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
     """Rays of a pattern from a laser, and their landing points."""
     directions = ray_directions(laser, pattern)

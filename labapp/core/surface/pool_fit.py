@@ -25,7 +25,14 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.surface.level import Level, Rear, Witnesses, guess_level
 from labapp.core.surface.solver import NormalEquations, Rounds, propagate_sigma
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays, median
+from labapp.core.values import (
+    BoolArray,
+    CannotMeasure,
+    FloatArray,
+    IntArray,
+    ReadOnlyArrays,
+    median,
+)
 
 MARGIN_ROWS = 2.5
 """How far beyond the outermost reflection points the splines go on, in rows of rays: the torch may
@@ -111,6 +118,10 @@ class FittedPool(ReadOnlyArrays):
     def sigma_of(self, gradients: FloatArray) -> FloatArray:
         """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p)."""
         return propagate_sigma(self.factor, gradients, self.mean_splines, self.level.sigma_mm)
+
+    def free_sigma_of(self, gradients: FloatArray) -> FloatArray:
+        """The same without what the level adds."""
+        return propagate_sigma(self.factor, gradients, self.mean_splines, 0.0)
 
 
 def fit_pool(
@@ -214,14 +225,11 @@ def rounds_with_level(
     from labapp.core.surface import kernels
 
     basis, level = rounds.equations.basis, near or Level(0.0, np.inf, 1, Rear(), 0.0)
-    is_seen, start = bool((witnesses.sign < 0).any()), rounds.points_mm
-    landing = (start - start[:, 2:] / rounds.rays[:, 2:] * rounds.rays)[:, :2]
-    from_middle = np.linalg.norm(landing - landing.mean(axis=0), axis=-1)
-    outer = from_middle > median(from_middle)
+    outer = None if (witnesses.sign < 0).any() else _outer(rounds)
 
     def shift(count: int) -> float:
         nonlocal level
-        if not is_seen:
+        if outer is not None:
             height = kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
             level = guess_level(height, outer)
             return level.shift_mm
@@ -240,6 +248,14 @@ def rounds_with_level(
 
     rounds.run(most, until_mm, NEWTON_STEPS if near is None else 1, shift=shift)
     return level
+
+
+def _outer(rounds: Rounds) -> BoolArray:
+    """Which rays would land farther from the middle than half of them, shape (n,)."""
+    points, rays = rounds.points_mm, rounds.rays
+    landing = (points - points[:, 2:] / rays[:, 2:] * rays)[:, :2]
+    from_middle = np.linalg.norm(landing - landing.mean(axis=0), axis=-1)
+    return np.asarray(from_middle > median(from_middle))
 
 
 def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) -> FittedPool:
