@@ -265,7 +265,7 @@ SLOW = """
 
     def slow(*given):
         time.sleep(0.05)
-        return Measurement("no-rows", "for the test", "fit", dots=Dots(*np.ones((7, 5))))
+        return Measurement("no-rows", "for the test", "fit", dots=Dots(*np.ones((7, 5)))), None
 
     measurers.measure = slow
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it

@@ -86,7 +86,7 @@ WIDENINGS, MANY = 3, 4
 often at most."""
 
 RAISED_MM = 0.01
-"""Where no reflection point moved by more with the level, it is not looked for again."""
+"""After a smaller shift of the surface its level is not looked for again."""
 
 
 class TrackLost(CannotMeasure):
@@ -212,6 +212,10 @@ class _Fit:
     def settle(self) -> None:
         """Run rounds to the end."""
         self.run(SETTLED_MM)
+        self.check_settled()
+
+    def check_settled(self) -> None:
+        """Raise `TrackLost` where reflection points still move."""
         if not self.rounds.moved_mm < UNSETTLED_MM:
             raise TrackLost("the surface does not settle")
 
@@ -394,9 +398,9 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     missing = missing_share(len(found.missed), len(fit.rays))
     witnesses = Witnesses.of(observed.bench.rays, witness, prior.basis, missing)
     near = Level(0.0, prior.open_mm, prior.level.sign, prior.level.rear, 0.0)
-    how = fit.settings.rounds, RAISED_MM, near, prior.drop_is_free
+    how = fit.settings.rounds, SETTLED_MM, near, prior.drop_is_free, RAISED_MM
     level = rounds_with_level(fit.rounds, witnesses, *how)
-    fit.settle()
+    fit.check_settled()
     return RayClasses(witness, found.missed, found.stray), level
 
 

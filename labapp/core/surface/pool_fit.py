@@ -200,6 +200,7 @@ def rounds_with_level(
     until_mm: float,
     near: Level | None = None,
     drop_is_free: bool = True,
+    raised_mm: float = 0.0,
 ) -> Level:
     """Run rounds of the fit, each with the level that the witnesses give; returns the last one.
 
@@ -216,6 +217,8 @@ def rounds_with_level(
     drop_is_free
         Whether the drop of the rear is found along with the level, in the first half of the rounds.
         Held, it leaves the level as open as it was before.
+    raised_mm
+        After a shift of the surface by less the level is not looked for again.
 
     Raises
     ------
@@ -229,6 +232,8 @@ def rounds_with_level(
 
     def shift(count: int) -> float:
         nonlocal level
+        if count and abs(level.shift_mm) < raised_mm:
+            return 0.0
         if outer is not None:
             height = kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
             level = guess_level(height, outer)
