@@ -12,6 +12,7 @@ import textwrap
 import time
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,9 +56,9 @@ def measured_images(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """Replace the measurement by one that only keeps the images it was given."""
     images: list[np.ndarray] = []
 
-    def measure(image: np.ndarray, *_: object) -> Measurement:
+    def measure(image: np.ndarray, *_: object) -> tuple[Measurement, None]:
         images.append(image)
-        return answer()
+        return answer(), None
 
     monkeypatch.setattr(measurers, "measure", measure)
     return images
@@ -127,7 +128,12 @@ def test_options_reach_the_measurement(
     labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[Settings] = []
-    monkeypatch.setattr(measurers, "measure", lambda *given: seen.append(given[3]) or answer())
+
+    def measure(*given: Any) -> tuple[Measurement, None]:
+        seen.append(given[2])
+        return answer(), None
+
+    monkeypatch.setattr(measurers, "measure", measure)
     out = tmp_path / "out"
     options = "--scheme irs --algorithm epa-rc --correspondence I/I --frames 0:3:2".split()
     labapp("reconstruct", folder, "--setup", SETUP, "--out", out, *options)
@@ -259,7 +265,7 @@ SLOW = """
 
     def slow(*given):
         time.sleep(0.05)
-        return Measurement("no-rows", "for the test", "fit", dots=Dots(*np.ones((7, 5))))
+        return Measurement("no-rows", "for the test", "fit", dots=Dots(*np.ones((7, 5)))), None
 
     measurers.measure = slow
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it

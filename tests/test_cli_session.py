@@ -51,27 +51,27 @@ def picture(shift_px: float) -> np.ndarray:
 
 def measure(
     image: np.ndarray,
-    rig: object,
-    calibration: object,
+    _bench: object,
     settings: Settings,
+    _prior: None = None,
     correction: Correction | None = None,
-) -> Measurement:
+) -> tuple[Measurement, None]:
     """Find real dots and a surface of the height that row 2 has columns, or is blocked."""
     try:
         dots = find_dots(image, settings.dots)
         lattice = find_lattice(dots, (image.shape[0], image.shape[1]), settings.lattice)
     except CannotMeasure as answer:
-        return Measurement(answer.status, answer.reason, settings.scheme)
+        return Measurement(answer.status, answer.reason, settings.scheme), None
     if correction is not None:
         dots, lattice = correction.dots, correction.lattice
     found = Measurement("ok", "", settings.scheme, dots, lattice, correction=correction)
     if settings.scheme == "ers":
-        return replace(found, status="no-match", reason="for the test")
+        return replace(found, status="no-match", reason="for the test"), None
     sizes = dict.fromkeys(Measures.__dataclass_fields__, 1.0)
     sizes |= {name: 0.0 for name in sizes if "_setup_" in name}
     sizes["height_mm"] = float(len(dots) + 100 * len(lattice.blocked_rows))
     sizes["own_are_mm"] = np.nan
-    return replace(found, measures=Measures(**sizes))
+    return replace(found, measures=Measures(**sizes)), None
 
 
 @pytest.fixture(autouse=True)
@@ -474,7 +474,7 @@ def test_stopped_it_keeps_what_was_finished(
 ) -> None:
     seen: list[object] = []
 
-    def pressed(*given: object) -> Measurement:
+    def pressed(*given: object) -> tuple[Measurement, None]:
         seen.append(given)
         if len(seen) == 3:
             os.kill(os.getpid(), sent)

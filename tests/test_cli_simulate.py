@@ -205,7 +205,7 @@ def test_rings_on_a_pool_do_not_lead_to_rays_a_row_off(number: int) -> None:
     # All labels were a row off in the one, five of the rim were wrong in the other.
     scenario = read_scenario(EXAMPLES / "mode_02.toml")
     setup, frame = parse_setup(scenario.setup, "setup"), scenario.recording.frame(number)
-    found = measure(frame.image, setup.rig, setup.calibration, Settings())
+    found = measure(frame.image, setup.bench, Settings())[0]
     assert found.status in ("ok", "no-match")
     if found.match is not None:
         assert found.dots is not None

@@ -196,7 +196,7 @@ def _start(session: Session, frame: int, *, automatic: bool) -> Correction:
     if corrected is None and result is not None and not result.stale:
         return start_correction(result.measurement)
     image, setup = session.frame(frame).image, session.setup
-    return start_correction(measure(image, setup.rig, setup.calibration, session.settings))
+    return start_correction(measure(image, setup.bench, session.settings)[0])
 
 
 def _apply(

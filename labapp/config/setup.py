@@ -15,6 +15,7 @@ from tomlkit.items import Table
 
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import (
@@ -49,6 +50,11 @@ class Setup:
     rig: Rig
     calibration: ImageCalibration
     text: str
+
+    @functools.cached_property
+    def bench(self) -> Bench:
+        """Rig and calibration as the measurement takes them."""
+        return Bench(self.rig, self.calibration)
 
 
 def read_setup(path: str | os.PathLike[str]) -> Setup:

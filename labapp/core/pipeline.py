@@ -6,30 +6,39 @@
 4. `reconstruct`: the pool's surface and boundary, by the scheme that is chosen (ch. 6, 7).
 5. `measure_surface`: its size and the reflection errors (Eq. 6-3 … 6-8).
 
-Of a frame that the operator has corrected, his dots and rows take the place of steps 1 and 2.
+Of a frame that the operator has corrected, his dots and rows take the place of steps 1 and 2. With
+a prior, what the frame before left, dots have the rays of those that it predicts there (`follow`),
+and no rows are needed for it: the other steps are the same.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
+from labapp.core.images.band_pass import DetectorTuning, quick_dots, tuned_dots
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.match import Match
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
 from labapp.core.matching.decision import NOTHING_EXPLAINS, MatchSettings
+from labapp.core.matching.observation import Observation
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
-from labapp.core.schemes import SCHEMES, ers, irs
+from labapp.core.schemes import SCHEMES, ers, fit, irs
+from labapp.core.sequence.following import TrackLost, follow
+from labapp.core.sequence.prior import Prior
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import CannotMeasure
+
+Passed = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -101,54 +110,100 @@ def setup_status(rig: Rig) -> str:
 
 def measure(
     image: Image,
-    rig: Rig,
-    calibration: ImageCalibration,
+    bench: Bench,
     settings: Settings,
+    prior: Prior | None = None,
     correction: Correction | None = None,
-) -> Measurement:
+    passed: Passed = lambda _: None,
+) -> tuple[Measurement, Prior | None]:
     """Measure the pool that a frame shows. Never raises for a bad frame: the status says why.
 
     Parameters
     ----------
     image
         Grey frame, shape (height, width), any real type.
-    rig, calibration
-        The bench, and how the camera sees the imaging plane.
+    bench
+        What the frame was seen on.
     settings
         See `Settings`.
+    prior
+        What the frame before left to this one: then dots get their rays where it predicts them, and
+        the status is ``track-lost``, or another that is not ``ok``, where it does not lead here.
+        None: the frame is measured by itself.
     correction
         The frame's dots and rows as the operator has them; they are measured in place of what would
         be found, and of the image only the shape counts.
+    passed
+        Called with the name of each step when it is done: dots, match, measures.
+
+    Returns
+    -------
+    measurement, prior
+        The results; what they leave to the next frame, None where there is no surface that can be
+        followed.
     """
     result = Measurement(
-        "ok", "", settings.scheme, correction=correction, setup_status=setup_status(rig)
+        "ok", "", settings.scheme, correction=correction, setup_status=setup_status(bench.rig)
     )
-    height, width = image.shape
-    match_settings = replace(settings.match, correspondence=settings.correspondence)
-    bench = (rig, calibration, (height, width), match_settings)
+    rig, limits = bench.rig, replace(settings.match, correspondence=settings.correspondence)
+    shape, known = (image.shape[0], image.shape[1]), None
+    followed, tuning, near = None, None, None
     try:
-        if correction is None:
-            dots = find_dots(image, settings.dots)
+        if correction is not None:
+            dots, lattice = correction.dots, correction.lattice
+            result = replace(result, dots=dots, lattice=lattice)
+            match, near = match_corrected(dots, lattice, bench, shape, limits)
+            lattice = lattice_of_corrected(match, rig, lattice)
+        elif prior is not None:
+            dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
             result = replace(result, dots=dots)
-            lattice, no_lattice = _lattice_or_why(dots, (height, width), settings.lattice)
-            result = replace(result, lattice=lattice)
-            try:
-                match = match_rays(dots, lattice, *bench)
-            except CannotMeasure as why:
-                nothing = why.reason == NOTHING_EXPLAINS
-                raise (no_lattice if no_lattice and nothing else why) from None
+            passed("dots")
+            observed = Observation.of(dots, bench, shape)
+            followed = follow(prior, observed, settings.fit, limits)
+            match, known = followed.match, prior.known(followed.lit)
             lattice = lattice_of_match(match, rig, len(dots))
         else:
-            dots, given = correction.dots, correction.lattice
-            result = replace(result, dots=dots, lattice=given)
-            match = match_corrected(dots, given, *bench)
-            lattice = lattice_of_corrected(match, rig, given)
+            dots, tuning = _dots(image, settings.dots)
+            passed("dots")
+            rows, no_rows = _lattice_or_why(dots, shape, settings.lattice)
+            result = replace(result, dots=dots, lattice=rows)
+            try:
+                match, near = match_rays(dots, rows, bench, shape, limits)
+            except CannotMeasure as why:
+                nothing = why.reason == NOTHING_EXPLAINS
+                raise (no_rows if no_rows and nothing else why) from None
+            lattice = lattice_of_match(match, rig, len(dots))
         result = replace(result, match=match, lattice=lattice)
-        reconstruction = reconstruct(match, rig, settings)
-        size = measures.measure_surface(reconstruction, match, rig)
-        return replace(result, reconstruction=reconstruction, measures=size)
+        if settings.scheme != "fit":
+            made = reconstruct(match, rig, settings)
+            size = measures.measure_surface(made, match, rig)
+            return replace(result, reconstruction=made, measures=size), None
+        pool = followed.pool if followed else fit.solve(match, rig, settings.fit, near)
+        passed("match")
+        made, size = fit.complete(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
-        return replace(result, status=why.status, reason=why.reason)
+        return replace(result, status=why.status, reason=why.reason), None
+    passed("measures")
+    result = replace(result, reconstruction=made, measures=size)
+    if prior is not None and followed is not None:
+        return result, prior.followed_by(followed, made)
+    if tuning is None or rig.pattern.marker is None:
+        return result, None
+    return result, Prior.of(bench, tuning, match, pool, made)
+
+
+def _as_before(image: Image, prior: Prior) -> Image:
+    """The image, which must have the size of the one before."""
+    if image.shape != prior.tuning.noise.shape:
+        raise TrackLost("the frame has another size than the one before")
+    return image
+
+
+def _dots(image: Image, settings: DotSettings) -> tuple[Dots, DetectorTuning | None]:
+    """The dots, and what the default detector was tuned to, for the frames after this one."""
+    if settings.method == "band-pass":
+        return tuned_dots(image, settings.band_pass)
+    return find_dots(image, settings), None
 
 
 def start_correction(measurement: Measurement) -> Correction:

@@ -10,8 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.bench import Bench
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.exposure import Exposure, judge_exposure
 from labapp.core.images.find_dots import find_dots
@@ -111,7 +110,7 @@ class Quality:
 def look(
     image: Image,
     settings: Settings,
-    bench: tuple[Rig, ImageCalibration] | None = None,
+    bench: Bench | None = None,
 ) -> Measurement:
     """Measure a frame as far as can be: dots and rows only where there is no set-up yet.
 
@@ -122,20 +121,20 @@ def look(
     settings
         Those of the measurement.
     bench
-        Rig and image calibration; None before they are known.
+        What it was seen on; None before that is known.
     """
     height, width = image.shape
     found = Measurement(UNMEASURED, "there is no set-up yet", settings.scheme)
     try:
         dots = find_dots(image, settings.dots)
         found = replace(found, dots=dots)
-        rays = USUAL_RAYS if bench is None else bench[0].pattern.rows * bench[0].pattern.columns
+        rays = USUAL_RAYS if bench is None else bench.rig.pattern.rows * bench.rig.pattern.columns
         if len(dots) > MANY * rays:
             # Rows are sought among them for minutes.
             words = f"{len(dots)} spots stand out, where the lens makes {rays} dots at most"
             raise CannotMeasure("too-many-dots", words)
         if bench is not None:
-            return measure(image, *bench, settings)
+            return measure(image, bench, settings)[0]
         lattice = find_lattice(dots, (height, width), settings.lattice)
         return replace(found, lattice=lattice)
     except CannotMeasure as answer:

@@ -101,9 +101,9 @@ class LiveChain:
     """Measures frames in this process; parameters as of `LiveMeasuring`."""
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
-        from labapp.core.sequence.warm import WarmChain
+        from labapp.core.recording.chain import WarmChain
 
-        self._chain = WarmChain(setup.rig, setup.calibration, settings)
+        self._chain = WarmChain(setup.bench, settings)
         self._rays = setup.rig.pattern.rows * setup.rig.pattern.columns
         self._bit_depth = bit_depth
         self._measured_s = -math.inf

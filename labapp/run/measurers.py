@@ -114,7 +114,7 @@ def _agreeing(
     warm
         Whether frames follow on those before, but for where the track was lost.
     """
-    from labapp.core.sequence.row_vote import RowVote
+    from labapp.core.recording.row_vote import RowVote
 
     vote = RowVote(setup.rig, settings.fit)
     waiting: deque[tuple[FrameResult, tuple[int, int] | None]] = deque()
@@ -166,7 +166,7 @@ def _cold(
 ) -> FrameResult:
     """Measure a frame by itself, with its dots and rows as they were corrected."""
     with _one_thread():
-        found = measure(frame.image, setup.rig, setup.calibration, settings, correction)
+        found, _ = measure(frame.image, setup.bench, settings, None, correction)
     return FrameResult(number, frame.time_s, found)
 
 
@@ -213,7 +213,7 @@ def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
 
 @dataclass(frozen=True)
 class WarmMeasurer:
-    """Measures each frame from the one before, here, in stretches (`core.sequence.warm`).
+    """Measures each frame from the one before, here, in stretches (`WarmChain`).
 
     A frame that was corrected by hand is measured by itself, as it was corrected.
 
@@ -236,12 +236,11 @@ class WarmMeasurer:
             yield from _agreeing(stretch, self.setup, self.settings, warm=True)
 
     def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
-        from labapp.core.sequence.warm import WarmChain
+        from labapp.core.recording.chain import WarmChain
 
-        given = (self.setup.rig, self.setup.calibration, self.settings)
         for place, number in enumerate(frames):
             if place in BY_THEMSELVES:
-                warm = WarmChain(*given)
+                warm = WarmChain(self.setup.bench, self.settings)
             frame = _read(self.read, number, self.settings)
             if isinstance(frame, FrameResult):
                 yield frame
@@ -369,5 +368,5 @@ def _load() -> None:
     """Load in this process all that measures."""
     import labapp.core.matching.match_kernels
     import labapp.core.rows.lattice_kernels
-    import labapp.core.sequence.warm
+    import labapp.core.sequence.following
     import labapp.export.fixed_point  # noqa: F401

@@ -268,7 +268,7 @@ class Session(SessionContents):
         pool
             Processes to measure in (`run.measurers.measuring_pool`); None: here.
         warm
-            Whether to measure each frame from the one before (`core.sequence.warm`), here.
+            Whether to measure each frame from the one before (`WarmChain`), here.
         sinks
             Where else results go once they are kept (`run.runner.run`).
 

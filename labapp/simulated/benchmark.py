@@ -18,7 +18,7 @@ from threadpoolctl import ThreadpoolController
 from labapp.config.scenario import read_scenario
 from labapp.config.setup import Setup, read_setup
 from labapp.core.pipeline import Settings, measure
-from labapp.core.sequence.warm import WarmChain
+from labapp.core.recording.chain import WarmChain
 from labapp.core.surface.measures import sigma_name
 from labapp.core.values import FloatArray, IntArray
 from labapp.export.results import ResultsWriter
@@ -63,7 +63,7 @@ seed = 6001
 TRUE_PX = 3.0
 """A found dot within this distance is a true one."""
 
-STEPS = ("dots", "match", "fit", "level", "measures")
+STEPS = ("dots", "match", "measures")
 
 
 @dataclass(frozen=True)
@@ -191,8 +191,8 @@ def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
         steps[step].append(now - last[0])
         last[0] = now
 
-    rig, calibration, settings = video.setup.rig, video.setup.calibration, Settings()
-    chain = WarmChain(rig, calibration, settings, passed)
+    bench, settings = video.setup.bench, Settings()
+    chain = WarmChain(bench, settings, passed)
     wall, used = [], []
     with (
         open_source(video.path) as source,
@@ -209,7 +209,7 @@ def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
         begun = time.process_time()
         for number in range(cold):
             image = source.frame((number + 1) * frames // (cold + 1)).image
-            measure(image, rig, calibration, settings)
+            measure(image, bench, settings)
         cold_s = (time.process_time() - begun) / cold
     by_step = {name: Spread.of(times) for name, times in steps.items()}
     return Latency(Spread.of(wall), by_step, Spread.of(used), cold_s)

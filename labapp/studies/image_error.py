@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints
@@ -143,9 +144,8 @@ def _frame_errors(task: tuple[Pool, Rig, int, tuple[str, ...]]) -> FrameErrors:
     known = exactly_seen(cap, rig)
     exact = np.array([_sizes(known, scheme) for scheme in schemes])
     frame = rendered(cap, rig, number)
-    seen = measure_frame(
-        frame.image, rig, known.uncertainty.axes.calibration, circle_settings(schemes[-1])
-    )
+    bench = Bench(rig, known.uncertainty.axes.calibration)
+    seen, _ = measure_frame(frame.image, bench, circle_settings(schemes[-1]))
     off, missed = _off(seen, frame)
     errors = np.full_like(exact, np.nan)
     if seen.match is not None:

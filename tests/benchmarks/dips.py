@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.matching.correspondence import match_rays
@@ -83,7 +84,7 @@ def matched(seen: SeenDots, rig: Rig = BENCH_RIG) -> Match:
         lattice = grow_lattice(seen.dots, GrowSettings())
     except CannotMeasure:
         lattice = None
-    return match_rays(seen.dots, lattice, rig, BENCH_VIEW, FRAME_SHAPE, MatchSettings())
+    return match_rays(seen.dots, lattice, Bench(rig, BENCH_VIEW), FRAME_SHAPE, MatchSettings())[0]
 
 
 def report(kind: str, answers: list[Answer]) -> int:

@@ -17,6 +17,7 @@ import time
 
 import numpy as np
 
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Settings, measure
 from labapp.simulation.camera import CameraView
@@ -68,8 +69,9 @@ def measured(kind: str, seed: int) -> tuple[Answer, float]:
     frame = render(trace(pool, rig), view, draw_look(rng), rng)
     shown = int(frame.shown.sum())
     axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
+    bench = Bench(rig, ImageCalibration.from_three_points(*axes))
     began = time.process_time()
-    found = measure(frame.image, rig, ImageCalibration.from_three_points(*axes), Settings())
+    found = measure(frame.image, bench, Settings())[0]
     took_s = time.process_time() - began
     if found.match is None or found.measures is None or found.dots is None:
         return Answer(found.status, shown=shown), took_s

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import DotPattern, Laser, Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
@@ -99,7 +100,8 @@ def matched(
     except CannotMeasure:
         lattice = None
     try:
-        match = match_rays(dots, lattice, rig, BENCH_VIEW, FRAME_SHAPE, settings or MatchSettings())
+        given = Bench(rig, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
+        match, _ = match_rays(dots, lattice, *given)
     except CannotMeasure as answer:
         return None, answer.status if answer.reason else "no reason"
     return match, "ok"
@@ -355,14 +357,8 @@ def test_a_forced_correspondence_that_is_right_changes_nothing(
 
 
 def corrected(correction: Correction, settings: MatchSettings | None = None) -> Match:
-    return match_corrected(
-        correction.dots,
-        correction.lattice,
-        BENCH_RIG,
-        BENCH_VIEW,
-        FRAME_SHAPE,
-        settings or MatchSettings(),
-    )
+    given = Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
+    return match_corrected(correction.dots, correction.lattice, *given)[0]
 
 
 def by_hand(seen: SeenDots, orientation: Orientation = "S/S") -> tuple[Correction, Site]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from labapp.config.setup import parse_setup, pattern_values, updated_setup
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.optics import ray_directions
 from labapp.core.geometry.patterns import PATTERNS, square
 from labapp.core.geometry.rig import DotPattern
@@ -81,7 +82,7 @@ def test_the_twin_and_the_measurement_have_the_same_rays() -> None:
 def test_a_frame_of_another_kind_is_measured() -> None:
     rig = replace(BENCH, pattern=DotPattern(kind="staggered"))
     frame = rendered(spherical_cap(6.0, 0.3), rig, 0)
-    found = measure(frame.image, rig, axes_of(VIEW).calibration, Settings())
+    found = measure(frame.image, Bench(rig, axes_of(VIEW).calibration), Settings())[0]
     assert found.status == "ok", found.reason
     assert found.match is not None
     assert found.measures is not None

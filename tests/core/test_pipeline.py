@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pytest
 
 from labapp.config.setup import read_setup
+from labapp.core.geometry.bench import Bench
 from labapp.core.images.dots import Dots
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.pipeline import (
@@ -27,7 +28,7 @@ from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.media import open_source
 from labapp.simulation.pools import spherical_cap
-from tests.same import assert_same
+from tests.same import assert_alike
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, as_dots, see
 
 SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
@@ -50,10 +51,7 @@ def images() -> dict[int, npt.NDArray[np.generic]]:
 
 @pytest.fixture(scope="module")
 def measurements(images: dict[int, npt.NDArray[np.generic]]) -> dict[int, Measurement]:
-    return {
-        index: measure(image, SETUP.rig, SETUP.calibration, Settings())
-        for index, image in images.items()
-    }
+    return {index: measure(image, SETUP.bench, Settings())[0] for index, image in images.items()}
 
 
 @pytest.mark.slow
@@ -154,7 +152,7 @@ def test_the_algorithms_of_irs_are_different_ones(
 def test_the_scheme_is_the_one_that_is_asked_for(
     images: dict[int, npt.NDArray[np.generic]], measurements: dict[int, Measurement]
 ) -> None:
-    result = measure(images[FRAMES[1]], SETUP.rig, SETUP.calibration, Settings(scheme="ers"))
+    result = measure(images[FRAMES[1]], SETUP.bench, Settings(scheme="ers"))[0]
     assert result.status == "ok"
     assert result.scheme == "ers"
     assert result.reconstruction is not None
@@ -170,7 +168,7 @@ def test_the_scheme_is_the_one_that_is_asked_for(
         np.testing.assert_array_equal(getattr(ours.match, name), getattr(other.match, name))
     assert ours.match.trials == other.match.trials
     again = reconstruct(other.match, SETUP.rig, Settings())
-    assert_same(measure_surface(again, other.match, SETUP.rig), ours.measures)
+    assert_alike(measure_surface(again, other.match, SETUP.rig), ours.measures)
 
 
 def test_a_correction_that_changes_nothing_changes_no_figure(
@@ -181,8 +179,8 @@ def test_a_correction_that_changes_nothing_changes_no_figure(
     correction = start_correction(found)
     assert correction.lattice.reference == found.lattice.reference
     dark = np.zeros_like(images[FRAMES[2]])  # of the image only the shape counts
-    again = measure(dark, SETUP.rig, SETUP.calibration, Settings(), correction)
-    assert_same(again.measures, found.measures)
+    again = measure(dark, SETUP.bench, Settings(), correction=correction)[0]
+    assert_alike(again.measures, found.measures)
     assert again.correction is correction
     assert start_correction(again) is correction
     assert again.lattice is not None
@@ -217,7 +215,7 @@ def test_a_false_dot_is_deleted_and_a_missing_one_added_by_hand(
     assert np.linalg.norm(better.dots.image_px[last] - true) < 0.3
     better = assign(better, [last], *site)
     assert np.flatnonzero(better.manual).tolist() == [last]
-    result = measure(images[index], SETUP.rig, SETUP.calibration, Settings(), better)
+    result = measure(images[index], SETUP.bench, Settings(), correction=better)[0]
     assert result.status == "ok"
     assert result.match is not None
     assert len(result.match.dot) == len(found.match.dot)
@@ -240,11 +238,10 @@ def test_a_frame_that_was_refused_is_measured_with_its_reference_set() -> None:
     k, t = (offset[0] + 10).tolist()
     result = measure(
         np.zeros(FRAME_SHAPE),
-        BENCH_RIG,
-        BENCH_VIEW,
+        Bench(BENCH_RIG, BENCH_VIEW),
         Settings(),
-        set_reference(Correction.of(dots, replace(lattice, reference=None)), (k, t)),
-    )
+        correction=set_reference(Correction.of(dots, replace(lattice, reference=None)), (k, t)),
+    )[0]
     assert (result.status, result.reason) == ("ok", "")
     assert result.match is not None
     np.testing.assert_array_equal(result.match.ray, ray[result.match.dot])
@@ -262,9 +259,8 @@ def test_a_hole_that_no_ray_confirmed_is_no_reference() -> None:
 
 
 def test_a_correction_without_dots_has_a_status() -> None:
-    result = measure(
-        np.zeros((640, 480)), SETUP.rig, SETUP.calibration, Settings(), Correction.of(None, None)
-    )
+    nothing = Correction.of(None, None)
+    result = measure(np.zeros((640, 480)), SETUP.bench, Settings(), correction=nothing)[0]
     assert result.status == "too-few-dots"
     assert result.lattice is not None
 
@@ -273,7 +269,7 @@ def test_a_frame_is_left_as_it_was(images: dict[int, npt.NDArray[np.generic]]) -
     image = images[FRAMES[0]][:400].astype(np.float32)
     image.flags.writeable = False
     before = image.copy()
-    measure(image, SETUP.rig, SETUP.calibration, Settings())
+    measure(image, SETUP.bench, Settings())
     np.testing.assert_array_equal(image, before)
 
 
@@ -297,12 +293,7 @@ def noise(seed: int) -> FloatArray:
 def test_a_frame_that_shows_nothing_has_a_status_and_a_reason(
     image: npt.NDArray[np.generic], scheme: str
 ) -> None:
-    result = measure(
-        image,
-        SETUP.rig,
-        SETUP.calibration,
-        Settings(scheme=scheme),
-    )
+    result = measure(image, SETUP.bench, Settings(scheme=scheme))[0]
     assert result.status != "ok"
     assert " " not in result.status
     assert result.reason
@@ -314,7 +305,7 @@ def test_a_frame_that_shows_nothing_has_a_status_and_a_reason(
 @pytest.mark.parametrize("method", ["block-threshold", "wavelet"])
 def test_the_text_s_detectors_say_that_a_blank_frame_has_no_dots(method: str) -> None:
     settings = Settings(dots=DotSettings(method=method))
-    result = measure(np.zeros((640, 480), np.uint8), SETUP.rig, SETUP.calibration, settings)
+    result = measure(np.zeros((640, 480), np.uint8), SETUP.bench, settings)[0]
     assert result.status == "no-dots"
 
 
@@ -327,7 +318,7 @@ def test_a_frame_of_one_or_a_few_dots_is_answered(count: int) -> None:
     frame = np.random.default_rng(0).normal(20.0, 1.0, u.shape)
     for k in range(count):
         frame += 80.0 * np.exp(-((u - 200 - 40 * k) ** 2 + (v - 300) ** 2) / 8.0)
-    result = measure(frame, SETUP.rig, SETUP.calibration, Settings())
+    result = measure(frame, SETUP.bench, Settings())[0]
     assert result.status == "too-few-dots"
     assert result.reason
 
@@ -337,7 +328,7 @@ def test_a_step_that_cannot_be_done_keeps_those_before_it(
 ) -> None:
     half = images[FRAMES[0]].copy()
     half[: half.shape[0] * 7 // 10] = np.median(half)  # only the lowest dots are left
-    result = measure(half, SETUP.rig, SETUP.calibration, Settings())
+    result = measure(half, SETUP.bench, Settings())[0]
     assert result.status != "ok"
     assert result.reason
     assert result.dots is not None

@@ -30,7 +30,7 @@ def judged(image: GreyImage, sample: str | None = "gtaw") -> Quality:
 
 def seen(image: GreyImage, sample: str | None) -> Measurement:
     setup = None if sample is None else read_setup(SAMPLES / sample / "setup.toml")
-    return look(image, Settings(), None if setup is None else (setup.rig, setup.calibration))
+    return look(image, Settings(), None if setup is None else setup.bench)
 
 
 def about(quality: Quality, what: str) -> str:

@@ -9,9 +9,9 @@ import pytest
 
 from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Measurement
+from labapp.core.recording.row_vote import RowVote
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import fit
-from labapp.core.sequence.row_vote import RowVote
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Wave, egg

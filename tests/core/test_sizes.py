@@ -5,20 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.sequence.warm_fit import SequenceGeometry
 from labapp.core.surface import measures
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.boundary_trace import retrace_boundary
 from labapp.core.surface.level import Level, Rear
-from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.sizes import Sizes, sizes_and_gradients
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 
 BASIS = SplineBasis.over(np.array([-4.0, -5.0]), np.array([4.0, 4.0]), 0.9)
-RIG = Rig(Laser(31.0, 32.0), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
-BED = SequenceGeometry.of(RIG, BASIS, FitSettings())
 CENTER = np.array([0.1, -0.4])
 
 

@@ -9,12 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.sequence.track import TrackLost
-from labapp.core.sequence.warm import WarmChain, follow
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.recording.chain import WarmChain
+from labapp.core.values import FloatArray
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Wave, egg
 from labapp.simulation.recording import RecordedFrame, Recording
@@ -26,6 +26,7 @@ VIEW = CameraView((44.0, 590.0), (242.02, 590.0), 34.925, (44.0, 499.99), 15.875
 CALIBRATION = ImageCalibration.from_three_points(
     VIEW.origin_px, VIEW.x_axis_px, VIEW.x_axis_mm, VIEW.z_axis_px, VIEW.z_axis_mm
 )
+BENCH = Bench(RIG, CALIBRATION)
 RATE_HZ, WAVE_HZ = 200.0, 31.0
 FRAMES, WARMED = 18, 16
 TRUE_PX = 2.5
@@ -55,7 +56,7 @@ class Run:
 
 @cache
 def warmed() -> Run:
-    chain = WarmChain(RIG, CALIBRATION, Settings())
+    chain = WarmChain(BENCH, Settings())
     measurements, track_lost = [], []
     for frame in frames()[:WARMED]:
         measurements.append(chain.measure(frame.image))
@@ -119,7 +120,7 @@ def test_sizes_are_true_within_what_they_are_said_to_be_uncertain_by() -> None:
 @pytest.mark.parametrize("number", [2, 9])
 def test_a_followed_frame_is_what_the_cold_chain_makes_of_it(number: int) -> None:
     warm = warmed().measurements[number]
-    cold = measure(frames()[number].image, RIG, CALIBRATION, Settings())
+    cold = measure(frames()[number].image, BENCH, Settings())[0]
     assert cold.match is not None
     assert warm.match is not None
     assert cold.measures is not None
@@ -180,7 +181,7 @@ def test_a_dot_that_a_false_one_runs_into_has_no_ray_in_either_chain(
 ) -> None:
     frame, follower = frames()[WARMED], chain()
     image = with_dots(frame.image, frame.dot_px[8, 8][None] + beside)
-    followed, cold = follower.measure(image), measure(image, RIG, CALIBRATION, Settings())
+    followed, cold = follower.measure(image), measure(image, BENCH, Settings())[0]
     assert follower.track_lost is None
     for result in (followed, cold):
         assert wrong_rays(result, frame) == 0
@@ -213,9 +214,9 @@ def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() ->
 @pytest.mark.slow
 def test_a_pool_that_goes_on_by_a_row_is_not_followed_to_the_wrong_rays(way: int) -> None:
     """The dot that would tell, where the absent one was, is missing."""
-    track = chain()._track
-    assert track is not None
-    step = way * track.geometry.spacing_mm[1]
+    prior = chain()._prior
+    assert prior is not None
+    step = way * BENCH.rays.spacing_mm[1]
     for k, share in enumerate(np.linspace(0.6, 1.4, 17).tolist()):
         pool = egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6 + share * step))
         made = Recording(
@@ -224,16 +225,13 @@ def test_a_pool_that_goes_on_by_a_row_is_not_followed_to_the_wrong_rays(way: int
         )  # fmt: skip
         frame = made.frame(0)
         image = without_dots(frame.image, frame.dot_px[[9 + way], [9]])
-        try:
-            result, _ = follow(image, track, CALIBRATION, Settings())
-        except (TrackLost, CannotMeasure):
-            continue
+        result, _ = measure(image, BENCH, Settings(), prior)
         assert wrong_rays(result, frame) == 0
 
 
 def test_a_pool_elsewhere_with_as_many_rays_begins_a_track_of_its_own() -> None:
     """Their splines are others: what was remembered of the former pool is of no use."""
-    follower = WarmChain(RIG, CALIBRATION, Settings())
+    follower = WarmChain(BENCH, Settings())
     for number, at in enumerate(
         [
             (5.57, 3.04, 3.73, 0.27, (-0.66, -0.39)),
@@ -291,7 +289,7 @@ def test_the_track_goes_on_after_a_frame_without_dots() -> None:
 
 @pytest.mark.slow
 def test_another_scheme_is_measured_by_the_cold_chain() -> None:
-    follower = WarmChain(RIG, CALIBRATION, Settings(scheme="ers"))
+    follower = WarmChain(BENCH, Settings(scheme="ers"))
     for frame in frames()[:2]:
         result = follower.measure(frame.image)
         assert follower.track_lost is not None

@@ -19,7 +19,7 @@ import pytest
 from labapp.config.setup import Setup, read_setup
 from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.sequence import warm
+from labapp.core.recording import chain as recording_chain
 from labapp.core.surface.measures import Measures
 from labapp.export.scene import Scene, empty_scene
 from labapp.media import open_source
@@ -337,7 +337,7 @@ class Chain:
 @pytest.fixture
 def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     chain = Chain()
-    monkeypatch.setattr(warm, "WarmChain", lambda *_: chain)
+    monkeypatch.setattr(recording_chain, "WarmChain", lambda *_: chain)
     monkeypatch.setattr(live_measuring, "judge_quality", chain.judge)
     monkeypatch.setattr(time, "monotonic", lambda: chain.now_s)
     return chain

@@ -205,8 +205,8 @@ class Later(Executor):
 def plain(monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer) -> Any:
     """A cold measurer whose measurements say no more than grey level and correction of a frame."""
 
-    def measure(image: np.ndarray, *given: Any) -> Measurement:
-        return Measurement("no-dots", f"{image[0, 0]}, {given[-1]}", given[2].scheme)
+    def measure(image: np.ndarray, *given: Any) -> tuple[Measurement, None]:
+        return Measurement("no-dots", f"{image[0, 0]}, {given[-1]}", given[1].scheme), None
 
     def read(number: int) -> Frame:
         if number == 3:
@@ -270,7 +270,7 @@ THREADS = """
         import scipy.linalg
         libraries = ThreadpoolController().select(user_api="blas").info()
         print({library["num_threads"] for library in libraries})
-        return Measurement("no-dots", "it is dark", "fit")
+        return Measurement("no-dots", "it is dark", "fit"), None
 
     measurers.measure = measure
     setup = read_setup("sample_sessions/gtaw/setup.toml")
@@ -303,19 +303,18 @@ def slipping(
         with open_source(recording.path) as source:
             images = {number: source.frame(number) for number in range(4)}
 
-        def measure(image: np.ndarray, *given: Any) -> Measurement:
-            found = pipeline.measure(image, *given)
+        def measure(image: np.ndarray, *given: Any) -> tuple[Measurement, None]:
+            found, _ = pipeline.measure(image, *given)
             if image is not images[slips].image:
-                return found
+                return found, None
             assert found.match is not None
             match = replace(
                 found.match,
                 ray=found.match.ray + np.array([1, 0]),
                 witness=np.roll(found.match.witness, 1, axis=0),
             )
-            return replace(
-                found, match=match, reconstruction=fit.reconstruct(match, rig, FitSettings())
-            )
+            made = fit.reconstruct(match, rig, FitSettings())
+            return replace(found, match=match, reconstruction=made), None
 
         monkeypatch.setattr(measurers, "measure", measure)
         return ColdMeasurer(images.__getitem__, recording.setup, recording.settings)
@@ -343,7 +342,7 @@ def test_two_frames_whose_rows_differ_are_both_not_answered(
 def test_what_was_measured_is_told_before_measuring_fails(
     monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer
 ) -> None:
-    def measure(image: np.ndarray, *given: Any) -> Measurement:
+    def measure(image: np.ndarray, *given: Any) -> Any:
         if image[0, 0] == 4:
             raise OSError("a process has ended")
         return pipeline.measure(images[int(image[0, 0])], *given)

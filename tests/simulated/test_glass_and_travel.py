@@ -12,8 +12,9 @@ import tomlkit
 
 from labapp.config.scenario import Scenario, read_scenario, shipped_scenarios
 from labapp.config.setup import Setup, parse_setup
+from labapp.core.geometry.bench import Bench
 from labapp.core.pipeline import Settings, measure
-from labapp.core.sequence.warm import WarmChain
+from labapp.core.recording.chain import WarmChain
 from labapp.errors import InputError
 
 FRAMES = 5
@@ -67,7 +68,7 @@ def test_what_hides_rays_and_how_it_moves_share_a_table(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_cold_and_followed_frames_have_the_true_sizes(scenario: Scenario, setup: Setup) -> None:
-    chain = WarmChain(setup.rig, setup.calibration, Settings())
+    chain = WarmChain(Bench(setup.rig, setup.calibration), Settings())
     bare = replace(setup.rig.imaging_plane, glass_mm=0.0)
     for n in range(FRAMES):
         frame = scenario.recording.frame(n)
@@ -81,13 +82,13 @@ def test_cold_and_followed_frames_have_the_true_sizes(scenario: Scenario, setup:
         assert np.sqrt(np.mean(followed.reconstruction.residual_mm**2)) < 0.03
         if n != FRAMES - 1:
             continue
-        cold = measure(frame.image, setup.rig, setup.calibration, Settings())
+        cold, _ = measure(frame.image, Bench(setup.rig, setup.calibration), Settings())
         assert cold.measures is not None
         off = cold.measures.height_mm - followed.measures.height_mm
         assert abs(off) < followed.measures.height_sigma_mm
         # Taken for a bench without glass, it is refused or farther off.
         wrong = replace(setup.rig, imaging_plane=bare)
-        without = measure(frame.image, wrong, setup.calibration, Settings())
+        without, _ = measure(frame.image, Bench(wrong, setup.calibration), Settings())
         if without.measures is not None:
             apart = without.measures.height_mm - true.height_mm
             assert abs(apart) > 3 * abs(cold.measures.height_mm - true.height_mm)

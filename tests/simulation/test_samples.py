@@ -47,7 +47,7 @@ def recorded(sample, index):
 def measured(sample, index, correction=None):
     setup = read_setup(FOLDER / sample.name / "setup.toml")
     image = recorded(sample, index)
-    return measure(image, setup.rig, setup.calibration, Settings(), correction)
+    return measure(image, setup.bench, Settings(), correction=correction)[0]
 
 
 def same_picture(made, kept):
@@ -295,18 +295,17 @@ def test_marked_rows_bring_a_blocked_frame_closer():
 @pytest.mark.parametrize("mark", [True, False])
 @pytest.mark.slow
 def test_a_frame_with_more_hidden_is_refused_and_put_right_by_hand(mark):
-    index, bench = 5, read_setup(FOLDER / "blocked_rows" / "setup.toml")
-    bench = bench.rig, bench.calibration, Settings()
+    index, bench = 5, read_setup(FOLDER / "blocked_rows" / "setup.toml").bench
     sample = replace(blocked_rows(), torches=(ConeTorch((*BENT_MM, 0.8)),) * 6)
     frame = sample.frame(index)
-    result = measure(frame.image, *bench)
+    result = measure(frame.image, bench, Settings())[0]
     _, reference, place, blocked = advised(index)
     assert result.status == "no-match"
     np.testing.assert_allclose(place, frame.dot_px[9, 9], atol=1.0)
     correction = set_reference(start_correction(result), reference)
     for row in blocked if mark else ():
         correction = block_row(correction, row)
-    again = measure(frame.image, *bench, correction)
+    again = measure(frame.image, bench, Settings(), correction=correction)[0]
     assert again.status == "ok"
     tolerance = 0.03 if mark else 0.05
     assert again.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=tolerance)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
 from labapp.core.geometry.rig import DotPattern, ImagingPlane, Laser
-from labapp.core.values import FloatArray
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
     """Unit direction of every projected ray (Eq. 4-1, Fig. 4-14).
 
@@ -121,3 +122,43 @@ def intersect_level(
 ) -> FloatArray:
     """Where rays meet the horizontal plane z = z_mm, one or one each (…, 1), shape (…, 3), mm."""
     return np.asarray(origin_mm + ((z_mm - origin_mm[..., 2:]) / direction[..., 2:]) * direction)
+
+
+@dataclass(frozen=True)
+class ProjectedRays(ReadOnlyArrays):
+    """The rays of a pattern, and where they would land on the work piece, z = 0.
+
+    Parameters
+    ----------
+    directions
+        Unit directions, shape (rows, columns, 3).
+    landing_mm
+        Landing points, shape (rows, columns, 3), mm.
+    spacing_mm
+        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
+    absent
+        Rays that the lens does not make, shape (rows, columns).
+    """
+
+    directions: FloatArray
+    landing_mm: FloatArray
+    spacing_mm: FloatArray
+    absent: BoolArray
+
+
+@lru_cache(maxsize=64)
+def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
+    """Rays of a pattern from a laser, and their landing points."""
+    directions = ray_directions(laser, pattern)
+    landing = intersect_level(laser.position_mm, directions)
+    absent = np.zeros(directions.shape[:2], bool)
+    for i, j in pattern.absent_rays:
+        absent[i - 1, j - 1] = True
+    return ProjectedRays(directions, landing, landing_spacing(landing), absent)
+
+
+def landing_spacing(landing_mm: FloatArray) -> FloatArray:
+    """Distance between neighbours of a grid of landing points along X and along Y, (2,), mm."""
+    across = np.median(np.diff(landing_mm[..., 0], axis=1))
+    along = np.median(np.diff(landing_mm[..., 1], axis=0))
+    return np.asarray(np.abs([across, along]), float)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -130,9 +131,12 @@ class RigUncertainty(ReadOnlyArrays):
         sigma = np.where(self.sigma > 0.0, self.sigma, 1.0)
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
-    @property
+    @cached_property
     def root(self) -> FloatArray:
-        """Lower root R of the covariance, shape (q, q): offsets R·n of normal deviates n."""
+        """Lower root R of the covariance, shape (q, q): offsets R·n of normal deviates n.
+
+        The column of a quantity that is known exactly is 0.
+        """
         root, uncertain = np.zeros_like(self.covariance), np.flatnonzero(self.sigma)
         some = np.ix_(uncertain, uncertain)
         correlation = self.correlation[some] + 1e-12 * np.eye(len(uncertain))  # ±1 is singular

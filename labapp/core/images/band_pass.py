@@ -116,10 +116,16 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
     CannotMeasure
         ``no-dots`` if nothing in the frame stands out of the noise.
     """
+    return tuned_dots(frame, settings)[0]
+
+
+def tuned_dots(frame: Image, settings: BandPassSettings) -> tuple[Dots, DetectorTuning]:
+    """Find the dots of a frame (`band_pass_dots`), and the tuning for those after it."""
     picture = as_picture(np.asarray(frame))
     if picture.ndim != 2 or min(picture.shape) < 8 or not float(np.ptp(picture)) > 0:
         raise CannotMeasure("no-dots", "the frame is blank or too small to hold a dot")
-    return quick_dots(frame, _tuned(picture, settings)[0], settings)
+    tuning = _tuned(picture, settings)[0]
+    return quick_dots(frame, tuning, settings), tuning
 
 
 def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings) -> Dots:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, ways
@@ -26,6 +26,7 @@ from labapp.core.matching.hypothesis import (
 )
 from labapp.core.matching.observation import LEAST_LABELS, UNLABELLED, Observation
 from labapp.core.rows.lattice import Lattice, Site
+from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, IntArray
 
 AGREED = 0.8
@@ -40,11 +41,10 @@ the correction does not fit."""
 def match_corrected(
     dots: Dots,
     lattice: Lattice,
-    rig: Rig,
-    calibration: ImageCalibration,
+    bench: Bench,
     frame_shape: tuple[int, int],
     settings: MatchSettings,
-) -> Match:
+) -> tuple[Match, SplineSurface]:
     """Find the ray of every dot of a frame that the operator has corrected: what he set is binding.
 
     With a reference, every dot that has a row and a column gets the ray that these give; without
@@ -57,7 +57,7 @@ def match_corrected(
     dots, lattice
         The dots as corrected. 0 for no row or no column; missing dots of blocked rows do not
         testify.
-    rig, calibration, frame_shape, settings
+    bench, frame_shape, settings
         See `match_rays`.
 
     Raises
@@ -71,16 +71,16 @@ def match_corrected(
     orientations = settings.orientations
     reference = lattice.reference
     if reference is None:
-        match = match_rays(dots, rows if count else None, rig, calibration, frame_shape, settings)
+        match, near = match_rays(dots, rows if count else None, bench, frame_shape, settings)
         if count == 0:
-            return match
-        reference, orientations = _found_reference(match, rows, rig), (match.orientation,)
+            return match, near
+        reference, orientations = _found_reference(match, rows, bench.rig), (match.orientation,)
     elif count < LEAST_LABELS:
         raise CannotMeasure(
             "too-few-dots",
             f"{count} dots have a row and a column, telling rays needs {LEAST_LABELS}",
         )
-    observed = Observation.of(dots, rig, calibration, frame_shape)
+    observed = Observation.of(dots, bench, frame_shape)
     tried = (_bound(observed, lattice, reference, orientation) for orientation in orientations)
     bound = [b for b in tried if b is not None]
     if not bound:
@@ -100,7 +100,8 @@ def match_corrected(
     # Which rays came back follows from the fit that frames without a correction get.
     usual = evaluate(best.observed, best.hypothesis.labels)
     final = best.hypothesis if usual is None else replace(best.hypothesis, witness=usual.witness)
-    return match_of_hypothesis(best.observed, final, best.orientation, reference)
+    match = match_of_hypothesis(best.observed, final, best.orientation, reference)
+    return match, final.pool.surface
 
 
 def lattice_of_corrected(match: Match, rig: Rig, given: Lattice) -> Lattice:

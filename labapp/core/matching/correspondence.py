@@ -19,7 +19,7 @@ from itertools import product
 
 import numpy as np
 
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, missing_share, ways
@@ -37,10 +37,10 @@ from labapp.core.matching.decision import (
 )
 from labapp.core.matching.hypothesis import (
     Hypothesis,
-    certain_witness,
     extended_over_grid,
     grow_and_evaluate,
     labels_from_lattice,
+    paths_of,
     reoriented_labels,
 )
 from labapp.core.matching.observation import (
@@ -51,11 +51,14 @@ from labapp.core.matching.observation import (
     Observation,
     try_fit,
 )
+from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.quadric_search import search_quadrics
+from labapp.core.matching.ray_classes import certain_witness
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.rows.lattice import Lattice, Site, empty_sites
 from labapp.core.surface.pool_fit import FitSettings
-from labapp.core.values import CannotMeasure, IntArray
+from labapp.core.surface.spline import SplineSurface
+from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 MOST_SITES = 8
 """So many sites of the marker in the grid lead to a hypothesis, of those that fit best."""
@@ -64,19 +67,18 @@ MOST_SITES = 8
 def match_rays(
     dots: Dots,
     lattice: Lattice | None,
-    rig: Rig,
-    calibration: ImageCalibration,
+    bench: Bench,
     frame_shape: tuple[int, int],
     settings: MatchSettings,
-) -> Match:
-    """Find the ray of every dot that one ray alone can have made.
+) -> tuple[Match, SplineSurface]:
+    """Find the ray of every dot that one ray alone can have made, and a surface that has them.
 
     Parameters
     ----------
     dots, lattice
         What the frame shows; no lattice where none could be grown.
-    rig, calibration
-        The bench, and how the camera sees the imaging plane.
+    bench
+        The bench.
     frame_shape
         Height and width of the frame, px.
     settings
@@ -93,7 +95,7 @@ def match_rays(
         raise CannotMeasure(
             "too-few-dots", f"{len(dots)} dots were found, telling rays needs {LEAST_LABELS}"
         )
-    observed = Observation.of(dots, rig, calibration, frame_shape)
+    observed = Observation.of(dots, bench, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
     for first_labels in (_by_grid, _by_empty_sites, _by_quadrics):
@@ -110,7 +112,7 @@ def match_rays(
         best = None
     if best is None:
         best = _decide_among(observed, found + _by_caps(observed), lattice, settings)
-    return match_of_hypothesis(observed, best, best.orientation(observed))
+    return match_of_hypothesis(observed, best, best.orientation(observed)), best.pool.surface
 
 
 def _decide_among(
@@ -244,7 +246,16 @@ def match_of_hypothesis(
     at = np.argwhere(best.labels != UNLABELLED)
     dot = best.labels[at[:, 0], at[:, 1]]
     trials.sort(key=lambda trial: trial.residual_mm)
-    witness, missed = certain_witness(observed, best), best.missed_count
+    paths, surface, factor = paths_of(observed, best.pool), best.pool.surface, best.pool.factor
+
+    def covariance_of(rays: IntArray) -> FloatArray:
+        at = paths.points_mm[rays], paths.plane_mm[rays]
+        return covariance_of_dots(observed.rig, surface.basis, factor, *at)
+
+    witness, missed = (
+        certain_witness(observed, best.witness, paths, covariance_of),
+        best.missed_count,
+    )
     return match_of_pairs(observed, at, dot, own, witness, missed, trials, reference)
 
 

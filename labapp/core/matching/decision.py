@@ -367,7 +367,7 @@ def _evaluate_twice(
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
     """Whether no more than `PAIR` rays without a dot are side by side."""
     seen = np.zeros(hypothesis.labels.shape, np.uint8)
-    seen[tuple(hypothesis.missed_rays.at.T)] = 1
+    seen[tuple(hypothesis.missed_rays.T)] = 1
     sizes = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
     return bool((sizes <= PAIR).all())
 

@@ -23,21 +23,20 @@ from labapp.core.matching.observation import (
     count_labels,
     neighbours_of,
     try_fit,
-    widened,
 )
 from labapp.core.matching.prediction import (
     FALSE_DOTS_PER_MM2,
     RIVAL_MARGIN,
-    Prediction,
+    RayPaths,
     false_dot_deviance,
-    lines_out_of_view,
     pair_deviances,
     predict,
 )
+from labapp.core.matching.ray_classes import RayClasses, classify_rays
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.level import Level
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
-from labapp.core.values import BoolArray, CannotMeasure, IntArray, median
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
 
 KNOT_ERROR_MM = 0.045
 """How far dots may be off the right surface, mm, because its knots cannot follow a dent."""
@@ -92,9 +91,11 @@ class Hypothesis:
         The surface.
     witness
         See `Match.witness`.
-    missed_rays, stray_dots
-        Predictions for the rays amid the others that have no dot; indices of the dots that have no
-        ray, shape (s,).
+    missed_rays, missed_mm
+        Rows and columns of the rays amid the others that have no dot, counted from 0, shape (m, 2);
+        where the surface puts their dots, IPCS, shape (m, 2), mm.
+    stray_dots
+        Indices of the dots that have no ray, shape (s,).
     marker
         What shows at the marker's absent ray; None if the pattern has no marker.
     cost_without_marker
@@ -105,7 +106,8 @@ class Hypothesis:
     labels: IntArray
     pool: FittedPool
     witness: IntArray
-    missed_rays: Prediction
+    missed_rays: IntArray
+    missed_mm: FloatArray
     stray_dots: IntArray
     marker: Marker | None
     cost_without_marker: float
@@ -123,7 +125,7 @@ class Hypothesis:
     @property
     def missed_count(self) -> int:
         """How many rays amid the others have no dot."""
-        return len(self.missed_rays.at)
+        return len(self.missed_rays)
 
     @property
     def label_count(self) -> int:
@@ -166,11 +168,35 @@ def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """Labelled rays that landed well beyond where all the others put the boundary."""
     at = np.argwhere(hypothesis.labels != UNLABELLED)
     x, y = observed.landing_mm[at[:, 0], at[:, 1], :2].T
-    surface, level = hypothesis.pool.surface, hypothesis.pool.level
-    slope = surface.gradient(x, y)
-    rise = np.linalg.norm(slope * observed.spacing_mm, axis=-1)
-    over = surface.height(x, y) - level.rear.height(y)
-    return np.asarray(at[level.sign * over < -BEYOND_SPACINGS * rise])
+    height, slope = hypothesis.pool.surface.height_and_gradient(x, y)
+    far = landing_rises(height, slope, y, hypothesis.pool.level, observed.spacing_mm)[1]
+    return np.asarray(at[far])
+
+
+def landing_rises(
+    height: FloatArray, slope: FloatArray, y: FloatArray, level: Level, spacing_mm: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """How far within the boundary rays land, and whether that is far beyond it.
+
+    Parameters
+    ----------
+    height, slope
+        Of the surface where n rays would land on z = 0: shape (n,), mm, and gradients, (n, 2).
+    y
+        Where they would land along Y, shape (n,), mm.
+    level
+        Where z = 0 lies.
+    spacing_mm
+        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
+
+    Returns
+    -------
+    inward_mm, far
+        Height over the boundary's on the pool's side, shape (n,), mm; whether a ray lands by
+        `BEYOND_SPACINGS` outside, shape (n,).
+    """
+    inward = level.sign * (height - level.rear.height(y))
+    return inward, inward < -BEYOND_SPACINGS * np.linalg.norm(slope * spacing_mm, axis=-1)
 
 
 def evaluate(
@@ -186,14 +212,22 @@ def evaluate(
     pool = try_fit(observed, labels, initial=initial)
     if pool is None:
         return None
+    witness = classify_rays(observed, labels, paths_of(observed, pool)).witness
     try:
-        pool = observed.fit(labels, _witness(observed, labels, pool), settings, pool)
+        pool = observed.fit(labels, witness, settings, pool)
     except CannotMeasure:
         return None
-    missed_rays, stray, marker, cost = _misfit(observed, labels, pool)
-    witness = _witness(observed, labels, pool)
+    paths = paths_of(observed, pool)
+    classes, marker, cost = _misfit(observed, labels, pool, paths)
     cost += _boundary_cost(pool.level)
-    return Hypothesis(labels, pool, witness, missed_rays, stray, marker, cost)
+    missed = np.stack(np.divmod(classes.missed, labels.shape[1]), axis=-1)
+    missed_mm = paths.plane_mm[classes.missed]
+    return Hypothesis(labels, pool, classes.witness, missed, missed_mm, classes.stray, marker, cost)
+
+
+def paths_of(observed: Observation, pool: FittedPool) -> RayPaths:
+    """What a fitted surface makes of all rays."""
+    return RayPaths.of(observed.bench, pool.surface.basis, pool.surface.coefficients)
 
 
 def rough_costs(observed: Observation, labels: IntArray, pool: FittedPool) -> tuple[float, float]:
@@ -201,21 +235,21 @@ def rough_costs(observed: Observation, labels: IntArray, pool: FittedPool) -> tu
 
     What the rays near the boundary cost is not in it: that would need a further fit.
     """
-    _, _, marker, cost = _misfit(observed, labels, pool)
+    _, marker, cost = _misfit(observed, labels, pool, paths_of(observed, pool))
     return cost, cost + LIT_MARKER_COST * (marker == "lit")
 
 
 def _misfit(
-    observed: Observation, labels: IntArray, pool: FittedPool
-) -> tuple[Prediction, IntArray, Marker | None, float]:
-    """Missed rays, stray dots, state of the marker, and what the dots and these two cost."""
+    observed: Observation, labels: IntArray, pool: FittedPool, paths: RayPaths
+) -> tuple[RayClasses, Marker | None, float]:
+    """Missed rays and stray dots, state of the marker, and what the dots and these two cost."""
     lit = labels != UNLABELLED
-    missed_rays, stray = _unexplained(observed, labels, pool)
+    classes = classify_rays(observed, labels, paths)
     marker = _marker_state(observed, lit, pool)
     variance = observed.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + KNOT_ERROR_MM**2
     chi2 = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY_COST)
-    cost = float(chi2.sum()) + STRAY_COST * len(stray) + MISSED_COST * len(missed_rays.at)
-    return missed_rays, stray, marker, cost
+    cost = float(chi2.sum()) + STRAY_COST * len(classes.stray)
+    return classes, marker, cost + MISSED_COST * len(classes.missed)
 
 
 def _boundary_cost(level: Level) -> float:
@@ -253,9 +287,7 @@ def contested(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """
     labels = hypothesis.labels
     dots = labels[labels != UNLABELLED]
-    rivals = np.concatenate(
-        [hypothesis.missed_rays.plane_mm, observed.plane_mm[hypothesis.stray_dots]]
-    )
+    rivals = np.concatenate([hypothesis.missed_mm, observed.plane_mm[hypothesis.stray_dots]])
     if len(rivals) == 0 or len(dots) < 2:
         return np.zeros(0, np.int64)
     spacing = median(
@@ -277,7 +309,7 @@ def without_false_ends(
     """
     lit = hypothesis.labels != UNLABELLED
     fewer = []
-    for at in {at for ray in hypothesis.missed_rays.at.tolist() for at in _alone_around(lit, ray)}:
+    for at in {at for ray in hypothesis.missed_rays.tolist() for at in _alone_around(lit, ray)}:
         labels = hypothesis.labels.copy()
         labels[at] = UNLABELLED
         fewer.append(evaluate(observed, labels, settings, initial=hypothesis.pool))
@@ -394,61 +426,3 @@ def _labels_of_pairs(ray: IntArray, dot: IntArray, shape: tuple[int, ...]) -> In
     labels = np.full(shape, UNLABELLED, np.int64)
     labels[ray[there, 0] - 1, ray[there, 1] - 1] = dot[there]
     return labels
-
-
-def _unexplained(
-    observed: Observation, labels: IntArray, pool: FittedPool
-) -> tuple[Prediction, IntArray]:
-    """Rays that should have a dot and have none, and indices of dots that have no ray.
-
-    Neither counts where the surface lets dots run into each other.
-    """
-    lit = labels != UNLABELLED
-    among = predict(observed, pool, amid(lit) & ~observed.absent & ~observed.hidden)
-    merged = among.spacing_mm < observed.resolution_mm
-    silent = ~lit[tuple(among.at.T)] & ~merged & ~among.blocked(observed)
-    missed_rays = among.part(silent & observed.in_view(among.plane_mm))
-    stray = np.setdiff1d(np.arange(len(observed.plane_mm)), labels[lit])
-    if merged.any() and len(stray):
-        off = np.asarray(
-            scipy.spatial.cKDTree(among.plane_mm[merged]).query(observed.plane_mm[stray])[0]
-        )
-        stray = stray[off > observed.resolution_mm]
-    return missed_rays, stray
-
-
-def _witness(observed: Observation, labels: IntArray, pool: FittedPool) -> IntArray:
-    """Which rays came back, which did not, and which cannot tell (see `Match.witness`)."""
-    lit = labels != UNLABELLED
-    witness = np.zeros(lit.shape, np.int64)
-    around = predict(observed, pool, np.ones_like(lit))
-    merged = around.spacing_mm < observed.resolution_mm
-    seen = observed.in_view(around.plane_mm) & ~around.blocked(observed) & ~merged
-    witness[around.at[seen, 0], around.at[seen, 1]] = -1
-    witness[amid(lit) | observed.absent | observed.hidden] = 0
-    witness[lit] = 1
-    # A dot that no ray was given may be the dot of a ray that seems dark.
-    stray = np.setdiff1d(np.arange(len(observed.plane_mm)), labels[lit])
-    if len(stray):
-        distance = scipy.spatial.cKDTree(observed.plane_mm[stray]).query(around.plane_mm)[0]
-        doubt = around.at[distance < around.spacing_mm]
-        doubt = doubt[witness[doubt[:, 0], doubt[:, 1]] < 0]
-        witness[doubt[:, 0], doubt[:, 1]] = 0
-    return witness
-
-
-def certain_witness(observed: Observation, hypothesis: Hypothesis) -> IntArray:
-    """The witness of a hypothesis without rows that are dark but may have left the view.
-
-    Beside the last row that is seen the fit goes on as smoothly as it can, while a pool's edge
-    grows steep: the dots of the next row may lie farther out than they are predicted.
-    """
-    pool, dark = hypothesis.pool, hypothesis.witness < 0
-    rim = predict(observed, pool, dark & widened(hypothesis.labels != UNLABELLED, 1))
-    lost = lines_out_of_view(
-        observed,
-        rim.at,
-        rim.plane_mm,
-        lambda some: rim.part(some).covariance_mm2(pool, observed.rig),
-    )
-    return np.where(lost, 0, hypothesis.witness)

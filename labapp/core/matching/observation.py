@@ -12,11 +12,10 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.optics import intersect_level, ray_directions
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
-from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool, landing_spacing
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.values import (
     BoolArray,
     CannotMeasure,
@@ -63,8 +62,8 @@ class Observation(ReadOnlyArrays):
         Their covariance, shape (n, 2, 2), mm².
     size_mm
         Standard deviation of the light of each, shape (n,), mm.
-    rig, calibration
-        The bench, and how the camera sees the plane.
+    bench
+        The bench.
     frame_shape
         Height and width of the frame, px.
     hidden_rows
@@ -74,59 +73,57 @@ class Observation(ReadOnlyArrays):
     plane_mm: FloatArray
     covariance_mm2: FloatArray
     size_mm: FloatArray
-    rig: Rig
-    calibration: ImageCalibration
+    bench: Bench
     frame_shape: tuple[int, int]
     hidden_rows: frozenset[int] = frozenset()
 
     @classmethod
-    def of(
-        cls, dots: Dots, rig: Rig, calibration: ImageCalibration, frame_shape: tuple[int, int]
-    ) -> Observation:
+    def of(cls, dots: Dots, bench: Bench, frame_shape: tuple[int, int]) -> Observation:
         """Put the dots of a frame, of some height and width, px, on the imaging plane."""
         from labapp.core.images import dot_kernels
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
-        image_px = calibration.ideal_px(dots.image_px)
-        plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, image_px, sigma)
-        return cls(plane, covariance, dots.size_px * scale, rig, calibration, frame_shape)
+        image_px = bench.calibration.ideal_px(dots.image_px)
+        plane, covariance, scale = dot_kernels.on_plane(bench.calibration.matrix, image_px, sigma)
+        return cls(plane, covariance, dots.size_px * scale, bench, frame_shape)
 
     @cached_property
     def resolution_mm(self) -> float:
         """How near another dot may be before the two run into each other, mm."""
         return RESOLVED_SIZES * median(self.size_mm)
 
-    @cached_property
+    @property
+    def rig(self) -> Rig:
+        """That of the bench."""
+        return self.bench.rig
+
+    @property
     def rays(self) -> FloatArray:
         """Directions of the rays, shape (rows, columns, 3)."""
-        return ray_directions(self.rig.laser, self.rig.pattern)
+        return self.bench.rays.directions
 
-    @cached_property
+    @property
     def landing_mm(self) -> FloatArray:
         """Where the rays would land on z = 0, shape (rows, columns, 3), mm."""
-        return intersect_level(self.rig.laser.position_mm, self.rays)
+        return self.bench.rays.landing_mm
 
-    @cached_property
+    @property
     def spacing_mm(self) -> FloatArray:
         """Distance between neighbouring landing points along X and along Y, shape (2,), mm."""
-        return landing_spacing(self.landing_mm)
+        return self.bench.rays.spacing_mm
 
     @cached_property
     def view_mm2(self) -> float:
         """Area of the imaging plane that the frame shows, mm²."""
         height, width = self.frame_shape
         corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-        seen = self.calibration.to_plane(corners).astype(np.float32)
+        seen = self.bench.calibration.to_plane(corners).astype(np.float32)
         return float(cv2.contourArea(seen))
 
-    @cached_property
+    @property
     def absent(self) -> BoolArray:
         """Rays that the lens does not make, shape (rows, columns)."""
-        mask = np.zeros(self.rays.shape[:2], bool)
-        for i, j in self.rig.pattern.absent_rays:
-            mask[i - 1, j - 1] = True
-        mask.flags.writeable = False
-        return mask
+        return self.bench.rays.absent
 
     @cached_property
     def hidden(self) -> BoolArray:
@@ -194,9 +191,8 @@ class Observation(ReadOnlyArrays):
         from labapp.core.matching import match_kernels
 
         margin = np.broadcast_to(np.asarray(margin_mm, float), plane_mm.shape)
-        made = match_kernels.within_view(
-            plane_mm.reshape(-1, 2), margin.reshape(-1, 2), self.calibration.from_plane, *self._view
-        )
+        at, view = (plane_mm.reshape(-1, 2), margin.reshape(-1, 2)), self._view
+        made = match_kernels.within_view(*at, self.bench.calibration.from_plane, *view)
         return made.reshape(plane_mm.shape[:-1])
 
     @cached_property
@@ -205,17 +201,8 @@ class Observation(ReadOnlyArrays):
         plane = self.rig.imaging_plane
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
-        height, width = self.frame_shape
-        corner = np.array([width - 1.0, height - 1.0])
-        share = np.array([0.0, 0.5, 1.0])
-        # A distorting lens bends the frame's edges: the rectangle is the one within them.
-        left, right, top, bottom = (
-            self.calibration.ideal_px(np.stack(np.broadcast_arrays(*at), axis=-1) * corner)
-            for at in ((0.0, share), (1.0, share), (share, 0.0), (share, 1.0))
-        )
-        first = np.array([left[:, 0].max(), top[:, 1].max()]) + EDGE_PX
-        last = np.array([right[:, 0].min(), bottom[:, 1].min()]) - EDGE_PX
-        return np.array([low, high]), np.array([first, last])
+        first, last = self.bench.frame_px(self.frame_shape)
+        return np.array([low, high]), np.array([first + EDGE_PX, last - EDGE_PX])
 
 
 def try_fit(

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.matching.observation import Observation
 from labapp.core.surface.pool_fit import FittedPool
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import BoolArray, FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 GATE_SIGMA2, RIVAL_MARGIN = 20.0, 6.0
 """A dot may be a ray's if its squared Mahalanobis distance from the prediction is below the first,
@@ -36,6 +37,45 @@ dark."""
 
 NEAR_EDGE_MM = 8.0
 """Only so near the edge of the view it is worked out how uncertain predictions are."""
+
+
+@dataclass(frozen=True)
+class RayPaths(ReadOnlyArrays):
+    """Where all R rays of the pattern, row by row, meet a surface, and the dots they make.
+
+    Parameters
+    ----------
+    coefficients
+        Of the surface's splines, shape (p,), mm.
+    points_mm
+        Reflection points, shape (R, 3), mm.
+    slopes
+        The surface's gradient there, shape (R, 2).
+    plane_mm
+        Dots, IPCS, shape (R, 2), mm; NaN for rays that leave the splines or never meet the plane.
+    """
+
+    coefficients: FloatArray
+    points_mm: FloatArray
+    slopes: FloatArray
+    plane_mm: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        bench: Bench,
+        basis: SplineBasis,
+        coefficients: FloatArray,
+        near_mm: FloatArray | None = None,
+        steps: int = 4,
+    ) -> RayPaths:
+        """Intersect and reflect the rays, from points nearby, shape (R, 3), or from z = 0."""
+        from labapp.core.surface import kernels
+
+        start = bench.rays.landing_mm.reshape(-1, 3) if near_mm is None else near_mm
+        rays, plane = bench.rays.directions.reshape(-1, 3), bench.rig.imaging_plane.pose_mm
+        met = kernels.intersect_and_reflect(basis.grid, coefficients, rays, start, steps, plane)
+        return cls(coefficients, *met)
 
 
 @dataclass(frozen=True)
@@ -74,13 +114,6 @@ class Prediction:
         """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
         basis = pool.surface.basis
         return covariance_of_dots(rig, basis, pool.factor, self.points_mm, self.plane_mm)
-
-    def blocked(self, observed: Observation) -> BoolArray:
-        """Whether the torch may hide the dots, shape (m,) (`kernels.behind_torch`)."""
-        from labapp.core.surface import kernels
-
-        rays, tip = observed.rays[tuple(self.at.T)], observed.rig.electrode.height_mm
-        return kernels.behind_torch(self.points_mm, rays, self.slopes, tip)
 
 
 def covariance_of_dots(

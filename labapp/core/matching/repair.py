@@ -58,7 +58,7 @@ def _closed_up(hypothesis: Hypothesis) -> Iterator[IntArray]:
     """
     labels = hypothesis.labels
     for axis in (0, 1):
-        lines, missed = np.unique(hypothesis.missed_rays.at[:, axis], return_counts=True)
+        lines, missed = np.unique(hypothesis.missed_rays[:, axis], return_counts=True)
         for line in lines[missed >= max(LEAST_ROW, 0.5 * hypothesis.missed_count)]:
             own = labels if axis == 0 else labels.T
             after, before = np.full_like(own, UNLABELLED), np.full_like(own, UNLABELLED)
@@ -96,7 +96,7 @@ def _about_unexplained(observed: Observation, hypothesis: Hypothesis) -> BoolArr
     """
     missed_rays, stray = hypothesis.missed_rays, hypothesis.stray_dots
     about = np.zeros(hypothesis.labels.shape, bool)
-    about[missed_rays.at[:, 0], missed_rays.at[:, 1]] = True
+    about[tuple(missed_rays.T)] = True
     rays = predict(observed, hypothesis.pool, within_rings(hypothesis.labels, 1))
     if len(stray) and len(rays.at):
         nearest = rays.at[scipy.spatial.cKDTree(rays.plane_mm).query(observed.plane_mm[stray])[1]]

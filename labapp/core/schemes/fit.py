@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
-from labapp.core.surface.boundary_trace import trace_boundary
-from labapp.core.surface.pool_fit import FitSettings, fit_pool
+from labapp.core.surface import measures
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.boundary_trace import retrace_boundary, trace_boundary
+from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.surface.setup_uncertainty import Fitted, setup_sigma
+from labapp.core.surface.setup_uncertainty import setup_changes, setup_sigma
 from labapp.core.surface.sizes import sizes_and_gradients
-from labapp.core.values import CannotMeasure
+from labapp.core.surface.spline import SplineSurface
+from labapp.core.values import CannotMeasure, FloatArray
 
 LEAST_DOTS = 9
 """A surface from fewer reflections is a guess."""
@@ -20,15 +25,47 @@ UNSETTLED_MM = 0.02
 """A reflection point that still moves as far in the last round has not been found."""
 
 
+@dataclass(frozen=True)
+class Known:
+    """What is known of a pool from the frame before.
+
+    Parameters
+    ----------
+    boundary
+        Where it ended.
+    free_sigma_mm
+        Uncertainty of the height of the n reflection points, their level apart, shape (n,), mm;
+        None: to be worked out.
+    size_sigma_setup
+        See `Reconstruction`; None: to be worked out.
+    """
+
+    boundary: Boundary
+    free_sigma_mm: FloatArray | None
+    size_sigma_setup: FloatArray | None
+
+
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
     """Fit one smooth surface to all reflections (`fit_pool`), and follow it to its boundary.
 
     Raises
     ------
     CannotMeasure
+        As `solve`; ``open-boundary`` if the surface does not come down to the work piece all round.
+    """
+    return complete(match, solve(match, rig, settings), rig, settings)[0]
+
+
+def solve(
+    match: Match, rig: Rig, settings: FitSettings, near: SplineSurface | None = None
+) -> FittedPool:
+    """Fit the surface, beginning with one that is near where there is one.
+
+    Raises
+    ------
+    CannotMeasure
         ``too-few-dots`` for fewer than nine matched dots; ``no-surface`` if the rays cannot be
-        met with a surface; ``open-boundary`` if the surface does not come down to the work piece
-        all round, or no ray tells where it does.
+        met with a surface; ``open-boundary`` if no ray tells where it ends.
     """
     if len(match.ray) < LEAST_DOTS:
         raise CannotMeasure(
@@ -38,30 +75,54 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         raise CannotMeasure(
             "open-boundary", "no ray that would show stayed away: where the pool ends is not seen"
         )
-    pool = fit_pool(
-        *(match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness, rig, settings),
-        missing=match.missing,
-    )
+    dots = match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness
+    pool = fit_pool(*dots, rig, settings, near, match.missing)
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")
-    x, y = pool.points_mm[:, 0], pool.points_mm[:, 1]
-    center = (pool.points_mm[:, :2].min(axis=0) + pool.points_mm[:, :2].max(axis=0)) / 2
-    surface, level = pool.surface, pool.level
-    boundary, boundary_slope = trace_boundary(surface.basis, surface.coefficients, level, center)
-    sizes = sizes_and_gradients(
-        surface.basis, surface.coefficients, level, boundary, boundary_slope
-    )
-    fitted = Fitted(match, rig, settings, surface, pool.points_mm, level)
-    by_setup = setup_sigma(rig, fitted.setup_changes(sizes.gradient))
-    return Reconstruction(
+    return pool
+
+
+def complete(
+    match: Match, pool: FittedPool, rig: Rig, settings: FitSettings, known: Known | None = None
+) -> tuple[Reconstruction, measures.Measures]:
+    """Boundary and sizes of a fitted surface, and all their uncertainties.
+
+    Raises
+    ------
+    CannotMeasure
+        ``open-boundary`` if the surface does not come down to the work piece all round.
+    """
+    basis, coefficients, level = pool.surface.basis, pool.surface.coefficients, pool.level
+    points = pool.points_mm
+    center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
+    at = basis, coefficients, level, center
+    if known is None:
+        boundary, slope = trace_boundary(*at)
+    else:
+        boundary, slope = retrace_boundary(*at, known.boundary)
+    sizes = sizes_and_gradients(basis, coefficients, level, boundary, slope)
+    if known is not None and not sizes.holds:
+        raise CannotMeasure(
+            "open-boundary", "the surface comes down to the work piece within its boundary"
+        )
+    by_setup = None if known is None else known.size_sigma_setup
+    if by_setup is None:
+        changes = setup_changes(match, rig, settings, pool, sizes.gradient)
+        by_setup = setup_sigma(changes)
+    free = None if known is None else known.free_sigma_mm
+    if free is None:
+        free = pool.free_sigma_of(basis.matrix(*points[:, :2].T))
+    made = Reconstruction(
         scheme="fit",
-        surface=surface,
+        surface=pool.surface,
         boundary=boundary,
         ray=match.ray,
-        points_mm=pool.points_mm,
+        points_mm=points,
         residual_mm=pool.residual_mm,
-        sigma_mm=pool.sigma_of(surface.basis.matrix(x, y)),
+        sigma_mm=np.hypot(free, level.sigma_mm),
         size_sigma=np.hypot(pool.sigma_of(sizes.gradient), by_setup),
         size_sigma_level=np.abs(sizes.by_level) * level.sigma_mm,
         size_sigma_setup=by_setup,
     )
+    errors = measures.reflection_errors(made, match, rig)
+    return made, measures.assemble_measures(errors, sizes.size, sizes.peak_mm, center, made)

@@ -573,15 +573,16 @@ def newton_along_rays(
 ) -> tuple[FloatArray, float]:
     """Points moved along their rays to a surface by so many Newton steps, shape (n, 3), mm.
 
-    The second value is the length of the longest last step, mm; NaN where one is.
+    The second value is how far the farthest moved along X, Y or Z, mm; NaN where one is.
     """
     moved, most, work = points.copy(), 0.0, np.empty((4, 4))
     for k in range(len(points)):
-        step = 0.0
         for _ in range(steps):
-            step, _, _ = _newton_step(grid, coefficients, rays[k], moved[k], work)
-        if not abs(step) <= most:  # NaN, too
-            most = abs(step)
+            _newton_step(grid, coefficients, rays[k], moved[k], work)
+        for axis in range(3):
+            by = abs(moved[k, axis] - points[k, axis])
+            if not by <= most:  # NaN, too
+                most = by
         if np.isnan(most):
             break
     return moved, most

@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.values import BoolArray, FloatArray, IntArray, median
+from labapp.core.geometry.optics import ProjectedRays
+from labapp.core.surface.spline import SplineBasis
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, median
 
 STEPS_A_REACH = 120
 """Steps of the grid of levels over a reach of 1 on either side."""
@@ -101,6 +103,59 @@ class Level:
     def disagreement(self) -> float:
         """Mean surprise of the rays near the boundary, bits; infinite where there are none."""
         return self.negative_log_likelihood / np.log(2) / self.rays if self.rays else np.inf
+
+
+@dataclass(frozen=True)
+class Witnesses(ReadOnlyArrays):
+    """Rays of which it is known whether they came back, m of them.
+
+    Parameters
+    ----------
+    landing_mm
+        Where they would land on z = 0, shape (m, 3), mm.
+    sign
+        +1 came back, −1 did not, shape (m,).
+    spacing_mm
+        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
+    head_sign
+        +1 where the pool's head lies towards +Y, −1 for the reverse (`Rig.head_sign`).
+    missing
+        Probability that a ray that came back has no dot (`Match.missing`).
+    """
+
+    landing_mm: FloatArray
+    sign: IntArray
+    spacing_mm: FloatArray
+    head_sign: int
+    missing: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        rays: ProjectedRays,
+        head_sign: int,
+        witness: IntArray,
+        basis: SplineBasis,
+        missing: float,
+    ) -> Witnesses:
+        """Those of `Match.witness`, shape (rows, columns), that would land among some splines."""
+        landing = rays.landing_mm
+        known = (witness != 0) & basis.contains(landing[..., 0], landing[..., 1])
+        return cls(landing[known], witness[known], rays.spacing_mm, head_sign, missing)
+
+    def level(
+        self,
+        basis: SplineBasis,
+        coefficients: FloatArray,
+        drop_mm: float | None = None,
+        about: tuple[float, int, float] | None = None,
+    ) -> Level:
+        """Find the level of a surface of these splines (`find_level`)."""
+        from labapp.core.surface import kernels
+
+        height, *slope = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        seen = np.array(slope).T, self.landing_mm[:, 1], self.sign, self.spacing_mm
+        return find_level(height, *seen, (self.head_sign, drop_mm), about, self.missing)
 
 
 def find_level(

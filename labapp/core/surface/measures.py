@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.geometry.optics import intersect_level, ray_directions
+from labapp.core.geometry.optics import project_rays
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.boundary import Boundary
@@ -181,9 +181,7 @@ def reflection_scale(match: Match, rig: Rig) -> FloatArray:
     The ranges of the projected dots on z = 0 along X and Y over those of the reflected dots along
     X′ and Z′.
     """
-    i, j = match.ray.T - 1
-    direction = ray_directions(rig.laser, rig.pattern)[i, j]
-    projected = intersect_level(rig.laser.position_mm, direction)[:, :2]
+    projected = project_rays(rig.laser, rig.pattern).landing_mm[tuple(match.ray.T - 1)][:, :2]
     return np.asarray(np.ptp(projected, axis=0) / np.ptp(match.plane_mm, axis=0))
 
 
@@ -193,11 +191,7 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
     Only actual reflected dots count: the centre reference that IRS and ERS add is "not an actual
     visible point" (§6.2), and its stand-in's error would say nothing.
     """
-    return scaled_errors(reconstruction, reflection_scale(match, rig))
-
-
-def scaled_errors(reconstruction: Reconstruction, scale: FloatArray) -> ReflectionErrors:
-    """Reflection errors where the scale, shape (2,), is known (`reflection_scale`)."""
+    scale = reflection_scale(match, rig)
     error = np.hypot(*(reconstruction.residual_mm * scale).T)
     met = np.isfinite(error)
     every, inner = error[met], error[met & _inner(reconstruction.ray)]

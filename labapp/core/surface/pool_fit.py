@@ -20,12 +20,19 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.geometry.optics import intersect_level, ray_directions
+from labapp.core.geometry.optics import project_rays
 from labapp.core.geometry.rig import Rig
-from labapp.core.surface.level import Level, Rear, find_level, guess_level
-from labapp.core.surface.solver import NormalEquations, propagate_sigma
+from labapp.core.surface.level import Level, Rear, Witnesses, guess_level
+from labapp.core.surface.solver import NormalEquations, Rounds, propagate_sigma
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays, median
+from labapp.core.values import (
+    BoolArray,
+    CannotMeasure,
+    FloatArray,
+    IntArray,
+    ReadOnlyArrays,
+    median,
+)
 
 MARGIN_ROWS = 2.5
 """How far beyond the outermost reflection points the splines go on, in rows of rays: the torch may
@@ -34,8 +41,9 @@ hide some before the boundary is reached."""
 CORRELATED_MM2 = 1.0
 """Area over which a pool's third derivatives are correlated, mm²."""
 
-LEVEL_REACH = 0.3
-"""Reach of the search for a level (`find_level`) near that of the round before."""
+FIRST_REACH, LEVEL_REACH = 0.4, 0.3
+"""Reach of the search for a level (`find_level`) near that of a surface nearby, and near that of
+the round before."""
 
 NEWTON_STEPS = 4
 """Steps from a reflection point to that on the surface of the next round."""
@@ -111,6 +119,10 @@ class FittedPool(ReadOnlyArrays):
         """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p)."""
         return propagate_sigma(self.factor, gradients, self.mean_splines, self.level.sigma_mm)
 
+    def free_sigma_of(self, gradients: FloatArray) -> FloatArray:
+        """The same without what the level adds."""
+        return propagate_sigma(self.factor, gradients, self.mean_splines, 0.0)
+
 
 def fit_pool(
     ray: IntArray,
@@ -144,64 +156,135 @@ def fit_pool(
     """
     from labapp.core.surface import kernels
 
-    laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
-    pattern = ray_directions(rig.laser, rig.pattern)
-    ground = intersect_level(laser, pattern)
-    rays, points = pattern[tuple(ray.T - 1)], ground[tuple(ray.T - 1)]
-    spacing = landing_spacing(ground)
-    basis = _basis_around(points[:, :2], MARGIN_ROWS * spacing.max(), settings.knot_mm)
-    grid, covariance = basis.grid, plane_covariance_mm2
-    witnesses = (witness != 0) & basis.contains(ground[..., 0], ground[..., 1])
-    stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
-    dots = rig.imaging_plane.to_universal(plane_mm)
-    weights = kernels.slope_weights(laser, plane, points, dots, covariance, settings.floor_mm)
-    reuse = settings.floor_mm / 50
-    equations = NormalEquations(basis, stiffness, laser, plane, dots, weights, reuse_mm=reuse)
-    from_middle = np.linalg.norm(points[:, :2] - points[:, :2].mean(axis=0), axis=-1)
-    outer = from_middle > median(from_middle)
-    coefficients, moved = np.zeros(basis.count), np.inf
+    rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
+    points = rays.landing_mm[at]
+    margin = MARGIN_ROWS * rays.spacing_mm.max()
+    basis = _basis_around(points[:, :2], margin, settings.knot_mm)
+    equations = normal_equations(basis, rig, points, plane_mm, plane_covariance_mm2, settings)
+    equations.reuse_mm = settings.floor_mm / 50
     if initial is not None:
-        at = initial.basis.grid, initial.coefficients, rays, points
-        points, _ = kernels.newton_along_rays(*at, NEWTON_STEPS)
-    level = Level(0.0, np.inf, 1, Rear(), 0.0)
-    for count in range(settings.rounds):
-        coefficients = equations.step(coefficients, points, moved)
-        if not (witness[witnesses] < 0).any():
-            level = guess_level(kernels.surface_at(grid, coefficients, points)[0], outer)
-        else:
-            # The drop of the rear is held from half-way on, or the rounds might go to and fro.
-            drop = None if 2 * count <= settings.rounds else level.rear.drop_mm
-            height, *slope = kernels.surface_at(grid, coefficients, ground[witnesses])
-            about = (0.0, level.sign, LEVEL_REACH) if count else None
-            before = level
-            seen = np.array(slope).T, ground[witnesses, 1], witness[witnesses], spacing
-            level = find_level(height, *seen, (rig.head_sign, drop), about, missing)
-            if drop is not None:  # a drop that is held leaves the level as open as a free one
-                level = replace(level, sigma_mm=max(level.sigma_mm, before.sigma_mm))
-        coefficients += level.shift_mm  # the splines add up to 1
-        if not np.isfinite(coefficients).all():
-            raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
-        met, _ = kernels.newton_along_rays(grid, coefficients, rays, points, NEWTON_STEPS)
-        moved, points = float(np.max(np.abs(met - points))), met
-        if moved < settings.settled_mm:
-            break
-    points, _, computed = kernels.intersect_and_reflect(grid, coefficients, rays, points, 1, plane)
+        near = initial.basis.grid, initial.coefficients, rays.directions[at], points
+        points, _ = kernels.newton_along_rays(*near, NEWTON_STEPS)
+    rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
+    witnesses = Witnesses.of(rays, rig.head_sign, witness, basis, missing)
+    level = rounds_with_level(rounds, witnesses, settings.rounds, settings.settled_mm)
+    return fitted_pool(rounds, level, rig, plane_mm)
+
+
+def normal_equations(
+    basis: SplineBasis,
+    rig: Rig,
+    points_mm: FloatArray,
+    plane_mm: FloatArray,
+    plane_covariance_mm2: FloatArray,
+    settings: FitSettings,
+) -> NormalEquations:
+    """Normal equations of n dots on the plane, shape (n, 2), whose rays meet the surface nearby.
+
+    Points nearby have shape (n, 3); the others are as in `fit_pool`.
+    """
+    from labapp.core.surface import kernels
+
+    laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
+    dots = rig.imaging_plane.to_universal(plane_mm)
+    near = laser, plane, points_mm, dots
+    weights = kernels.slope_weights(*near, plane_covariance_mm2, settings.floor_mm)
+    stiffness = basis.stiffness(CORRELATED_MM2 / settings.jerk**2)
+    return NormalEquations(basis, stiffness, laser, plane, dots, weights)
+
+
+def rounds_with_level(
+    rounds: Rounds,
+    witnesses: Witnesses,
+    most: int,
+    until_mm: float,
+    near: Level | None = None,
+    drop_is_free: bool = True,
+    raised_mm: float = 0.0,
+) -> Level:
+    """Run rounds of the fit, each with the level that the witnesses give; returns the last one.
+
+    Parameters
+    ----------
+    rounds
+        The fit, which is advanced.
+    witnesses
+        Rays that tell the level. Without a dark one it is guessed.
+    most, until_mm
+        See `Rounds.run`.
+    near
+        Level of a surface nearby, which the first search begins from. None: all are tried.
+    drop_is_free
+        Whether the drop of the rear is found along with the level, in the first half of the rounds.
+        Held, it leaves the level as open as it was before.
+    raised_mm
+        After a shift of the surface by less the level is not looked for again.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if no surface has the slopes.
+    """
+    from labapp.core.surface import kernels
+
+    basis, level = rounds.equations.basis, near or Level(0.0, np.inf, 1, Rear(), 0.0)
+    outer = None if (witnesses.sign < 0).any() else _outer(rounds)
+
+    def shift(count: int) -> float:
+        nonlocal level
+        if count and abs(level.shift_mm) < raised_mm:
+            return 0.0
+        if outer is not None:
+            height = kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
+            level = guess_level(height, outer)
+            return level.shift_mm
+        # The drop is held from half-way on, or the rounds might go to and fro.
+        is_held = not drop_is_free or 2 * count > most
+        reach = LEVEL_REACH if count else FIRST_REACH
+        found = witnesses.level(
+            basis,
+            rounds.coefficients,
+            level.rear.drop_mm if is_held else None,
+            (0.0, level.sign, reach) if count or near else None,
+        )
+        sigma = max(found.sigma_mm, level.sigma_mm) if is_held else found.sigma_mm
+        level = replace(found, sigma_mm=sigma)
+        return found.shift_mm
+
+    rounds.run(most, until_mm, NEWTON_STEPS if near is None else 1, shift=shift)
+    return level
+
+
+def _outer(rounds: Rounds) -> BoolArray:
+    """Which rays would land farther from the middle than half of them, shape (n,)."""
+    points, rays = rounds.points_mm, rounds.rays
+    landing = (points - points[:, 2:] / rays[:, 2:] * rays)[:, :2]
+    from_middle = np.linalg.norm(landing - landing.mean(axis=0), axis=-1)
+    return np.asarray(from_middle > median(from_middle))
+
+
+def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) -> FittedPool:
+    """Return what rounds with their level came to, for dots on the plane, shape (n, 2).
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-surface`` if the surface sends rays away from the plane.
+    """
+    from labapp.core.surface import kernels
+
+    basis, plane = rounds.equations.basis, rig.imaging_plane.pose_mm
+    at = basis.grid, rounds.coefficients, rounds.rays, rounds.points_mm
+    points, _, computed = kernels.intersect_and_reflect(*at, 1, plane)
     residual = computed - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
-    surface = SplineSurface(basis, coefficients)
-    assert equations.factor is not None
-    return FittedPool(surface, equations.factor, level, points, residual, moved)
+    assert rounds.equations.factor is not None
+    surface = SplineSurface(basis, rounds.coefficients)
+    return FittedPool(surface, rounds.equations.factor, level, points, residual, rounds.moved_mm)
 
 
 def _basis_around(places_mm: FloatArray, margin_mm: float, knot_mm: float) -> SplineBasis:
     """Splines over places, shape (n, 2), mm, and a margin round them."""
     low, high = places_mm.min(axis=0) - margin_mm, places_mm.max(axis=0) + margin_mm
     return SplineBasis.over(low, high, knot_mm)
-
-
-def landing_spacing(landing_mm: FloatArray) -> FloatArray:
-    """Distance between neighbours of a grid of landing points along X and along Y, (2,), mm."""
-    across = np.median(np.diff(landing_mm[..., 0], axis=1))
-    along = np.median(np.diff(landing_mm[..., 1], axis=0))
-    return np.asarray(np.abs([across, along]), float)

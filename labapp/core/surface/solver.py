@@ -8,6 +8,7 @@ they are solved with.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,6 +97,77 @@ class NormalEquations:
         # Slopes leave the level open: the mean height of the points stays.
         change -= kernels.surface_at(self.basis.grid, change, points_mm)[0].mean()
         return np.asarray(coefficients + change)
+
+
+@dataclass
+class Rounds:
+    """Rounds of the fit of n rays to their dots, and how far they have come.
+
+    Each solves for the surface that has the slopes at the reflection points as they are, and moves
+    these along their rays to it.
+
+    Parameters
+    ----------
+    equations
+        Of the dots.
+    rays
+        Their rays' unit directions, shape (n, 3).
+    coefficients
+        The surface so far, shape (p,), mm.
+    points_mm
+        Where the rays meet it, shape (n, 3), mm.
+    moved_mm
+        How far the reflection point that moved most moved in the last round, mm.
+    """
+
+    equations: NormalEquations
+    rays: FloatArray
+    coefficients: FloatArray
+    points_mm: FloatArray
+    moved_mm: float = 0.0
+
+    def run(
+        self,
+        most: int,
+        until_mm: float,
+        newton_steps: int = 1,
+        smooth_about: FloatArray | float = 0.0,
+        shift: Callable[[int], float] = lambda _: 0.0,
+    ) -> None:
+        """Run rounds until no reflection point moves by ``until_mm``.
+
+        Parameters
+        ----------
+        most
+            How many rounds at most.
+        until_mm
+            See above, mm.
+        newton_steps
+            Steps from a reflection point to the surface of the next round.
+        smooth_about
+            See `NormalEquations.step`.
+        shift
+            What to add to the surface's height in a round, counted from 0, mm.
+
+        Raises
+        ------
+        CannotMeasure
+            ``no-surface`` if the slopes do not settle the surface.
+        """
+        from labapp.core.surface import kernels
+
+        grid = self.equations.basis.grid
+        for count in range(most):
+            at = self.coefficients, self.points_mm, self.moved_mm
+            self.coefficients = self.equations.step(*at, smooth_about)
+            self.coefficients += shift(count)  # the splines add up to 1
+            self.points_mm, self.moved_mm = kernels.newton_along_rays(
+                grid, self.coefficients, self.rays, self.points_mm, newton_steps
+            )
+            if np.isnan(self.moved_mm):
+                raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
+            if self.moved_mm < until_mm:
+                break
 
 
 def solve(factor: FloatArray, right: npt.ArrayLike) -> FloatArray:

@@ -194,6 +194,16 @@ class SplineBasis(ReadOnlyArrays):
         nx, ny = self.shape
         return kernels.roughness(_products(nx), _products(ny), self.step_mm)
 
+    def stiffness(self, weight: float) -> FloatArray:
+        """`roughness` times a weight, kept for the next time."""
+        if weight not in self._stiffness:
+            self._stiffness[weight] = weight * self.roughness
+        return self._stiffness[weight]
+
+    @cached_property
+    def _stiffness(self) -> dict[float, FloatArray]:
+        return {}
+
 
 @dataclass(frozen=True)
 class SplineSurface(ReadOnlyArrays):

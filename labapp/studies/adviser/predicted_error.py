@@ -15,12 +15,12 @@ from labapp.core.geometry.optics import (
     bisecting_gradient,
     direction_to_dots,
     intersect_level,
-    ray_directions,
+    project_rays,
 )
 from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES, AxisPoints, RigUncertainty
-from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings, landing_spacing
+from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings
 from labapp.core.surface.solver import SlopeFit, fit_slopes
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
@@ -149,11 +149,9 @@ class _Model:
         self.peak_xy = np.array(size.peak_mm if convex else size.bottom_mm)
         self.peak_mm = size.height_mm if convex else size.depth_mm
         self.rim = pool.boundary_mm(RIM_POINTS)[:, :2]
-        ground = intersect_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))[
-            ..., :2
-        ]
-        self.ground = ground
-        margin = MARGIN_ROWS * landing_spacing(ground).max()
+        rays = project_rays(rig.laser, rig.pattern)
+        self.ground = ground = rays.landing_mm[..., :2]
+        margin = MARGIN_ROWS * rays.spacing_mm.max()
         corners = np.vstack([self.points[:, :2], self.rim, self.peak_xy])
         self.basis = SplineBasis.over(
             corners.min(axis=0) - margin, corners.max(axis=0) + margin, settings.knot_mm
@@ -224,7 +222,8 @@ class _Model:
         """Height that is measured if the bench is taken to be off by ``offset``."""
         plane = moved_dots(self.plane, self.rig, axes, offset)
         rig = aimed_as(self.rig.laser, moved_rig(self.rig, offset))
-        source, directions = rig.laser.position_mm, ray_directions(rig.laser, rig.pattern)
+        source = rig.laser.position_mm
+        directions = project_rays(rig.laser, rig.pattern).directions
         rays = directions[self.seen.visible]
         points = source + (self.points[:, 2:] - source[2]) / rays[:, 2:] * rays
         reflected = direction_to_dots(points, plane, rig.imaging_plane)

@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from labapp.core.geometry.optics import intersect_level, ray_directions
+from labapp.core.geometry.optics import project_rays
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement
@@ -45,8 +45,7 @@ class RowVote:
 
     def __init__(self, rig: Rig, settings: FitSettings) -> None:
         self._rig, self._settings = rig, settings
-        directions = ray_directions(rig.laser, rig.pattern)
-        self._places = intersect_level(rig.laser.position_mm, directions)[..., :2].reshape(-1, 2)
+        self._places = project_rays(rig.laser, rig.pattern).landing_mm[..., :2].reshape(-1, 2)
         self._votes: Counter[tuple[int, int]] = Counter()
         """How many frames are so many rows and columns off the first."""
         self._at = (0, 0)

@@ -1,0 +1,55 @@
+"""The bench that frames are measured on, and what follows from it for all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.optics import ProjectedRays, project_rays
+from labapp.core.geometry.rig import Rig
+from labapp.core.values import FloatArray
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A rig, and how the camera sees its imaging plane.
+
+    Parameters
+    ----------
+    rig
+        Laser, pattern, electrode and imaging plane.
+    calibration
+        From the image to the imaging plane.
+    """
+
+    rig: Rig
+    calibration: ImageCalibration
+
+    @cached_property
+    def rays(self) -> ProjectedRays:
+        """The rays of the pattern, and where they would land."""
+        return project_rays(self.rig.laser, self.rig.pattern)
+
+    def frame_px(self, frame_shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """First and last pixel (u, v) of a frame, freed of the lens's distortion, shapes (2,).
+
+        A distorting lens bends the frame's edges: the rectangle is the one within them.
+        """
+        if frame_shape not in self._frames_px:
+            height, width = frame_shape
+            corner, share = np.array([width - 1.0, height - 1.0]), np.array([0.0, 0.5, 1.0])
+            left, right, top, bottom = (
+                self.calibration.ideal_px(np.stack(np.broadcast_arrays(*at), axis=-1) * corner)
+                for at in ((0.0, share), (1.0, share), (share, 0.0), (share, 1.0))
+            )
+            first = np.array([left[:, 0].max(), top[:, 1].max()])
+            last = np.array([right[:, 0].min(), bottom[:, 1].min()])
+            self._frames_px[frame_shape] = first, last
+        return self._frames_px[frame_shape]
+
+    @cached_property
+    def _frames_px(self) -> dict[tuple[int, int], tuple[FloatArray, FloatArray]]:
+        return {}

@@ -1,0 +1,77 @@
+"""Frames one after the other: each measured from what the one before left, or else by itself.
+
+The same frames give the same answers: nothing depends on the clock or on how many are measured at
+once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from labapp.core.geometry.bench import Bench
+from labapp.core.images.dots import Image
+from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.sequence.following import HELD
+from labapp.core.sequence.prior import Prior
+
+
+class WarmChain:
+    """Measures the frames of one recording in their order.
+
+    Parameters
+    ----------
+    bench
+        What they were seen on.
+    settings
+        Of the measurement. Only the fit to band-passed dots, the default, can be followed.
+    passed
+        See `pipeline.measure`; called for followed frames.
+
+    Attributes
+    ----------
+    track_lost
+        Why the last frame was measured by itself; None where it was followed.
+    """
+
+    def __init__(
+        self, bench: Bench, settings: Settings, passed: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self.bench, self.settings = bench, settings
+        self._passed = passed
+        self.track_lost: str | None = None
+        self._prior: Prior | None = None
+
+    def follow(self, image: Image) -> Measurement | None:
+        """Measure the next frame from those before; None where they do not lead to it.
+
+        That takes no longer, and a frame after it may be followed again.
+        """
+        if self._prior is None:
+            self.track_lost = "no frame before it was measured"
+            return None
+        given = self.bench, self.settings, self._prior
+        measurement, prior = measure(image, *given, passed=self._passed)
+        if prior is None:
+            self.track_lost = measurement.reason
+            return None
+        self._prior, self.track_lost = prior, None
+        return measurement
+
+    def measure(self, image: Image) -> Measurement:
+        """Measure the next frame from those before, or else by itself (`search`)."""
+        return self.follow(image) or self.search(image)
+
+    def search(self, image: Image) -> Measurement:
+        """Measure the next frame as if it were the first.
+
+        Where that succeeds, those after it may be followed from it.
+        """
+        self.track_lost = self.track_lost or "it was measured by itself"
+        measurement, prior = measure(image, self.bench, self.settings)
+        former = self._prior
+        if prior is not None and former is not None:
+            prior = prior.with_past_of(former, self.bench, self.settings.fit)
+        elif prior is None and former is not None and measurement.status != "ok":
+            prior = former.after_gap() if former.unseen < HELD else None
+        self._prior = prior
+        return measurement

@@ -1,0 +1,461 @@
+"""Which ray made which dot, where the frames before predict where dots should be.
+
+A pool that swings is carried on as it swung (`prior.predictions`). Where that does not find the
+dots, as at the start, they are followed from the absent one outwards, ring by ring. The dots found
+have their rays; others beside them get theirs from the surface fitted to these. An answer is given
+only where the absent ray's place is dark amid lit ones, and where no more is left unexplained than
+without a prior.
+
+Contract of `correspondence`: a dot that is not sure of its ray gets none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.images import dot_kernels
+from labapp.core.match import Trial, missing_share
+from labapp.core.matching import match_kernels
+from labapp.core.matching.correspondence import match_of_pairs
+from labapp.core.matching.decision import MatchSettings
+from labapp.core.matching.hypothesis import FEW_BEYOND, landing_rises
+from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
+from labapp.core.matching.outliers import unsupported
+from labapp.core.matching.prediction import (
+    GATE_SIGMA2,
+    MODEL_ERROR_MM,
+    RIVAL_MARGIN,
+    SIGMA_INFLATION,
+    RayPaths,
+    covariance_of_dots,
+)
+from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
+from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
+from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Followed, Prior, predictions
+from labapp.core.surface import kernels
+from labapp.core.surface.level import Level, Witnesses
+from labapp.core.surface.pool_fit import (
+    FitSettings,
+    fitted_pool,
+    normal_equations,
+    rounds_with_level,
+)
+from labapp.core.surface.solver import Rounds
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
+
+FOUND = 0.85
+"""Share of the dots of the frame before that must be found again."""
+
+STEADY = 0.2
+"""… and half of them within this share of the way to the next dot of where they were predicted."""
+
+FIRST_RING, GROWING_ROUNDS, GROWN_FROM = 2, 3, 12
+"""Where no prediction finds the dots, they are first looked for so near the absent one, in so many
+rounds a ring, from so many surfaces of the past."""
+
+GATE, CLEARLY = 0.35, 2.0
+"""A dot is a tracked ray's within this share of the way to the next predicted dot, if no other dot
+is, and no other ray within so many times its distance."""
+
+RIVALS = 3
+"""So many of the nearest rays contend for a dot, and so many other dots for a ray: the next ones
+are farther off by a row or a column."""
+
+ASTRAY = 0.25
+"""A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
+
+WORSE = 2.0
+"""The residual is at most so many times that of the frame that was matched without a prior."""
+
+HELD = 8
+"""For so many frames the datum is carried on while a dot beside the absent one is not seen."""
+
+PREDICTED = 0.1
+"""So near half of the dots must be to where they were predicted, of the way to the next one, for
+the datum to be carried on: a pool that has gone on by a row lights other rays, and all of them
+fit."""
+
+ROUGHLY_MM = 0.03
+"""Where no reflection point moved by more, what is left to move does not change which dots have
+which rays."""
+
+WIDENINGS, MANY = 3, 4
+"""Where so many dots at once are found to have rays, others beyond them may: it is looked again, so
+often at most."""
+
+RAISED_MM = 0.01
+"""After a smaller shift of the surface its level is not looked for again."""
+
+
+class TrackLost(CannotMeasure):
+    """A prior does not lead to this frame; says why in a sentence."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__("track-lost", reason)
+
+
+def follow(
+    prior: Prior, observed: Observation, settings: FitSettings, limits: MatchSettings
+) -> Followed:
+    """Find the ray of every dot, and the surface, from the frames before.
+
+    Raises
+    ------
+    TrackLost
+        If the prior does not lead here.
+    CannotMeasure
+        If there is no surface.
+    """
+    paths, labels, off = _found_again(prior, observed, settings)
+    fit = _Fit.of(prior, observed, settings, labels, paths)
+    fit.run(ROUGHLY_MM)
+    for _ in range(WIDENINGS):
+        before, labels = labels, _widened(fit)
+        if np.array_equal(labels, before):
+            break
+        fit = fit.with_labels(labels)
+        if count_labels(labels) < count_labels(before) + MANY:
+            break
+        fit.run(ROUGHLY_MM)
+    fit.settle()
+    covariance = fit.covariance_around()
+    wrong = _unsupported(fit, covariance)
+    if len(wrong):
+        fit = fit.without_dots(wrong)
+        fit.settle()
+        covariance = fit.covariance_around()
+    classes, level = _with_level(prior, fit, covariance)
+    outside = _landed_outside(prior, fit, level)
+    if len(outside):
+        fit = fit.without_dots(outside)
+        fit.settle()
+        classes, level = _with_level(prior, fit, fit.covariance_around())
+    rays, dots = fit.rays, fit.labels.ravel()[fit.rays]
+    _check_explained(classes, limits, len(observed.plane_mm), len(rays))
+    pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
+    if not pool.residual_rms_mm < WORSE * prior.residual_mm:
+        raise TrackLost("the surface no longer has the dots")
+    paths = fit.paths()
+    is_seen = _datum_is_seen(observed, paths, off)
+    if not is_seen and prior.unseen >= HELD:
+        raise TrackLost("the dots beside the absent one have not been seen for long")
+    own = prior.match.orientation
+    others = (trial for trial in prior.match.trials if trial.orientation != own)
+    trials = (Trial(own, pool.residual_rms_mm), *others)
+    at = np.stack(np.divmod(rays, fit.labels.shape[1]), axis=-1)
+    missed = len(classes.missed)
+    match = match_of_pairs(observed, at, dots, own, classes.witness, missed, trials)
+    return Followed(match, pool, paths, fit.labels != UNLABELLED, is_seen)
+
+
+@dataclass
+class _Fit:
+    """A fit to labelled dots, and how far it has come.
+
+    Parameters
+    ----------
+    prior, observed, settings
+        What it begins from, the frame's dots, and how it is fitted.
+    labels
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+    rays
+        Numbers of the n rays that have one, row by row, shape (n,).
+    near
+        What a surface nearby makes of all rays.
+    rounds
+        The rounds.
+    """
+
+    prior: Prior
+    observed: Observation
+    settings: FitSettings
+    labels: IntArray
+    rays: IntArray
+    near: RayPaths
+    rounds: Rounds
+    _paths: tuple[FloatArray, RayPaths] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        prior: Prior,
+        observed: Observation,
+        settings: FitSettings,
+        labels: IntArray,
+        near: RayPaths,
+    ) -> _Fit:
+        """Begin it with a surface nearby."""
+        rays = np.flatnonzero(labels != UNLABELLED)
+        if len(rays) < LEAST_DOTS:
+            raise TrackLost("hardly a dot is left that has a ray")
+        dots, landing = labels.ravel()[rays], observed.landing_mm.reshape(-1, 3)[rays]
+        seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
+        equations = normal_equations(prior.basis, observed.rig, landing, *seen, settings)
+        directions = observed.rays.reshape(-1, 3)[rays]
+        rounds = Rounds(equations, directions, near.coefficients, near.points_mm[rays])
+        return cls(prior, observed, settings, labels, rays, near, rounds)
+
+    def with_labels(self, labels: IntArray) -> _Fit:
+        """The fit of other labels, from where this one ended."""
+        return _Fit.of(self.prior, self.observed, self.settings, labels, self.paths())
+
+    def without_dots(self, dots: IntArray) -> _Fit:
+        """The fit without some dots, from where this one ended."""
+        return self.with_labels(np.where(np.isin(self.labels, dots), UNLABELLED, self.labels))
+
+    def run(self, until_mm: float) -> None:
+        """Run rounds until no reflection point moves by so much."""
+        self.rounds.run(MOST_ROUNDS, until_mm)
+
+    def settle(self) -> None:
+        """Run rounds to the end."""
+        self.run(SETTLED_MM)
+        self.check_settled()
+
+    def check_settled(self) -> None:
+        """Raise `TrackLost` where reflection points still move."""
+        if not self.rounds.moved_mm < UNSETTLED_MM:
+            raise TrackLost("the surface does not settle")
+
+    def paths(self) -> RayPaths:
+        """What the surface makes of all rays, kept for the next time."""
+        coefficients = self.rounds.coefficients
+        if self._paths is None or self._paths[0] is not coefficients:
+            points = self.near.points_mm.copy()
+            points[self.rays] = self.rounds.points_mm
+            bench, basis = self.observed.bench, self.prior.basis
+            self._paths = coefficients, RayPaths.of(bench, basis, coefficients, points, 1)
+        return self._paths[1]
+
+    def covariance_of(self, paths: RayPaths, rays: IntArray) -> FloatArray:
+        """Covariance of some rays' dots, as far as the surface is uncertain, (m, 2, 2), mm²."""
+        factor = self.rounds.equations.factor
+        assert factor is not None
+        at = paths.points_mm[rays], paths.plane_mm[rays]
+        return covariance_of_dots(self.observed.rig, self.prior.basis, factor, *at)
+
+    def covariance_around(self) -> FloatArray:
+        """Covariance of the dots of lit rays and those beside them, NaN of others, (R, 2, 2)."""
+        paths = self.paths()
+        known = np.isfinite(paths.plane_mm[:, 0])
+        rays = np.flatnonzero(widened(self.labels != UNLABELLED, 1).ravel() & known)
+        made = np.full((len(known), 2, 2), np.nan)
+        made[rays] = self.covariance_of(paths, rays)
+        return made
+
+
+# --- from the prediction to labels --------------------------------------------------------------
+
+
+def _found_again(
+    prior: Prior, observed: Observation, settings: FitSettings
+) -> tuple[RayPaths, IntArray, float]:
+    """Ray paths that find the dots again, the labels they give, and how far dots are off.
+
+    That is the median share of the way to the next dot, from where they were predicted. Where no
+    prediction finds them, a surface is grown from the last one, and from those before it: then dots
+    were nowhere predicted, and it is infinite.
+    """
+    lit, count, last = prior.lit, int(prior.lit.sum()), prior.paths.points_mm
+    # A surface is sure of rays amid the lit ones, too, whose dots may have been missed.
+    own, looked_for = (lit | amid(lit)) & ~observed.absent, widened(lit, 2)
+    for coefficients in predictions(prior):
+        paths = RayPaths.of(observed.bench, prior.basis, coefficients, last, 1)
+        labels, off = _tracked(observed, paths, own, looked_for)
+        if len(off) >= FOUND * count and (half := median(off)) < STEADY:
+            return paths, labels, half
+    found = 0
+    for coefficients in prior.past[: -GROWN_FROM - 1 : -1]:
+        paths = RayPaths.of(observed.bench, prior.basis, coefficients, last, 2)
+        paths, labels = _grown(prior, observed, settings, paths)
+        found = max(found, count_labels(labels))
+        if found >= max(FOUND * count, LEAST_DOTS):
+            return paths, labels, np.inf
+    raise TrackLost(f"{found} of {count} dots were found again")
+
+
+def _grown(
+    prior: Prior, observed: Observation, settings: FitSettings, paths: RayPaths
+) -> tuple[RayPaths, IntArray]:
+    """Find the dots again from the absent one outwards, ring by ring.
+
+    Dots in the middle move least from frame to frame; how they moved tells how those around do.
+    """
+    i, j = np.indices(prior.lit.shape) + 1
+    marker = observed.rig.pattern.marker
+    assert marker is not None
+    ring = np.maximum(np.abs(i - marker[0]), np.abs(j - marker[1]))
+    looked_for, start = widened(prior.lit, 2), paths.coefficients
+    labels = np.full(ring.shape, UNLABELLED)
+    for reach in range(FIRST_RING, int(ring[prior.lit].max()) + 2):
+        labels, _ = _tracked(observed, paths, prior.lit & (ring <= reach), looked_for)
+        if count_labels(labels) < LEAST_DOTS:
+            break
+        fit = _Fit.of(prior, observed, settings, labels, paths)
+        fit.rounds.run(GROWING_ROUNDS, SETTLED_MM, smooth_about=start)
+        paths = fit.paths()
+    return paths, labels
+
+
+def _tracked(
+    observed: Observation, paths: RayPaths, lit: BoolArray, looked_for: BoolArray
+) -> tuple[IntArray, FloatArray]:
+    """Dots of the rays that were lit before, each by the one prediction that is near.
+
+    Parameters
+    ----------
+    observed, paths
+        The frame's dots, and the surface that predicts them.
+    lit, looked_for
+        Rays that may have dots, and those and their rivals, shape (rows, columns).
+
+    Returns
+    -------
+    labels, off
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns); how far those found are from
+        where they were predicted, in shares of the way to the next predicted dot, shape (found,).
+    """
+    labels = np.full(lit.shape, UNLABELLED)
+    near = np.flatnonzero(looked_for.ravel() & np.isfinite(paths.plane_mm[:, 0]))
+    if len(near) < 2 or len(observed.plane_mm) < 2:
+        return labels, np.empty(0)
+    plane = paths.plane_mm[near]
+    step = dot_kernels.next_apart(plane)
+    off, ray = dot_kernels.two_nearest(observed.plane_mm, plane)
+    other, dot = dot_kernels.two_nearest(plane, observed.plane_mm)
+    own, off_own = ray[:, 0], off[:, 0]
+    gate = GATE * step[own]
+    sure = (off_own < gate) & (step[own] > observed.resolution_mm) & lit.ravel()[near[own]]
+    sure &= (dot[own, 0] == np.arange(len(own))) & (off[:, 1] > CLEARLY * off_own)
+    sure &= other[own, 1] > gate  # speckle may split a dot in two
+    labels.ravel()[near[own[sure]]] = np.flatnonzero(sure)
+    return labels, off_own[sure] / step[own[sure]]
+
+
+def _widened(fit: _Fit) -> IntArray:
+    """Labels that the fitted surface supports, and new ones beside them that it makes sure of.
+
+    A new label stands where it is likelier by far than any other ray for the dot, and any other
+    dot for the ray (`label_growth`), with what the prediction is uncertain by.
+    """
+    observed, paths, lit = fit.observed, fit.paths(), fit.labels != UNLABELLED
+    known = np.isfinite(paths.plane_mm[:, 0])
+    looked_for = np.flatnonzero(widened(lit, 2).ravel() & known)
+    next_mm = np.full(len(known), np.inf)
+    next_mm[looked_for] = dot_kernels.next_apart(paths.plane_mm[looked_for])
+    labels, rays = fit.labels.copy().ravel(), fit.rays
+    off = np.linalg.norm(paths.plane_mm[rays] - observed.plane_mm[labels[rays]], axis=-1)
+    labels[rays[off > np.maximum(6.0 * median(off), ASTRAY * next_mm[rays])]] = UNLABELLED
+    is_free = np.ones(len(observed.plane_mm), bool)
+    is_free[labels[labels != UNLABELLED]] = False
+    free = np.flatnonzero(is_free)
+    beside = widened(lit, 1) & ~lit & ~observed.absent
+    if len(free) and beside.any():
+        apart = _apart_mm(paths.plane_mm[looked_for], observed.plane_mm[free])
+        near = looked_for[np.unique(np.argsort(apart, axis=0)[:RIVALS])]
+        apart = _apart_mm(paths.plane_mm[near], observed.plane_mm)
+        dots = np.union1d(free, np.argsort(apart, axis=1)[:, : RIVALS + 1])
+        spread = SIGMA_INFLATION**2 * fit.covariance_of(paths, near) + MODEL_ERROR_MM**2 * np.eye(2)
+        seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
+        distance, cost = match_kernels.pair_deviances(*seen, paths.plane_mm[near], spread)
+        for dot in np.searchsorted(dots, free).tolist():
+            best = int(np.argmin(cost[dot]))
+            ray = int(near[best])
+            rivals = np.delete(cost[dot], best), np.delete(cost[:, best], dot)
+            clear = all(len(r) == 0 or r.min() > cost[dot, best] + RIVAL_MARGIN for r in rivals)
+            may = beside.ravel()[ray] and next_mm[ray] > observed.resolution_mm
+            if clear and may and distance[dot, best] < GATE_SIGMA2:
+                labels[ray] = dots[dot]
+    return labels.reshape(lit.shape)
+
+
+def _apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Distances, shape (len(one), len(other))."""
+    x, y = one[:, 0, None] - other[:, 0], one[:, 1, None] - other[:, 1]
+    return np.asarray(np.sqrt(x * x + y * y))
+
+
+# --- what labels must stand ---------------------------------------------------------------------
+
+
+def _unsupported(fit: _Fit, covariance: FloatArray) -> IntArray:
+    """Labelled dots that the surface does not support (`outliers.unsupported`)."""
+    plane = fit.paths().plane_mm[fit.rays]
+    residual = plane - fit.observed.plane_mm[fit.labels.ravel()[fit.rays]]
+    made = residual, covariance[fit.rays], fit.settings.floor_mm
+    return unsupported(fit.observed, fit.labels, *made)
+
+
+def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayClasses, Level]:
+    """Classify the rays, and shift the surface to the level that they give."""
+    observed, paths = fit.observed, fit.paths()
+    found = classify_rays(observed, fit.labels, paths)
+    witness = certain_witness(observed, found.witness, paths, lambda some: covariance[some])
+    if not (witness < 0).any():
+        raise TrackLost("no ray that would show stayed away")
+    missing = missing_share(len(found.missed), len(fit.rays))
+    witnesses = Witnesses.of(
+        observed.bench.rays, observed.rig.head_sign, witness, prior.basis, missing
+    )
+    near = Level(0.0, prior.open_mm, prior.level.sign, prior.level.rear, 0.0)
+    how = fit.settings.rounds, SETTLED_MM, near, prior.drop_is_free, RAISED_MM
+    level = rounds_with_level(fit.rounds, witnesses, *how)
+    fit.check_settled()
+    return RayClasses(witness, found.missed, found.stray), level
+
+
+def _landed_outside(prior: Prior, fit: _Fit, level: Level) -> IntArray:
+    """Labelled dots that may be false ones, by where their rays landed.
+
+    Well beyond the boundary one or two (`landing_rises`); of rays that were not lit before, all
+    that are not within it.
+    """
+    basis, coefficients = prior.basis, fit.rounds.coefficients
+    landing = fit.observed.landing_mm.reshape(-1, 3)[fit.rays]
+    height, *slope = kernels.surface_at(basis.grid, coefficients, landing)
+    spacing = fit.observed.spacing_mm
+    inward, far = landing_rises(height, np.array(slope).T, landing[:, 1], level, spacing)
+    is_new = ~prior.lit.ravel()[fit.rays]
+    far &= ~is_new
+    outside = (is_new & (inward < 0)) | (far & (far.sum() <= FEW_BEYOND))
+    return np.asarray(fit.labels.ravel()[fit.rays[outside]])
+
+
+def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays: int) -> None:
+    stray, missed = len(classes.stray), len(classes.missed)
+    if stray > limits.stray[0] + limits.stray[1] * dots:
+        raise TrackLost(f"{stray} dots have no ray")
+    if missed > limits.missed[0] + limits.missed[1] * rays:
+        raise TrackLost(f"{missed} rays amid the others have no dot")
+
+
+def _datum_is_seen(observed: Observation, paths: RayPaths, off: float) -> bool:
+    """Whether all four neighbours of the absent ray are lit.
+
+    A dot too far off for the fit (`_unsupported`) is still light in its place.
+
+    Raises
+    ------
+    TrackLost
+        If the absent ray's place is lit; or a neighbour is dark and the dots are not where they
+        were predicted, or three are: no hole tells the rows then (`lattice.find_holes`).
+    """
+    pattern = observed.rig.pattern
+    assert pattern.marker is not None
+    (i, j), columns = np.subtract(pattern.marker, 1).tolist(), pattern.columns
+    if not (0 < i < pattern.rows - 1 and 0 < j < columns - 1):
+        raise TrackLost("the absent ray is at the pool's edge")
+    hole = i * columns + j + np.array([0, -1, 1, -columns, columns])
+    plane = paths.plane_mm[hole]
+    if not np.isfinite(plane).all():
+        raise TrackLost("the absent ray is at the pool's edge")
+    reach = min(np.linalg.norm(plane[1] - plane[2]), np.linalg.norm(plane[3] - plane[4])) / 2
+    between = observed.plane_mm - plane[:, None]
+    dark = np.linalg.norm(between, axis=-1).min(axis=1) > reach / 2
+    if not dark[0]:
+        raise TrackLost("a dot is where the absent one should be dark")
+    if sum(dark[1:]) > (2 if off < PREDICTED else 0):
+        raise TrackLost("the dots beside the absent one are not seen")
+    return not dark[1:].any()

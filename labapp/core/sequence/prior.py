@@ -1,0 +1,265 @@
+"""What a measured frame leaves to the next: its prior, and where that predicts the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled
+from labapp.core.geometry.bench import Bench
+from labapp.core.images.band_pass import DetectorTuning
+from labapp.core.match import Match
+from labapp.core.matching.prediction import RayPaths
+from labapp.core.schemes.fit import UNSETTLED_MM, Known
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.level import Level
+from labapp.core.surface.pool_fit import NEWTON_STEPS, FitSettings, FittedPool, normal_equations
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.solver import Rounds
+from labapp.core.surface.spline import SplineBasis
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
+
+MEMORY, ORDER, TEACHERS = 32, 8, 3
+"""Frames that predictions are learnt from, and from how many of them, at most, one is made; every
+so-many-th lit ray tells as much as all."""
+
+MOST_ROUNDS, SETTLED_MM = 8, 3e-4
+"""Rounds of a fit from a surface nearby; no reflection point moves by more in the last."""
+
+POINTS_EVERY, SETUP_EVERY, SINKS_EVERY = 8, 64, 16
+"""Every so many frames the uncertainty of the reflection points is worked out anew, that of the
+sizes by the set-up, and whether the rear sinks."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A frame matched and fitted from its prior.
+
+    Parameters
+    ----------
+    match, pool, paths
+        The pairs, the surface fitted to them, and what that makes of all rays.
+    lit
+        Rays that have a dot, shape (rows, columns).
+    datum_is_seen
+        Whether the absent ray's place is dark amid four lit ones.
+    """
+
+    match: Match
+    pool: FittedPool
+    paths: RayPaths
+    lit: BoolArray
+    datum_is_seen: bool
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What a frame leaves to the next.
+
+    Parameters
+    ----------
+    tuning
+        Size of dots and noise.
+    match
+        Of the frame that was matched without a prior.
+    residual_mm
+        Root mean square residual there, mm.
+    basis
+        The splines.
+    paths, lit, boundary, level
+        What the last surface makes of the R rays of the pattern; which of them had dots, shape
+        (rows, columns); where the pool ends, and z = 0.
+    past, slopes
+        Spline coefficients of the last frames, the newest last, shape (frames, p), mm, and the
+        slopes of those surfaces where rays met them, shape (frames, R, 2).
+    open_mm
+        Uncertainty of the level when the drop of the rear was last found along with it, mm.
+    free_sigma_mm
+        Uncertainty of the height where each ray meets the surface, its level apart, as it was last
+        worked out, shape (R,), mm; NaN where it never was. It changes slowly.
+    size_sigma_setup
+        Uncertainty of the sizes by the set-up (`Reconstruction`), as it was last worked out.
+    unseen
+        Frames since the absent ray's place was last seen dark amid four lit ones.
+    count
+        Frames that were followed.
+    """
+
+    tuning: DetectorTuning
+    match: Match
+    residual_mm: float
+    basis: SplineBasis
+    paths: RayPaths
+    lit: BoolArray
+    boundary: Boundary
+    level: Level
+    past: FloatArray
+    slopes: FloatArray
+    open_mm: float
+    free_sigma_mm: FloatArray
+    size_sigma_setup: FloatArray
+    unseen: int = 0
+    count: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        bench: Bench,
+        tuning: DetectorTuning,
+        match: Match,
+        pool: FittedPool,
+        made: Reconstruction,
+    ) -> Prior:
+        """That of a frame that was matched without one."""
+        basis, coefficients = pool.surface.basis, pool.surface.coefficients
+        paths, level = RayPaths.of(bench, basis, coefficients), replace(pool.level, shift_mm=0.0)
+        return cls(
+            tuning=tuning,
+            match=match,
+            residual_mm=pool.residual_rms_mm,
+            basis=basis,
+            paths=paths,
+            lit=match.witness > 0,
+            boundary=made.boundary,
+            level=level,
+            past=coefficients[None],
+            slopes=paths.slopes[None],
+            open_mm=level.sigma_mm,
+            free_sigma_mm=np.full(len(paths.slopes), np.nan),
+            size_sigma_setup=made.size_sigma_setup,
+        )
+
+    def followed_by(self, followed: Followed, made: Reconstruction) -> Prior:
+        """That of the next frame, which followed on this one."""
+        paths, lit, pool = followed.paths, followed.lit, followed.pool
+        free = self.free_sigma_mm.copy()
+        free[lit.ravel()] = np.sqrt(np.maximum(made.sigma_mm**2 - pool.level.sigma_mm**2, 0.0))
+        return replace(
+            self,
+            paths=paths,
+            lit=lit,
+            boundary=made.boundary,
+            level=pool.level,
+            past=np.vstack([self.past[1 - MEMORY :], paths.coefficients]),
+            slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
+            open_mm=pool.level.sigma_mm if self.drop_is_free else self.open_mm,
+            free_sigma_mm=free,
+            size_sigma_setup=made.size_sigma_setup,
+            unseen=0 if followed.datum_is_seen else self.unseen + 1,
+            count=self.count + 1,
+        )
+
+    @property
+    def drop_is_free(self) -> bool:
+        """Whether the next frame's level is found along with the drop of the rear."""
+        return self.count % SINKS_EVERY == SINKS_EVERY - 1
+
+    def known(self, lit: BoolArray) -> Known:
+        """What is known of the next frame's pool, which lights these rays, shape (rows, columns).
+
+        What changes slowly is worked out anew now and then.
+        """
+        free = self.free_sigma_mm[lit.ravel()]
+        is_known = self.count % POINTS_EVERY != 0 and bool(np.isfinite(free).all())
+        setup_is_due = self.count % SETUP_EVERY == SETUP_EVERY - 1
+        by_setup = None if setup_is_due else self.size_sigma_setup
+        return Known(self.boundary, free if is_known else None, by_setup)
+
+    def after_gap(self) -> Prior:
+        """That of a frame which was not measured: dots may be anywhere near."""
+        past, slopes = self.past[-1:], self.slopes[-1:]
+        return replace(self, unseen=self.unseen + 1, past=past, slopes=slopes)
+
+    def with_past_of(self, former: Prior, bench: Bench, settings: FitSettings) -> Prior:
+        """The prior in the splines of a former one, with what that remembers, if they suit it."""
+        x, y = bench.rays.landing_mm[..., 0], bench.rays.landing_mm[..., 1]
+        if (self.basis.contains(x, y) != former.basis.contains(x, y)).any():
+            return self
+        paths = self._in_splines(former, bench, settings)
+        if paths is None:
+            return self
+        return replace(
+            self,
+            basis=former.basis,
+            paths=paths,
+            past=np.vstack([former.past[1 - MEMORY :], paths.coefficients]),
+            slopes=np.concatenate([former.slopes[1 - MEMORY :], paths.slopes[None]]),
+        )
+
+    def _in_splines(self, former: Prior, bench: Bench, settings: FitSettings) -> RayPaths | None:
+        """The surface fitted in the splines of a former prior; None where it does not settle."""
+        match, basis = self.match, former.basis
+        at = tuple(match.ray.T - 1)
+        ray = np.ravel_multi_index(at, self.lit.shape)
+        points = self.paths.points_mm[ray]
+        dots = match.plane_mm, match.plane_covariance_mm2
+        equations = normal_equations(basis, bench.rig, points, *dots, settings)
+        fit = Rounds(equations, bench.rays.directions[at], former.past[-1], points)
+        try:
+            fit.run(MOST_ROUNDS, SETTLED_MM)
+        except CannotMeasure:
+            return None
+        if not fit.moved_mm < UNSETTLED_MM:
+            return None
+        raised = fit.coefficients + float(np.mean(points[:, 2] - fit.points_mm[:, 2]))
+        return RayPaths.of(bench, basis, raised, self.paths.points_mm, NEWTON_STEPS)
+
+
+def predictions(prior: Prior) -> Iterator[FloatArray]:
+    """Spline coefficients that the next frame may have, the likeliest first.
+
+    A pool that swings goes on as it did: a linear recurrence, learnt from the frames before on the
+    slopes at lit rays, carries any few oscillations on.
+    """
+    past, order = prior.past, min(ORDER, len(prior.past) // 2)
+    if order > 2:
+        teachers = np.flatnonzero(prior.lit)[::TEACHERS]
+        gram, right = recurrence(prior.slopes, teachers, order)
+        gram.flat[:: order + 1] += 1e-4 * np.trace(gram)
+        ratio = np.linalg.solve(gram, right)
+        mean = past.mean(axis=0)
+        yield mean + ratio @ (past[: -order - 1 : -1] - mean)
+    if len(past) > 1:
+        yield 2 * past[-1] - past[-2]
+    yield past[-1]
+
+
+@compiled(
+    types.Array(types.float64, 3, "A", readonly=True),
+    types.Array(types.int64, 1, "A", readonly=True),
+    types.int64,
+)
+def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of the linear recurrence by which frames follow on each other.
+
+    Of the slopes of some rays in M frames, shape (M, R, 2), each over its mean: shapes
+    (order, order) and (order,), the newest of the frames that are followed first.
+    """
+    gram, right = np.zeros((order, order)), np.zeros(order)
+    own = np.empty(len(slopes))
+    next_ones = own[order:]
+    for ray in rays:
+        for axis in range(2):
+            mean = 0.0
+            for m in range(len(slopes)):
+                own[m] = slopes[m, ray, axis]
+                mean += own[m] / len(slopes)
+            for m in range(len(slopes)):
+                own[m] -= mean
+            for k in range(order):
+                one, product = own[order - 1 - k :], 0.0
+                for m in range(len(next_ones)):
+                    product += one[m] * next_ones[m]
+                right[k] += product
+                for other in range(k + 1):
+                    two, product = own[order - 1 - other :], 0.0
+                    for m in range(len(next_ones)):
+                        product += one[m] * two[m]
+                    gram[k, other] += product
+    for k in range(order):
+        for other in range(k):
+            gram[other, k] = gram[k, other]
+    return gram, right
