@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 
@@ -71,7 +72,7 @@ class PlanePicture:
     Parameters
     ----------
     unit_mm
-        Length of a unit of the target's axes, mm.
+        Length of a unit of the target's axes, or edge of a board's squares, mm.
     found
         What was found in the picture.
     picture_sha256
@@ -79,7 +80,7 @@ class PlanePicture:
     """
 
     unit_mm: float
-    found: PlaneCalibration
+    found: PlaneCalibration | BoardCalibration
     picture_sha256: str
 
 

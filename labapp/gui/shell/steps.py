@@ -106,7 +106,8 @@ def calibrations_in_use(session: Session) -> tuple[bool, bool]:
     )
     return (
         laser is not None and _entered(keys.get("laser"), found),
-        plane is not None and _entered(keys.get("image_calibration"), plane.found.setup_keys),
+        plane is not None
+        and all(_entered(keys.get(name), own) for name, own in plane.found.setup_keys.items()),
     )
 
 
