@@ -40,6 +40,7 @@ from labapp.log import log_file, start_log
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
+    from labapp.core.calibration.imaging_plane import Calibration
     from labapp.core.calibration.plane_calibration import PlaneCalibration
 
 IMPATIENT_S = 2.0
@@ -294,34 +295,9 @@ def calibrate_plane(
     setup: SetupToChange = None,
 ) -> None:
     """Find the imaging plane, and with a board the lens, in a picture of the target (§5.1)."""
-    from labapp.config.setup import lens_of
-    from labapp.core.calibration.boards import A_BOARD, parse_board
-    from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
-    from labapp.core.calibration.plane_calibration import (
-        PlaneCalibration,
-        PlaneCalibrationSettings,
-    )
-    from labapp.core.values import CannotMeasure
-    from labapp.media import open_source
+    from labapp.core.calibration.plane_calibration import PlaneCalibration
 
-    pictures = []
-    for path in images:
-        with open_source(path) as source:
-            pictures.append(source.frame(0).image)
-    try:
-        named = None if board is None else parse_board(board)
-    except ValueError as error:
-        raise InputError("--board", "board", f"{board} ({error})", A_BOARD) from error
-    lens = lens_of(setup.read_text("utf-8")) if setup is not None and setup.is_file() else None
-    settings = PlaneCalibrationSettings(unit_mm=unit_mm)
-    try:
-        found = calibrate_imaging_plane(pictures, settings, named, lens)
-    except CannotMeasure as answer:
-        if answer.status != "no-target":
-            shown = "a picture in which the board is seen, flat and sharp"
-            raise InputError(images[0], "board", answer.reason, shown) from answer
-        typer.echo(f"{images[0]}: {answer}", err=True)
-        raise typer.Exit(NOTHING_MEASURED) from answer
+    found = _calibrated(images, unit_mm, board, setup)
     if isinstance(found, PlaneCalibration):
         _show_target(found, unit_mm)
     elif square_mm is not None:
@@ -336,6 +312,37 @@ def calibrate_plane(
     for line in found.fit_lines():
         typer.echo(line)
     _write_values(setup, found.setup_keys)
+
+
+def _calibrated(
+    images: Sequence[Path], unit_mm: float, board: str | None, setup: Path | None
+) -> Calibration:
+    """Calibrate by pictures; with the lens that the setup has, where they show the target."""
+    from labapp.config.setup import lens_of
+    from labapp.core.calibration.boards import A_BOARD, parse_board
+    from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
+    from labapp.core.calibration.plane_calibration import PlaneCalibrationSettings
+    from labapp.core.values import CannotMeasure
+    from labapp.media import open_source
+
+    pictures = []
+    for path in images:
+        with open_source(path) as source:
+            pictures.append(source.frame(0).image)
+    try:
+        named = None if board is None else parse_board(board)
+    except ValueError as error:
+        raise InputError("--board", "board", f"{board} ({error})", A_BOARD) from error
+    lens = lens_of(setup.read_text("utf-8")) if setup is not None and setup.is_file() else None
+    settings = PlaneCalibrationSettings(unit_mm=unit_mm)
+    try:
+        return calibrate_imaging_plane(pictures, settings, named, lens)
+    except CannotMeasure as answer:
+        if answer.status != "no-target":
+            shown = "a picture in which the board is seen, flat and sharp"
+            raise InputError(images[0], "board", answer.reason, shown) from answer
+        typer.echo(f"{images[0]}: {answer}", err=True)
+        raise typer.Exit(NOTHING_MEASURED) from answer
 
 
 def _show_target(found: PlaneCalibration, unit_mm: float) -> None:

@@ -35,7 +35,7 @@ from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
-    from labapp.export.frame_result import FrameResult
+    from labapp.core.sequence.residual_check import ResidualRecord
     from labapp.export.summary import Summary
     from labapp.run.runner import Measurer, Sink
     from labapp.run.streams import Stream
@@ -150,10 +150,6 @@ def _measure_recording(
 
     setup = read_setup(setup_path)
     summary, record = Summary(), ResidualRecord(setup.rig, settings.fit)
-
-    def noted(result: FrameResult) -> None:
-        record.add(result.measurement)
-
     with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:
             note(progress.console, f"warning: {warning}")
@@ -185,8 +181,12 @@ def _measure_recording(
             done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
             note(progress.console, done)
             raise typer.Exit(INTERRUPTED) from None
-    typer.echo(summary.text())
-    if verdict.is_doubtful:
-        typer.echo(f"set-up doubtful: {verdict.reason}")
+    doubt = f"\nset-up doubtful: {verdict.reason}" if verdict.is_doubtful else ""
+    typer.echo(summary.text() + doubt)
     typer.echo(f"Results are in {out.absolute()}")
     return summary
+
+
+def _note_residuals(record: ResidualRecord) -> Sink:
+    """A sink that takes note of each frame's residuals."""
+    return lambda result: record.add(result.measurement)

@@ -191,6 +191,24 @@ class PlanePage(Page):
         self.unit.set_value(presenter.UNIT_MM)
         self.unit.edited.connect(lambda _: self._unit_changed())
         form.add(self.unit)
+        self._add_board_fields(form)
+        self.find_button = button(
+            "Find O′ and the axes",
+            "Look for the dot and the two bars in the picture",
+            self.find_axes,
+        )
+        form.add_wide(self.find_button)
+        form.add_wide(self.refused)
+        self._add_print_fields(form)
+        help_text = wrapping_label(
+            "Drag a point that is not right: O′ to the middle of the dot, the others to the "
+            "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
+        )
+        fill(self.panel_layout, form, help_text)
+        self._make_results()
+        self.lock_with_session(self.unit, self.square)
+
+    def _add_board_fields(self, form: FieldForm) -> None:
         self.square = NumberField(
             "Square of the board",
             "mm",
@@ -208,13 +226,8 @@ class PlanePage(Page):
             self._choose_further,
         )
         form.add_wide(self.add_button)
-        self.find_button = button(
-            "Find O′ and the axes",
-            "Look for the dot and the two bars in the picture",
-            self.find_axes,
-        )
-        form.add_wide(self.find_button)
-        form.add_wide(self.refused)
+
+    def _add_print_fields(self, form: FieldForm) -> None:
         self.print = ChoiceField(
             "To print",
             tuple((name, name.replace("_", " ")) for name in PRINTS),
@@ -228,13 +241,6 @@ class PlanePage(Page):
                 self._choose_target,
             )
         )
-        help_text = wrapping_label(
-            "Drag a point that is not right: O′ to the middle of the dot, the others to the "
-            "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
-        )
-        fill(self.panel_layout, form, help_text)
-        self._make_results()
-        self.lock_with_session(self.unit, self.square)
 
     def _make_results(self) -> None:
         model = FieldForm()
@@ -363,6 +369,8 @@ class PlanePage(Page):
         self.model.setEnabled(has_marks and not self.locked)
         if isinstance(self.found, PlaneCalibration):
             self.model.set_value(self.found.model)
+        elif is_board:
+            self.model.set_value("homography")
         self.square.setEnabled(is_board and not self.locked)
         self.add_button.setEnabled(is_board and not self.locked)
         self.add_button.setToolTip(ADD if is_board else f"{ADD}: load the one in the plane first")
