@@ -621,6 +621,47 @@ def test_a_picture_without_a_target_is_answered(labapp: Run, tmp_path: Path) -> 
     assert "flat.png: no-target: " in complained
 
 
+def board_picture(path: Path, name: str) -> Path:
+    """Picture of a board by a lens that distorts by 1 %."""
+    from labapp.core.calibration.boards import BOARDS
+    from labapp.simulation.board import PrintedBoard
+    from labapp.simulation.camera import Lens, PosedView
+    from labapp.simulation.target import TargetLook, render_target
+
+    lens = Lens(1000.0, k1=-0.06)
+    view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1.0, -2.0, 1.3), lens=lens)
+    rng = np.random.default_rng(1)
+    cv2.imwrite(str(path), render_target(PrintedBoard(BOARDS[name]), view, TargetLook(), rng))
+    return path
+
+
+def test_a_board_puts_lens_and_plane_into_a_setup(labapp: Run, tmp_path: Path) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_text(SETUP.read_text())
+    picture = board_picture(tmp_path / "board.png", "charuco_4_inch")
+    code, said, complained = labapp("calibrate", "plane", picture, "--setup", setup)
+    assert (code, complained) == (0, "")
+    assert "charuco_4_inch" in said
+    from labapp.config.setup import lens_of, read_setup
+
+    found = read_setup(setup)
+    assert found.calibration.lens == lens_of(setup.read_text())
+    assert found.calibration.lens is not None
+    assert found.calibration.lens.distortion[0] < 0
+    assert found.rig.uncertainty is not None
+    assert "camera_lens.distortion_percent" not in found.rig.uncertainty.assumed
+
+
+@pytest.mark.parametrize(
+    ("board", "field"), [("charuco_letter_a4", "board"), ("charuco:2x2:8", "board")]
+)
+def test_a_wrong_board_is_bad_input(labapp: Run, tmp_path: Path, board: str, field: str) -> None:
+    picture = board_picture(tmp_path / "board.png", "charuco_4_inch")
+    code, _, complained = labapp("calibrate", "plane", picture, "--board", board)
+    assert code == 2
+    assert f"{field}: " in complained
+
+
 # --- help -------------------------------------------------------------------------------------
 
 

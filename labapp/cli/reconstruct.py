@@ -7,6 +7,7 @@ folder (`export.results`), the summary, streams, progress.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -34,6 +35,7 @@ from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
+    from labapp.core.sequence.residual_check import ResidualRecord
     from labapp.export.summary import Summary
     from labapp.run.runner import Measurer, Sink
     from labapp.run.streams import Stream
@@ -139,6 +141,7 @@ def _measure_recording(
     Parameters are the command's options (`reconstruct`), and sinks for the streams.
     """
     from labapp.config.setup import read_setup
+    from labapp.core.sequence.residual_check import ResidualRecord
     from labapp.export.results import ResultsWriter
     from labapp.export.summary import Summary
     from labapp.media import open_source
@@ -146,7 +149,7 @@ def _measure_recording(
     from labapp.run.runner import provenance, run, select_frames
 
     setup = read_setup(setup_path)
-    summary = Summary()
+    summary, record = Summary(), ResidualRecord(setup.rig, settings.fit)
     with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:
             note(progress.console, f"warning: {warning}")
@@ -163,12 +166,27 @@ def _measure_recording(
                         *(source_path, source.index, setup, settings, surfaces, sigma_parts),
                         processes,
                     )
-                for _ in run(selected, measurer, [results.write, summary.add, *streams, shown]):
+                sinks = [
+                    results.write,
+                    summary.add,
+                    lambda result: record.add(result.measurement),
+                    *streams,
+                    shown,
+                ]
+                for _ in run(selected, measurer, sinks):
                     pass  # the sinks have it
+                verdict = record.verdict()
+                results.note(setup_check=dataclasses.asdict(verdict))
         except KeyboardInterrupt:
             done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
             note(progress.console, done)
             raise typer.Exit(INTERRUPTED) from None
-    typer.echo(summary.text())
+    doubt = f"\nset-up doubtful: {verdict.reason}" if verdict.is_doubtful else ""
+    typer.echo(summary.text() + doubt)
     typer.echo(f"Results are in {out.absolute()}")
     return summary
+
+
+def _note_residuals(record: ResidualRecord) -> Sink:
+    """A sink that takes note of each frame's residuals."""
+    return lambda result: record.add(result.measurement)

@@ -158,6 +158,21 @@ _CALIBRATED_KEYS = frozenset(key.partition("[")[0] for key in CALIBRATED)
 _SHARED = {"laser": ("angle_distance_correlation",)}
 
 
+def lens_of(text: str) -> Lens | None:
+    """Lens that the text of a setup has, which may lack anything else; None where it has none."""
+    try:
+        keys = tomlkit.parse(text).unwrap().get("camera_lens")
+    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError):
+        return None
+    lens = ("focal_px", "center_px", "distortion")
+    rules = rules_for("camera_lens", keys)
+    if not isinstance(keys, dict) or not set(lens) <= keys.keys():
+        return None
+    if check_keys(Path(), "camera_lens", {name: keys[name] for name in lens}, rules):
+        return None
+    return Lens(**{name: tuple(keys[name]) for name in lens})
+
+
 def pattern_values(pattern: DotPattern) -> dict[str, object]:
     """Keys of a pattern in a setup file: key → value."""
     values: dict[str, object] = {

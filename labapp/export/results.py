@@ -163,6 +163,10 @@ class ResultsWriter:
             raise
         self.frames += 1
 
+    def note(self, **facts: object) -> None:
+        """Have `run.json` say something more of the run, once it ends."""
+        self._run |= facts
+
     def __enter__(self) -> Self:
         return self
 

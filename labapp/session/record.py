@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 
@@ -77,7 +78,7 @@ class PlanePicture:
     Parameters
     ----------
     unit_mm
-        Length of a unit of the target's axes, mm.
+        Length of a unit of the target's axes, or edge of a board's squares, mm.
     found
         What was found in the picture.
     picture_sha256
@@ -85,7 +86,7 @@ class PlanePicture:
     """
 
     unit_mm: float
-    found: PlaneCalibration
+    found: PlaneCalibration | BoardCalibration
     picture_sha256: str
 
 

@@ -17,6 +17,8 @@ from labapp.session.file.schema import NO_FRAME
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from labapp.core.calibration.board_calibration import BoardCalibration
+    from labapp.core.calibration.boards import Board
     from labapp.core.calibration.laser_calibration import (
         LaserCalibration,
         LaserCalibrationSettings,
@@ -154,6 +156,7 @@ class Session(SessionContents):
         InputError
             If it cannot be read.
         """
+        from labapp.config.setup import lens_of
         from labapp.core.calibration.plane_calibration import (
             PlaneCalibrationSettings,
             calibrate_plane,
@@ -162,12 +165,47 @@ class Session(SessionContents):
 
         with open_source(picture) as source:
             image = source.frame(0).image
-        found = calibrate_plane(image, PlaneCalibrationSettings(unit_mm=unit_mm))
+        settings = PlaneCalibrationSettings(unit_mm=unit_mm)
+        found = calibrate_plane(image, settings, lens_of(self.setup_text))
         self.use_plane(found, unit_mm, image, Path(picture).name)
         return found
 
+    def calibrate_camera(
+        self, pictures: Sequence[str | os.PathLike[str]], board: Board | None = None
+    ) -> BoardCalibration:
+        """Calibrate lens and imaging plane from pictures of a board; store and apply the result.
+
+        Parameters
+        ----------
+        pictures
+            Pictures, the first of the board in the imaging plane.
+        board
+            The board; None: the one of labapp's that is seen.
+
+        Raises
+        ------
+        CannotMeasure
+            If the board is not found in one of them.
+        InputError
+            If one cannot be read.
+        """
+        from labapp.core.calibration.board_calibration import calibrate_board
+        from labapp.media import open_source
+
+        images = []
+        for picture in pictures:
+            with open_source(picture) as source:
+                images.append(source.frame(0).image)
+        found = calibrate_board(images, board)
+        self.use_plane(found, found.board.square_mm, images[0], Path(pictures[0]).name)
+        return found
+
     def use_plane(
-        self, found: PlaneCalibration, unit_mm: float, image: GreyImage, name: str = "picture"
+        self,
+        found: PlaneCalibration | BoardCalibration,
+        unit_mm: float,
+        image: GreyImage,
+        name: str = "picture",
     ) -> None:
         """Apply an imaging plane found in a picture or placed by hand; store both.
 
@@ -182,7 +220,7 @@ class Session(SessionContents):
         readings = PlanePicture(unit_mm, found, self._pictures.add(name, image))
         values: dict[Key, Any] = {
             ("plane-calibration", NO_FRAME): readings,
-            ("setup", NO_FRAME): self._updated_setup({"image_calibration": found.setup_keys}),
+            ("setup", NO_FRAME): self._updated_setup(found.setup_keys),
         }
         self._documents.change("imaging-plane calibration", values)
 

@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from labapp.core.calibration.mark_fit import MarkFits, Model, fit_marks, root_mean_square
+from labapp.core.calibration.seen_axes import SeenAxes
 from labapp.core.calibration.target_bars import (
     Bar,
     bar_marks,
@@ -33,7 +34,7 @@ from labapp.core.calibration.target_marks import (
     segmented,
     three_marks,
 )
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.values import CannotMeasure, FloatArray
 
 AXES = ("O′X′", "O′Z′")
@@ -82,7 +83,7 @@ class PlaneCalibrationSettings(MarkSettings):
 
 
 @dataclass(frozen=True)
-class PlaneCalibration:
+class PlaneCalibration(SeenAxes):
     """Where O′ and the axes are in the picture, and what takes its pixels to the plane.
 
     Parameters
@@ -100,6 +101,8 @@ class PlaneCalibration:
         the picture there (any unit); empty where only the three points are known.
     model
         What is used: the three points, or a fit to the marks.
+    lens
+        The camera's lens, where it is known from elsewhere (`board_calibration`).
     """
 
     origin_px: tuple[float, float]
@@ -111,6 +114,7 @@ class PlaneCalibration:
     threshold: float
     marks: tuple[tuple[float, float, float, float, float], ...] = ()
     model: Model = "three points"
+    lens: Lens | None = None
 
     @cached_property
     def fits(self) -> MarkFits | None:
@@ -118,14 +122,16 @@ class PlaneCalibration:
         if not self.marks:
             return None
         marks = np.array(self.marks)
-        return fit_marks(marks[:, :2], marks[:, 2:4], marks[:, 4])
+        image_px = marks[:, 2:4] if self.lens is None else self.lens.ideal(marks[:, 2:4])
+        return fit_marks(marks[:, :2], image_px, marks[:, 4])
 
     @property
     def points_px(self) -> FloatArray:
         """(u, v) of O′ and of the points on O′X′ and O′Z′ as the model has them, shape (3, 2)."""
         if self.fits is None or self.model == "three points":
             return np.array([self.origin_px, self.x_axis_px, self.z_axis_px])
-        return self.fits.of(self.model).calibration.to_image(self._points_mm)
+        straight = self.fits.of(self.model).calibration.to_image(self._points_mm)
+        return straight if self.lens is None else self.lens.distorted(straight)
 
     @property
     def points_covariance_px2(self) -> FloatArray:
@@ -133,36 +139,6 @@ class PlaneCalibration:
         if self.fits is None or self.model == "three points":
             return np.diag(np.repeat(np.square(self.sigma_px), 2))
         return self.fits.of(self.model).covariance_px2(self._points_mm)
-
-    @property
-    def points_sigma_px(self) -> tuple[float, float, float]:
-        """Standard uncertainty of each of these points along either direction, px."""
-        variance = np.diag(self.points_covariance_px2).reshape(3, 2).mean(axis=1)
-        origin, on_x, on_z = np.sqrt(variance).tolist()
-        return origin, on_x, on_z
-
-    @property
-    def px_per_mm(self) -> tuple[float, float]:
-        """Scale from O′ to the point on O′X′ and to that on O′Z′ (Eq. 4-6), px/mm."""
-        along_x, along_z, _ = self._scales_and_angle(self.points_px)
-        return float(along_x), float(along_z)
-
-    @property
-    def angle_deg(self) -> float:
-        """Angle from O′X′ to O′Z′ as the picture shows it, anticlockwise, degrees."""
-        return float(self._scales_and_angle(self.points_px)[2])
-
-    @property
-    def scales_and_angle_sigma(self) -> FloatArray:
-        """± of both scales, px/mm, and of the angle, degrees, shape (3,)."""
-        points, step = self.points_px, 1e-3
-        base = self._scales_and_angle(points)
-        change = [
-            (self._scales_and_angle(points + step * one.reshape(3, 2)) - base) / step
-            for one in np.eye(6)
-        ]
-        squares = np.einsum("pk,pq,qk->k", change, self.points_covariance_px2, change)
-        return np.asarray(np.sqrt(squares))
 
     @property
     def image_calibration(self) -> ImageCalibration:
@@ -179,15 +155,15 @@ class PlaneCalibration:
         if self.model == "homography":
             assert self.fits is not None
             matrix = self.fits.of(self.model).calibration.matrix
-            return ImageCalibration(matrix / matrix[2, 2])
+            return ImageCalibration(matrix / matrix[2, 2], self.lens)
         origin, on_x, on_z = (_pair(point) for point in self.points_px)
         return ImageCalibration.from_three_points(
-            origin, on_x, self.x_axis_mm, on_z, self.z_axis_mm
+            origin, on_x, self.x_axis_mm, on_z, self.z_axis_mm, self.lens
         )
 
     @property
-    def setup_keys(self) -> dict[str, object]:
-        """The same as keys of ``[image_calibration]``, with the points' standard uncertainties.
+    def setup_keys(self) -> dict[str, dict[str, object]]:
+        """The same as keys of a setup file by section, with the points' standard uncertainties.
 
         None for a key that must not be there.
         """
@@ -198,9 +174,10 @@ class PlaneCalibration:
         }
         if self.model == "homography":
             rows = self.image_calibration.matrix.tolist()
-            return {**dict.fromkeys((*names, *lengths)), "homography": rows, **sigmas}
+            keys = {**dict.fromkeys((*names, *lengths)), "homography": rows, **sigmas}
+            return {"image_calibration": keys}
         points = dict(zip(names, self.points_px.tolist(), strict=True))
-        return {**points, **lengths, "homography": None, **sigmas}
+        return {"image_calibration": {**points, **lengths, "homography": None, **sigmas}}
 
     def fit_lines(self) -> list[str]:
         """What the fits to the marks leave over, which is used and why, in words."""
@@ -221,7 +198,8 @@ class PlaneCalibration:
 
     def bound_words(self) -> tuple[str, ...]:
         """How far the model may err where dots land; nothing without marks."""
-        return () if self.fits is None else self.fits.bound_words(self.image_calibration)
+        straight = ImageCalibration(self.image_calibration.matrix)
+        return () if self.fits is None else self.fits.bound_words(straight)
 
     def with_scale(self, factor: float) -> PlaneCalibration:
         """The same picture of a target that is larger by a factor."""
@@ -232,24 +210,9 @@ class PlaneCalibration:
             marks=tuple((x * factor, z * factor, u, v, noise) for x, z, u, v, noise in self.marks),
         )
 
-    @property
-    def _points_mm(self) -> FloatArray:
-        return np.array([[0.0, 0.0], [self.x_axis_mm, 0.0], [0.0, self.z_axis_mm]])
-
-    def _scales_and_angle(self, points_px: FloatArray) -> FloatArray:
-        x_arm, z_arm = points_px[1:] - points_px[0]
-        turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
-        return np.array(
-            [
-                np.hypot(*x_arm) / self.x_axis_mm,
-                np.hypot(*z_arm) / self.z_axis_mm,
-                np.degrees(turn) % 360.0,
-            ]
-        )
-
 
 def calibrate_plane(
-    image: Image, settings: PlaneCalibrationSettings | None = None
+    image: Image, settings: PlaneCalibrationSettings | None = None, lens: Lens | None = None
 ) -> PlaneCalibration:
     """Find O′ and the axes in a picture of the imaging plane (§5.1.2).
 
@@ -259,6 +222,8 @@ def calibrate_plane(
         Grey or BGR(A) picture, shape (rows, columns[, channels]), of any integer or float type.
     settings
         The target's design and limits; None for the defaults.
+    lens
+        The camera's lens, where it is known.
 
     Raises
     ------
@@ -275,7 +240,7 @@ def calibrate_plane(
     for threshold, binary in segmented(grey, darkness, settings):
         try:
             marks = three_marks(binary, settings)
-            return _measured(marks, darkness, background, threshold, settings)
+            return _measured(marks, darkness, background, threshold, settings, lens)
         except Refusal as refusal:
             # What failed last in the chain came closest: its reason helps the operator most.
             if refusal.stage > failure.stage:
@@ -289,6 +254,7 @@ def _measured(
     background: FloatArray,
     level: float | None,
     settings: PlaneCalibrationSettings,
+    lens: Lens | None,
 ) -> PlaneCalibration:
     """Measure the three objects and hold them to the design."""
     dot, x_mark, z_mark = marks
@@ -314,6 +280,7 @@ def _measured(
         z_axis_mm=sum(settings.z_units) / 2.0 * settings.unit_mm,
         sigma_px=(sigma[0], sigma[1], sigma[2]),
         threshold=bare * (1.0 - level) if level is not None else float(settings.threshold or 0.0),
+        lens=lens,
     )
     bars = (x_bar, z_bar)
     for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):

@@ -98,7 +98,8 @@ def calibrations_in_use(session: Session) -> tuple[bool, bool]:
     laser, plane = session.laser_calibration, session.plane_calibration
     return (
         laser is not None and _entered(keys.get("laser"), laser.found.setup_keys),
-        plane is not None and _entered(keys.get("image_calibration"), plane.found.setup_keys),
+        plane is not None
+        and all(_entered(keys.get(name), own) for name, own in plane.found.setup_keys.items()),
     )
 
 

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from labapp.core.calibration.board_calibration import MOST_PICTURES, BoardCalibration
+from labapp.core.calibration.boards import FEWEST_CORNERS, Board, BoardCorners
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
@@ -93,6 +95,18 @@ def _spline_fits(value: Any) -> bool:
     )
 
 
+def _corners_fit(value: Any) -> bool:
+    return _all_within(value.index, 0, len(value.board.corners_mm) - 1)
+
+
+def _boards_fit(value: Any) -> bool:
+    return bool(
+        1 <= len(value.seen) <= MOST_PICTURES
+        and min(value.size_px) > 1
+        and all(len(one.index) >= FEWEST_CORNERS for one in value.seen)
+    )
+
+
 def _all_within(numbers: Any, least: int, most: int) -> bool:
     return bool(((numbers >= least) & (numbers <= most)).all())
 
@@ -112,6 +126,11 @@ STORED = {
     "LaserCalibration": Stored(LaserCalibration),
     "PlanePicture": Stored(PlanePicture),
     "PlaneCalibration": Stored(PlaneCalibration),
+    "BoardCalibration": Stored(BoardCalibration, fits=_boards_fit),
+    "BoardCorners": Stored(
+        BoardCorners, shapes={"index": "n", "image_px": "n 2"}, fits=_corners_fit
+    ),
+    "Board": Stored(Board, fits=lambda value: value.is_possible),
     # The experiment
     "Record": Stored(Record),
     "Recording": Stored(Recording),

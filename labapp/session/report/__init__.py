@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import scipy
 
+from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -250,22 +251,29 @@ def _plane(story: Story, report: ReportData) -> None:
         story.text("Not calibrated in this session: values were given.")
         return
     found = plane.found
-    points = (found.origin_px, found.x_axis_px, found.z_axis_px)
+    is_board = isinstance(found, BoardCalibration)
+    if isinstance(found, BoardCalibration):
+        points, sigmas = found.points_px.tolist(), found.points_sigma_px
+    else:
+        points = [list(place) for place in (found.origin_px, found.x_axis_px, found.z_axis_px)]
+        sigmas = found.sigma_px
+    on_axis = "last corner" if is_board else "middle of the bar"
     places = ("0, 0", f"{found.x_axis_mm:.6g}, 0", f"0, {found.z_axis_mm:.6g}")
     rows = [
         [name, where, number(u, 2), number(v, 2), number(sigma, 2)]
         for name, where, (u, v), sigma in zip(
-            ("O′", "middle of the bar on O′X′", "middle of the bar on O′Z′"),
+            ("O′", f"{on_axis} on O′X′", f"{on_axis} on O′Z′"),
             places,
             points,
-            found.sigma_px,
+            sigmas,
             strict=True,
         )
     ]
     along_x, along_z = found.px_per_mm
     x_sigma, z_sigma, angle_sigma = found.scales_and_angle_sigma
+    unit = "a square of the board" if is_board else "a unit of the axes"
     story.table(
-        f"What was found in the calibration picture; a unit of the axes is {plane.unit_mm:.6g} mm. "
+        f"What was found in the calibration picture; {unit} is {plane.unit_mm:.6g} mm. "
         f"Scale {along_x:.4f} ± {x_sigma:.4f} px/mm along O′X′, "
         f"{along_z:.4f} ± {z_sigma:.4f} px/mm along O′Z′; "
         f"{found.angle_deg:.3f} ± {angle_sigma:.3f}° between them.",
@@ -273,7 +281,7 @@ def _plane(story: Story, report: ReportData) -> None:
         "llrrr",
         (0.36, 0.22, 0.14, 0.14, 0.14),
     )
-    if found.fits is not None:
+    if isinstance(found, BoardCalibration) or found.fits is not None:
         story.text("; ".join(" ".join(line.split()) for line in found.fit_lines()) + ".")
     if report.setup is not None and not _is_calibration(found, report.setup.calibration):
         story.text("The image calibration was changed after this one: other values are in use.")
@@ -284,7 +292,7 @@ def _plane(story: Story, report: ReportData) -> None:
         return
     story.figure(
         "The calibration picture with O′ and both axes as found.",
-        figures.target_picture(picture, found),
+        figures.target_picture(picture, points),
     )
 
 
@@ -295,7 +303,10 @@ def _is_laser(found: LaserCalibration, rig: Rig) -> bool:
     return bool(np.allclose(*known, rtol=1e-6))
 
 
-def _is_calibration(found: PlaneCalibration, calibration: ImageCalibration) -> bool:
+def _is_calibration(
+    found: PlaneCalibration | BoardCalibration, calibration: ImageCalibration
+) -> bool:
     """Whether the image calibration is the one that was found in the picture."""
-    matrix = found.image_calibration.matrix
-    return bool(np.allclose(matrix, calibration.matrix, rtol=1e-6, atol=1e-9))
+    own = found.image_calibration
+    same = np.allclose(own.matrix, calibration.matrix, rtol=1e-6, atol=1e-9)
+    return bool(same) and (own.lens is None) == (calibration.lens is None)

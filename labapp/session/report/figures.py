@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.patches import Polygon
 
-from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.optics import (
     intersect_imaging_plane,
     intersect_level,
@@ -128,9 +127,9 @@ def _label_rig(view: Any, rig: Rig, top: FloatArray) -> None:
     view.annotate(f"{-origin[1]:.4g} mm", (origin[1] / 2, -5.6), ha="center", va="bottom")
 
 
-def target_picture(image: GreyImage, found: PlaneCalibration) -> bytes:
-    """The calibration picture with O′ and both axes drawn over it."""
-    origin, *ends = (np.array(p) for p in (found.origin_px, found.x_axis_px, found.z_axis_px))
+def target_picture(image: GreyImage, points_px: Sequence[Sequence[float]]) -> bytes:
+    """The calibration picture with O′ and both axes, to a point on each, drawn over it."""
+    origin, *ends = (np.array(point) for point in points_px)
     tips = [origin + 1.25 * (end - origin) for end in ends]
     corners = np.array([origin, *tips])
     low, high = corners.min(axis=0), corners.max(axis=0)

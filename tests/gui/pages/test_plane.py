@@ -13,14 +13,19 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
+from labapp.config.setup import lens_of
+from labapp.core.calibration.board_calibration import BoardCalibration
+from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.values import CannotMeasure
 from labapp.gui.pages.plane import PlanePage, presenter
-from labapp.gui.shell.steps import states
+from labapp.gui.shell.steps import calibrations_in_use, states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from labapp.simulation.target import Target, target_svg
+from labapp.simulation.board import PrintedBoard, board_svg
+from labapp.simulation.camera import Lens, PosedView
+from labapp.simulation.target import Target, TargetLook, render_target, target_svg
 from tests.gui.conftest import KEPT
 
 GTAW = Path(__file__).parents[3] / "sample_sessions" / "gtaw"
@@ -157,7 +162,7 @@ def test_what_is_in_use_is_told_whichever_form_it_has(tmp_path: Path) -> None:
 
 def test_a_picture_without_a_target_is_refused_in_words() -> None:
     with pytest.raises(CannotMeasure, match="no dark marks"):
-        presenter.find(np.full((200, 300), 90, np.uint8), 6.35)
+        presenter.find([np.full((200, 300), 90, np.uint8)], 6.35, None)
 
 
 # --- the page ---------------------------------------------------------------------------------
@@ -298,5 +303,52 @@ def test_what_is_used_is_what_was_proposed_to_the_last_digit(
 
 def test_every_button_says_what_it_does(page: PlanePage) -> None:
     buttons = page.panel.findChildren(QPushButton)
-    assert len(buttons) == 5
+    assert len(buttons) == 6
     assert all(button.toolTip() for button in buttons)
+
+
+def board_picture(path: Path) -> Path:
+    """Picture of a board by a lens that distorts by 1 %."""
+    view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1, -2, 1.3), lens=Lens(1000.0, k1=-0.06))
+    printed, rng = PrintedBoard(BOARDS["charuco_4_inch"]), np.random.default_rng(1)
+    cv2.imwrite(str(path), render_target(printed, view, TargetLook(), rng))
+    return path
+
+
+def test_a_board_is_recognised_used_and_taken_back(
+    page: PlanePage, tmp_path: Path, qtbot: QtBot
+) -> None:
+    session = page.workspace.session
+    assert session is not None
+    before = session.setup_text
+    page.load(board_picture(tmp_path / "board.png"))
+    qtbot.waitUntil(lambda: isinstance(page.found, BoardCalibration), timeout=30_000)
+    found = page.found
+    assert isinstance(found, BoardCalibration)
+    assert page.square.value() == 8.0
+    assert page.add_button.isEnabled()
+    assert not any(point.isVisible() for point in page.points)
+    rows = {row.name: row for row in presenter.result(found).rows}
+    assert rows["Distortion"].value == pytest.approx(-0.96, abs=0.1)
+    shown = presenter.residual_map(found, 640)
+    assert shown is not None
+    assert len(shown.share) == len(found.seen[0].index)
+    page.use()
+    kept = session.plane_calibration
+    assert kept is not None
+    assert isinstance(kept.found, BoardCalibration)
+    np.testing.assert_array_equal(kept.found.seen[0].image_px, found.seen[0].image_px)
+    assert session.setup is not None
+    assert session.setup.calibration.lens == found.image_calibration.lens
+    assert calibrations_in_use(session)[1]
+    assert lens_of(session.setup_text) is not None
+    session.undo()
+    assert session.setup_text == before
+
+
+def test_a_board_is_saved_for_printing(page: PlanePage, tmp_path: Path) -> None:
+    page.print.set_value("charuco_letter_a4")
+    page.save_target(tmp_path / "board.pdf")
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+    page.save_target(tmp_path / "board.svg")
+    assert (tmp_path / "board.svg").read_text("utf-8") == board_svg(BOARDS["charuco_letter_a4"])

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from labapp.config.setup import lens_of
+from labapp.core.calibration.board_calibration import BoardCalibration
+from labapp.core.calibration.imaging_plane import Calibration, calibrate_imaging_plane
 from labapp.core.calibration.mark_fit import Model, root_mean_square
-from labapp.core.calibration.plane_calibration import (
-    PlaneCalibration,
-    PlaneCalibrationSettings,
-    calibrate_plane,
-)
-from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow
 from labapp.gui.shell.steps import calibrations_in_use
@@ -37,9 +37,10 @@ DESIGN = PlaneCalibrationSettings()
 Place = tuple[float, float]
 
 
-def find(image: GreyImage, unit_mm: float) -> PlaneCalibration:
-    """O′ and the axes as they are found; `CannotMeasure` says why not."""
-    return calibrate_plane(image, PlaneCalibrationSettings(unit_mm=unit_mm))
+def find(images: Sequence[GreyImage], unit_mm: float, lens: Lens | None) -> Calibration:
+    """O′ and the axes, or the corners of a board; `CannotMeasure` says why not."""
+    settings = PlaneCalibrationSettings(unit_mm=unit_mm)
+    return calibrate_imaging_plane(images, settings, lens=lens)
 
 
 def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
@@ -76,8 +77,10 @@ def moved(found: PlaneCalibration, point: int, place: Place) -> PlaneCalibration
     )
 
 
-def with_unit(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
-    """The same points on a target of another unit."""
+def with_unit(found: Calibration, unit_mm: float) -> Calibration:
+    """The same points on a target of another unit; a board as it is."""
+    if isinstance(found, BoardCalibration):
+        return found
     x_mm = sum(DESIGN.x_units) / 2 * unit_mm
     return found.with_scale(x_mm / found.x_axis_mm)
 
@@ -87,8 +90,11 @@ def _of_units(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
     return replace(found, x_axis_mm=x_mm, z_axis_mm=z_mm)
 
 
-def places(found: PlaneCalibration) -> tuple[Place, Place, Place]:
+def places(found: Calibration) -> tuple[Place, Place, Place]:
     """The three points, px."""
+    if isinstance(found, BoardCalibration):
+        origin, on_x, on_z = (_place(point) for point in found.points_px)
+        return origin, on_x, on_z
     return found.origin_px, found.x_axis_px, found.z_axis_px
 
 
@@ -111,10 +117,12 @@ class PlaneResult:
     warnings: tuple[str, ...] = ()
 
 
-def result(found: PlaneCalibration | None) -> PlaneResult:
+def result(found: Calibration | None) -> PlaneResult:
     """Scales, angle and their ± of a calibration, and what is wrong with it."""
     if found is None:
-        return PlaneResult(why_not="Load a picture of the target first")
+        return PlaneResult(why_not="Load a picture of the target or of a board first")
+    if isinstance(found, BoardCalibration):
+        return PlaneResult((*_scale_rows(found), *_board_rows(found)))
     try:
         _ = found.image_calibration
     except ValueError as error:
@@ -125,25 +133,57 @@ def result(found: PlaneCalibration | None) -> PlaneResult:
     if waiting:
         are = "it is" if len(waiting) == 1 else "they are"
         return PlaneResult(why_not=f"Drag {' and '.join(waiting)} to where {are} in the picture")
-    values = (*found.px_per_mm, found.angle_deg)
-    sigmas = found.scales_and_angle_sigma.tolist()
-    units = (("Scale along O′X′", "px/mm"), ("Scale along O′Z′", "px/mm"), ("Angle", "°"))
-    rows = [
-        ResultRow(name, value, sigma, unit)
-        for (name, unit), value, sigma in zip(units, values, sigmas, strict=True)
-    ]
-    rows += _residual_rows(found)
+    rows = _scale_rows(found) + _residual_rows(found)
     rows += [
         ResultRow(name, f"{u:.1f}, {v:.1f}", unit="px", note=f"± {sigma:.2f} px each way")
         for name, (u, v), sigma in zip(POINTS, places(found), found.sigma_px, strict=True)
     ]
-    along_x, along_z, angle = values
+    (along_x, along_z), angle = found.px_per_mm, found.angle_deg
     warnings = []
     if abs(along_x / along_z - 1) > DESIGN.scale_tolerance:
         warnings.append("The two scales differ by more than a camera in front of the plane sees")
     if abs(angle - 90) > DESIGN.angle_tolerance_deg:
         warnings.append(f"The axes are {angle:.0f}° apart, which should be about 90°")
     return PlaneResult(tuple(rows), "", tuple(warnings))
+
+
+def _scale_rows(found: Calibration) -> list[ResultRow]:
+    values = (*found.px_per_mm, found.angle_deg)
+    sigmas = found.scales_and_angle_sigma.tolist()
+    units = (("Scale along O′X′", "px/mm"), ("Scale along O′Z′", "px/mm"), ("Angle", "°"))
+    return [
+        ResultRow(name, value, sigma, unit)
+        for (name, unit), value, sigma in zip(units, values, sigmas, strict=True)
+    ]
+
+
+def _board_rows(found: BoardCalibration) -> list[ResultRow]:
+    """Lens and residual of a board, and how far places may be off."""
+    value, sigma = found.distortion_percent
+    seen = f"{len(found.seen[0].index)} of {len(found.board.corners_mm)}"
+    worst = float(np.hypot(*found.fit.residuals_px.T).max())
+    pictures = f"Over the corners of {len(found.seen)} pictures; worst {worst:.2f} px"
+    return [
+        ResultRow("Board", found.board.name, note=str(found.board)),
+        ResultRow("Corners found", seen, note=f"{found.left_out} left out"),
+        ResultRow(
+            "Distortion",
+            value,
+            sigma,
+            "%",
+            note="In the picture's corner, of the way from its middle"
+            + ("" if found.fit.lens else ": none is seen, and none is used"),
+        ),
+        ResultRow("Residual", found.fit.rms_px, None, "px", 3, pictures),
+        ResultRow(
+            "± in the corners",
+            found.corner_sigma_mm,
+            None,
+            "mm",
+            3,
+            "Standard uncertainty of a place on the plane in the picture's corners",
+        ),
+    ]
 
 
 def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:
@@ -166,8 +206,11 @@ def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:
     return rows
 
 
-def choices(found: PlaneCalibration | None) -> tuple[tuple[Model, str], ...]:
+def choices(found: Calibration | None) -> tuple[tuple[Model, str], ...]:
     """The models that can be used, and how they are named; the better fit says so."""
+    if isinstance(found, BoardCalibration):
+        lens = "Homography, no lens" if found.fit.lens is None else "Lens and homography"
+        return (("homography", lens),)
     if found is None or found.fits is None:
         return (("three points", "Three points"),)
     best = found.fits.best
@@ -178,8 +221,10 @@ def choices(found: PlaneCalibration | None) -> tuple[tuple[Model, str], ...]:
     return (*told, ("three points", "Three points"))
 
 
-def why(found: PlaneCalibration | None) -> str:
+def why(found: Calibration | None) -> str:
     """Why the model that is proposed is."""
+    if isinstance(found, BoardCalibration):
+        return f"Not determined: {'; '.join(found.undetermined())}."
     if found is None or UNPLACED in found.sigma_px:
         return ""
     if found.fits is None:
@@ -211,18 +256,21 @@ class ResidualMap:
     words: str
 
 
-def residual_map(found: PlaneCalibration | None, height_px: int) -> ResidualMap | None:
+def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | None:
     """Residuals of the model as arrows, enlarged to be seen in a picture of such a height."""
-    if found is None or found.fits is None or found.model == "three points":
+    if isinstance(found, BoardCalibration):
+        begin, residual = found.seen[0].image_px, found.residual_px
+    elif found is None or found.fits is None or found.model == "three points":
         return None
-    residual = found.fits.of(found.model).residual_px
+    else:
+        residual = found.fits.of(found.model).residual_px
+        begin = np.array(found.marks)[:, 2:4]
     length = np.hypot(*residual.T)
     longest = max(float(length.max()), 1e-9)
     # 1, 2 or 5 times a power of ten: the longest becomes a tenth of the picture at most.
     room = 0.1 * height_px / longest
     power = 10.0 ** np.floor(np.log10(room))
     times = max(step for step in (1, 2, 5) if step * power <= room) * power
-    begin = np.array(found.marks)[:, 2:4]
     words = f"Arrows: residuals × {times:g}, the longest {longest:.2f} px"
     return ResidualMap(begin, begin + times * residual, length / longest, words)
 
@@ -232,13 +280,14 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     names = (("Scale along X′", "px/mm"), ("Scale along Z′", "px/mm"), ("Angle", "°"))
     values, sigmas = [np.nan] * 3, [None] * 3
     kept = session.plane_calibration if calibrations_in_use(session)[1] else None
-    entered = tomllib.loads(session.setup_text).get("image_calibration", {})
-    keys = {key: value for key, value in entered.items() if not key.endswith("_sigma")}
+    keys = tomllib.loads(session.setup_text).get("image_calibration", {})
+    keys = {name: value for name, value in keys.items() if not name.endswith("_sigma")}
+    lens = lens_of(session.setup_text)
     try:
         calibration = (
-            ImageCalibration(np.array(keys["homography"], float))
+            ImageCalibration(np.array(keys["homography"], float), lens)
             if "homography" in keys
-            else ImageCalibration.from_three_points(**keys)
+            else ImageCalibration.from_three_points(**keys, lens=lens)
         )
     except (TypeError, ValueError, KeyError):
         pass  # it is not there, or not right: the set-up page says what
@@ -256,7 +305,7 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     )
 
 
-def axes(found: PlaneCalibration, unit_mm: float) -> tuple[FloatArray, FloatArray]:
+def axes(found: Calibration, unit_mm: float) -> tuple[FloatArray, FloatArray]:
     """The axes and their unit marks as they should lie in the picture.
 
     Returns
@@ -265,6 +314,10 @@ def axes(found: PlaneCalibration, unit_mm: float) -> tuple[FloatArray, FloatArra
         Ends of the axes, shape (3, 2): O′X′'s end, O′, O′Z′'s end; and the unit marks, shape
         (n, 2); px.
     """
+    if isinstance(found, BoardCalibration):
+        ends = np.array([[found.x_axis_mm, 0.0], [0.0, 0.0], [0.0, found.z_axis_mm]])
+        seen = found.image_calibration.to_image(found.board.corners_mm)
+        return found.image_calibration.to_image(ends), seen
     x_end, z_end = DESIGN.x_units[1], DESIGN.z_units[1]
     line = np.array([[x_end, 0.0], [0.0, 0.0], [0.0, z_end]]) * unit_mm
     marks = [(n, 0) for n in range(1, int(x_end) + 1)]

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pyqtgraph as pg
 
+from labapp.config.setup import lens_of
+from labapp.core.calibration.board_calibration import BoardCalibration
+from labapp.core.calibration.boards import BOARDS
+from labapp.core.calibration.imaging_plane import Calibration
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.gui.dialogs import ask_file, ask_save, write_file
@@ -23,9 +27,18 @@ from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
+from labapp.simulation.board import board_pdf, board_svg
 from labapp.simulation.target import Target, target_svg
 
-NO_PICTURE = "Load a picture of the target on the imaging plane, taken by the camera in its place."
+NO_PICTURE = (
+    "Load a picture of the target, or of a board, in the imaging plane, taken by the camera in its "
+    "place."
+)
+
+ADD = "A further picture of the same board, tilted or nearer to a corner of the picture"
+
+PRINTS = ("imaging_plane_4_inch", *BOARDS)
+"""What can be printed: the text's target, and the boards."""
 
 COLOR = "#ffb000"
 
@@ -40,7 +53,8 @@ class PlanePage(Page):
         self.view = PictureView("Picture of the target")
         self.view.show_picture(None, NO_PICTURE)
         self.canvas_layout.addWidget(self.view)
-        self.found: PlaneCalibration | None = None
+        self.found: Calibration | None = None
+        self._tilted: tuple[GreyImage, ...] = ()
         self._name = "picture"
         self._loaded: object = None
         self._axes = pg.PlotDataItem(pen=pg.mkPen(COLOR, width=1.5))
@@ -59,7 +73,6 @@ class PlanePage(Page):
             self._loaded = loaded
             self._clear()
             if kept is not None:
-                self.unit.set_value(kept.unit_mm)
                 self.take_kept()
         self.kept_button.setEnabled(kept is not None)
         none = "The session keeps no picture yet: Use keeps it"
@@ -71,8 +84,22 @@ class PlanePage(Page):
         """Show a picture of the target and look for O′ and the axes in it."""
 
         def loaded(image: GreyImage) -> None:
-            self._name = path.name
+            self._name, self._tilted = path.name, ()
             self._show(image, None)
+            self.find_axes()
+
+        self.workspace.tasks.start(
+            "Loading the picture",
+            lambda _: read_picture(path),
+            loaded,
+            beside=self.refused.setText,
+        )
+
+    def add_picture(self, path: Path) -> None:
+        """Take a further picture of the board, held anyhow before the camera."""
+
+        def loaded(image: GreyImage) -> None:
+            self._tilted = (*self._tilted, image)
             self.find_axes()
 
         self.workspace.tasks.start(
@@ -90,7 +117,9 @@ class PlanePage(Page):
 
         def shown(image: GreyImage) -> None:
             if session.plane_calibration == kept:
-                self.unit.set_value(kept.unit_mm)
+                is_board = isinstance(kept.found, BoardCalibration)
+                (self.square if is_board else self.unit).set_value(kept.unit_mm)
+                self._tilted = ()
                 self._show(image, kept.found)
 
         self.workspace.tasks.start(
@@ -104,15 +133,17 @@ class PlanePage(Page):
         image = self.view.picture
         if image is None:
             return
-        unit = self._unit()
+        unit, images, lens = self._unit(), (image, *self._tilted), lens_of(self.session.setup_text)
 
-        def found(calibration: PlaneCalibration) -> None:
+        def found(calibration: Calibration) -> None:
             if self.view.picture is image:
+                if isinstance(calibration, BoardCalibration):
+                    self.square.set_value(calibration.board.square_mm)
                 self._place(presenter.with_unit(calibration, self._unit()))
 
         self.workspace.tasks.start(
             "Looking for O′ and the axes",
-            lambda _: presenter.find(image, unit),
+            lambda _: presenter.find(images, unit, lens),
             found,
             beside=self.refused.setText,
         )
@@ -122,6 +153,8 @@ class PlanePage(Page):
         image, found, unit = self.view.picture, self.found, self._unit()
         if image is None or found is None:
             return
+        if isinstance(found, BoardCalibration):
+            unit = found.board.square_mm
         if self.workspace.attempt(
             lambda session: session.use_plane(found, unit, image, self._name)
         ):
@@ -158,6 +191,7 @@ class PlanePage(Page):
         self.unit.set_value(presenter.UNIT_MM)
         self.unit.edited.connect(lambda _: self._unit_changed())
         form.add(self.unit)
+        self._add_board_fields(form)
         self.find_button = button(
             "Find O′ and the axes",
             "Look for the dot and the two bars in the picture",
@@ -165,20 +199,48 @@ class PlanePage(Page):
         )
         form.add_wide(self.find_button)
         form.add_wide(self.refused)
-        form.add_wide(
-            button(
-                "Save the target for printing…",
-                "The target at true size (SVG): print it at 100 % and measure its unit",
-                self._choose_target,
-            )
-        )
+        self._add_print_fields(form)
         help_text = wrapping_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
             "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
         )
         fill(self.panel_layout, form, help_text)
         self._make_results()
-        self.lock_with_session(self.unit)
+        self.lock_with_session(self.unit, self.square)
+
+    def _add_board_fields(self, form: FieldForm) -> None:
+        self.square = NumberField(
+            "Square of the board",
+            "mm",
+            lowest=0.1,
+            highest=1000,
+            step=0.05,
+            decimals=3,
+            tooltip="Edge of a square: measure ten of them on the printed board",
+        )
+        self.square.edited.connect(lambda _: self._square_changed())
+        form.add(self.square)
+        self.add_button = button(
+            "Add picture of the board…",
+            ADD,
+            self._choose_further,
+        )
+        form.add_wide(self.add_button)
+
+    def _add_print_fields(self, form: FieldForm) -> None:
+        self.print = ChoiceField(
+            "To print",
+            tuple((name, name.replace("_", " ")) for name in PRINTS),
+            tooltip="The text's target, or a board: ChArUco boards may be seen in part",
+        )
+        form.add(self.print)
+        form.add_wide(
+            button(
+                "Save for printing…",
+                "At true size (SVG or PDF): print it at 100 % and measure its unit or squares",
+                self._choose_target,
+            )
+        )
 
     def _make_results(self) -> None:
         model = FieldForm()
@@ -204,14 +266,26 @@ class PlanePage(Page):
             self.load(path)
 
     def _choose_target(self) -> None:
-        proposed = self.workspace.folder / "imaging_plane_4_inch.svg"
-        if path := ask_save(self, "Save target", proposed, "SVG (*.svg)"):
+        proposed = self.workspace.folder / f"{self.print.value()}.svg"
+        if path := ask_save(self, "Save for printing", proposed, "SVG (*.svg);;PDF (*.pdf)"):
             self.save_target(path)
+
+    def _choose_further(self) -> None:
+        if path := ask_file(self, "Picture of the board", self.workspace.folder):
+            self.add_picture(path)
 
     def save_target(self, path: Path) -> None:
         """Write the target for the printer."""
-        if self.workspace.run_or_report(lambda: write_file(path, target_svg(Target()).encode())):
-            self.workspace.notified.emit(f"Target saved as {path.name}: print it at 100 %", False)
+        name = str(self.print.value())
+
+        def content() -> bytes:
+            if name not in BOARDS:
+                return target_svg(Target()).encode()
+            is_pdf = path.suffix.lower() == ".pdf"
+            return board_pdf(BOARDS[name]) if is_pdf else board_svg(BOARDS[name]).encode()
+
+        if self.workspace.run_or_report(lambda: write_file(path, content())):
+            self.workspace.notified.emit(f"Saved as {path.name}: print it at 100 %", False)
 
     # --- the picture ------------------------------------------------------------------------
 
@@ -222,16 +296,21 @@ class PlanePage(Page):
         if self.found is not None:
             self._place(presenter.with_unit(self.found, self._unit()))
 
+    def _square_changed(self) -> None:
+        square = self.square.value()
+        if isinstance(self.found, BoardCalibration) and square is not None:
+            self._place(self.found.with_square(square))
+
     def _clear(self) -> None:
         self.view.show_picture(None, NO_PICTURE)
         self._place(None)
 
-    def _show(self, image: GreyImage, found: PlaneCalibration | None) -> None:
+    def _show(self, image: GreyImage, found: Calibration | None) -> None:
         self.view.show_picture(image)
         rows, columns = image.shape
         self._place(found or presenter.first_points((rows, columns), self._unit()))
 
-    def _place(self, found: PlaneCalibration | None) -> None:
+    def _place(self, found: Calibration | None) -> None:
         self.found = found
         if found is not None and not self.points:
             self.view.add(self._axes)
@@ -242,20 +321,20 @@ class PlanePage(Page):
                 self.points.append(point)
                 self.view.add_point(point)
         for k, point in enumerate(self.points):
-            point.setVisible(found is not None)
+            point.setVisible(isinstance(found, PlaneCalibration))
             if found is not None:
                 point.set_place(*presenter.places(found)[k])
         self._follow()
 
     def drag(self, point: int, u: float, v: float) -> None:
         """One of the points is dragged."""
-        if self.found is not None:
+        if isinstance(self.found, PlaneCalibration):
             self.found = presenter.moved(self.found, point, (u, v))
             self._follow()
 
     def choose_model(self, model: Model) -> None:
         """Use another model than is proposed."""
-        if self.found is not None:
+        if isinstance(self.found, PlaneCalibration):
             self._place(replace(self.found, model=model))
 
     def _show_residuals(self) -> None:
@@ -285,10 +364,16 @@ class PlanePage(Page):
         """Show what follows from the points."""
         result = presenter.result(self.found)
         self.model.set_choices(presenter.choices(self.found))
-        has_marks = self.found is not None and bool(self.found.marks)
+        is_board = isinstance(self.found, BoardCalibration)
+        has_marks = isinstance(self.found, PlaneCalibration) and bool(self.found.marks)
         self.model.setEnabled(has_marks and not self.locked)
-        if self.found is not None:
+        if isinstance(self.found, PlaneCalibration):
             self.model.set_value(self.found.model)
+        elif is_board:
+            self.model.set_value("homography")
+        self.square.setEnabled(is_board and not self.locked)
+        self.add_button.setEnabled(is_board and not self.locked)
+        self.add_button.setToolTip(ADD if is_board else f"{ADD}: load the one in the plane first")
         self._show_residuals()
         self.result.set_rows(result.rows)
         self.result.setVisible(bool(result.rows))

@@ -1,0 +1,373 @@
+"""Boards for the camera's calibration: ChArUco boards and chessboards, and their inner corners.
+
+A board stands where the imaging plane does, upright as it is printed. O′ is its lower left inner
+corner as the camera sees it; X′ runs along its lower row of inner corners, Z′ along its left
+column. A ChArUco board has a marker with a number in each white square, so that it is known which
+corners are seen where a part of it is hidden or out of the picture; a chessboard must be seen as a
+whole, and it does not tell what is up: it may be turned by 45° at most.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from labapp.core.calibration.board_corner import fit_corner
+from labapp.core.calibration.target_marks import Image, grey_levels
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
+
+Kind = Literal["charuco", "chessboard"]
+
+FEWEST_CORNERS, FEWEST_LINES = 12, 3
+"""A board is found by so many inner corners, in so many rows and so many columns."""
+
+FEWEST_MARKERS = 4
+"""So many markers of a ChArUco board are no accident."""
+
+MARGIN = 0.15
+"""White between a marker and its square, a share of the square's edge."""
+
+REACH = 0.19
+"""Radius of what is looked at about a corner, of a square's edge: a marker begins at 0.21."""
+
+SMALLEST_PX = 12.0
+"""Smallest square whose corners are found, px."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board of black and white squares.
+
+    Parameters
+    ----------
+    name
+        What it is called.
+    kind
+        ``charuco``, with markers in the white squares, or ``chessboard``.
+    columns, rows
+        Squares each way.
+    square_mm
+        Edge of a square: measure it on the print.
+    dictionary
+        Name of the markers' dictionary in OpenCV, without ``DICT_``.
+    first_id
+        Number of the first marker, at the upper left; the others follow row by row.
+    """
+
+    name: str
+    kind: Kind
+    columns: int
+    rows: int
+    square_mm: float
+    dictionary: str = "4X4_250"
+    first_id: int = 0
+
+    @property
+    def marker_mm(self) -> float:
+        """Edge of a marker."""
+        return (1.0 - 2.0 * MARGIN) * self.square_mm
+
+    @property
+    def ids(self) -> range:
+        """Numbers of its markers."""
+        count = self.columns * self.rows // 2 if self.kind == "charuco" else 0
+        return range(self.first_id, self.first_id + count)
+
+    @cached_property
+    def corners_mm(self) -> FloatArray:
+        """(X′, Z′) of the inner corners, row by row from the upper left, shape (n, 2), mm."""
+        x, z = np.meshgrid(np.arange(self.columns - 1), np.arange(self.rows - 1)[::-1])
+        return np.asarray(np.stack([x, z], axis=-1).reshape(-1, 2) * self.square_mm, np.float64)
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether there is such a board: 4 to 60 squares each way, of 0.1 to 1000 mm."""
+        sides = (self.columns, self.rows)
+        return 4 <= min(sides) <= max(sides) <= 60 and 0.1 <= self.square_mm <= 1000.0
+
+    def with_square(self, square_mm: float) -> Board:
+        """The same board with squares of another size."""
+        return replace(self, square_mm=square_mm)
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.columns} × {self.rows} squares of {self.square_mm:g} mm"
+
+
+BOARDS = {
+    board.name: board
+    for board in (
+        Board("charuco_4_inch", "charuco", 12, 11, 8.0),
+        Board("chessboard_4_inch", "chessboard", 12, 11, 8.0),
+        Board("charuco_letter_a4", "charuco", 12, 15, 15.0, first_id=100),
+        Board("chessboard_letter_a4", "chessboard", 12, 15, 15.0),
+    )
+}
+"""The boards that can be printed (`resources/targets`)."""
+
+A_BOARD = (
+    f"one of {', '.join(BOARDS)}; or KIND:COLUMNSxROWS:SQUARE_MM, with :DICTIONARY:FIRST_ID after "
+    "it for a charuco board of other markers than 4X4_250 from 0"
+)
+
+_FORM = re.compile(r"(charuco|chessboard):(\d{1,3})x(\d{1,3}):(\d+(?:\.\d+)?)(?::(\w+):(\d{1,6}))?")
+
+
+def parse_board(text: str) -> Board:
+    """Board of its name in `BOARDS`, or of its kind and size, such as ``chessboard:9x7:10``.
+
+    Raises
+    ------
+    ValueError
+        If it is neither, or no such board can be.
+    """
+    if text in BOARDS:
+        return BOARDS[text]
+    form = _FORM.fullmatch(text)
+    if form is None:
+        raise ValueError("it is the name of no board")
+    kind, columns, rows, square, dictionary, first = form.groups()
+    board = Board(
+        text.rpartition(":")[0] if dictionary is None else text,
+        "charuco" if kind == "charuco" else "chessboard",
+        int(columns),
+        int(rows),
+        float(square),
+        dictionary or "4X4_250",
+        int(first or 0),
+    )
+    if not board.is_possible:
+        raise ValueError("a board has 4 to 60 squares each way, of 0.1 to 1000 mm")
+    if kind == "charuco":
+        try:
+            known = len(_dictionary(board.dictionary).bytesList)
+        except AttributeError as error:
+            raise ValueError(f"OpenCV has no dictionary DICT_{board.dictionary}") from error
+        if board.ids.stop > known:
+            raise ValueError(f"the dictionary has markers 0 to {known - 1}")
+    elif (board.columns + board.rows) % 2 == 0:
+        raise ValueError("a chessboard that is not symmetric has an odd and an even side")
+    return board
+
+
+@dataclass(frozen=True)
+class BoardCorners(ReadOnlyArrays):
+    """Inner corners of a board that are seen in a picture.
+
+    Parameters
+    ----------
+    board
+        The board.
+    index
+        Of each in `Board.corners_mm`, shape (n,).
+    image_px
+        (u, v) of each, shape (n, 2), px.
+    """
+
+    board: Board
+    index: IntArray
+    image_px: FloatArray
+
+    @cached_property
+    def plane_mm(self) -> FloatArray:
+        """(X′, Z′) of each, shape (n, 2), mm."""
+        return np.asarray(self.board.corners_mm[self.index])
+
+    def keep(self, which: BoolArray) -> BoardCorners:
+        """Those that are marked, shape (n,)."""
+        return BoardCorners(self.board, self.index[which], self.image_px[which])
+
+
+def find_board(image: Image, board: Board | None = None) -> BoardCorners:
+    """Find the inner corners of a board in a picture.
+
+    Parameters
+    ----------
+    image
+        Grey or BGR(A) picture, shape (rows, columns[, channels]), of any integer or float type.
+    board
+        The board; None: whichever of `BOARDS` it is.
+
+    Raises
+    ------
+    ValueError
+        If the image is no picture.
+    CannotMeasure
+        ``no-board`` if none is found, ``wrong-board`` if another one is; the reason says which.
+    """
+    levels = grey_levels(image)
+    grey = _stretched(levels)
+    if board is None:
+        board = _recognised(grey)
+    found = _charuco(grey, board) if board.kind == "charuco" else _chessboard(grey, board)
+    found = _refined(levels, found)
+    lines = [np.unique(found.plane_mm[:, axis]).size for axis in (0, 1)]
+    if len(found.index) < FEWEST_CORNERS or min(lines) < FEWEST_LINES:
+        raise CannotMeasure(
+            "no-board",
+            f"{len(found.index)} of the {len(board.corners_mm)} inner corners of {board.name} are "
+            f"seen: at least {FEWEST_CORNERS} in {FEWEST_LINES} rows and columns are needed.",
+        )
+    return found
+
+
+def is_charuco(image: Image) -> bool:
+    """Whether a picture shows markers of one of `BOARDS`."""
+    ids = _markers(_stretched(grey_levels(image)), "4X4_250")
+    return any(_share(board, ids) for board in BOARDS.values())
+
+
+def _recognised(grey: npt.NDArray[np.uint8]) -> Board:
+    """The board of `BOARDS` that a picture shows."""
+    ids = _markers(grey, "4X4_250")
+    shown = [board for board in BOARDS.values() if _share(board, ids)]
+    if shown:
+        return max(shown, key=lambda board: _share(board, ids))
+    size = _chessboard_size(grey)
+    for board in BOARDS.values():
+        if board.kind == "chessboard" and size == (board.columns - 1, board.rows - 1):
+            # Two prints of one number of squares differ in size alone, which the user knows.
+            return board
+    if size is not None:
+        raise CannotMeasure(
+            "wrong-board",
+            f"The picture shows a chessboard with {size[0]} × {size[1]} inner corners, which is "
+            "none of the boards that labapp prints: name its squares and their size.",
+        )
+    raise CannotMeasure(
+        "no-board",
+        "The picture shows neither markers of a ChArUco board nor a chessboard with a white rim.",
+    )
+
+
+def _share(board: Board, ids: IntArray) -> int:
+    """How many of the markers that are seen are a board's; 0 if too few to be no accident."""
+    own = int(np.isin(ids, board.ids).sum())
+    return own if own >= FEWEST_MARKERS else 0
+
+
+def _charuco(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
+    size = (board.columns, board.rows)
+    dictionary, ids = _dictionary(board.dictionary), np.array(board.ids, np.int32)
+    design = cv2.aruco.CharucoBoard(size, 1.0, 1.0 - 2.0 * MARGIN, dictionary, ids)
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.minMarkers = 1
+    detector = cv2.aruco.CharucoDetector(design, parameters, _marker_parameters())
+    answer: tuple[Any, ...] = detector.detectBoard(grey)
+    corners, numbers, _, seen = answer
+    if numbers is None or not len(numbers):
+        raise _no_charuco(grey, board, seen)
+    index = np.asarray(numbers, np.int64).ravel()
+    places = np.asarray(corners, np.float64).reshape(-1, 2)
+    return BoardCorners(board, index, places)
+
+
+def _no_charuco(grey: npt.NDArray[np.uint8], board: Board, seen: Any) -> CannotMeasure:
+    """Why no corner of a board is found."""
+    others = np.setdiff1d(_markers(grey, board.dictionary), np.array(board.ids))
+    if len(others) >= FEWEST_MARKERS:
+        return CannotMeasure(
+            "wrong-board",
+            f"The markers in the picture ({others.min()} to {others.max()}) are not those of "
+            f"{board.name} ({board.ids.start} to {board.ids.stop - 1}): it is another board.",
+        )
+    return CannotMeasure(
+        "no-board",
+        f"{0 if seen is None else len(seen)} markers of {board.name} are seen, and no corner "
+        "beside them: the board is out of the picture, blurred, hidden by glare, mirrored, or not "
+        "this one.",
+    )
+
+
+def _refined(grey: FloatArray, found: BoardCorners) -> BoardCorners:
+    """The corners as the grey levels around them have them; those that look otherwise left out."""
+    pitch = _pitch_px(found)
+    if pitch < SMALLEST_PX:
+        raise CannotMeasure(
+            "no-board",
+            f"The squares of {found.board.name} are {pitch:.0f} px wide, which is too small: "
+            f"{SMALLEST_PX:.0f} px are needed. Move the camera nearer or use a larger board.",
+        )
+    radius = float(np.clip(REACH * pitch, 3.0, 12.0))
+    places = [fit_corner(grey, place, radius) for place in found.image_px]
+    seen = [k for k, place in enumerate(places) if place is not None]
+    image_px = np.array([places[k] for k in seen], float).reshape(-1, 2)
+    return BoardCorners(found.board, found.index[seen], image_px)
+
+
+def _pitch_px(found: BoardCorners) -> float:
+    """Distance of neighbouring corners in the picture, px; infinite where there are none."""
+    nearest = [
+        np.sort(np.hypot(*(found.image_px - place).T))[1:2] for place in found.image_px.tolist()
+    ]
+    apart = np.concatenate([*nearest, np.empty(0)])
+    return float(np.median(apart)) if len(apart) else float("inf")
+
+
+def _chessboard(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
+    size = (board.columns - 1, board.rows - 1)
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    seen = _chessboard_size(grey)
+    if seen is not None and sorted(seen) != sorted(size):
+        raise CannotMeasure(
+            "wrong-board",
+            f"{seen[0]} × {seen[1]} inner corners are seen where {board.name} has {size[0]} × "
+            f"{size[1]}: part of it is hidden or out of the picture, or it is another board.",
+        )
+    done, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
+    if not done:
+        raise CannotMeasure(
+            "no-board",
+            f"The {size[0]} × {size[1]} inner corners of {board.name} are not all seen. A "
+            "chessboard must be whole and have a white rim; of a ChArUco board a part is enough.",
+        )
+    grid = np.asarray(corners, np.float64).reshape(board.rows - 1, board.columns - 1, 2)
+    # Which way the rows run is not told: upright is how a board stands.
+    if grid[:, -1, 0].mean() < grid[:, 0, 0].mean():
+        grid = grid[:, ::-1]
+    if grid[-1, :, 1].mean() < grid[0, :, 1].mean():
+        grid = grid[::-1]
+    return BoardCorners(board, np.arange(grid.shape[0] * grid.shape[1]), grid.reshape(-1, 2))
+
+
+def _chessboard_size(grey: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
+    """Inner corners along a row and along a column of the chessboard in a picture."""
+    flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
+    done, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+    if not done:
+        return None
+    rows, columns = np.asarray(meta).shape[:2]
+    grid = np.asarray(corners, np.float64).reshape(rows, columns, 2)
+    along_row, along_column = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    lies = abs(along_row[0]) * abs(along_column[1]) < abs(along_row[1]) * abs(along_column[0])
+    return (rows, columns) if lies else (columns, rows)
+
+
+def _markers(grey: npt.NDArray[np.uint8], dictionary: str) -> IntArray:
+    """Numbers of the markers that a picture shows."""
+    detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), _marker_parameters())
+    answer: tuple[Any, ...] = detector.detectMarkers(grey)
+    ids = answer[1]
+    return np.empty(0, np.int64) if ids is None else np.asarray(ids, np.int64).ravel()
+
+
+def _marker_parameters() -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = 0.02
+    return parameters
+
+
+def _dictionary(name: str) -> Any:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
+
+
+def _stretched(grey: FloatArray) -> npt.NDArray[np.uint8]:
+    """Grey levels from 0 to 255, whatever contrast the picture has."""
+    low, high = np.percentile(grey, (0.5, 99.5))
+    share = (grey - low) / max(float(high - low), 1e-9)
+    return np.asarray(np.rint(255.0 * np.clip(share, 0.0, 1.0)), np.uint8)

@@ -1,0 +1,71 @@
+"""O′ and a point on each axis as a calibration picture has them: scales, angle and their ±."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+
+from labapp.core.values import FloatArray
+
+
+class SeenAxes:
+    """What follows from three points in a picture and their covariance."""
+
+    x_axis_mm: float
+    z_axis_mm: float
+
+    @property
+    @abstractmethod
+    def points_px(self) -> FloatArray:
+        """(u, v) of O′ and of the points on O′X′ and O′Z′, shape (3, 2)."""
+
+    @property
+    @abstractmethod
+    def points_covariance_px2(self) -> FloatArray:
+        """Covariance of these points, shape (6, 6), px²."""
+
+    @property
+    def points_sigma_px(self) -> tuple[float, float, float]:
+        """Standard uncertainty of each of these points along either direction, px."""
+        variance = np.diag(self.points_covariance_px2).reshape(3, 2).mean(axis=1)
+        origin, on_x, on_z = np.sqrt(variance).tolist()
+        return origin, on_x, on_z
+
+    @property
+    def px_per_mm(self) -> tuple[float, float]:
+        """Scale from O′ to the point on O′X′ and to that on O′Z′ (Eq. 4-6), px/mm."""
+        along_x, along_z, _ = self._scales_and_angle(self.points_px)
+        return float(along_x), float(along_z)
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle from O′X′ to O′Z′ as the picture shows it, anticlockwise, degrees."""
+        return float(self._scales_and_angle(self.points_px)[2])
+
+    @property
+    def scales_and_angle_sigma(self) -> FloatArray:
+        """± of both scales, px/mm, and of the angle, degrees, shape (3,)."""
+        points, step = self.points_px, 1e-3
+        base = self._scales_and_angle(points)
+        change = [
+            (self._scales_and_angle(points + step * one.reshape(3, 2)) - base) / step
+            for one in np.eye(6)
+        ]
+        squares = np.einsum("pk,pq,qk->k", change, self.points_covariance_px2, change)
+        return np.asarray(np.sqrt(squares))
+
+    @property
+    def _points_mm(self) -> FloatArray:
+        return np.array([[0.0, 0.0], [self.x_axis_mm, 0.0], [0.0, self.z_axis_mm]])
+
+    def _scales_and_angle(self, points_px: FloatArray) -> FloatArray:
+        x_arm, z_arm = points_px[1:] - points_px[0]
+        turn = np.arctan2(-z_arm[1], z_arm[0]) - np.arctan2(-x_arm[1], x_arm[0])
+        return np.array(
+            [
+                np.hypot(*x_arm) / self.x_axis_mm,
+                np.hypot(*z_arm) / self.z_axis_mm,
+                np.degrees(turn) % 360.0,
+            ]
+        )

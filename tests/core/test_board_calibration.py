@@ -1,0 +1,256 @@
+"""Camera and imaging plane from pictures of boards, rendered by the twin's own lens and camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.config.setup_keys import SECTIONS
+from labapp.core.calibration.board_calibration import BoardCalibration, calibrate_board
+from labapp.core.calibration.boards import BOARDS, parse_board
+from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
+from labapp.core.calibration.lens_fit import PlaneView, fit_lens, fit_terms
+from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
+from labapp.core.values import CannotMeasure
+from labapp.simulation.board import PrintedBoard
+from labapp.simulation.camera import Lens, PosedView
+from labapp.simulation.target import Target, TargetLook, render_target
+
+pytestmark = pytest.mark.slow
+
+CHARUCO, CHESS = BOARDS["charuco_4_inch"], BOARDS["chessboard_4_inch"]
+WIDTH, HEIGHT = SIZE = 480, 640
+FOCAL_PX = 1000.0
+CORNER = np.hypot(WIDTH - 1, HEIGHT - 1) / 2 / FOCAL_PX
+
+
+def lens(percent: float, **terms: float) -> Lens | None:
+    """A lens with so much distortion in the picture's corner."""
+    return Lens(FOCAL_PX, k1=percent / 100 / CORNER**2, **terms) if percent else None
+
+
+def shot(
+    board, percent=0.0, turned=(1.0, -2.0, 1.3), center=None, seed=1, px_per_mm=5.0, axis=None
+):
+    """A view of a board, and its picture."""
+    middle = board.corners_mm.mean(axis=0) if center is None else center
+    view = PosedView.at(
+        tuple(middle), px_per_mm, turned_deg=turned, lens=lens(percent), axis_px=axis
+    )
+    look = TargetLook()
+    return view, render_target(PrintedBoard(board), view, look, np.random.default_rng(seed))
+
+
+def off_mm(found: BoardCalibration, view: PosedView) -> np.ndarray:
+    """How far places all over the picture are from where they are on the plane, mm."""
+    u, v = np.linspace(5, WIDTH - 6, 9), np.linspace(5, HEIGHT - 6, 9)
+    seen = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    return np.hypot(*(found.image_calibration.to_plane(seen) - view.to_plane(seen)).T)
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHESS], ids=lambda board: board.kind)
+@pytest.mark.parametrize("percent", [-1.0, 0.5, 0.0])
+def test_lens_and_plane_are_found(board, percent):
+    view, image = shot(board, percent, seed=3)
+    found = calibrate_board([image])
+    value, sigma = found.distortion_percent
+    assert found.board == board
+    assert abs(value - percent) < 4 * sigma < 0.2
+    assert found.fit.rms_px < 0.1
+    assert off_mm(found, view).max() < 0.05
+    assert (found.image_calibration.lens is None) == (percent == 0.0)
+
+
+def test_corners_are_as_noisy_as_is_said():
+    view, image = shot(CHARUCO, -1.0)
+    found = calibrate_board([image])
+    true = view.to_image(found.seen[0].plane_mm)
+    off = found.seen[0].image_px - true
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(found.fit.sigma_px, rel=0.2)
+    assert np.sqrt(np.mean(off**2)) < 0.07
+
+
+def test_lens_off_the_middle_is_tangential():
+    view, image = shot(CHARUCO, -1.0, axis=(215.0, 345.0), seed=2)
+    found = calibrate_board([image])
+    assert {"k1", "p1", "p2"} <= set(found.fit.terms)
+    assert off_mm(found, view).max() < 0.06
+
+
+def test_pull_of_the_distortion_is_normal():
+    rng = np.random.default_rng(5)
+    pulls = []
+    for _ in range(60):
+        view = PosedView.at(
+            (40.0, 36.0), 5.0, turned_deg=tuple(rng.normal(0, 2, 3)), lens=lens(-0.8)
+        )
+        seen = view.to_image(CHARUCO.corners_mm) + rng.normal(0, 0.05, (110, 2))
+        fit = fit_terms([PlaneView(CHARUCO.corners_mm, seen)], SIZE, ("k1",))
+        value, sigma = fit.distortion_percent()
+        pulls.append((value + 0.8) / sigma)
+    assert 0.75 < np.std(pulls) < 1.3
+    assert abs(np.mean(pulls)) < 0.45
+
+
+def test_no_lens_is_taken_from_noise():
+    rng = np.random.default_rng(6)
+    view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(2.0, -1.0, 1.0))
+    straight = view.to_image(CHARUCO.corners_mm)
+    taken = [
+        fit_lens(
+            [PlaneView(CHARUCO.corners_mm, straight + rng.normal(0, 0.05, (110, 2)))], SIZE
+        ).lens
+        for _ in range(100)
+    ]
+    assert sum(one is not None for one in taken) <= 1
+
+
+def test_covariance_is_that_of_repeated_noise():
+    rng = np.random.default_rng(7)
+    view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(2.0, -1.0, 1.0), lens=lens(-1.0))
+    straight, places = view.to_image(CHARUCO.corners_mm), np.array([[0.0, 0.0], [80.0, 0.0]])
+    fits = [
+        fit_terms(
+            [PlaneView(CHARUCO.corners_mm, straight + rng.normal(0, 0.05, (110, 2)))], SIZE, ("k1",)
+        )
+        for _ in range(80)
+    ]
+    spread = np.std([fit.calibration().to_image(places).ravel() for fit in fits], axis=0)
+    sigma = np.sqrt(np.diag(fits[0].covariance_px2(places)))
+    np.testing.assert_allclose(spread, sigma, rtol=0.3)
+
+
+def test_further_pictures_tell_more_and_agree_with_opencv():
+    view, first = shot(CHARUCO, -1.0)
+    poses = [((15, 0, 0), (40, 20)), ((0, -15, 3), (30, 60)), ((-10, 12, -4), (50, 50))]
+    more = [shot(CHARUCO, -1.0, turned, center, k)[1] for k, (turned, center) in enumerate(poses)]
+    one, all_ = calibrate_board([first]), calibrate_board([first, *more])
+    assert all_.distortion_percent[1] < 0.8 * one.distortion_percent[1]
+    assert off_mm(all_, view).max() < 0.04
+    on_board = [np.column_stack([s.plane_mm, np.zeros(len(s.index))]) for s in all_.seen]
+    camera = np.array([[1500.0, 0, 239.5], [0, 1500.0, 319.5], [0, 0, 1]])
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+    flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
+    rms, camera, bent, *_ = cv2.calibrateCamera(
+        [one.astype(np.float32) for one in on_board],
+        [s.image_px.astype(np.float32) for s in all_.seen],
+        SIZE,
+        camera,
+        np.zeros(5),
+        flags=flags,
+    )
+    corner = CORNER * FOCAL_PX / camera[0, 0]
+    assert 100 * bent.ravel()[0] * corner**2 == pytest.approx(all_.distortion_percent[0], abs=0.08)
+    assert rms == pytest.approx(np.sqrt(2) * all_.fit.rms_px, rel=0.1)
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHESS], ids=lambda board: board.kind)
+def test_board_may_be_turned_a_little(board):
+    view, image = shot(board, -1.0, turned=(0.0, 0.0, 5.0))
+    assert off_mm(calibrate_board([image]), view).max() < 0.05
+
+
+def test_charuco_may_be_seen_in_part():
+    view, image = shot(CHARUCO, -1.0, center=(75.0, 70.0))
+    found = calibrate_board([image])
+    true = view.to_image(found.seen[0].plane_mm)
+    assert 40 < len(found.seen[0].index) < 90
+    assert np.abs(found.seen[0].image_px - true).max() < 0.4
+    assert found.covered < 0.3
+    assert any("larger board" in words for words in found.undetermined())
+
+
+def test_glare_hides_corners_and_moves_none():
+    view, image = shot(CHARUCO, -1.0)
+    image = image.copy()
+    cv2.circle(image, (300, 400), 60, 255, -1)
+    found = calibrate_board([image])
+    seen = found.seen[0]
+    assert 40 < len(seen.index) < 105
+    assert np.abs(seen.image_px - view.to_image(seen.plane_mm)).max() < 0.4
+
+
+def mirrored():
+    return cv2.flip(shot(CHARUCO)[1], 1)
+
+
+def glaring_chessboard():
+    image = shot(CHESS)[1].copy()
+    return cv2.circle(image, (240, 300), 70, 255, -1)
+
+
+@pytest.mark.parametrize(
+    ("image", "board", "status"),
+    [
+        (lambda: shot(BOARDS["charuco_letter_a4"], px_per_mm=2.6)[1], CHARUCO, "wrong-board"),
+        (lambda: shot(parse_board("chessboard:9x8:8"))[1], None, "wrong-board"),
+        (lambda: shot(parse_board("chessboard:9x8:8"))[1], CHESS, "wrong-board"),
+        (lambda: shot(CHESS, center=(75.0, 70.0))[1], CHESS, "wrong-board"),
+        (glaring_chessboard, CHESS, "no-board"),
+        (mirrored, CHARUCO, "no-board"),
+        (lambda: np.full((HEIGHT, WIDTH), 30, np.uint8), None, "no-board"),
+        (lambda: shot(CHARUCO, center=(400.0, 40.0))[1], CHARUCO, "no-board"),
+    ],
+)
+def test_what_is_no_board_is_refused(image, board, status):
+    with pytest.raises(CannotMeasure) as refused:
+        calibrate_board([image()], board)
+    assert refused.value.status in (status, "wrong-board")
+
+
+def test_bent_board_is_refused():
+    _, image = shot(CHARUCO)
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    bent = cv2.remap(image, u, v + 8 * np.sin(u / 30), cv2.INTER_LINEAR)
+    with pytest.raises(CannotMeasure, match="wrong-board"):
+        calibrate_board([bent])
+
+
+def test_what_the_picture_shows_is_recognised():
+    rng = np.random.default_rng(2)
+    target = Target()
+    view = PosedView.at((40.0, 40.0), 5.5)
+    picture = render_target(target, view, TargetLook(), rng)
+    settings = PlaneCalibrationSettings(unit_mm=target.unit_mm)
+    assert isinstance(calibrate_imaging_plane([picture], settings), PlaneCalibration)
+    for board in (CHARUCO, CHESS, BOARDS["charuco_letter_a4"]):
+        scale = 5.0 if board.square_mm == 8.0 else 2.6
+        found = calibrate_imaging_plane([shot(board, px_per_mm=scale)[1]], settings)
+        assert isinstance(found, BoardCalibration)
+        assert found.board == board
+
+
+def test_known_lens_straightens_the_target():
+    rng, target = np.random.default_rng(2), Target()
+    view = PosedView.at((36.0, 36.0), 6.2, turned_deg=(0, 0, 0.6), lens=lens(-1.0))
+    picture = render_target(target, view, TargetLook(), rng)
+    known = calibrate_board([shot(CHARUCO, -1.0)[1]]).image_calibration.lens
+    settings = PlaneCalibrationSettings(unit_mm=target.unit_mm)
+    with_lens = calibrate_imaging_plane([picture], settings, lens=known)
+    without = calibrate_imaging_plane([picture], settings)
+    assert off_mm(with_lens, view).max() < 0.4 * off_mm(without, view).max()
+
+
+def test_setup_keys_are_those_of_a_setup_file():
+    keys = calibrate_board([shot(CHARUCO, -1.0)[1]]).setup_keys
+    for section, values in keys.items():
+        assert set(values) <= set(SECTIONS[section])
+        assert all(SECTIONS[section][k].accepts(v) for k, v in values.items() if v is not None)
+
+
+def test_square_scales_the_plane():
+    found = calibrate_board([shot(CHARUCO)[1]])
+    larger = found.with_square(8.4)
+    assert larger.px_per_mm[0] == pytest.approx(found.px_per_mm[0] * 8.0 / 8.4)
+    assert larger.distortion_percent == pytest.approx(found.distortion_percent)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "charuco", "charuco:3x9:8", "charuco:9x9:0", "charuco:60x60:8", "chessboard:9x9:8",
+     "charuco:9x9:8:NONE:0", "other:9x8:8", "charuco:9x9:8:4X4_50:40"],
+)  # fmt: skip
+def test_impossible_boards_are_refused(text):
+    with pytest.raises(ValueError, match=r"."):
+        parse_board(text)

@@ -1,0 +1,90 @@
+"""What the residuals of recordings say of the set-up: right ones, and such that are off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.rig import ImagingPlane
+from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.match import Match
+from labapp.core.pipeline import Measurement
+from labapp.core.schemes import fit
+from labapp.core.sequence.residual_check import MOST, ResidualRecord
+from labapp.core.surface.pool_fit import FitSettings
+from labapp.simulation.forward import trace
+from labapp.simulation.pools import Oscillation, egg
+from tests.scenes import BENCH_RIG, BENCH_VIEW
+
+KNOWN = RigUncertainty(AxisPoints(BENCH_VIEW, 69.85, 31.75), *covariance_of({}))
+RIG = replace(BENCH_RIG, uncertainty=KNOWN)
+EXACT = replace(BENCH_RIG, uncertainty=None)
+
+
+def frames(truth, count=8, seed=0, noise_mm=0.02):
+    """Frames of a pool that swings, seen on a bench, and fitted on what it is taken for."""
+    rng = np.random.default_rng(seed)
+    for n in range(count):
+        pool = egg(6.6, 3.0, 4.2, 0.29, (0.0, -0.6), (Oscillation(0.012, 22.0, n / 60.0),))
+        seen = trace(pool, truth)
+        ray = np.argwhere(seen.visible) + 1
+        dots = seen.plane_mm[seen.visible] + rng.normal(0, noise_mm, (len(ray), 2))
+        witness = np.where(seen.visible, 1, np.where(seen.lit | seen.absent, 0, -1))
+        covariance = np.broadcast_to(noise_mm**2 * np.eye(2), (len(ray), 2, 2))
+        index = np.arange(len(ray))
+        match = Match("S/S", index, ray, np.zeros_like(ray), dots, covariance, witness)
+        made = fit.reconstruct(match, EXACT, FitSettings())
+        yield Measurement("ok", "", "fit", match=match, reconstruction=made)
+
+
+def verdict_of(measured):
+    record = ResidualRecord(RIG)
+    for one in measured:
+        record.add(one)
+    return record.verdict()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_right_set_up_is_not_doubted(seed):
+    assert not verdict_of(frames(BENCH_RIG, seed=seed)).is_doubtful
+
+
+def test_rolled_plane_is_doubted_and_named():
+    plane = BENCH_RIG.imaging_plane
+    rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 3.0), plane.width_mm, plane.height_mm)
+    found = verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled)))
+    assert found.is_doubtful
+    roll = next(one for one in found.suspects if "roll" in one.name)
+    assert roll.off == pytest.approx(3.0, abs=0.8)
+
+
+def test_error_that_is_not_off_by_more_than_known_is_not_doubted():
+    plane = BENCH_RIG.imaging_plane
+    rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 0.4), plane.width_mm, plane.height_mm)
+    assert not verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled))).is_doubtful
+
+
+def test_few_frames_say_nothing():
+    found = verdict_of(frames(BENCH_RIG, count=3))
+    assert not found.is_doubtful
+    assert "too few" in found.reason
+
+
+@pytest.mark.parametrize(("lost", "doubtful"), [(19, True), (10, False)])
+def test_frames_that_match_nothing_are_a_doubt(lost, doubtful):
+    none = Measurement("no-match", "", "fit")
+    some = next(iter(frames(BENCH_RIG, count=1)))
+    assert verdict_of([none] * lost + [some] * (20 - lost)).is_doubtful == doubtful
+
+
+def test_dark_frames_are_no_doubt_of_the_set_up():
+    assert not verdict_of([Measurement("no-dots", "", "fit")] * 30).is_doubtful
+
+
+def test_long_recordings_are_thinned_evenly():
+    record, one = ResidualRecord(RIG), next(iter(frames(BENCH_RIG, count=1)))
+    for _ in range(500):
+        record.add(one)
+    assert MOST / 2 <= len(record._samples) <= MOST
