@@ -167,7 +167,9 @@ def fit_pool(
         points, _ = kernels.newton_along_rays(*near, NEWTON_STEPS)
     rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
     witnesses = Witnesses.of(rays, rig.head_sign, witness, basis, missing)
-    level = rounds_with_level(rounds, witnesses, settings.rounds, settings.settled_mm)
+    outer = None if (witnesses.sign < 0).any() else _outer(rays.landing_mm[at][:, :2])
+    until = settings.rounds, settings.settled_mm
+    level = rounds_with_level(rounds, witnesses, *until, outer=outer)
     return fitted_pool(rounds, level, rig, plane_mm)
 
 
@@ -201,6 +203,7 @@ def rounds_with_level(
     near: Level | None = None,
     drop_is_free: bool = True,
     raised_mm: float = 0.0,
+    outer: BoolArray | None = None,
 ) -> Level:
     """Run rounds of the fit, each with the level that the witnesses give; returns the last one.
 
@@ -209,7 +212,7 @@ def rounds_with_level(
     rounds
         The fit, which is advanced.
     witnesses
-        Rays that tell the level. Without a dark one it is guessed.
+        Rays that tell the level.
     most, until_mm
         See `Rounds.run`.
     near
@@ -219,6 +222,9 @@ def rounds_with_level(
         Held, it leaves the level as open as it was before.
     raised_mm
         After a shift of the surface by less the level is not looked for again.
+    outer
+        Which of the n reflection points lie far from their middle, shape (n,): the level is guessed
+        from these, where no witness is dark (`guess_level`).
 
     Raises
     ------
@@ -228,7 +234,6 @@ def rounds_with_level(
     from labapp.core.surface import kernels
 
     basis, level = rounds.equations.basis, near or Level(0.0, np.inf, 1, Rear(), 0.0)
-    outer = None if (witnesses.sign < 0).any() else _outer(rounds)
 
     def shift(count: int) -> float:
         nonlocal level
@@ -255,11 +260,9 @@ def rounds_with_level(
     return level
 
 
-def _outer(rounds: Rounds) -> BoolArray:
-    """Which rays would land farther from the middle than half of them, shape (n,)."""
-    points, rays = rounds.points_mm, rounds.rays
-    landing = (points - points[:, 2:] / rays[:, 2:] * rays)[:, :2]
-    from_middle = np.linalg.norm(landing - landing.mean(axis=0), axis=-1)
+def _outer(places_mm: FloatArray) -> BoolArray:
+    """Which of n places, shape (n, 2), are farther from their middle than half of them."""
+    from_middle = np.linalg.norm(places_mm - places_mm.mean(axis=0), axis=-1)
     return np.asarray(from_middle > median(from_middle))
 
 
