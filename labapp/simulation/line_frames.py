@@ -20,8 +20,8 @@ from labapp.simulation.forward import PoolSurface, trace
 from labapp.simulation.render import Look, Picture, arc_glow, expose, speckle_field
 from labapp.simulation.torch import Torch
 
-RAYS_A_LINE = 241
-FINER = 24
+RAYS_A_LINE = 321
+FINER = 20
 """Light is added up at so many places between two rays that are followed."""
 
 EDGE = 2.0
@@ -175,21 +175,20 @@ def _line_light(
     seen = trace(pool, Rig(rig.laser, dense, rig.electrode, rig.imaging_plane), torch)
     form = len(number), len(nodes), RAYS_A_LINE
     image = view.to_image(seen.plane_mm).reshape(*form, 2)
-    shows: BoolArray = seen.visible.reshape(form)
-    shows &= ~_gaps(image[:, 1], look, view, rng)[:, None]
+    middle, size = image[:, 1], np.array([view.width_px, view.height_px])
+    shows: BoolArray = seen.visible.reshape(form)[:, 1] & ~_gaps(middle, look, view, rng)
     light = np.zeros((view.height_px, view.width_px))
     weights = np.exp(-(ACROSS**2) / 2)
     for n in range(form[0]):
+        left, right = (_filled(image[n, side] - middle[n]) for side in (0, 2))
         for place, weight in zip(ACROSS / EDGE, weights / weights.sum(), strict=True):
             # The parabola through the three rays across the line.
-            shares = place * (place - 1) / 2, 1 - place**2, place * (place + 1) / 2
-            row = sum(share * each for share, each in zip(shares, image[n], strict=True))
-            _add_light(light, np.asarray(row), shows[n, round(place) + 1], bright[n] * weight)
+            off = place * (place - 1) / 2 * left + place * (place + 1) / 2 * right
+            _add_light(light, middle[n] + off, shows[n], bright[n] * weight)
     sigma_px = look.sigma_mm * float(np.sqrt(abs(np.linalg.det(view.px_per_mm))))
     light = gaussian_filter(light, sigma_px)
     points = seen.point_mm.reshape(*form, 3)[:, 1]
-    middle, size = image[:, 1], np.array([view.width_px, view.height_px])
-    visible: BoolArray = shows[:, 1] & ((middle >= 0) & (middle <= size - 1)).all(axis=-1)
+    visible: BoolArray = shows & ((middle >= 0) & (middle <= size - 1)).all(axis=-1)
     lines = tuple(
         TrueLine(int(number[n]), fan[on], middle[n, on], points[n, on])
         for n in range(form[0])
@@ -215,6 +214,15 @@ def _add_light(light: FloatArray, image_px: FloatArray, shows: BoolArray, weight
             kept = (u >= 0) & (u < width) & (v >= 0) & (v < height)
             flat: IntArray = v[kept] * width + u[kept]
             light += weight * np.bincount(flat, part[kept], light.size).reshape(light.shape)
+
+
+def _filled(offsets: FloatArray) -> FloatArray:
+    """Offsets of rays, shape (n, 2), with those of the nearest known ray where they are NaN."""
+    known = np.flatnonzero(np.isfinite(offsets[:, 0]))
+    if not len(known):
+        return np.zeros_like(offsets)
+    nearest = np.argmin(np.abs(np.arange(len(offsets))[:, None] - known), axis=1)
+    return np.asarray(offsets[known[nearest]])
 
 
 def _gaps(
