@@ -84,8 +84,7 @@ class LightLine(ReadOnlyArrays):
     tangent
         Unit vector along it, shape (n, 2).
     sigma_px
-        Standard uncertainty of the ridge across itself, shape (n,), px; that of neighbouring points
-        is common to them over about the scale of the smoothing.
+        Standard uncertainty of the ridge across itself, shape (n,), px.
     curvature
         Of the ridge, 1/px, shape (n,); positive where it turns to the right (clockwise as seen).
     ends_px
@@ -98,6 +97,8 @@ class LightLine(ReadOnlyArrays):
         Its light over its length: integral across it, grey levels·px, the median of its points.
     gap_px
         Length of its longest gap, px.
+    smoothed_px
+        Standard deviation of the weights that it is smoothed by along itself, px.
     """
 
     image_px: FloatArray
@@ -109,6 +110,7 @@ class LightLine(ReadOnlyArrays):
     width_px: float
     light: float
     gap_px: float
+    smoothed_px: float
 
     @property
     def length_px(self) -> float:
@@ -265,6 +267,7 @@ def _line(
         width_px=width,
         light=light,
         gap_px=path.longest_gap,
+        smoothed_px=smooth_px,
     )
 
 

@@ -48,6 +48,28 @@ def _next_point(
     return best
 
 
+@_inner
+def _take_beside(
+    index: IntArray,
+    pixel: IntArray,
+    place: FloatArray,
+    along: FloatArray,
+    free: IntArray,
+    at: int,
+) -> None:
+    """Take the points beside a point of a ridge, and not ahead of it: they are the same ridge."""
+    height, width = index.shape
+    for du in range(-1, 2):
+        for dv in range(-1, 2):
+            u, v = pixel[at, 0] + du, pixel[at, 1] + dv
+            if 0 <= u < width and 0 <= v < height and index[v, u] >= 0:
+                beside = index[v, u]
+                ahead = (place[beside, 0] - place[at, 0]) * along[0]
+                ahead += (place[beside, 1] - place[at, 1]) * along[1]
+                if ahead < 0.5:
+                    free[beside] = 0
+
+
 @_compiled(_index, _i2, _f2, _f2, _i1, _i)
 def link(
     index: IntArray,
@@ -76,7 +98,7 @@ def link(
     tuple
         Points of all chains, one chain after the other, and where each begins, with the end.
     """
-    count, (height, width) = len(order), index.shape
+    count = len(order)
     free = np.ones(count, np.int64)
     points, starts = np.empty(count, np.int64), np.zeros(count + 1, np.int64)
     filled, chains = 0, 0
@@ -96,16 +118,7 @@ def link(
                     break
                 along = tangent[other, 0] * tangent[-1, 0] + tangent[other, 1] * tangent[-1, 1]
                 tangent[-1] = tangent[other] if along > 0 else -tangent[other]
-                # What lies beside the ridge is the same ridge.
-                for du in range(-1, 2):
-                    for dv in range(-1, 2):
-                        u, v = pixel[other, 0] + du, pixel[other, 1] + dv
-                        if 0 <= u < width and 0 <= v < height and index[v, u] >= 0:
-                            beside = index[v, u]
-                            ahead = (place[beside, 0] - place[other, 0]) * tangent[-1, 0]
-                            ahead += (place[beside, 1] - place[other, 1]) * tangent[-1, 1]
-                            if ahead < 0.5:
-                                free[beside] = 0
+                _take_beside(index, pixel, place, tangent[-1], free, other)
                 free[other] = 0
                 side[long] = other
                 long += 1

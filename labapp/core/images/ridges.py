@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -117,7 +118,7 @@ def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
     on = np.abs(offset).max(axis=-1, initial=0.0) <= WITHIN_PX
     pixel = np.ascontiguousarray(np.stack([u, v], axis=-1)[on].astype(np.int64))
     place, across, strength = pixel + offset[on], across[on], strength[on]
-    index = np.full(picture.shape, -1, np.int32)
+    index: Any = np.full(picture.shape, -1, np.int32)
     index[pixel[:, 1], pixel[:, 0]] = np.arange(len(pixel))
     order = np.argsort(-strength, kind="stable")
     seeds = int(np.sum(strength > settings.seed * noise))

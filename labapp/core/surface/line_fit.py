@@ -16,7 +16,7 @@ import scipy
 
 from labapp.core.geometry.line_pattern import LineRig, line_directions
 from labapp.core.geometry.optics import intersect_level
-from labapp.core.surface.line_model import LineData, LineModel
+from labapp.core.surface.line_model import Linearized, LineData, LineModel
 from labapp.core.surface.pool_fit import CORRELATED_MM2
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
@@ -26,9 +26,6 @@ RADII_MM = (6.0, 9.0, 14.0, 24.0, 45.0, 120.0)
 
 QUADRIC_SIGMA_MM = 0.1
 """How far a pool's lines are from those of a quadric, mm on the imaging plane."""
-
-WITHIN_MM = 0.15
-"""How far a pool's boundary is from that of a quadric, mm in height."""
 
 QUADRIC_ROUNDS, SPLINE_ROUNDS = 14, 20
 MARGIN_MM = 0.8
@@ -116,7 +113,7 @@ class LineSurface(ReadOnlyArrays):
     def sigma_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Standard uncertainty of the height at points, each shape (n,), mm."""
         rows = self.surface.basis.matrix(x_mm, y_mm)
-        return np.sqrt(np.maximum(np.vecdot(rows @ self.covariance, rows), 0.0))
+        return np.asarray(np.sqrt(np.maximum(np.vecdot(rows @ self.covariance, rows), 0.0)))
 
     @property
     def curvature_per_mm(self) -> float:
@@ -168,7 +165,6 @@ def fit_lines(
     found = [_best_quadrics(data, numbers, rig, settings) for numbers in numberings]
     tried = sorted((one for some in found for one in some), key=lambda one: one.cost)
     refined = [_refined(one, data, settings) for one in tried[:3]]
-    refined = [one for one in refined if one is not None]
     if not refined:
         raise CannotMeasure("no-surface", "no surface reflects the lines as they are seen")
     refined.sort(key=lambda one: one[1])
@@ -206,7 +202,9 @@ def _quadric_basis(basis: SplineBasis) -> FloatArray:
     x, y = (each.ravel() for each in np.meshgrid(x, y))
     rough = _dense(basis.roughness)
     rows = basis.matrix(x, y)
-    return np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ _monomials(x, y))
+    return np.asarray(
+        np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ _monomials(x, y)), np.float64
+    )
 
 
 def _best_quadrics(
@@ -231,9 +229,7 @@ def _best_quadrics(
     )
     y = ground[:, 1].mean()
     found = []
-    # Numbers that grow upwards in the picture are those of a flat or convex pool.
-    signs = (1, -1)
-    for sign in signs:
+    for sign in (1, -1):
         starts = []
         for radius in RADII_MM:
             height = min(2.8**2 / (2 * radius), 0.6)
@@ -311,8 +307,8 @@ def _dense(band: FloatArray) -> FloatArray:
 
 def _refined(
     start: _Hypothesis, data: LineData, settings: LineFitSettings
-) -> tuple[LineSurface, float] | None:
-    """The smooth surface nearest to a quadric that suits the lines, and its cost; None: none."""
+) -> tuple[LineSurface, float]:
+    """The smooth surface nearest to a quadric that suits the lines, and its cost."""
     points = start.model.residuals(start.coefficients, data).point_mm[:, :2]
     low, high = points.min(axis=0) - MARGIN_MM, points.max(axis=0) + MARGIN_MM
     basis = SplineBasis.over(low, high, settings.knot_mm)
@@ -323,14 +319,15 @@ def _refined(
     place = np.stack([x, y, np.zeros_like(x)], axis=-1)
     height, _ = start.model.surface_at(start.coefficients, place)
     rough = _dense(basis.roughness)
-    first = np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ height)
+    first: FloatArray = np.asarray(
+        np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ height), np.float64
+    )
     best = None
     for jerk in JERKS:
         fitted = _fit_splines(model, first, data, rough / (jerk**2 * CORRELATED_MM2), settings)
-        if fitted is not None and (best is None or fitted[2] < best[2]):
+        if best is None or fitted[2] < best[2]:
             best = fitted
-    if best is None:
-        return None
+    assert best is not None
     coefficients, covariance, cost, linear = best
     chi2 = float(np.sum(_robust(linear.residual)))
     surface = LineSurface(
@@ -345,8 +342,14 @@ def _refined(
     return surface, cost
 
 
-def _fit_splines(model, first, data, stiffness, settings):
-    """Gauss–Newton steps over the coefficients, the covariance and minus twice the evidence."""
+def _fit_splines(
+    model: LineModel,
+    first: FloatArray,
+    data: LineData,
+    stiffness: FloatArray,
+    settings: LineFitSettings,
+) -> tuple[FloatArray, FloatArray, float, Linearized]:
+    """Coefficients, their covariance, −2 log of the evidence, and the equations there."""
     c, damping = first, 1e-3
     linear = model.residuals(c, data)
     cost = float(np.sum(_robust(linear.residual)) + c @ stiffness @ c)

@@ -1,0 +1,148 @@
+"""Line patterns measured on the twin: five lines (§3.2.1), penetration runs (Fig. 3-14), GMAW (§3.3).
+
+    python tests/benchmarks/lines.py five [--pools N] [--seed S] [--pictures FOLDER]
+    python tests/benchmarks/lines.py runs [--frames N] [--seed S]
+    python tests/benchmarks/lines.py gmaw [--frames N] [--seed S]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.line_pattern import LinePattern, LineRig
+from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
+from labapp.core.sequence.line_frame import LineFrame, LineMeasureSettings, measure_lines
+from labapp.simulation.camera import CameraView
+from labapp.simulation.line_frames import LineFrame as TrueFrame
+from labapp.simulation.line_frames import LineLook, render_lines
+from labapp.simulation.pools import Pool, egg
+
+RIG = LineRig(
+    Laser(27.0, 90.0),
+    LinePattern(5, 0.23, 5.0),
+    Electrode(5.0),
+    ImagingPlane.vertical(53.6, 32.0, -5.0, 64.0, 84.0),
+)
+VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)
+CALIBRATION = ImageCalibration.from_three_points(
+    VIEW.origin_px, VIEW.x_axis_px, VIEW.x_axis_mm, VIEW.z_axis_px, VIEW.z_axis_mm
+)
+K95 = 1.96
+
+
+def draw_pool(rng: np.random.Generator, sign: int) -> Pool:
+    """A pool of 5-7 mm, 0.1-0.4 mm high or deep; its head is shorter than its tail."""
+    width, length = rng.uniform(5.0, 7.0, 2)
+    head = length * rng.uniform(0.42, 0.5)
+    center = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)
+    return egg(width, head, length - head, sign * rng.uniform(0.1, 0.4), center)
+
+
+def dense(points: np.ndarray) -> np.ndarray:
+    """A polyline at every hundredth of its steps."""
+    at, steps = np.linspace(0, len(points) - 1, 30 * len(points)), np.arange(len(points))
+    return np.stack([np.interp(at, steps, points[:, k]) for k in (0, 1)], axis=-1)
+
+
+def ridge_errors(found: LineFrame, true: TrueFrame) -> tuple[list[int], np.ndarray]:
+    """The true number of each line found (0: none), and distances across, px."""
+    numbers, errors = [], []
+    lines = {one.number: dense(one.image_px) for one in true.lines}
+    for one in found.seen.lines:
+        near = {n: cKDTree(line).query(one.image_px) for n, line in lines.items()}
+        best = min(near, key=lambda n: np.median(near[n][0]))
+        away, place = near[best]
+        if np.median(away) > 3.0:
+            numbers.append(0)
+            continue
+        numbers.append(best)
+        beside = (place > 0) & (place < len(lines[best]) - 1)
+        errors.append(away[beside])
+    return numbers, np.concatenate(errors) if errors else np.zeros(0)
+
+
+def lines_right(found: LineFrame, true: TrueFrame, numbers: list[int]) -> bool:
+    """Whether each line that shows for a fifth of the longest is found once, in order."""
+    longest = max(len(one.fan) for one in true.lines)
+    wanted = {one.number for one in true.lines if len(one.fan) >= 0.2 * longest}
+    steps = set(np.diff(numbers).tolist())
+    return set(numbers) >= wanted and 0 not in numbers and steps in ({1}, {-1})
+
+
+def draw(image: np.ndarray, found: LineFrame, path: Path) -> None:
+    """Overlay lines and ends on a frame."""
+    big = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(int)
+    big = cv2.cvtColor(np.clip(2 * big - 30, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    colours = [(60, 60, 255), (60, 200, 255), (60, 255, 60), (255, 200, 60), (255, 60, 200)]
+    for k, one in enumerate(found.seen.lines):
+        for u, v in np.rint(2 * one.image_px + 0.5).astype(int).tolist():
+            cv2.circle(big, (u, v), 1, colours[k % 5], -1)
+        for u, v in np.rint(2 * one.ends_px + 0.5).astype(int).tolist():
+            cv2.circle(big, (u, v), 6, (255, 255, 255), 1)
+    cv2.imwrite(str(path), big)
+
+
+def five(pools: int, seed: int, pictures: Path | None) -> None:
+    """Lines, ridge and surface of pools convex and concave in turn."""
+    settings, rows, squares, points, took = LineMeasureSettings(), [], 0.0, 0, 0.0
+    for n in range(pools):
+        rng = np.random.default_rng([seed, n])
+        sign = 1 if n % 2 == 0 else -1
+        pool = draw_pool(rng, sign)
+        true = render_lines(pool, RIG, VIEW, LineLook(gaps=2), rng)
+        begin = time.perf_counter()
+        found = measure_lines(true.image, RIG, CALIBRATION, settings)
+        took += time.perf_counter() - begin
+        numbers, errors = ridge_errors(found, true)
+        right = lines_right(found, true, numbers)
+        rms = float(np.sqrt(np.mean(errors**2))) if len(errors) else np.nan
+        squares, points = squares + float(np.sum(errors**2)), points + len(errors)
+        height = pool.size.height_mm if sign > 0 else pool.size.depth_mm
+        surface = found.surface
+        z, sigma = (surface.height_mm, surface.height_sigma_mm) if surface else (np.nan, np.nan)
+        rows.append((sign, right, rms, found.status == "ok", (z - height) / height, sigma, height))
+        print(
+            f"{n:3d} {height:+.3f} mm, width {pool.size.width_mm:.2f}: {found.status:8s}"
+            f" lines {numbers} {'right' if right else 'WRONG'}, ridge {rms:.2f} px,"
+            f" z {z:+.3f} ± {sigma:.3f} ({100 * (z - height) / height:+.1f} %)"
+            + (f" misfit {surface.misfit:.2f} margin {surface.margin:.0f}" if surface else ""),
+            flush=True,
+        )
+        if pictures:
+            draw(true.image, found, pictures / f"five{n}.png")
+    sign, right, rms, ok, error, sigma, height = map(np.array, zip(*rows, strict=True))
+    print(f"{took / pools:.2f} s a frame; ridge over all points {np.sqrt(squares / points):.3f} px")
+    for name, chosen in (("convex", sign > 0), ("concave", sign < 0), ("all", sign != 0)):
+        said = chosen & ok
+        off = np.abs(error[said])
+        within = off * np.abs(height[said]) <= K95 * sigma[said]
+        print(
+            f"{name:8s} lines right {right[chosen].mean():.1%}, ridge median"
+            f" {np.nanmedian(rms[chosen]):.3f} px, determined {ok[chosen].mean():.1%}:"
+            f" height error median {np.median(off):.1%}, worst {off.max():.1%},"
+            f" within 95 % ± {within.mean():.1%}"
+        )
+
+
+def main() -> None:
+    """Run a part."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("part", choices=["five"])
+    parser.add_argument("--pools", type=int, default=60)
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pictures", type=Path)
+    chosen = parser.parse_args()
+    if chosen.part == "five":
+        five(chosen.pools, chosen.seed, chosen.pictures)
+
+
+if __name__ == "__main__":
+    main()
