@@ -1,8 +1,8 @@
 """Line patterns measured on the twin: five lines (§3.2.1), penetration runs (Fig. 3-14), GMAW (§3.3).
 
-    python tests/benchmarks/lines.py five [--pools N] [--seed S] [--pictures FOLDER]
-    python tests/benchmarks/lines.py runs [--frames N] [--seed S]
-    python tests/benchmarks/lines.py gmaw [--frames N] [--seed S]
+python tests/benchmarks/lines.py five [--pools N] [--seed S] [--pictures FOLDER]
+python tests/benchmarks/lines.py runs [--frames N] [--seed S]
+python tests/benchmarks/lines.py gmaw [--frames N] [--seed S]
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def ridge_errors(found: LineFrame, true: TrueFrame) -> tuple[list[int], np.ndarr
     """The true number of each line found (0: none), and distances across, px."""
     numbers, errors = [], []
     lines = {one.number: dense(one.image_px) for one in true.lines}
-    for one in found.seen.lines:
+    for one in found.seen.lines if lines else ():
         near = {n: cKDTree(line).query(one.image_px) for n, line in lines.items()}
         best = min(near, key=lambda n: np.median(near[n][0]))
         away, place = near[best]
@@ -63,6 +63,8 @@ def ridge_errors(found: LineFrame, true: TrueFrame) -> tuple[list[int], np.ndarr
             numbers.append(0)
             continue
         numbers.append(best)
+        if one.folded:  # its two halves have no ridge of their own
+            continue
         beside = (place > 0) & (place < len(lines[best]) - 1)
         errors.append(away[beside])
     return numbers, np.concatenate(errors) if errors else np.zeros(0)

@@ -22,9 +22,16 @@ END_WIDTHS = 1.5
 """A line's ridge is not followed nearer to its end than so many standard deviations of its smoothed
 light: there, it turns aside."""
 
-END_PX, END_REACH_PX = 20.0, 30.0
+END_PX, END_REACH_PX = 10.0, 30.0
 """A line's light near its end is the median over so much of it; its end is looked for so far ahead
 of where its ridge was followed, px."""
+
+UPRIGHT = 0.35
+"""A line is upright that is narrower than this share of its height."""
+
+DIP, LEAST_FOLDED = 0.6, 6
+"""An upright chain is cut where it falls below this share of what it is on both sides; parts of
+fewer points are left out."""
 
 ALIKE = 2.5
 """Parts of one line are not brighter one than the other by a larger factor."""
@@ -34,6 +41,8 @@ CENTER_ROUNDS = 4
 
 PATH_SMOOTHER = 1.8
 """The path that a line's light is averaged along is smoothed over so many times that length."""
+
+GLOW_ROUNDS = 5
 
 GRAIN_COLUMNS = 3.3
 """So many columns of pixels along a line share a grain of speckle."""
@@ -117,6 +126,11 @@ class LightLine(ReadOnlyArrays):
         """Length along the ridge, px."""
         return float(np.linalg.norm(np.diff(self.image_px, axis=0), axis=-1).sum())
 
+    @property
+    def folded(self) -> bool:
+        """Whether both halves lie on each other: the pool gathers the line (a caustic)."""
+        return is_upright(self.image_px)
+
 
 def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
     """Find all bright lines of a grey frame, shape (height, width), fringes included."""
@@ -130,25 +144,69 @@ def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
     width = float(np.sqrt(max(np.median(ratio) - scale**2, 0.0)))
     scale = float(np.clip(width, settings.least_scale_px, settings.most_scale_px))
     ridges = find_ridges(frame, replace(settings.ridges, scale_px=scale))
-    chains = [_core(ridges, k) for k in _long_chains(ridges, settings)]
+    chains = [
+        part
+        for k in _long_chains(ridges, settings)
+        for part in _parts(ridges, np.arange(ridges.starts[k], ridges.starts[k + 1]))
+    ]
+    chains = [_core(ridges, part) for part in chains]
     joined = _join(ridges, chains, settings)
     picture = np.ascontiguousarray(frame, np.float32)
+    picture = picture - glow(picture)
     lines = (_line(picture, ridges, one, scale, settings) for one in joined)
     return tuple(one for one in lines if one is not None)
+
+
+def glow(picture: Grey) -> Grey:
+    """Smooth light under a picture's lines: a cubic in u and v that few of its pixels lie below.
+
+    Its slope would draw the middle of a line's light to the brighter side.
+    """
+    height, width = picture.shape
+    small = cv2.resize(picture, (max(width // 8, 8), max(height // 8, 8)), 0, 0, 0, cv2.INTER_AREA)
+    v, u = np.mgrid[-1 : 1 : small.shape[0] * 1j, -1 : 1 : small.shape[1] * 1j]  # type: ignore[misc]
+    terms = np.stack(
+        [u.ravel() ** i * v.ravel() ** j for i in range(4) for j in range(4 - i)], axis=-1
+    )
+    light, weights = small.ravel().astype(float), np.ones(small.size)
+    for _ in range(GLOW_ROUNDS):
+        fitted = np.linalg.lstsq(terms * weights[:, None], light * weights, rcond=None)[0]
+        off = light - terms @ fitted
+        limit = 3.0 * 1.4826 * float(np.median(np.abs(off))) + 1e-6
+        weights = (off < limit).astype(float)
+    smooth = (terms @ fitted).reshape(small.shape).astype(np.float32)
+    return np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def _long_chains(ridges: Ridges, settings: LineSettings) -> IntArray:
     return np.flatnonzero(np.diff(ridges.starts) >= settings.least_px)
 
 
-def _core(ridges: Ridges, chain: int) -> IntArray:
+def _parts(ridges: Ridges, points: IntArray) -> list[IntArray]:
+    """A chain in parts where it is upright and dips: folded lines, one above the other."""
+    if not is_upright(ridges.image_px[points]):
+        return [points]
+    height = ridges.height[points]
+    before, after = np.maximum.accumulate(height), np.maximum.accumulate(height[::-1])[::-1]
+    dark = height < DIP * np.minimum(before, after)
+    edges = np.flatnonzero(np.diff(np.pad(dark, 1).astype(int)))
+    cuts = [int(a + np.argmin(height[a:b])) for a, b in edges.reshape(-1, 2).tolist()]
+    return [part for part in np.split(points, cuts) if len(part) >= LEAST_FOLDED]
+
+
+def _core(ridges: Ridges, points: IntArray) -> IntArray:
     """Points of a chain without its ends, where the ridge is weak and turns aside."""
-    points = np.arange(ridges.starts[chain], ridges.starts[chain + 1])
     strength = ridges.strength[points]
     bright = np.flatnonzero(strength > np.median(strength) / 2)
     points = points[bright[0] : bright[-1] + 1]
     trim = min(round(END_WIDTHS * _spread(ridges, points)), len(points) // 6)
     return points[trim : len(points) - trim]
+
+
+def is_upright(place: FloatArray) -> bool:
+    """Whether a line of places, shape (n, 2), goes up rather than across."""
+    across, up = np.ptp(place, axis=0)
+    return bool(across < UPRIGHT * up)
 
 
 def _spread(ridges: Ridges, points: IntArray) -> float:
@@ -176,6 +234,9 @@ def _join(ridges: Ridges, chains: list[IntArray], settings: LineSettings) -> lis
     fits &= np.abs(np.log(bright[:, None] / bright)) < np.log(ALIKE)
     trimmed = np.repeat([END_WIDTHS * _spread(ridges, chain) for chain in chains], 2)
     fits &= length <= settings.gap_px + trimmed[:, None] + trimmed
+    # Upright chains one above the other are lines that the pool has folded together (a caustic).
+    folded = np.repeat([is_upright(ridges.image_px[chain]) for chain in chains], 2)
+    fits &= ~(folded[:, None] & folded)
     one, other = np.nonzero(np.triu(fits, 1))
     cost = length[one, other] * (3.0 - ahead[one, other] - behind[one, other])
     partner: dict[int, int] = {}
@@ -233,11 +294,11 @@ def _line(
     """A line of ridge points in order; None where too little is left of it."""
     place, strength = ridges.image_px[points], ridges.strength[points]
     spread2 = _spread(ridges, points) ** 2
-    if len(points) < settings.least_px:
+    least = LEAST_FOLDED / 2 if is_upright(place) else settings.least_px
+    if len(points) < least:
         return None
-    upright = np.ptp(place[:, 0]) < np.ptp(place[:, 1]) / 4
     first, last = place[0], place[-1]
-    if first[1] > last[1] if upright else first[0] > last[0]:
+    if first[1] > last[1] if is_upright(place) else first[0] > last[0]:
         points, place = points[::-1], place[::-1]
     width = float(np.sqrt(max(spread2 - scale**2, (0.75 * scale) ** 2)))
     smooth_px = min(max(settings.smooth_widths * width, settings.smooth_px), len(place) / 8)

@@ -15,6 +15,8 @@ from labapp.core.surface.line_data import line_data
 from labapp.core.surface.line_fit import LineFitSettings, LineSurface, fit_lines
 from labapp.core.values import CannotMeasure, FloatArray
 
+FOLDED = "the pool gathers the lines to points: they show how many they are, and no shape"
+
 
 @dataclass(frozen=True)
 class LineMeasureSettings:
@@ -66,7 +68,7 @@ class LineFrame:
     ----------
     status
         ``ok``; ``profile`` where the lines leave a direction of the surface open; ``no-lines``,
-        ``too-few-lines``, ``no-surface``.
+        ``folded-lines``, ``too-few-lines``, ``no-surface``.
     reason
         One sentence where there is no surface; empty otherwise.
     seen, features
@@ -90,9 +92,13 @@ def measure_lines(
     features = line_features(seen.lines, calibration)
     if not seen.lines:
         return LineFrame("no-lines", "no line stands out of the noise", seen, features, None)
-    data = line_data(seen.lines, calibration)
+    open_lines = [k for k, one in enumerate(seen.lines) if not one.folded]
+    if len(open_lines) < len(seen.lines) / 2:
+        return LineFrame("folded-lines", FOLDED, seen, features, None)
+    data = line_data(tuple(seen.lines[k] for k in open_lines), calibration)
+    numberings = [each[open_lines] for each in _numberings(seen, rig.pattern.count)]
     try:
-        surface = fit_lines(data, _numberings(seen, rig.pattern.count), rig, settings.fit)
+        surface = fit_lines(data, numberings, rig, settings.fit)
     except CannotMeasure as problem:
         return LineFrame(problem.status, problem.reason, seen, features, None)
     open_ = "" if surface.status == "ok" else "the lines leave a direction of the surface open"

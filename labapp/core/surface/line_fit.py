@@ -30,8 +30,9 @@ QUADRIC_SIGMA_MM = 0.1
 QUADRIC_ROUNDS, SPLINE_ROUNDS = 14, 20
 MARGIN_MM = 0.8
 
-JERKS = (0.005, 0.015, 0.05)
-"""Third derivatives of the surface that may be expected, mm⁻²; the evidence weighs them."""
+JERKS = (0.02, 0.05)
+"""Third derivatives of the surface that may be expected, mm⁻²; the evidence chooses. Smaller ones
+suit lines just as well and draw the height of hollow pools away by 3 %, more than their ±."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class LineFitSettings:
     settled: float = 0.05
     margin: float = 6.0
     most_relative_sigma: float = 0.12
-    most_misfit: float = 4.0
+    most_misfit: float = 1.2
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class LineSurface(ReadOnlyArrays):
         x, y = (np.linspace(*ends, 81) for ends in zip(low, high, strict=True))
         x, y = (each.ravel() for each in np.meshgrid(x, y))
         z = self.surface.height(x, y)
-        best = int(np.argmax(np.abs(z)))
+        best = int(np.argmax(np.nan_to_num(np.abs(z))))
         return np.array([x[best], y[best], z[best]])
 
     @property
