@@ -64,7 +64,7 @@ class LineLook:
     gaps
         Number of gaps in the lines: oxides on the pool hide the light (§3.2.2).
     gap_mm
-        Largest width of a gap along the plane, mm.
+        Largest width of what hides it, on the pool, mm.
     """
 
     light: Look = field(default_factory=Look)
@@ -73,7 +73,7 @@ class LineLook:
     beam_fraction: float = 0.045
     fringes: tuple[float, ...] = (0.18, 0.08)
     gaps: int = 0
-    gap_mm: float = 1.5
+    gap_mm: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -175,8 +175,9 @@ def _line_light(
     seen = trace(pool, Rig(rig.laser, dense, rig.electrode, rig.imaging_plane), torch)
     form = len(number), len(nodes), RAYS_A_LINE
     image = view.to_image(seen.plane_mm).reshape(*form, 2)
+    points = seen.point_mm.reshape(*form, 3)[:, 1]
     middle, size = image[:, 1], np.array([view.width_px, view.height_px])
-    shows: BoolArray = seen.visible.reshape(form)[:, 1] & ~_gaps(middle, look, view, rng)
+    shows: BoolArray = seen.visible.reshape(form)[:, 1] & ~_gaps(points, look, rng)
     light = np.zeros((view.height_px, view.width_px))
     weights = np.exp(-(ACROSS**2) / 2)
     for n in range(form[0]):
@@ -187,7 +188,6 @@ def _line_light(
             _add_light(light, middle[n] + off, shows[n], bright[n] * weight)
     sigma_px = look.sigma_mm * float(np.sqrt(abs(np.linalg.det(view.px_per_mm))))
     light = gaussian_filter(light, sigma_px)
-    points = seen.point_mm.reshape(*form, 3)[:, 1]
     visible: BoolArray = shows & ((middle >= 0) & (middle <= size - 1)).all(axis=-1)
     lines = tuple(
         TrueLine(int(number[n]), fan[on], middle[n, on], points[n, on])
@@ -225,16 +225,13 @@ def _filled(offsets: FloatArray) -> FloatArray:
     return np.asarray(offsets[known[nearest]])
 
 
-def _gaps(
-    image_px: FloatArray, look: LineLook, view: CameraView, rng: np.random.Generator
-) -> BoolArray:
+def _gaps(point_mm: FloatArray, look: LineLook, rng: np.random.Generator) -> BoolArray:
     """Rays of each line, shape (lines, rays), that something on the pool hides."""
-    hidden: BoolArray = np.zeros(image_px.shape[:2], bool)
-    scale = float(np.sqrt(abs(np.linalg.det(view.px_per_mm))))
+    hidden: BoolArray = np.zeros(point_mm.shape[:2], bool)
     for _ in range(look.gaps):
         line, ray = rng.integers(0, hidden.shape[0]), rng.integers(0, hidden.shape[1])
-        half = rng.uniform(0.3, 1.0) * look.gap_mm * scale / 2
-        hidden[line] |= np.linalg.norm(image_px[line] - image_px[line, ray], axis=-1) < half
+        away = np.linalg.norm(point_mm[line] - point_mm[line, ray], axis=-1)
+        hidden[line] |= away < rng.uniform(0.3, 1.0) * look.gap_mm / 2
     return hidden
 
 

@@ -15,7 +15,7 @@ from labapp.core.images.dots import Grey, Image
 from labapp.core.images.ridges import Ridges, RidgeSettings, find_ridges
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
-TANGENT_POINTS = 12
+TANGENT_POINTS = 20
 """The direction in which a chain ends is that of so many of its points."""
 
 END_WIDTHS = 1.5
@@ -32,6 +32,13 @@ UPRIGHT = 0.35
 DIP, LEAST_FOLDED = 0.6, 6
 """An upright chain is cut where it falls below this share of what it is on both sides; parts of
 fewer points are left out."""
+
+WHISKER_PX, WHISKER_OFF = 16, 3.0
+"""A chain of fewer points that is no farther than so many times the ridges' scale from a stronger
+one is part of that one's side."""
+
+SHORT_PX = 25
+"""Chains of fewer points are not joined when one is more above than beside the other."""
 
 ALIKE = 2.5
 """Parts of one line are not brighter one than the other by a larger factor."""
@@ -74,9 +81,9 @@ class LineSettings:
     ridges: RidgeSettings = field(default_factory=RidgeSettings)
     least_scale_px: float = 1.6
     most_scale_px: float = 4.0
-    least_px: float = 10.0
+    least_px: float = 7.0
     gap_px: float = 14.0
-    turn_deg: float = 35.0
+    turn_deg: float = 45.0
     smooth_px: float = 6.0
     smooth_widths: float = 3.0
     edge_px: float = 6.0
@@ -149,7 +156,7 @@ def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
         for k in _long_chains(ridges, settings)
         for part in _parts(ridges, np.arange(ridges.starts[k], ridges.starts[k + 1]))
     ]
-    chains = [_core(ridges, part) for part in chains]
+    chains = _without_whiskers(ridges, [_core(ridges, part) for part in chains], scale)
     joined = _join(ridges, chains, settings)
     picture = np.ascontiguousarray(frame, np.float32)
     picture = picture - glow(picture)
@@ -163,8 +170,9 @@ def glow(picture: Grey) -> Grey:
     Its slope would draw the middle of a line's light to the brighter side.
     """
     height, width = picture.shape
-    small = cv2.resize(picture, (max(width // 8, 8), max(height // 8, 8)), 0, 0, 0, cv2.INTER_AREA)
-    v, u = np.mgrid[-1 : 1 : small.shape[0] * 1j, -1 : 1 : small.shape[1] * 1j]  # type: ignore[misc]
+    size = max(width // 8, 8), max(height // 8, 8)
+    small = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+    u, v = np.meshgrid(*(np.linspace(-1, 1, count) for count in size))
     terms = np.stack(
         [u.ravel() ** i * v.ravel() ** j for i in range(4) for j in range(4 - i)], axis=-1
     )
@@ -192,6 +200,21 @@ def _parts(ridges: Ridges, points: IntArray) -> list[IntArray]:
     edges = np.flatnonzero(np.diff(np.pad(dark, 1).astype(int)))
     cuts = [int(a + np.argmin(height[a:b])) for a, b in edges.reshape(-1, 2).tolist()]
     return [part for part in np.split(points, cuts) if len(part) >= LEAST_FOLDED]
+
+
+def _without_whiskers(ridges: Ridges, chains: list[IntArray], scale: float) -> list[IntArray]:
+    """Chains without the short ones that stand off a stronger one's side."""
+    bright = [float(ridges.strength[chain].sum()) for chain in chains]
+    kept: list[IntArray] = []
+    for k in np.argsort(bright)[::-1]:
+        chain = chains[k]
+        if kept and len(chain) < WHISKER_PX:
+            others = ridges.image_px[np.concatenate(kept)]
+            away = np.linalg.norm(ridges.image_px[chain][:, None] - others, axis=-1).min(axis=1)
+            if np.median(away) < WHISKER_OFF * scale:
+                continue
+        kept.append(chain)
+    return kept
 
 
 def _core(ridges: Ridges, points: IntArray) -> IntArray:
@@ -236,7 +259,9 @@ def _join(ridges: Ridges, chains: list[IntArray], settings: LineSettings) -> lis
     fits &= length <= settings.gap_px + trimmed[:, None] + trimmed
     # Upright chains one above the other are lines that the pool has folded together (a caustic).
     folded = np.repeat([is_upright(ridges.image_px[chain]) for chain in chains], 2)
-    fits &= ~(folded[:, None] & folded)
+    short = np.repeat([len(chain) < SHORT_PX for chain in chains], 2)
+    steep = np.abs(step[..., 0]) < np.abs(step[..., 1])
+    fits &= ~(folded[:, None] & folded | steep & short[:, None] & short)
     one, other = np.nonzero(np.triu(fits, 1))
     cost = length[one, other] * (3.0 - ahead[one, other] - behind[one, other])
     partner: dict[int, int] = {}

@@ -14,7 +14,7 @@ import numpy as np
 from labapp.core.images.light_lines import LightLine
 from labapp.core.values import FloatArray
 
-FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.35
+FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.4
 """A fringe is fainter than this share of its neighbour further in: per length, and in all."""
 
 FAINTEST_TOTAL = 0.02
@@ -68,19 +68,17 @@ def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
     total = np.array([one.light * one.length_px for one in ordered])
     light = np.array([one.light for one in ordered])
     brightest = int(np.argmax(total))
-    first = _outermost(light[brightest::-1], total[brightest::-1])
-    last = _outermost(light[brightest:], total[brightest:])
-    first, last = brightest - first, brightest + last
-    if last - first + 1 > count:
-        runs = np.convolve(total[first : last + 1], np.ones(count), "valid")
-        first += int(np.argmax(runs))
-        last = first + count - 1
+    real = _pattern_lines(light, total, brightest)
     heights = _heights(ordered)
+    if len(real) > count:
+        runs = np.convolve(total[real], np.ones(count), "valid")
+        start = int(np.argmax(runs))
+        real = real[start : start + count]
     return LinesSeen(
-        tuple(ordered[first : last + 1]),
-        _is_fringe(heights, first, -1),
-        _is_fringe(heights, last, 1),
-        len(lines) - (last - first + 1),
+        tuple(ordered[k] for k in real),
+        _is_fringe(heights, real, -1),
+        _is_fringe(heights, real, 1),
+        len(lines) - len(real),
     )
 
 
@@ -95,20 +93,26 @@ def _from_below(lines: list[LightLine]) -> list[LightLine]:
     return [lines[k] for k in np.argsort(_heights(lines))]
 
 
-def _outermost(light: FloatArray, total: FloatArray) -> int:
-    """How far out from the brightest line, entry 0, the pattern's lines go on."""
-    for k in range(1, len(light)):
-        if light[k] < FRINGE_LIGHT * light[k - 1] and total[k] < FRINGE_TOTAL * total[k - 1]:
-            return k - 1
-    return len(light) - 1
+def _pattern_lines(light: FloatArray, total: FloatArray, brightest: int) -> list[int]:
+    """Which lines are as bright as the next of the pattern's nearer to the brightest one."""
+    real = [brightest]
+    for way in (range(brightest - 1, -1, -1), range(brightest + 1, len(light))):
+        inner = brightest
+        for k in way:
+            alike = light[k] > FRINGE_LIGHT * light[inner]
+            if alike or total[k] > FRINGE_TOTAL * total[inner]:
+                real.append(k)
+                inner = k
+    return sorted(real)
 
 
-def _is_fringe(heights: FloatArray, outer: int, step: int) -> bool:
+def _is_fringe(heights: FloatArray, real: list[int], side: int) -> bool:
     """Whether what is beside the outermost line has a fringe's distance from it."""
-    beside, inner = outer + step, outer - step
+    outer, inner = (real[0], real[1:2]) if side < 0 else (real[-1], real[-2:-1])
+    beside = outer + side
     if not 0 <= beside < len(heights):
         return False
-    if not 0 <= inner < len(heights):
+    if not inner:
         return True
-    spacing = abs(heights[outer] - heights[inner])
+    spacing = abs(heights[outer] - heights[inner[0]])
     return bool(NEAREST * spacing < abs(heights[beside] - heights[outer]) < FARTHEST * spacing)

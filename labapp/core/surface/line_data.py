@@ -29,12 +29,12 @@ def line_data(lines: tuple[LightLine, ...], calibration: ImageCalibration) -> Li
     points = [_points(one, calibration) for one in lines]
     ends = [_ends(one, calibration) for one in lines]
     place, normal, sigma = (np.concatenate(column) for column in zip(*points, strict=True))
-    end, tangent, end_sigma = (np.concatenate(column) for column in zip(*ends, strict=True))
+    end, end_sigma = (np.concatenate(column) for column in zip(*ends, strict=True))
     line, end_line = (
         np.concatenate([np.full(len(each[0]), k) for k, each in enumerate(some)])
         for some in (points, ends)
     )
-    return LineData(line, place, normal, sigma, end_line, end, tangent, end_sigma)
+    return LineData(line, place, normal, sigma, end_line, end, end_sigma)
 
 
 def _points(
@@ -51,13 +51,12 @@ def _points(
     return place, np.stack([-along[:, 1], along[:, 0]], axis=-1), sigma
 
 
-def _ends(
-    line: LightLine, calibration: ImageCalibration
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places, tangents and uncertainties of the ends that are the line's own."""
+def _ends(line: LightLine, calibration: ImageCalibration) -> tuple[FloatArray, FloatArray]:
+    """Places and uncertainties of the ends that are the line's own."""
     own = ~line.cut
-    place, along, scale = _on_plane(line.ends_px[own], line.tangent[[0, -1]][own], calibration)
-    return place, along, END_SIGMA_PX * scale
+    across = np.stack([-line.tangent[:, 1], line.tangent[:, 0]], axis=-1)[[0, -1]][own]
+    place, _, scale = _on_plane(line.ends_px[own], across, calibration)
+    return place, END_SIGMA_PX * scale
 
 
 def _on_plane(

@@ -13,11 +13,14 @@ import numpy as np
 from labapp.core.geometry.line_pattern import LineRig, line_directions
 from labapp.core.geometry.optics import intersect_imaging_plane, reflect, surface_normal
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 NEWTON_STEPS = 6
-STEP_MM = 1e-5
-"""Of the differences that derivatives are taken from."""
+STEP_MM, FAN_STEP = 1e-5, 1e-5
+"""Of the differences that derivatives are taken from, mm and rad."""
+
+END_HEIGHT_MM = 0.004
+"""How well the boundary is at z = 0, mm."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ class LineData(ReadOnlyArrays):
         Standard uncertainty across the line, shape (n,), mm.
     end_line
         Which line each end is of, shape (m,).
-    end_mm, end_tangent
-        Places of the ends, and unit vectors along the line there, shape (m, 2).
+    end_mm
+        Places of the ends, shape (m, 2).
     end_sigma_mm
         Standard uncertainty along the line, shape (m,), mm.
     """
@@ -46,7 +49,6 @@ class LineData(ReadOnlyArrays):
     sigma_mm: FloatArray
     end_line: IntArray
     end_mm: FloatArray
-    end_tangent: FloatArray
     end_sigma_mm: FloatArray
 
 
@@ -127,9 +129,18 @@ class LineModel:
         curves = self.curves(coefficients)
         line = np.concatenate([data.line, data.end_line])
         place = np.concatenate([data.plane_mm, data.end_mm])
+        number = self.numbers[line]
         fan = nearest_on_curves(curves, line, place)
-        point, direction, slope = self._meet(coefficients, self.numbers[line], fan)
+        rate, _ = self._rates(coefficients, number, fan)
+        point, direction, slope = self._meet(coefficients, number, fan)
         plane = self._land(point, direction, slope)
+        # The polyline's nearest place to the curve's: one step of Newton's.
+        ahead = np.vecdot(rate, place - plane) / np.maximum(np.vecdot(rate, rate), 1e-6)
+        step = curves.fan[1] - curves.fan[0]
+        fan = np.clip(fan + np.clip(ahead, -step, step), curves.fan[0], curves.fan[-1])
+        point, direction, slope = self._meet(coefficients, number, fan)
+        plane = self._land(point, direction, slope)
+        rate, rise = self._rates(coefficients, number, fan)
         by_height, by_slope = self._derivatives(coefficients, point, direction, slope)
         cells = self.basis.cells(point[:, 0], point[:, 1])
         value, slope_x, slope_y = cells.value_and_slopes()
@@ -138,52 +149,34 @@ class LineModel:
         change += by_slope[:, :, :1] * slope_x[:, None] + by_slope[:, :, 1:] * slope_y[:, None]
         count = len(data.line)
         off = place - plane
+        # Across the predicted curve: along it, the place is open and moves with the surface.
+        across = np.stack([-rate[:count, 1], rate[:count, 0]], axis=-1)
+        across *= np.sign(np.vecdot(across, data.normal))[:, None]
+        across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
         residual, local = np.empty(len(line)), np.empty(value.shape)
-        residual[:count] = np.vecdot(data.normal, off[:count]) / data.sigma_mm
-        local[:count] = (data.normal[:, :, None] * change[:count]).sum(axis=1)
-        local[:count] /= data.sigma_mm[:, None]
+        residual[:count] = np.vecdot(across, off[:count]) / data.sigma_mm
+        local[:count] = (across[:, :, None] * change[:count]).sum(axis=1) / data.sigma_mm[:, None]
+        # A higher surface meets the ray earlier: the meeting point rises by less, or more.
+        descent = np.minimum(direction[:, 2] - np.vecdot(slope, direction[:, :2]), -0.05)
+        rises = (direction[:, 2] / descent)[:, None] * value
         ends = slice(count, None)
-        residual[ends], local[ends] = self._end_equations(
-            *(coefficients, data, curves, point[ends], fan[ends], off[ends]),
-            *(value[ends], change[ends]),
+        residual[ends], local[ends] = _end_equations(
+            *(data, np.abs(fan[ends]) >= curves.fan[-1] - 1e-6, point[ends, 2], off[ends]),
+            *(rate[ends], rise[ends], rises[ends], change[ends]),
         )
         jacobian = np.zeros((len(line), self.basis.count))
         np.put_along_axis(jacobian, cells.splines, local, axis=1)
         return Linearized(np.nan_to_num(residual, nan=1e3), jacobian, point, fan)
 
-    def _end_equations(
-        self,
-        coefficients: FloatArray,
-        data: LineData,
-        curves: Curves,
-        point: FloatArray,
-        fan: FloatArray,
-        off: FloatArray,
-        value: FloatArray,
-        change: FloatArray,
+    def _rates(
+        self, coefficients: FloatArray, number: FloatArray, fan: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """An end of the light is the boundary, z = 0, unless the fan itself ends there."""
-        step = 1e-4
-        lines = self.numbers[data.end_line]
-        sides = [self._meet(coefficients, lines, fan + sign * step) for sign in (-1, 1)]
-        ahead, behind = (self._land(*side) for side in sides)
-        along = np.vecdot(data.end_tangent, behind - ahead) / (2 * step)  # mm/rad
-        along = np.where(np.abs(along) < 1.0, np.copysign(1.0, along), along)
-        rise = (sides[1][0][:, 2] - sides[0][0][:, 2]) / (2 * step)
-        by_place = rise / along  # change of z at the end for a change of its place along the line
-        sigma = np.hypot(by_place * data.end_sigma_mm, END_HEIGHT_MM)
-        moved = (data.end_tangent[:, :, None] * change).sum(axis=1)
-        height = np.vecdot(value, coefficients[self.basis.cells(*point.T[:2]).splines])
-        # A higher surface meets the ray earlier: the meeting point rises by less, or more.
-        _, direction, slope = self._meet(coefficients, lines, fan)
-        descent = np.minimum(direction[:, 2] - np.vecdot(slope, direction[:, :2]), -0.05)
-        rises = (direction[:, 2] / descent)[:, None] * value
-        residual, local = -height / sigma, (rises - by_place[:, None] * moved) / sigma[:, None]
-        at_fan = np.abs(fan) >= curves.fan[-1] - 1e-6
-        out = np.vecdot(data.end_tangent, off) / data.end_sigma_mm
-        residual = np.where(at_fan, out, residual)
-        local = np.where(at_fan[:, None], moved / data.end_sigma_mm[:, None], local)
-        return residual, local
+        """Change of the place on the plane, (n, 2), and of z, (n,), along the fan, mm/rad."""
+        before, after = (
+            self._meet(coefficients, number, fan + sign * FAN_STEP) for sign in (-1.0, 1.0)
+        )
+        rate = (self._land(*after) - self._land(*before)) / (2 * FAN_STEP)
+        return np.nan_to_num(rate), (after[0][:, 2] - before[0][:, 2]) / (2 * FAN_STEP)
 
     def _meet(
         self, coefficients: FloatArray, number: FloatArray, fan: FloatArray
@@ -234,8 +227,27 @@ class LineModel:
         return by_height, by_slope
 
 
-END_HEIGHT_MM = 0.004
-"""How well the boundary is at z = 0, mm."""
+def _end_equations(
+    data: LineData,
+    at_fan: BoolArray,
+    height: FloatArray,
+    off: FloatArray,
+    rate: FloatArray,
+    rise: FloatArray,
+    rises: FloatArray,
+    change: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """An end of the light is the boundary, z = 0, unless the fan itself ends there."""
+    length = np.maximum(np.linalg.norm(rate, axis=-1), 1.0)
+    along = rate / length[:, None]
+    by_place = rise / length  # change of z at the end for a change of its place along the line
+    sigma = np.hypot(by_place * data.end_sigma_mm, END_HEIGHT_MM)
+    moved = (along[:, :, None] * change).sum(axis=1)
+    residual, local = -height / sigma, (rises - by_place[:, None] * moved) / sigma[:, None]
+    out = np.vecdot(along, off) / data.end_sigma_mm
+    residual = np.where(at_fan, out, residual)
+    local = np.where(at_fan[:, None], moved / data.end_sigma_mm[:, None], local)
+    return residual, local
 
 
 def nearest_on_curves(curves: Curves, line: IntArray, place_mm: FloatArray) -> FloatArray:
