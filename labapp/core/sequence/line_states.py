@@ -80,7 +80,7 @@ class LineSeries(ReadOnlyArrays):
         width, curvature = np.full(len(frames), np.nan), np.full(len(frames), np.nan)
         for k, one in enumerate(frames):
             if one.surface is not None and one.surface.margin >= SURE_MARGIN:
-                width[k] = np.ptp(one.surface.point_mm[:, 0])
+                width[k] = one.surface.width_mm
                 curvature[k] = one.surface.curvature_per_mm
         return cls(count, width, curvature)
 

@@ -22,7 +22,7 @@ from labapp.core.values import BoolArray, FloatArray
 OVERSAMPLE = 8
 """Frequencies tried in the inverse of a recording's length."""
 
-RECENT, BLINDED, BLINDED_LEVELS = 40, 2.5, 6.0
+RECENT, BLINDED, BLINDED_LEVELS = 40, 4.0, 6.0
 """A frame that is so many times as bright as the darkest of the last ones is blinded."""
 
 
@@ -50,7 +50,7 @@ class TrackSettings:
     column_px: float = 3.0
     width_px: float = 2.2
     least_share: float = 0.5
-    least_contrast: float = 3.0
+    least_contrast: float = 1.5
     lines: LineSettings = field(default_factory=LineSettings)
 
 

@@ -117,6 +117,11 @@ class LineSurface(ReadOnlyArrays):
         return np.asarray(np.sqrt(np.maximum(np.vecdot(rows @ self.covariance, rows), 0.0)))
 
     @property
+    def width_mm(self) -> float:
+        """Width of the pool along X, between the ends of the lines, mm."""
+        return float(np.ptp(self.point_mm[:, 0]))
+
+    @property
     def curvature_per_mm(self) -> float:
         """Mean curvature of the quadric nearest to the surface, 1/mm; positive when convex."""
         x, y = self.point_mm[:, 0], self.point_mm[:, 1]
