@@ -15,7 +15,7 @@ from labapp.core.geometry.optics import intersect_imaging_plane, reflect, surfac
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
-NEWTON_STEPS = 6
+NEWTON_STEPS = 4
 STEP_MM, FAN_STEP = 1e-5, 1e-5
 """Of the differences that derivatives are taken from, mm and rad."""
 
