@@ -20,6 +20,9 @@ FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.4
 FAINTEST_TOTAL = 0.02
 """What has less light in all than this share of the brightest line is no line."""
 
+LEG_PX = 30.0
+"""Longest leg of a line that is nearly folded, px."""
+
 NEAREST, FARTHEST = 0.3, 2.5
 """A fringe is so many times as far from the line beside it as that from the next one."""
 
@@ -63,7 +66,11 @@ def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
     if not lines:
         return LinesSeen((), False, False, 0)
     total = np.array([one.light * one.length_px for one in lines])
-    kept = [lines[k] for k in np.flatnonzero(total > FAINTEST_TOTAL * total.max())]
+    bright = [lines[k] for k in np.argsort(total)[::-1] if total[k] > FAINTEST_TOTAL * total.max()]
+    kept: list[LightLine] = []
+    for one in bright:
+        if not any(_are_legs(one, other) for other in kept):
+            kept.append(one)
     ordered = _from_below(kept)
     total = np.array([one.light * one.length_px for one in ordered])
     light = np.array([one.light for one in ordered])
@@ -80,6 +87,17 @@ def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
         _is_fringe(heights, real, 1),
         len(lines) - len(real),
     )
+
+
+def _are_legs(one: LightLine, other: LightLine) -> bool:
+    """Whether two short lines are at one height: both legs of a line that is nearly folded."""
+    if max(one.length_px, other.length_px) > LEG_PX:
+        return False
+    (low, high), (bottom, top) = (
+        (float(v.min()), float(v.max())) for v in (one.image_px[:, 1], other.image_px[:, 1])
+    )
+    shared = min(high, top) - max(low, bottom)
+    return shared > min(high - low, top - bottom) / 2
 
 
 def _heights(lines: list[LightLine]) -> FloatArray:
