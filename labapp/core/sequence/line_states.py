@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import label
 
 from labapp.core.sequence.line_frame import LineFrame
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
@@ -26,6 +27,9 @@ State = Literal["no-pool", "growing", "concave", "flattening", "convex"]
 
 SURE_MARGIN = 6.0
 """A frame's curvature counts where the other sign costs so much more (`LineSurface.margin`)."""
+
+BETWEEN = 6
+"""A change is not interrupted for fewer frames."""
 
 TUKEY = 3.0
 """Values farther than so many standard deviations from the local line have little weight."""
@@ -40,8 +44,8 @@ class StateSettings:
     window
         Standard deviation of the weights of the local fit over time, frames.
     share
-        A state of change lasts while the rate of change is above this share of its largest: half,
-        as a local fit to a corner has half the rate beyond it.
+        A state of change lasts while the rate of change is above this share of its largest: about
+        half, as a local fit to a corner has half the rate beyond it.
     sigmas
         And above so many standard uncertainties.
     least_growth_mm, least_change_per_mm
@@ -49,7 +53,7 @@ class StateSettings:
     """
 
     window: float = 5.0
-    share: float = 0.5
+    share: float = 0.55
     sigmas: float = 4.0
     least_growth_mm: float = 0.1
     least_change_per_mm: float = 0.006
@@ -157,7 +161,8 @@ def local_line(
         typical = np.sqrt(np.sum(base * np.minimum(off, noise[:, None]) ** 2, axis=1) / (s0 + 1e-9))
         noise = TUKEY * np.minimum(typical, noise) + 1e-9
         weights = base * np.maximum(1 - (off / (2 * noise[:, None])) ** 2, 0.0) ** 2 + 1e-9 * base
-    sigma = noise / TUKEY * np.sqrt(np.sum(weights**2 * step**2, axis=1)) / np.maximum(s2, 1e-9)
+    typical = np.median(noise[on & np.isfinite(noise)])
+    sigma = typical / TUKEY * np.sqrt(np.sum(weights**2 * step**2, axis=1)) / np.maximum(s2, 1e-9)
     enough = on & (s0 > 0.5) & (determinant > 1e-3)
     result[:, enough] = np.stack([value, rate, sigma])[:, enough]
     return result[0], result[1], result[2]
@@ -174,7 +179,18 @@ def _changes(
     if not real.any():
         return real
     largest = float(np.quantile(rate[real], 0.7))
-    return np.asarray(real & (rate > settings.share * largest))
+    # Where a change begins and ends, its rate is half and less sure: what adjoins a sure change.
+    fast = np.nan_to_num(rate) > settings.share * largest
+    parts, _ = label(known & (fast | _closed(fast)))
+    return np.asarray(np.isin(parts, np.unique(parts[real])) & (parts > 0))
+
+
+def _closed(on: BoolArray) -> BoolArray:
+    """Frames between two that are on and at most `BETWEEN` apart."""
+    frames = np.arange(len(on))
+    last = np.maximum.accumulate(np.where(on, frames, -BETWEEN))
+    after = np.minimum.accumulate(np.where(on, frames, len(on) + BETWEEN)[::-1])[::-1]
+    return np.asarray(after - last <= BETWEEN)
 
 
 def _steady(on: BoolArray) -> BoolArray:
