@@ -81,7 +81,7 @@ def test_a_line_that_leaves_the_picture_is_cut():
 
 def test_gaps_are_bridged_and_reported():
     path = arc((130.0, 180.0), 90.0, 1.0)
-    first, second = path[path[:, 0] < 145.5], path[path[:, 0] > 154.5]
+    first, second = path[path[:, 0] < 144.5], path[path[:, 0] > 155.5]
     frame = drawn((first, 60.0), (second, 60.0))
     (line,) = find_lines(frame, LineSettings())
     assert 6 < line.gap_px < 30

@@ -37,6 +37,9 @@ WHISKER_PX, WHISKER_OFF = 16, 3.0
 """A chain of fewer points that is no farther than so many times the ridges' scale from a stronger
 one is part of that one's side."""
 
+GAP_SHARE = 0.4
+"""A line has a gap where its ridge falls below this share of its median strength."""
+
 SHORT_PX = 25
 """Chains of fewer points are not joined when one is more above than beside the other."""
 
@@ -317,6 +320,8 @@ def _line(
     picture: Grey, ridges: Ridges, points: IntArray, scale: float, settings: LineSettings
 ) -> LightLine | None:
     """A line of ridge points in order; None where too little is left of it."""
+    strength = ridges.strength[points]
+    points = points[strength > GAP_SHARE * np.median(strength)]
     place, strength = ridges.image_px[points], ridges.strength[points]
     spread2 = _spread(ridges, points) ** 2
     least = LEAST_FOLDED / 2 if is_upright(place) else settings.least_px
