@@ -21,7 +21,7 @@ import typer
 import typer.core
 import typer.main
 
-from labapp.cli import advise, analyze, benchmark, cameras, reconstruct, session, simulate
+from labapp.cli import advise, analyze, benchmark, cameras, lines, reconstruct, session, simulate
 from labapp.cli.shared import (
     BAD_INPUT,
     FAULT,
@@ -181,6 +181,7 @@ def program(
 
 
 app.command()(reconstruct.reconstruct)
+app.command()(lines.lines)
 
 
 @app.command()

@@ -75,6 +75,10 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
     """Check a setup that was read from ``path``; see `read_setup`."""
     path = Path(path)
     values = parse_toml(text, path, A_SETUP)
+    pattern = values.get("pattern")
+    if isinstance(pattern, dict) and pattern.get("kind") == "lines":
+        right = "a dot pattern; lines are measured by labapp lines"
+        raise InputError(path, "pattern.kind", '"lines"', right)
     problems = [
         *(unknown_key(path, key, SECTIONS) for key in values if key not in SECTIONS),
         *(

@@ -141,8 +141,8 @@ def render(
         peaks.append(look.dot_peak * rng.uniform(0.3, 0.9, look.false_dots))
     shape = (view.height_px, view.width_px)
     dots = _draw(shape, *(np.concatenate(part) for part in (centers, spreads, peaks)))
-    light = gaussian_filter(dots * _speckle(shape, look.speckle, rng), look.blur_px)
-    image = _expose(light + _glow(shape, look), look, rng)
+    light = gaussian_filter(dots * speckle_field(shape, look.speckle, rng), look.blur_px)
+    image = expose(light + arc_glow(shape, look), look, rng)
     return Frame(image, _middle(places, drawn), np.asarray(drawn.mean(axis=0) >= 1 / 2))
 
 
@@ -195,7 +195,7 @@ def _draw(
     return image
 
 
-def _speckle(shape: tuple[int, int], contrast: float, rng: np.random.Generator) -> FloatArray:
+def speckle_field(shape: tuple[int, int], contrast: float, rng: np.random.Generator) -> FloatArray:
     """Fine-grained field of mean 1 and the given contrast: fully grown speckle over a constant."""
     grain_px = 0.7
     wave = [gaussian_filter(rng.normal(size=shape), grain_px) for _ in range(2)]
@@ -203,7 +203,7 @@ def _speckle(shape: tuple[int, int], contrast: float, rng: np.random.Generator) 
     return np.asarray(1 + contrast * (intensity / intensity.mean() - 1))
 
 
-def _glow(shape: tuple[int, int], look: Look) -> FloatArray:
+def arc_glow(shape: tuple[int, int], look: Look) -> FloatArray:
     """Light of the plane itself: dark, with the arc's glow broad and from below."""
     v, u = np.mgrid[: shape[0], : shape[1]]
     across = (u - 0.55 * shape[1]) / (0.7 * shape[1])
@@ -211,7 +211,7 @@ def _glow(shape: tuple[int, int], look: Look) -> FloatArray:
     return np.asarray(look.background + look.glow * np.exp(-(across**2 + upward**2) / 2))
 
 
-def _expose(light: FloatArray, look: Look, rng: np.random.Generator) -> Picture:
+def expose(light: FloatArray, look: Look, rng: np.random.Generator) -> Picture:
     """Add photon and read noise and hot pixels, cut off what is too bright, and round."""
     variance = look.read_noise**2 + look.photon_noise * np.maximum(light, 0)
     seen = light + np.sqrt(variance) * rng.normal(size=light.shape)

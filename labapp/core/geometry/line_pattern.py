@@ -1,0 +1,87 @@
+"""The projected line pattern: k lines, each a fan of rays in one plane (§3.1.2, §3.2.1, Fig. 3-9).
+
+Unlike a dot, a point of a reflected line does not say which ray made it: only the plane of rays is
+known, and the place along the fan is open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
+from labapp.core.values import FloatArray
+
+
+@dataclass(frozen=True)
+class LinePattern:
+    """Parallel lines across the beam axis.
+
+    Line i, from 1, grows towards the head of the pool (+Y), as rows of dots do; the place in the
+    fan grows with X. Line i at angle φ has the direction
+    ``a + tan(φ)·e + tan((c − i)·γ)·n`` with c = (count + 1)/2 and the interline angle γ.
+
+    Parameters
+    ----------
+    count
+        Number of lines.
+    interline_angle_deg
+        Angle γ between neighbouring lines at the centre, degrees.
+    fan_angle_deg
+        Angle from one end of a line to the other, degrees.
+    rotation_deg
+        By how much the pattern is turned about the beam axis, degrees, as `DotPattern` has it.
+    """
+
+    count: int = 5
+    interline_angle_deg: float = 0.23
+    fan_angle_deg: float = 5.0
+    rotation_deg: float = 0.0
+
+    @property
+    def half_fan(self) -> float:
+        """Half of the fan angle, rad."""
+        return float(np.radians(self.fan_angle_deg) / 2)
+
+    def tangents(self, line: FloatArray, fan: FloatArray) -> FloatArray:
+        """Tangents of rays to the beam axis, to the side and upwards, shape (…, 2).
+
+        Parameters
+        ----------
+        line
+            Number of the line, from 1; numbers beyond 1 … count are diffraction fringes.
+        fan
+            Angle φ in the fan, rad; both of shapes that broadcast.
+        """
+        up = np.tan(((self.count + 1) / 2 - line) * np.radians(self.interline_angle_deg))
+        tangents = np.stack(np.broadcast_arrays(np.tan(fan), up), axis=-1)
+        turn = np.radians(self.rotation_deg)
+        sin, cos = np.sin(turn), np.cos(turn)
+        return np.asarray(tangents @ np.array([[cos, sin], [-sin, cos]]))
+
+
+@dataclass(frozen=True)
+class LineRig:
+    """A bench with a line pattern: everything whose place must be known to measure.
+
+    Parameters
+    ----------
+    laser, pattern, electrode, imaging_plane
+        What it is made of.
+    """
+
+    laser: Laser
+    pattern: LinePattern
+    electrode: Electrode
+    imaging_plane: ImagingPlane
+
+
+def line_directions(
+    laser: Laser, pattern: LinePattern, line: FloatArray, fan: FloatArray
+) -> FloatArray:
+    """Unit directions of rays of lines, shape (…, 3); see `LinePattern.tangents`."""
+    axis, across, along = laser.axes
+    tangents = pattern.tangents(line, fan)
+    direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along
+    return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True))

@@ -1,0 +1,145 @@
+"""Ridges of a grey frame to subpixel: Steger's detector of curvilinear structures.
+
+C. Steger, "An unbiased detector of curvilinear structures", IEEE PAMI 20 (1998) 113-125. At each
+pixel the frame, smoothed by a Gaussian, is a parabola across the direction of strongest curvature;
+its top is a ridge point where it lies in the pixel. Points are linked to chains along the ridge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from labapp.core.images.dots import Grey, Image
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+
+WITHIN_PX = 0.6
+"""A ridge point lies so near its pixel's centre along u and along v: a little over half."""
+
+FLANKS = 2.5
+"""The background of a ridge is seen so many standard deviations of the smoothed line beside it."""
+
+
+@dataclass(frozen=True)
+class RidgeSettings:
+    """How ridges are found.
+
+    Parameters
+    ----------
+    scale_px
+        Standard deviation of the Gaussian that the frame is smoothed by, px: about that of a line's
+        light across it, and not below 1/√3 of it.
+    seed, floor
+        Curvature across the ridge, over its noise, of the strongest point of a chain and of all its
+        points at least.
+    """
+
+    scale_px: float = 2.0
+    seed: float = 7.0
+    floor: float = 3.0
+
+
+@dataclass(frozen=True)
+class Ridges(ReadOnlyArrays):
+    """Chains of ridge points; every array but ``starts`` has n rows.
+
+    Parameters
+    ----------
+    image_px
+        (u, v), shape (n, 2), px.
+    tangent
+        Unit vector along the ridge, shape (n, 2); which way is open.
+    strength
+        Curvature across the ridge of the smoothed frame, grey levels/px², shape (n,).
+    height
+        Of the smoothed frame's ridge over its background, grey levels, shape (n,).
+    starts
+        Where each of k chains begins, and n, shape (k + 1,).
+    noise
+        Standard deviation of ``strength`` where there is no ridge.
+    smooth
+        The smoothed frame, shape (height, width).
+    """
+
+    image_px: FloatArray
+    tangent: FloatArray
+    strength: FloatArray
+    height: FloatArray
+    starts: IntArray
+    noise: float
+    smooth: Grey
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+
+@lru_cache(maxsize=8)
+def _derivative_kernels(scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Gaussian and its first two derivatives, sampled; a parabola's come out exactly."""
+    reach = int(np.ceil(4 * scale_px))
+    x = np.arange(-reach, reach + 1.0)
+    bell = np.exp(-(x**2) / (2 * scale_px**2))
+    bell /= bell.sum()
+    slope = x * bell / np.sum(x**2 * bell)  # correlated, not convolved: rises with x
+    bend = (x**2 - np.sum(x**2 * bell)) * bell
+    bend *= 2 / np.sum(x**2 * bend)
+    return bell, slope, bend
+
+
+def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
+    """Find the bright ridges of a grey frame, shape (height, width), and link them to chains."""
+    from labapp.core.images import ridge_kernels
+
+    picture = np.ascontiguousarray(frame, np.float32)
+    bell, slope, bend = _derivative_kernels(settings.scale_px)
+
+    def filtered(along_u: FloatArray, along_v: FloatArray) -> Grey:
+        return np.asarray(cv2.sepFilter2D(picture, cv2.CV_32F, along_u, along_v))
+
+    smooth, uu, vv, uv = (
+        filtered(*pair) for pair in ((bell, bell), (bend, bell), (bell, bend), (slope, slope))
+    )
+    noise = 1.4826 * float(np.median(np.abs(uu[::3, ::3] - np.median(uu[::3, ::3])))) + 1e-9
+    # The larger curvature, of a maximum: from the trace and the determinant of the Hessian.
+    half, root = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv * uv)
+    v, u = np.nonzero(half - root < -settings.floor * noise)
+    h, r = half[v, u].astype(float), root[v, u].astype(float)
+    strength = r - h
+    # Unit vector across the ridge: the eigenvector of the eigenvalue half − root.
+    angle = 0.5 * np.arctan2(2.0 * uv[v, u], (uu - vv)[v, u].astype(float)) + np.pi / 2
+    across = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    du, dv = filtered(slope, bell)[v, u], filtered(bell, slope)[v, u]
+    shift = (du * across[:, 0] + dv * across[:, 1]) / strength
+    offset = shift[:, None] * across
+    on = np.abs(offset).max(axis=-1, initial=0.0) <= WITHIN_PX
+    pixel = np.ascontiguousarray(np.stack([u, v], axis=-1)[on].astype(np.int64))
+    place, across, strength = pixel + offset[on], across[on], strength[on]
+    index: Any = np.full(picture.shape, -1, np.int32)
+    index[pixel[:, 1], pixel[:, 0]] = np.arange(len(pixel))
+    order = np.argsort(-strength, kind="stable")
+    seeds = int(np.sum(strength > settings.seed * noise))
+    along = np.zeros((len(place) + 1, 2))
+    along[:-1, 0], along[:-1, 1] = -across[:, 1], across[:, 0]
+    chosen, starts = ridge_kernels.link(index, pixel, place, along, order, seeds)
+    place, along, strength = place[chosen], along[chosen], strength[chosen]
+    height = _height(smooth, place, along, settings.scale_px)
+    return Ridges(place, along, strength, height, starts, noise, smooth)
+
+
+def _height(smooth: Grey, place: FloatArray, along: FloatArray, scale_px: float) -> FloatArray:
+    """Height of a smoothed frame's ridges over the mean of both flanks, shape (n,)."""
+    reach = FLANKS * np.sqrt(2.0) * scale_px
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    sample = [place + side * reach * across for side in (-1.0, 0.0, 1.0)]
+    at = np.asarray(sample, np.float32)
+    if not at.size:
+        return np.zeros(0)
+    left, top, right = cv2.remap(
+        smooth, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    # A neighbouring line may be on one flank.
+    return np.asarray(top - np.minimum(left, right), float)

@@ -1,0 +1,151 @@
+"""One frame of a line pattern: lines, what they show, and the surface where they determine it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.line_pattern import LineRig
+from labapp.core.images.dots import Image
+from labapp.core.images.light_lines import LightLine, LineSettings, find_lines
+from labapp.core.images.line_numbers import LinesSeen, number_lines
+from labapp.core.surface.line_data import line_data
+from labapp.core.surface.line_fit import LineFitSettings, LineSurface, fit_lines
+from labapp.core.values import CannotMeasure, FloatArray
+
+FOLDED = "the pool gathers the lines to points: they show how many they are, and no shape"
+
+
+@dataclass(frozen=True)
+class LineMeasureSettings:
+    """How lines are found, and how the surface under them is fitted."""
+
+    lines: LineSettings = field(default_factory=LineSettings)
+    fit: LineFitSettings = field(default_factory=LineFitSettings)
+
+
+@dataclass(frozen=True)
+class LineFeatures:
+    """What a frame's lines show, on the imaging plane.
+
+    Parameters
+    ----------
+    count
+        How many of the pattern's lines are seen: the pool's size in steps of the lines' distance
+        (Fig. 3-14: from five to four as the pool shrinks).
+    length_mm
+        Of all lines together.
+    width_mm, height_mm
+        Extent of the lines along X′ and Z′.
+    area_mm2
+        Between the lowest and the highest line.
+    spacing_mm
+        Mean distance of neighbouring lines at their middles.
+    curvature_per_mm
+        Median of the lines' curvature at their middles, positive where they are arched upwards.
+    asymmetry
+        Of the lines about their highest points: (right − left)/(right + left) of their extents
+        along X′, the mean of all.
+    """
+
+    count: int
+    length_mm: float = 0.0
+    width_mm: float = 0.0
+    height_mm: float = 0.0
+    area_mm2: float = 0.0
+    spacing_mm: float = float("nan")
+    curvature_per_mm: float = float("nan")
+    asymmetry: float = float("nan")
+
+
+@dataclass(frozen=True)
+class LineFrame:
+    """What a frame of a line pattern gave.
+
+    Parameters
+    ----------
+    status
+        ``ok``; ``profile`` where the lines leave a direction of the surface open; ``no-lines``,
+        ``folded-lines``, ``too-few-lines``, ``no-surface``.
+    reason
+        One sentence where there is no surface; empty otherwise.
+    seen, features
+        The lines, and what they show.
+    surface
+        The surface nearest to them; a measurement only where the status is ``ok``.
+    """
+
+    status: str
+    reason: str
+    seen: LinesSeen
+    features: LineFeatures
+    surface: LineSurface | None
+
+
+def measure_lines(
+    image: Image, rig: LineRig, calibration: ImageCalibration, settings: LineMeasureSettings
+) -> LineFrame:
+    """Measure one grey frame, shape (height, width), of a line pattern."""
+    seen = number_lines(find_lines(image, settings.lines), rig.pattern.count)
+    features = line_features(seen.lines, calibration)
+    if not seen.lines:
+        return LineFrame("no-lines", "no line stands out of the noise", seen, features, None)
+    open_lines = [k for k, one in enumerate(seen.lines) if not one.folded]
+    if len(open_lines) < len(seen.lines) / 2:
+        return LineFrame("folded-lines", FOLDED, seen, features, None)
+    data = line_data(tuple(seen.lines[k] for k in open_lines), calibration)
+    numberings = [each[open_lines] for each in _numberings(seen, rig.pattern.count)]
+    try:
+        surface = fit_lines(data, numberings, rig, settings.fit)
+    except CannotMeasure as problem:
+        return LineFrame(problem.status, problem.reason, seen, features, None)
+    open_ = "" if surface.status == "ok" else "the lines leave a direction of the surface open"
+    return LineFrame(surface.status, open_, seen, features, surface)
+
+
+def _numberings(seen: LinesSeen, count: int) -> list[FloatArray]:
+    """Numbers that the lines may have, from the lowest up, growing either way."""
+    steps = np.arange(len(seen.lines), dtype=float)
+    return [
+        first + sign * steps
+        for sign in (1, -1)
+        for first in seen.first_numbers(count, same_order=sign > 0)
+    ]
+
+
+def line_features(lines: tuple[LightLine, ...], calibration: ImageCalibration) -> LineFeatures:
+    """What lines, from the lowest up, show on the imaging plane."""
+    if not lines:
+        return LineFeatures(0)
+    places = [calibration.to_plane(one.image_px) for one in lines]
+    every = np.concatenate(places)
+    width, height = np.ptp(every, axis=0)
+    middles = np.array([each[len(each) // 2] for each in places])
+    spacing = np.linalg.norm(np.diff(middles, axis=0), axis=-1)
+    scale = float(np.sqrt(np.abs(np.linalg.det(calibration.jacobian(lines[0].image_px[:1])[0]))))
+    bends = [one.curvature[len(one.curvature) // 2] / scale for one in lines]
+    return LineFeatures(
+        count=len(lines),
+        length_mm=float(sum(np.linalg.norm(np.diff(p, axis=0), axis=-1).sum() for p in places)),
+        width_mm=float(width),
+        height_mm=float(height),
+        area_mm2=_area_between(places[0], places[-1]) if len(lines) > 1 else 0.0,
+        spacing_mm=float(spacing.mean()) if len(spacing) else float("nan"),
+        curvature_per_mm=float(np.median(bends)),
+        asymmetry=float(np.mean([_asymmetry(each) for each in places])),
+    )
+
+
+def _area_between(low: FloatArray, high: FloatArray) -> float:
+    """Area of the polygon along one line and back along the other, mm²."""
+    x, z = np.concatenate([low, high[::-1]]).T
+    return float(abs(np.sum(x * np.roll(z, -1) - z * np.roll(x, -1))) / 2)
+
+
+def _asymmetry(place: FloatArray) -> float:
+    x = place[:, 0]
+    top = x[int(np.argmax(place[:, 1]))]
+    right, left = x.max() - top, top - x.min()
+    return float((right - left) / max(right + left, 1e-9))

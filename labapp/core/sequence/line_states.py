@@ -1,0 +1,199 @@
+"""The state of the pool over time, as §3.2.1 reads it from reflected lines.
+
+| state | what the text reads | rule |
+| --- | --- | --- |
+| ``no-pool`` | "a blurred plane without any lines" at point A (Fig. 3-11) | no line is seen |
+| ``growing`` | from A to B "the weld pool grows" (Fig. 3-11) | the pool's width rises, or lines have appeared and do not yet give one |
+| ``concave`` | full penetration, steady (Fig. 3-12) | curvature below zero, not changing |
+| ``flattening`` | "from being concave towards being convex", the size falls (Fig. 3-13) | curvature rises |
+| ``convex`` | partial penetration, images larger, lines fewer (Fig. 3-14) | curvature above zero, not changing |
+
+The text reads shapes by eye; here curvature and width are those of the surface that was fitted.
+"""  # noqa: E501
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import label
+
+from labapp.core.sequence.line_frame import LineFrame
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+
+State = Literal["no-pool", "growing", "concave", "flattening", "convex"]
+
+SURE_MARGIN = 6.0
+"""A frame's curvature counts where the other sign costs so much more (`LineSurface.margin`)."""
+
+BETWEEN = 6
+"""A change is not interrupted for fewer frames."""
+
+TUKEY = 3.0
+"""Values farther than so many standard deviations from the local line have little weight."""
+
+
+@dataclass(frozen=True)
+class StateSettings:
+    """How states are read.
+
+    Parameters
+    ----------
+    window
+        Standard deviation of the weights of the local fit over time, frames.
+    share
+        A state of change lasts while the rate of change is above this share of its largest: about
+        half, as a local fit to a corner has half the rate beyond it.
+    sigmas
+        And above so many standard uncertainties.
+    least_growth_mm, least_change_per_mm
+        What width and curvature must change by over a window to count at all, mm and 1/mm.
+    """
+
+    window: float = 5.0
+    share: float = 0.55
+    sigmas: float = 4.0
+    least_growth_mm: float = 0.1
+    least_change_per_mm: float = 0.006
+
+
+@dataclass(frozen=True)
+class LineSeries(ReadOnlyArrays):
+    """What the frames of a recording show, each array with an entry a frame.
+
+    Parameters
+    ----------
+    count
+        Lines seen.
+    width_mm
+        Of the pool along X, between the lines' ends; NaN where unknown.
+    curvature_per_mm
+        Of the pool, positive when convex; NaN where unknown or where its sign is in doubt.
+    """
+
+    count: IntArray
+    width_mm: FloatArray
+    curvature_per_mm: FloatArray
+
+    @classmethod
+    def of(cls, frames: Sequence[LineFrame]) -> LineSeries:
+        """Collect the series from frames in order."""
+        count = np.array([one.features.count for one in frames], np.int64)
+        width, curvature = np.full(len(frames), np.nan), np.full(len(frames), np.nan)
+        for k, one in enumerate(frames):
+            if one.surface is not None and one.surface.margin >= SURE_MARGIN:
+                width[k] = one.surface.width_mm
+                curvature[k] = one.surface.curvature_per_mm
+        return cls(count, width, curvature)
+
+
+def line_states(series: LineSeries, settings: StateSettings | None = None) -> tuple[State, ...]:
+    """State of the pool in each frame; see the module's table."""
+    settings = settings or StateSettings()
+    window = settings.window
+    lit = _steady(series.count > 0)
+    width, growth, growth_sigma = local_line(series.width_mm, lit, window)
+    curvature, bending, bending_sigma = local_line(series.curvature_per_mm, lit, window)
+    grows = _changes(growth, growth_sigma, settings.least_growth_mm, settings)
+    grows &= lit
+    flattens = _changes(bending, bending_sigma, settings.least_change_per_mm, settings)
+    flattens &= lit & ~grows & (growth <= 0.0)
+    # Lines that have just appeared may be too few for a surface.
+    unknown = lit & ~np.isfinite(width)
+    states: list[State] = []
+    for k in range(len(lit)):
+        if not lit[k]:
+            states.append("no-pool")
+        elif grows[k] or unknown[k]:
+            states.append("growing")
+        elif flattens[k]:
+            states.append("flattening")
+        else:
+            states.append("convex" if curvature[k] > 0 else "concave")
+    return tuple(states)
+
+
+def line_changes(series: LineSeries, least_frames: int = 3) -> list[tuple[int, int, int]]:
+    """Lasting changes of the number of lines: (frame, before, after) of each (Fig. 3-14)."""
+    changes: list[tuple[int, int, int]] = []
+    now, since, before = -1, 0, -1
+    for frame, count in enumerate(series.count.tolist()):
+        if count != now:
+            now, since = count, frame
+        if frame - since + 1 == least_frames and now != before:
+            if before >= 0:
+                changes.append((since, before, now))
+            before = now
+    return changes
+
+
+def local_line(
+    values: FloatArray, on: BoolArray, window: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Value, rate and its σ, over a window of frames, of robust lines fitted locally, shape (n,).
+
+    Parameters
+    ----------
+    values
+        A value a frame, shape (n,), NaN where unknown.
+    on
+        Frames that count, shape (n,); elsewhere the result is NaN.
+    window
+        Standard deviation of the Gaussian weights, frames.
+    """
+    frames = np.arange(len(values), dtype=float)
+    known = on & np.isfinite(values)
+    result = np.full((3, len(values)), np.nan)
+    if known.sum() < 3:
+        return result[0], result[1], result[2]
+    y = np.where(known, values, 0.0)
+    step = (frames - frames[:, None]) / window
+    weights = np.exp(-(step**2) / 2) * known
+    base, noise = weights, np.full(len(values), np.inf)
+    for _ in range(4):
+        s0, s1, s2 = (np.sum(weights * step**k, axis=1) for k in range(3))
+        t0, t1 = weights @ y, (weights * step) @ y
+        determinant = np.maximum(s0 * s2 - s1**2, 1e-9)
+        value, rate = (s2 * t0 - s1 * t1) / determinant, (s0 * t1 - s1 * t0) / determinant
+        off = y - (value[:, None] + rate[:, None] * step)
+        typical = np.sqrt(np.sum(base * np.minimum(off, noise[:, None]) ** 2, axis=1) / (s0 + 1e-9))
+        noise = TUKEY * np.minimum(typical, noise) + 1e-9
+        weights = base * np.maximum(1 - (off / (2 * noise[:, None])) ** 2, 0.0) ** 2 + 1e-9 * base
+    typical = np.median(noise[on & np.isfinite(noise)])
+    sigma = typical / TUKEY * np.sqrt(np.sum(weights**2 * step**2, axis=1)) / np.maximum(s2, 1e-9)
+    enough = on & (s0 > 0.5) & (determinant > 1e-3)
+    result[:, enough] = np.stack([value, rate, sigma])[:, enough]
+    return result[0], result[1], result[2]
+
+
+def _changes(
+    rate: FloatArray, sigma: FloatArray, least: float, settings: StateSettings
+) -> BoolArray:
+    """Frames in which a value rises at about its largest rate."""
+    known = np.isfinite(rate)
+    if not known.any():
+        return known
+    real = known & (rate > np.maximum(settings.sigmas * np.nan_to_num(sigma), least))
+    if not real.any():
+        return real
+    largest = float(np.quantile(rate[real], 0.7))
+    # Where a change begins and ends, its rate is half and less sure: what adjoins a sure change.
+    fast = np.nan_to_num(rate) > settings.share * largest
+    parts, _ = label(known & (fast | _closed(fast)))
+    return np.asarray(np.isin(parts, np.unique(parts[real])) & (parts > 0))
+
+
+def _closed(on: BoolArray) -> BoolArray:
+    """Frames between two that are on and at most `BETWEEN` apart."""
+    frames = np.arange(len(on))
+    last = np.maximum.accumulate(np.where(on, frames, -BETWEEN))
+    after = np.minimum.accumulate(np.where(on, frames, len(on) + BETWEEN)[::-1])[::-1]
+    return np.asarray(after - last <= BETWEEN)
+
+
+def _steady(on: BoolArray) -> BoolArray:
+    """Whether most of the five frames about each are on."""
+    padded = np.pad(on.astype(float), 2, mode="edge")
+    return np.asarray(np.convolve(padded, np.ones(5), "valid") >= 3)

@@ -1,0 +1,256 @@
+"""One line followed from frame to frame (§3.3): its shift, tilt and bend as time series.
+
+In a strip about where the line was, each column gives the place of its brightest light; a shape
+near the last one is fitted through them with Tukey's weights, so that what spatter, glare, droplets
+and bridging do to some columns is left out, and how much was left out is reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from scipy import signal
+
+from labapp.core.images.dots import Grey, Image
+from labapp.core.images.light_lines import LineSettings, find_lines
+from labapp.core.images.pulse_light import Pulses, classify_pulses, frame_brightness
+from labapp.core.values import BoolArray, FloatArray
+
+OVERSAMPLE = 8
+"""Frequencies tried in the inverse of a recording's length."""
+
+RECENT, BLINDED, BLINDED_LEVELS = 40, 4.0, 6.0
+"""A frame that is so many times as bright as the darkest of the last ones is blinded."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """How a line is followed.
+
+    Parameters
+    ----------
+    reach_px
+        How far above and below its place in the frame before a line is looked for, px.
+    column_px
+        Distance of the columns that are read, px.
+    width_px
+        Standard deviation of the line's light across it, px.
+    least_share
+        A line is lost where a smaller share of its columns agrees.
+    least_contrast
+        And where its light over its surroundings is less than so many of the noise.
+    lines
+        How the line is found where it is not yet followed.
+    """
+
+    reach_px: float = 14.0
+    column_px: float = 3.0
+    width_px: float = 2.2
+    least_share: float = 0.5
+    least_contrast: float = 1.5
+    lines: LineSettings = field(default_factory=LineSettings)
+
+
+@dataclass(frozen=True)
+class TrackedLine:
+    """A line in a frame.
+
+    Parameters
+    ----------
+    u_px, v_px
+        Its columns and its fitted place in each, shape (n,), px.
+    shift_px, tilt_px, bend_px
+        Its shape less that of the reference: mean, rise over half of its length, and rise of its
+        ends over its middle, px downwards.
+    share
+        Share of the columns that agree with it.
+    """
+
+    u_px: FloatArray
+    v_px: FloatArray
+    shift_px: float
+    tilt_px: float
+    bend_px: float
+    share: float
+
+
+class LineTracker:
+    """Follows one line; begin with a frame in which it can be seen."""
+
+    def __init__(self, settings: TrackSettings | None = None) -> None:
+        self.settings = settings or TrackSettings()
+        self._columns: FloatArray | None = None
+        self._reference = np.zeros(0)
+        self._terms = np.zeros((0, 3))
+        self._shape = np.zeros(3)
+        self._since = 0
+
+    def follow(self, frame: Image) -> TrackedLine | None:
+        """The line in the next frame, shape (height, width); None where it is lost."""
+        picture = np.ascontiguousarray(frame, np.float32)
+        if self._columns is None and not self._begin(picture):
+            return None
+        found = self._read(picture, self.settings.reach_px)
+        if found is None and self._since >= 3:  # it may be farther away by now
+            found = self._read(picture, 2 * self.settings.reach_px)
+        self._since = 0 if found is not None else self._since + 1
+        return found
+
+    def _begin(self, picture: Grey) -> bool:
+        lines = find_lines(picture, self.settings.lines)
+        if not lines:
+            return False
+        line = max(lines, key=lambda one: one.light * one.length_px)
+        u, v = line.image_px.T
+        order = np.argsort(u)
+        columns = np.arange(np.ceil(u.min()), u.max(), self.settings.column_px)
+        if len(columns) < 10:
+            return False
+        place = (columns - columns.mean()) / (np.ptp(columns) / 2)
+        self._terms = np.stack([np.ones_like(place), place, place**2 - 1 / 3], axis=-1)
+        self._columns, self._reference = columns, np.interp(columns, u[order], v[order])
+        self._shape = np.zeros(3)
+        self.settings = replace(self.settings, width_px=float(np.clip(line.width_px, 1.0, 5.0)))
+        return True
+
+    def _read(self, picture: Grey, reach: float) -> TrackedLine | None:
+        assert self._columns is not None
+        settings = self.settings
+        middle = self._reference + self._terms @ self._shape
+        side = np.arange(-reach, reach + 1.0)
+        v = (middle[None] + side[:, None]).astype(np.float32)
+        u = np.broadcast_to(self._columns.astype(np.float32), v.shape)
+        strip = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        band = _band(np.asarray(strip), settings.width_px)
+        inner = slice(2, -2)
+        best = np.argmax(band[inner], axis=0) + 2
+        columns = np.arange(len(best))
+        before, top, after = (band[best + k, columns].astype(float) for k in (-1, 0, 1))
+        bend = before - 2 * top + after
+        off = side[best] + np.where(bend < 0, (before - after) / (2 * np.minimum(bend, -1e-9)), 0.0)
+        noise = 1.4826 * float(np.median(np.abs(band - np.median(band)))) + 1e-6
+        clear = top > settings.least_contrast * noise
+        if clear.sum() < 6:
+            return None
+        fit, share = _robust_shape(self._terms, off, clear)
+        if share < settings.least_share:
+            return None
+        self._shape = self._shape + fit
+        shift, tilt, bend_px = self._shape.tolist()
+        fitted = middle + self._terms @ fit
+        return TrackedLine(self._columns, fitted, shift, tilt, bend_px, share)
+
+
+def _band(strip: Grey, width: float) -> Grey:
+    """Light of the line's width over its surroundings, down each column."""
+    return np.asarray(_down(strip, width) - _down(strip, 2.5 * width))
+
+
+def _down(strip: Grey, sigma: float) -> Grey:
+    reach = int(np.ceil(3 * sigma))
+    bell = np.exp(-(np.arange(-reach, reach + 1.0) ** 2) / (2 * sigma**2))
+    kernel = (bell / bell.sum()).astype(np.float32)
+    one = np.ones(1, np.float32)
+    down = cv2.sepFilter2D(strip, cv2.CV_32F, one, kernel, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(down)
+
+
+def _robust_shape(terms: FloatArray, off: FloatArray, clear: BoolArray) -> tuple[FloatArray, float]:
+    """Shift, tilt and bend through the columns' places, and the share of columns that agree."""
+    start = float(np.median(off[clear]))
+    fit, limit = np.array([start, 0.0, 0.0]), 8.0
+    weights = clear.astype(float)
+    for _ in range(8):
+        away = off - terms @ fit
+        weights = np.maximum(1 - (away / limit) ** 2, 0.0) ** 2 * clear
+        if weights.sum() < 6:
+            return fit, 0.0
+        weighted = terms * weights[:, None]
+        fit = np.linalg.solve(weighted.T @ terms + 1e-3 * np.eye(3), weighted.T @ off)
+        scatter = 1.4826 * float(np.median(np.abs((off - terms @ fit)[weights > 0])))
+        limit = float(np.clip(5.0 * scatter, 2.0, 8.0))
+    return fit, float(np.mean((np.abs(off - terms @ fit) < limit) & clear))
+
+
+@dataclass(frozen=True)
+class LineFilm:
+    """One line over a recording.
+
+    Parameters
+    ----------
+    pulses
+        Frames with and without a pulse.
+    lines
+        The line in each frame; None where it is lost or a pulse blinds the frame.
+    frequency_hz, strength
+        Of the line's strongest oscillation, and its share of the variance; NaN and 0 where there
+        is no time base or too little was followed.
+    """
+
+    pulses: Pulses
+    lines: tuple[TrackedLine | None, ...]
+    frequency_hz: float
+    strength: float
+
+
+def track_line(
+    frames: Iterable[Image],
+    frame_rate_hz: float | None,
+    settings: TrackSettings | None = None,
+) -> LineFilm:
+    """Sort the frames of a recording by pulse, and follow its line in those without one.
+
+    The line is read in every frame that is not blinded; what was read in frames that turn out, with
+    the others known, to have a pulse is dropped.
+    """
+    tracker, bright, lines = LineTracker(settings), list[float](), list[TrackedLine | None]()
+    for frame in frames:
+        bright.append(frame_brightness(frame))
+        recent = bright[-RECENT:]
+        blinded = bright[-1] > BLINDED * min(recent) + BLINDED_LEVELS
+        lines.append(None if blinded else tracker.follow(frame))
+    pulses = classify_pulses(np.array(bright), frame_rate_hz)
+    kept = tuple(None if on else one for one, on in zip(lines, pulses.on, strict=True))
+    if frame_rate_hz is None:
+        return LineFilm(pulses, kept, float("nan"), 0.0)
+    seen = [(k / frame_rate_hz, one.shift_px) for k, one in enumerate(kept) if one is not None]
+    if not seen:
+        return LineFilm(pulses, kept, float("nan"), 0.0)
+    time_s, shift = np.array(seen).T
+    return LineFilm(pulses, kept, *oscillation_frequency(time_s, shift))
+
+
+def oscillation_frequency(
+    time_s: FloatArray, values: FloatArray, lowest_hz: float = 5.0, highest_hz: float = 100.0
+) -> tuple[float, float]:
+    """Frequency of the strongest oscillation, Hz, and its share of the values' variance.
+
+    By Lomb's and Scargle's periodogram, as frames with a pulse are missing.
+
+    Parameters
+    ----------
+    time_s, values
+        Where the line was followed, each shape (n,).
+    lowest_hz, highest_hz
+        Where the frequency is looked for.
+    """
+    if len(values) < 16:
+        return float("nan"), 0.0
+    # What drifts is no oscillation.
+    smooth = np.polynomial.Polynomial.fit(time_s, values, 3)(time_s)
+    swing = values - smooth
+    limit = 6.0 * 1.4826 * float(np.median(np.abs(swing))) + 1e-9
+    kept = np.abs(swing) < limit
+    step = 1.0 / (OVERSAMPLE * max(float(np.ptp(time_s)), 1e-9))
+    rates = np.arange(lowest_hz, highest_hz, step)
+    power = signal.lombscargle(
+        time_s[kept], swing[kept], 2 * np.pi * rates, normalize=True, floating_mean=True
+    )
+    best = int(np.argmax(power))
+    if 0 < best < len(power) - 1:
+        before, top, after = power[best - 1 : best + 2]
+        rates[best] += step * (before - after) / (2 * (before - 2 * top + after))
+    return float(rates[best]), float(power[best])

@@ -1,0 +1,393 @@
+"""The pool surface under reflected lines: what the text could not reconstruct (§3.2.2).
+
+A point of a line gives one equation, its distance across from the predicted curve; an end of a line
+lies on the boundary, z = 0. The lines differ in nothing but their order, so that surfaces of both
+curvatures are fitted, first as quadrics, with each numbering that is possible; the one that
+contradicts lines and ends least is refined in splines, held smooth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy
+
+from labapp.core.geometry.line_pattern import LineRig, line_directions
+from labapp.core.geometry.optics import intersect_level
+from labapp.core.surface.line_model import Linearized, LineData, LineModel
+from labapp.core.surface.pool_fit import CORRELATED_MM2
+from labapp.core.surface.spline import SplineBasis, SplineSurface
+from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
+
+RADII_MM = (6.0, 9.0, 14.0, 24.0, 45.0, 120.0)
+"""Radii of curvature that quadrics begin with, convex and concave."""
+
+QUADRIC_SIGMA_MM = 0.1
+"""How far a pool's lines are from those of a quadric, mm on the imaging plane."""
+
+HALF_WIDTH_MM = 2.8
+"""Half the width of the pools that they belong to."""
+
+POOR_COST = 2.0
+"""A quadric that costs more a point is sought from a second radius, too."""
+
+NEAR_COST, NEAR_COST_MORE = 4.0, 60.0
+"""Quadrics that cost less than so many times the best one, and so much more, are refined."""
+
+QUADRIC_ROUNDS, SPLINE_ROUNDS = 20, 20
+MARGIN_MM = 0.8
+
+AGREES = 3.0
+"""A point or an end farther off than so many of its standard uncertainties does not agree."""
+
+
+@dataclass(frozen=True)
+class LineFitSettings:
+    """How the fit decides.
+
+    Parameters
+    ----------
+    knot_mm
+        Spacing of the spline knots, mm.
+    jerk
+        Third derivatives of the surface that are to be expected, mm⁻². With 0.005, lines are met as
+        well, and the height of hollow pools comes out 3 % too large, more than its ±.
+    settled
+        The rounds end when the cost falls by less.
+    margin
+        By how much the cost of another sign or numbering must be higher.
+    most_relative_sigma
+        A height is determined when its standard uncertainty is at most this share of it.
+    most_misfit
+        Largest χ² over its degrees of freedom of a surface that fits.
+    """
+
+    knot_mm: float = 0.9
+    jerk: float = 0.03
+    settled: float = 0.05
+    margin: float = 6.0
+    most_relative_sigma: float = 0.12
+    most_misfit: float = 0.85
+
+
+@dataclass(frozen=True)
+class LineSurface(ReadOnlyArrays):
+    """A surface that reflects the lines as they are seen, and how well it is known.
+
+    Parameters
+    ----------
+    surface
+        The surface, z = 0 at the boundary.
+    covariance
+        Of its coefficients, shape (p, p), mm².
+    numbers
+        Number of each line in the pattern, from the lowest in the picture up, shape (k,).
+    point_mm
+        Where the rays of the points and ends that agree with it meet the surface, shape (n, 3), mm.
+    misfit
+        χ² of points and ends over its degrees of freedom.
+    margin
+        By how much the next best sign or numbering costs more; infinite where there is none.
+    status
+        ``ok``, or ``profile`` where the lines leave a direction open: then heights are no
+        measurement, slopes along the lines may be one.
+    """
+
+    surface: SplineSurface
+    covariance: FloatArray
+    numbers: IntArray
+    point_mm: FloatArray
+    misfit: float
+    margin: float
+    status: str
+
+    @cached_property
+    def peak_mm(self) -> FloatArray:
+        """(x, y, z) of the highest point under the lines, of a hollow the lowest, mm."""
+        low, high = self.point_mm[:, :2].min(axis=0), self.point_mm[:, :2].max(axis=0)
+        x, y = (np.linspace(*ends, 81) for ends in zip(low, high, strict=True))
+        x, y = (each.ravel() for each in np.meshgrid(x, y))
+        z = self.surface.height(x, y)
+        best = int(np.argmax(np.nan_to_num(np.abs(z))))
+        return np.array([x[best], y[best], z[best]])
+
+    @property
+    def height_mm(self) -> float:
+        """Height of the highest point, or negative depth of the lowest one, mm."""
+        return float(self.peak_mm[2])
+
+    @cached_property
+    def height_sigma_mm(self) -> float:
+        """Its standard uncertainty, mm."""
+        return float(self.sigma_mm(*self.peak_mm[:2, None])[0])
+
+    def sigma_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Standard uncertainty of the height at points, each shape (n,), mm."""
+        rows = self.surface.basis.matrix(x_mm, y_mm)
+        return np.asarray(np.sqrt(np.maximum(np.vecdot(rows @ self.covariance, rows), 0.0)))
+
+    @property
+    def width_mm(self) -> float:
+        """Width of the pool along X, between the ends of the lines, mm."""
+        return float(np.ptp(self.point_mm[:, 0]))
+
+    @property
+    def curvature_per_mm(self) -> float:
+        """Mean curvature of the quadric nearest to the surface, 1/mm; positive when convex."""
+        x, y = self.point_mm[:, 0], self.point_mm[:, 1]
+        terms = _monomials(x - x.mean(), y - y.mean())
+        fitted = np.linalg.lstsq(terms, self.surface.height(x, y), rcond=None)[0]
+        return float(-fitted[3] - fitted[5])
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """A numbering, and the quadric that suits it best."""
+
+    numbers: FloatArray
+    model: LineModel
+    coefficients: FloatArray
+    cost: float
+
+
+def fit_lines(
+    data: LineData,
+    numberings: list[FloatArray],
+    rig: LineRig,
+    settings: LineFitSettings | None = None,
+) -> LineSurface:
+    """Fit the surface that reflects the lines of a frame.
+
+    Parameters
+    ----------
+    data
+        Points and ends of the lines, on the imaging plane.
+    numberings
+        Numbers that the lines, from the lowest up, may have, each shape (k,).
+    rig
+        The bench.
+    settings
+        See `LineFitSettings`.
+
+    Raises
+    ------
+    CannotMeasure
+        ``too-few-lines`` with fewer than two lines.
+    """
+    settings = settings or LineFitSettings()
+    if data.line.max(initial=-1) < 1:
+        raise CannotMeasure("too-few-lines", "one line alone does not settle a surface")
+    tried = sorted(
+        (_best_quadric(data, numbers, rig, settings) for numbers in numberings),
+        key=lambda one: one.cost,
+    )
+    limit = NEAR_COST * tried[0].cost + NEAR_COST_MORE
+    near = [one for one in tried if one.cost < limit][:3]
+    refined = sorted((_refined(one, data, settings) for one in near), key=lambda one: one[1])
+    best, cost = refined[0]
+    others = [other - cost for one, other in refined[1:] if _differ(one, best)]
+    others += [one.cost - tried[0].cost for one in tried[len(near) :]]
+    margin = min(others, default=np.inf)
+    return replace(best, margin=margin, status=_status(best, margin, settings))
+
+
+def _status(one: LineSurface, margin: float, settings: LineFitSettings) -> str:
+    sure = one.height_sigma_mm <= settings.most_relative_sigma * abs(one.height_mm)
+    fits = one.misfit <= settings.most_misfit
+    return "ok" if sure and fits and margin >= settings.margin else "profile"
+
+
+def _differ(one: LineSurface, other: LineSurface) -> bool:
+    """Whether two surfaces are two answers rather than the same one twice."""
+    apart = abs(one.height_mm - other.height_mm)
+    return apart > 0.05 * abs(other.height_mm) + 2 * other.height_sigma_mm
+
+
+# --- quadrics -------------------------------------------------------------------------------------
+
+
+def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def _quadric_basis(basis: SplineBasis) -> FloatArray:
+    """Coefficients of 1, x, y, x², xy, y² in the splines, shape (p, 6): they are in it exactly."""
+    x, y = (
+        np.linspace(low, high, 12) for low, high in zip(basis.low_mm, basis.high_mm, strict=True)
+    )
+    x, y = (each.ravel() for each in np.meshgrid(x, y))
+    rough = _dense(basis.roughness)
+    rows = basis.matrix(x, y)
+    return np.asarray(
+        np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ _monomials(x, y)), np.float64
+    )
+
+
+def _best_quadric(
+    data: LineData, numbers: FloatArray, rig: LineRig, settings: LineFitSettings
+) -> _Hypothesis:
+    """For a numbering, the quadric that suits the lines best."""
+    half = rig.pattern.half_fan
+    corner = line_directions(
+        rig.laser,
+        rig.pattern,
+        np.array([0.0, rig.pattern.count + 1.0])[:, None],
+        np.array([-half, half]),
+    )
+    ground = intersect_level(rig.laser.position_mm, corner).reshape(-1, 3)[:, :2]
+    basis = SplineBasis.over(ground.min(axis=0), ground.max(axis=0), settings.knot_mm)
+    model = LineModel(rig, basis, np.asarray(numbers, float), 41)
+    into = _quadric_basis(basis)
+    softer = replace(
+        data,
+        sigma_mm=np.hypot(data.sigma_mm, QUADRIC_SIGMA_MM),
+        end_sigma_mm=np.hypot(data.end_sigma_mm, 0.3),
+    )
+    y = ground[:, 1].mean()
+    # Numbers that grow upwards in the picture are those of a flat or convex pool.
+    sign = 1.0 if model.numbers[-1] > model.numbers[0] else -1.0
+    starts = []
+    for radius in RADII_MM:
+        height = min(HALF_WIDTH_MM**2 / (2 * radius), 0.6)
+        bend = -0.5 / radius
+        starts.append(sign * np.array([height + bend * y * y, 0.0, -2 * bend * y, bend, 0.0, bend]))
+    order = np.argsort([_cost(model, into @ start, softer) for start in starts])
+    quadric, cost = _fit_quadric(model, into, starts[order[0]], softer)
+    if cost > POOR_COST * len(data.line):
+        quadric, cost = min(
+            ((quadric, cost), _fit_quadric(model, into, starts[order[1]], softer)),
+            key=lambda one: one[1],
+        )
+    return _Hypothesis(model.numbers, model, into @ quadric, cost)
+
+
+def _cost(model: LineModel, coefficients: FloatArray, data: LineData) -> float:
+    residual = model.residuals(coefficients, data).residual
+    return float(np.sum(_robust(residual)))
+
+
+def _robust(residual: FloatArray) -> FloatArray:
+    """Huber's cost of residuals: quadratic to 3, linear beyond."""
+    size = np.abs(residual)
+    return np.asarray(np.where(size < 3.0, size**2, 6.0 * size - 9.0))
+
+
+def _weights(residual: FloatArray) -> FloatArray:
+    return np.minimum(1.0, 3.0 / np.maximum(np.abs(residual), 1e-9))
+
+
+def _fit_quadric(
+    model: LineModel, into: FloatArray, start: FloatArray, data: LineData
+) -> tuple[FloatArray, float]:
+    """Levenberg's and Marquardt's steps over the six coefficients of a quadric."""
+    scale = np.array([0.3, 0.1, 0.1, 0.05, 0.05, 0.05])
+    quadric, damping = start, 1e-2
+    linear = model.residuals(into @ quadric, data)
+    cost = float(np.sum(_robust(linear.residual)))
+    for _ in range(QUADRIC_ROUNDS):
+        weights = _weights(linear.residual)
+        jacobian = linear.jacobian @ into * scale
+        normal = (jacobian * weights[:, None]).T @ jacobian + np.eye(6)  # a prior of its scale
+        right = jacobian.T @ (weights * linear.residual) - quadric / scale
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
+        tried = quadric + scale * np.clip(step, -2.0, 2.0)
+        there = model.residuals(into @ tried, data)
+        new = float(np.sum(_robust(there.residual)))
+        if new < cost:
+            done = cost - new < 1e-3 * cost
+            quadric, linear, cost, damping = tried, there, new, damping / 5
+            if done:
+                break
+        else:
+            damping *= 8
+            if damping > 1e4:
+                break
+    return quadric, cost
+
+
+# --- splines --------------------------------------------------------------------------------------
+
+
+def _dense(band: FloatArray) -> FloatArray:
+    """A symmetric matrix from its lower band, shape (width + 1, p)."""
+    count = band.shape[1]
+    dense = np.zeros((count, count))
+    for k, row in enumerate(band):
+        dense[np.arange(k, count), np.arange(count - k)] = row[: count - k]
+    return dense + np.tril(dense, -1).T
+
+
+def _refined(
+    start: _Hypothesis, data: LineData, settings: LineFitSettings
+) -> tuple[LineSurface, float]:
+    """The smooth surface nearest to a quadric that suits the lines, and its cost."""
+    points = start.model.residuals(start.coefficients, data).point_mm[:, :2]
+    low, high = points.min(axis=0) - MARGIN_MM, points.max(axis=0) + MARGIN_MM
+    basis = SplineBasis.over(low, high, settings.knot_mm)
+    model = replace(start.model, basis=basis, rays=81)
+    x, y = (np.linspace(a, b, 20) for a, b in zip(low, high, strict=True))
+    x, y = (each.ravel() for each in np.meshgrid(x, y))
+    rows = basis.matrix(x, y)
+    place = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    height, _ = start.model.surface_at(start.coefficients, place)
+    rough = _dense(basis.roughness)
+    first: FloatArray = np.asarray(
+        np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ height), np.float64
+    )
+    stiffness = rough / (settings.jerk**2 * CORRELATED_MM2)
+    coefficients, covariance, cost, linear = _fit_splines(model, first, data, stiffness, settings)
+    agrees = np.abs(linear.residual) <= AGREES
+    surface = LineSurface(
+        SplineSurface(basis, coefficients),
+        covariance,
+        np.rint(start.numbers).astype(np.int64),
+        linear.point_mm[agrees] if agrees.sum() > 3 else linear.point_mm,
+        float(np.sum(_cauchy(linear.residual))) / max(len(linear.residual) - 8, 1),
+        np.inf,
+        "profile",
+    )
+    return surface, cost
+
+
+def _cauchy(residual: FloatArray) -> FloatArray:
+    """Cauchy's cost of residuals: one that is far off, as of an end in a gap, costs little."""
+    return np.asarray(AGREES**2 * np.log1p((residual / AGREES) ** 2))
+
+
+def _fit_splines(
+    model: LineModel,
+    first: FloatArray,
+    data: LineData,
+    stiffness: FloatArray,
+    settings: LineFitSettings,
+) -> tuple[FloatArray, FloatArray, float, Linearized]:
+    """Coefficients, their covariance, the cost, and the equations there."""
+    c, damping = first, 1e-3
+    linear = model.residuals(c, data)
+    cost = float(np.sum(_cauchy(linear.residual)) + c @ stiffness @ c)
+    for _ in range(SPLINE_ROUNDS):
+        weights = 1 / (1 + (linear.residual / AGREES) ** 2)
+        gram = (linear.jacobian * weights[:, None]).T @ linear.jacobian
+        normal = gram + stiffness
+        right = linear.jacobian.T @ (weights * linear.residual) - stiffness @ c
+        lift = damping * np.trace(gram) / len(c) * np.eye(len(c)) * 1e-3
+        step = scipy.linalg.solve(normal + lift, right, assume_a="pos")
+        there = model.residuals(c + step, data)
+        new = float(np.sum(_cauchy(there.residual)) + (c + step) @ stiffness @ (c + step))
+        if new < cost:
+            done = cost - new < settings.settled
+            c, linear, cost, damping = c + step, there, new, damping / 10
+            if done:
+                break
+        else:
+            damping *= 30
+            if damping > 1e8:
+                break
+    weights = 1 / (1 + (linear.residual / AGREES) ** 2)
+    gram = (linear.jacobian * weights[:, None]).T @ linear.jacobian
+    factor = np.linalg.cholesky(gram + stiffness + 1e-9 * np.eye(len(c)))
+    inverse = np.linalg.inv(factor)
+    covariance = inverse.T @ inverse
+    return c, covariance, cost, linear

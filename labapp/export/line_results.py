@@ -1,0 +1,175 @@
+"""The tables that `labapp lines` writes: lines, their points, features and states, surfaces."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.sequence.line_frame import LineFrame
+from labapp.core.sequence.line_states import State
+from labapp.core.sequence.line_track import LineFilm
+from labapp.core.surface.line_fit import LineSurface
+
+LINE_COLUMNS = (
+    "frame", "line", "number", "left_u_px", "left_v_px", "right_u_px", "right_v_px", "left_cut",
+    "right_cut", "left_x_mm", "left_z_mm", "right_x_mm", "right_z_mm", "length_px", "width_px",
+    "light", "gap_px", "folded",
+)  # fmt: skip
+POINT_COLUMNS = ("frame", "line", "u_px", "v_px", "sigma_px", "plane_x_mm", "plane_z_mm")
+FEATURE_COLUMNS = (
+    "frame", "time_s", "status", "state", "lines", "left_out", "length_mm", "width_mm",
+    "height_mm", "area_mm2", "spacing_mm", "curvature_per_mm", "asymmetry", "pool_height_mm",
+    "pool_height_sigma_mm", "pool_width_mm", "pool_curvature_per_mm", "misfit", "margin",
+)  # fmt: skip
+TRACK_COLUMNS = (
+    "frame", "time_s", "pulse", "pulse_probability", "followed", "shift_px", "tilt_px", "bend_px",
+    "agreeing_share",
+)  # fmt: skip
+SURFACE_COLUMNS = ("x_mm", "y_mm", "z_mm", "z_sigma_mm")
+
+SPACING_MM = 0.1
+
+
+def line_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> list[list[str]]:
+    """Rows of ``lines.csv``: one a line, from the lowest in the picture up."""
+    rows = []
+    numbers = _numbers(found)
+    for k, one in enumerate(found.seen.lines):
+        ends, plane = one.ends_px, calibration.to_plane(one.ends_px)
+        rows.append(
+            [
+                *(str(frame), str(k + 1), numbers[k]),
+                *(f"{value:.3f}" for value in ends.ravel()),
+                *(str(int(cut)) for cut in one.cut),
+                *(f"{value:.4f}" for value in plane.ravel()),
+                *(f"{value:.2f}" for value in (one.length_px, one.width_px, one.light)),
+                f"{one.gap_px:.1f}",
+                str(int(one.folded)),
+            ]
+        )
+    return rows
+
+
+def _numbers(found: LineFrame) -> list[str]:
+    """Number of each line in the pattern; empty where it is not settled."""
+    lines = found.seen.lines
+    if found.status != "ok" or found.surface is None:
+        return [""] * len(lines)
+    known = iter(found.surface.numbers.tolist())
+    return ["" if one.folded else str(next(known)) for one in lines]
+
+
+def point_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> list[list[str]]:
+    """Rows of ``line_points.csv``: the ridge of each line at about every pixel."""
+    rows = []
+    for k, one in enumerate(found.seen.lines):
+        plane = calibration.to_plane(one.image_px)
+        for place, sigma, on in zip(one.image_px, one.sigma_px, plane, strict=True):
+            values = (*place, sigma, *on)
+            rows.append([str(frame), str(k + 1), *(f"{value:.4f}" for value in values)])
+    return rows
+
+
+def feature_rows(
+    frames: Sequence[int],
+    times_s: Sequence[float | None],
+    found: Sequence[LineFrame],
+    states: Sequence[State],
+) -> list[list[str]]:
+    """Rows of ``features.csv``: one a frame."""
+    rows = []
+    for frame, time_s, one, state in zip(frames, times_s, found, states, strict=True):
+        seen = one.features
+        surface = one.surface if one.status == "ok" else None
+        measured: tuple[float, ...] = (np.nan,) * 6
+        if surface is not None:
+            measured = (
+                *(surface.height_mm, surface.height_sigma_mm, surface.width_mm),
+                *(surface.curvature_per_mm, surface.misfit, surface.margin),
+            )
+        rows.append(
+            [
+                *(str(frame), _cell(time_s), one.status, state, str(seen.count)),
+                str(one.seen.left_out),
+                *map(_cell, (seen.length_mm, seen.width_mm, seen.height_mm, seen.area_mm2)),
+                *map(_cell, (seen.spacing_mm, seen.curvature_per_mm, seen.asymmetry)),
+                *map(_cell, measured),
+            ]
+        )
+    return rows
+
+
+def track_rows(
+    frames: Sequence[int], times_s: Sequence[float | None], film: LineFilm
+) -> list[list[str]]:
+    """Rows of ``track.csv``: one a frame of one line that is followed."""
+    rows = []
+    for k, (frame, time_s, line) in enumerate(zip(frames, times_s, film.lines, strict=True)):
+        shape = (
+            [""] * 4
+            if line is None
+            else [_cell(x) for x in (line.shift_px, line.tilt_px, line.bend_px, line.share)]
+        )
+        on, chance = bool(film.pulses.on[k]), float(film.pulses.probability[k])
+        state = "on" if on else "off"
+        followed = str(int(line is not None))
+        rows.append([str(frame), _cell(time_s), state, f"{chance:.4f}", followed, *shape])
+    return rows
+
+
+def surface_rows(surface: LineSurface) -> list[list[str]]:
+    """Rows of ``surface_NNNNNN.csv``: nodes between the lines, on the pool's side of z = 0."""
+    low, high = surface.point_mm[:, :2].min(axis=0), surface.point_mm[:, :2].max(axis=0)
+    x, y = np.meshgrid(*(np.arange(a, b, SPACING_MM) for a, b in zip(low, high, strict=True)))
+    x, y = x.ravel(), y.ravel()
+    z = surface.surface.height(x, y)
+    inside = np.isfinite(z) & (z * np.sign(surface.height_mm) >= 0)
+    x, y, z = x[inside], y[inside], z[inside]
+    sigma = surface.sigma_mm(x, y)
+    return [
+        [f"{a:.3f}", f"{b:.3f}", f"{c:.5f}", f"{d:.5f}"]
+        for a, b, c, d in zip(x, y, z, sigma, strict=True)
+    ]
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None or not np.isfinite(value) else f"{value:.5f}"
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table as CSV, with a header row where columns are given."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    if columns:
+        writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+class LineTables:
+    """`lines.csv` and `line_points.csv` of a folder, written frame by frame."""
+
+    def __init__(self, folder: Path, calibration: ImageCalibration) -> None:
+        self._calibration = calibration
+        self._files = [
+            (folder / name).open("w", encoding="utf-8", newline="")
+            for name in ("lines.csv", "line_points.csv")
+        ]
+        for file, columns in zip(self._files, (LINE_COLUMNS, POINT_COLUMNS), strict=True):
+            file.write(csv_text(columns, []))
+
+    def write(self, frame: int, found: LineFrame) -> None:
+        """Write the lines of a frame."""
+        for file, rows in zip(self._files, (line_rows, point_rows), strict=True):
+            file.write(csv_text((), rows(frame, found, self._calibration)))
+            file.flush()
+
+    def close(self) -> None:
+        """Close both files."""
+        for file in self._files:
+            file.close()

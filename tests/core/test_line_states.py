@@ -1,0 +1,116 @@
+"""States of a run from its series, pulses from brightness, oscillation from a followed line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.line_pattern import LinePattern, LineRig
+from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
+from labapp.core.images.pulse_light import classify_pulses
+from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
+from labapp.core.sequence.line_track import oscillation_frequency, track_line
+from labapp.simulation.camera import CameraView
+from labapp.simulation.line_runs import PHASES, GmawLook, gmaw_run
+
+
+def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:
+    """A run like that of Fig. 3-11: what its frames would show, with gaps, and its states."""
+    rng = np.random.default_rng(seed)
+    ends = (15, 55, 110, 150, 200)
+    truth = [PHASES[int(np.searchsorted(ends, k, side="right"))] for k in range(200)]
+    at = np.arange(200.0)
+    width = np.interp(at, ends[:4], [2.2, 6.2, 6.2, 4.4])
+    bend = np.interp(at, ends[:4], [-0.06, -0.06, -0.06, 0.08])
+    count = np.where(width > 5, 5, np.where(width > 3, 4, 3))
+    lit = at >= ends[0]
+    width = np.where(lit, width + 0.05 * rng.normal(size=200), np.nan)
+    bend = np.where(lit, bend + noise * rng.normal(size=200), np.nan)
+    unknown = rng.random(200) < 0.15
+    bend[unknown], width[unknown] = np.nan, np.nan
+    bend[::37] = 0.2  # a wrong surface now and then
+    return LineSeries(np.where(lit, count, 0), width, bend), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_states_of_a_run(seed: int):
+    series, truth = run_series(seed)
+    states = line_states(series)
+    assert np.mean([a == b for a, b in zip(states, truth, strict=True)]) >= 0.96
+    assert [s for k, s in enumerate(states) if k in (5, 35, 80, 130, 180)] == list(PHASES)
+
+
+def test_a_steady_pool_neither_grows_nor_flattens():
+    rng = np.random.default_rng(4)
+    bend = -0.06 + 0.004 * rng.normal(size=120)
+    series = LineSeries(np.full(120, 5), 6.0 + 0.05 * rng.normal(size=120), bend)
+    assert set(line_states(series)) == {"concave"}
+
+
+def test_lasting_changes_of_the_number_of_lines():
+    count = np.array([5] * 10 + [4] + [5] * 10 + [4] * 10)
+    series = LineSeries(count, np.full(31, np.nan), np.full(31, np.nan))
+    assert line_changes(series) == [(21, 5, 4)]
+
+
+def test_pulses_from_brightness():
+    rng = np.random.default_rng(5)
+    on = (np.arange(900) / 1500 * 120 + 0.3) % 1.0 < 0.4
+    light = np.where(on, 120.0, 15.0) * (1 + 0.1 * rng.normal(size=900))
+    pulses = classify_pulses(light, 1500.0)
+    assert np.array_equal(pulses.on, on)
+    assert pulses.frequency_hz == pytest.approx(120.0, abs=0.3)
+
+
+def test_steady_light_has_no_pulses():
+    light = 20.0 * (1 + 0.05 * np.random.default_rng(6).normal(size=400))
+    pulses = classify_pulses(light, 1500.0)
+    assert not pulses.on.any()
+    assert np.isnan(pulses.frequency_hz)
+
+
+def test_the_period_settles_frames_in_between():
+    """Half as bright as a pulse: the place in the period says which it is."""
+    phase = (np.arange(1500) / 1500 * 120.0) % 1.0
+    on = phase < 0.4
+    light = np.where(on, 100.0, 10.0)
+    odd = np.flatnonzero((phase > 0.1) & (phase < 0.3))[7]
+    light[odd] = 54.0
+    assert classify_pulses(light, 1500.0).on[odd]
+    assert not classify_pulses(light).on[odd]
+
+
+def test_frequency_through_missing_frames():
+    rng = np.random.default_rng(7)
+    time_s = np.arange(3000) / 1500
+    kept = (time_s * 120) % 1.0 > 0.4
+    values = np.sin(2 * np.pi * 37.3 * time_s) + 2 * time_s + 0.5 * rng.normal(size=3000)
+    frequency, share = oscillation_frequency(time_s[kept], values[kept])
+    assert frequency == pytest.approx(37.3, abs=0.1)
+    assert share > 0.5
+
+
+@pytest.mark.slow
+def test_a_line_is_followed_through_pulses_spatter_and_glare():
+    rig = LineRig(
+        Laser(70.0, 60.0, aim_y_mm=-2.4),
+        LinePattern(1, 0.23, 4.0),
+        Electrode(15.0),
+        ImagingPlane.vertical(20.0, 32.0, -4.0, 64.0, 48.0),
+    )
+    view = CameraView((0.0, 239.0), (300.0, 239.0), 60.0, (0.0, 39.0), 40.0, 320, 240)
+    rng = np.random.default_rng(8)
+    run = list(gmaw_run(300, rig, view, rng, oscillation_hz=36.0, look=GmawLook(spatter=1.0)))
+    film = track_line((one.image for one in run), 1500.0)
+    truth = np.array([one.on for one in run])
+    assert np.mean(film.pulses.on == truth) >= 0.99
+    off = np.flatnonzero(~truth)
+    errors = []
+    for k in off:
+        line = film.lines[k]
+        if line is not None:
+            u, v = run[k].line_px[np.argsort(run[k].line_px[:, 0])].T
+            errors.append(np.abs(line.v_px - np.interp(line.u_px, u, v))[3:-3].max())
+    assert len(errors) >= 0.95 * len(off)
+    assert np.median(errors) < 0.6
+    assert film.frequency_hz == pytest.approx(36.0, abs=1.0)

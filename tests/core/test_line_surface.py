@@ -1,0 +1,151 @@
+"""The surface under lines, against the twin; its equations, against differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.line_pattern import LinePattern, LineRig, line_directions
+from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
+from labapp.core.sequence.line_frame import LineMeasureSettings, measure_lines
+from labapp.core.surface.line_fit import fit_lines
+from labapp.core.surface.line_model import LineData, LineModel
+from labapp.core.surface.spline import SplineBasis
+from labapp.core.values import CannotMeasure
+from labapp.simulation.camera import CameraView
+from labapp.simulation.line_frames import LineFrame, LineLook, render_lines
+from labapp.simulation.pools import Pool, spherical_cap
+
+RIG = LineRig(
+    Laser(27.0, 90.0),
+    LinePattern(5, 0.23, 5.0),
+    Electrode(5.0),
+    ImagingPlane.vertical(53.6, 32.0, -5.0, 64.0, 84.0),
+)
+VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)
+CALIBRATION = ImageCalibration.from_three_points(
+    VIEW.origin_px, VIEW.x_axis_px, VIEW.x_axis_mm, VIEW.z_axis_px, VIEW.z_axis_mm
+)
+
+
+def rendered(pool: Pool | None, seed: int = 1, look: LineLook | None = None) -> LineFrame:
+    return render_lines(pool, RIG, VIEW, look or LineLook(), np.random.default_rng(seed))
+
+
+def exact_data(frame: LineFrame, sigma_mm: float = 0.01) -> tuple[LineData, np.ndarray]:
+    """What a perfect detector would give, and the numbers of the lines from the lowest up."""
+    lines = sorted(frame.lines, key=lambda one: -float(np.mean(one.image_px[:, 1])))
+    places = [VIEW.to_plane(one.image_px) for one in lines]
+    tangents = [np.gradient(place, axis=0) for place in places]
+    some = slice(3, -3, 8)
+    along = np.concatenate([each[some] for each in tangents])
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    count = [len(place[some]) for place in places]
+    line = np.repeat(np.arange(len(lines)), count)
+    data = LineData(
+        line,
+        np.concatenate([place[some] for place in places]),
+        np.stack([-along[:, 1], along[:, 0]], axis=-1),
+        np.full(len(line), sigma_mm),
+        np.repeat(np.arange(len(lines)), 2),
+        np.concatenate([place[[0, -1]] for place in places]),
+        np.full(2 * len(lines), 0.1),
+    )
+    return data, np.array([one.number for one in lines], float)
+
+
+def test_rays_of_a_line_are_in_one_plane():
+    fan = np.linspace(-RIG.pattern.half_fan, RIG.pattern.half_fan, 5)
+    rays = line_directions(RIG.laser, RIG.pattern, np.full(5, 2.0), fan)
+    assert np.linalg.svd(rays)[1][2] == pytest.approx(0.0, abs=1e-12)
+    ends = np.degrees(np.arccos(rays[0] @ rays[-1]))
+    assert ends == pytest.approx(5.0, abs=0.01)
+
+
+@pytest.mark.parametrize("peak_mm", [0.25, -0.3])
+def test_equations_have_the_derivatives_of_their_residuals(peak_mm: float):
+    data, numbers = exact_data(rendered(spherical_cap(6.0, peak_mm)))
+    basis = SplineBasis.over(np.array([-4.0, -3.0]), np.array([4.0, 3.0]), 1.5)
+    model = LineModel(RIG, basis, numbers)
+    x, y = (each.ravel() for each in np.meshgrid(np.linspace(-4, 4, 20), np.linspace(-3, 3, 20)))
+    target = 0.97 * peak_mm * (1 - (x**2 + y**2) / 9.0)
+    coefficients = np.linalg.lstsq(basis.matrix(x, y), target, rcond=None)[0]
+    linear = model.residuals(coefficients, data)
+    rng, step = np.random.default_rng(2), 1e-6
+    for _ in range(3):
+        way = rng.normal(size=basis.count)
+        ahead, behind = (
+            model.residuals(coefficients + sign * step * way, data).residual for sign in (1, -1)
+        )
+        slope = -(ahead - behind) / (2 * step)  # a residual falls as its prediction rises
+        predicted = linear.jacobian @ way
+        off = np.abs(slope - predicted) / np.abs(predicted).max()
+        # Terms of the residual's own size are left out of the Jacobian.
+        assert np.median(off) < 0.01
+        assert np.quantile(off, 0.9) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("peak_mm", [0.25, -0.3])
+def test_exact_lines_give_the_surface_and_its_uncertainty(peak_mm: float):
+    data, numbers = exact_data(rendered(spherical_cap(6.0, peak_mm)))
+    fitted = fit_lines(data, [numbers, numbers[::-1]], RIG)
+    assert fitted.status == "ok"
+    assert fitted.numbers.tolist() == numbers.tolist()
+    error = abs(fitted.height_mm - peak_mm)
+    assert error < 0.04 * abs(peak_mm)
+    assert error < 3 * fitted.height_sigma_mm
+    assert np.sign(fitted.curvature_per_mm) == np.sign(peak_mm)
+    assert fitted.margin > 50
+
+
+def test_one_line_alone_is_no_surface():
+    data, numbers = exact_data(rendered(spherical_cap(6.0, 0.25)))
+    on, ends = data.line == 2, data.end_line == 2
+    alone = replace(
+        data,
+        line=np.zeros(on.sum(), int),
+        plane_mm=data.plane_mm[on],
+        normal=data.normal[on],
+        sigma_mm=data.sigma_mm[on],
+        end_line=np.zeros(ends.sum(), int),
+        end_mm=data.end_mm[ends],
+        end_sigma_mm=data.end_sigma_mm[ends],
+    )
+    with pytest.raises(CannotMeasure) as answer:
+        fit_lines(alone, [numbers[2:3]], RIG)
+    assert answer.value.status == "too-few-lines"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("peak_mm", "numbers"), [(0.25, [1, 2, 3, 4, 5]), (-0.3, [5, 4, 3, 2, 1])])
+def test_frames_give_height_numbers_and_features(peak_mm: float, numbers: list[int]):
+    frame = rendered(spherical_cap(6.0, peak_mm), look=LineLook(gaps=1))
+    found = measure_lines(frame.image, RIG, CALIBRATION, LineMeasureSettings())
+    assert found.status == "ok"
+    assert found.surface is not None
+    assert found.surface.numbers.tolist() == numbers
+    assert found.surface.height_mm == pytest.approx(peak_mm, rel=0.08)
+    assert found.surface.height_sigma_mm < 0.1 * abs(peak_mm)
+    assert found.features.count == 5
+    assert found.features.curvature_per_mm > 0
+    assert abs(found.features.asymmetry) < 0.1
+    plane = VIEW.to_plane(np.concatenate([one.image_px for one in frame.lines]))
+    assert found.features.width_mm == pytest.approx(np.ptp(plane[:, 0]), rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_caustic_is_no_surface():
+    """A hollow of this depth gathers each line to a point: nothing must be read from it."""
+    frame = rendered(spherical_cap(6.0, -0.138))
+    found = measure_lines(frame.image, RIG, CALIBRATION, LineMeasureSettings())
+    assert found.status != "ok"
+
+
+def test_solid_metal_shows_no_line():
+    found = measure_lines(rendered(None).image, RIG, CALIBRATION, LineMeasureSettings())
+    assert found.status == "no-lines"
+    assert found.features.count == 0

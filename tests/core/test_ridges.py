@@ -1,0 +1,121 @@
+"""Ridges and lines: found to a fraction of a pixel, joined, ended; the truth is drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from labapp.core.images.light_lines import LineSettings, find_lines
+from labapp.core.images.line_numbers import number_lines
+from labapp.core.images.ridges import RidgeSettings, find_ridges
+from labapp.core.values import FloatArray
+
+SHAPE = (200, 260)
+
+
+def arc(center: tuple[float, float], radius: float, half: float) -> FloatArray:
+    """Points of an arch about its top, from left to right, shape (n, 2), px."""
+    angle = np.linspace(-half, half, 4000)
+    return np.stack(
+        [center[0] + radius * np.sin(angle), center[1] - radius * np.cos(angle)], axis=-1
+    )
+
+
+def drawn(
+    *lines: tuple[FloatArray, float], width: float = 2.0, noise: float = 1.0, seed: int = 0
+) -> FloatArray:
+    """A frame of lines with their peaks, grey levels."""
+    light = np.zeros(SHAPE)
+    for points, peak in lines:
+        length = np.linalg.norm(np.diff(points, axis=0), axis=-1).sum()
+        corner = np.floor(points).astype(int)
+        share = points - corner
+        for du in (0, 1):
+            for dv in (0, 1):
+                part = np.abs(1 - du - share[:, 0]) * np.abs(1 - dv - share[:, 1])
+                place = corner[:, 1] + dv, corner[:, 0] + du
+                np.add.at(light, place, peak * part * length / len(points))
+    light = gaussian_filter(light, width) * width * np.sqrt(2 * np.pi)
+    return light + 20.0 + noise * np.random.default_rng(seed).normal(size=SHAPE)
+
+
+def test_ridge_points_lie_on_a_slanted_line():
+    at = np.linspace(0, 1, 4000)[:, None]
+    frame = drawn((np.array([30.3, 60.7]) + at * np.array([190.0, 61.0]), 60.0), noise=0.2)
+    ridges = find_ridges(frame, RidgeSettings())
+    main = slice(*ridges.starts[:2]) if len(ridges) == 1 else slice(None)
+    points = ridges.image_px[main]
+    inner = (points[:, 0] > 45) & (points[:, 0] < 205)
+    across = np.array([-61.0, 190.0]) / np.hypot(61.0, 190.0)
+    off = (points[inner] - [30.3, 60.7]) @ across
+    assert inner.sum() > 140
+    assert np.sqrt(np.mean(off**2)) < 0.05
+
+
+def test_a_bent_line_is_found_where_it_is():
+    """Smoothing draws the ridge of a bent line inwards by more than its noise."""
+    path = arc((130.4, 140.2), 45.0, 1.2)
+    frame = drawn((path, 60.0), width=2.5, noise=0.5)
+    line = max(find_lines(frame, LineSettings()), key=lambda one: one.light * one.length_px)
+    radius = np.linalg.norm(line.image_px - [130.4, 140.2], axis=-1)
+    assert abs(np.mean(radius) - 45.0) < 0.05
+    assert np.sqrt(np.mean((radius - 45.0) ** 2)) < 0.1
+    assert np.median(line.curvature) == pytest.approx(1 / 45.0, rel=0.1)
+    assert line.width_px == pytest.approx(2.5, rel=0.15)
+
+
+def test_ends_are_where_the_light_ends():
+    path = arc((130.4, 180.2), 80.0, 0.9)
+    (line,) = find_lines(drawn((path, 60.0), noise=0.5), LineSettings())
+    assert np.abs(line.ends_px - path[[0, -1]]).max() < 0.8
+    assert not line.cut.any()
+
+
+def test_a_line_that_leaves_the_picture_is_cut():
+    at = np.linspace(0, 1, 4000)[:, None]
+    frame = drawn((np.array([40.0, 90.0]) + at * np.array([218.0, 20.0]), 60.0))
+    (line,) = find_lines(frame, LineSettings())
+    assert line.cut.tolist() == [False, True]
+
+
+def test_gaps_are_bridged_and_reported():
+    path = arc((130.0, 180.0), 90.0, 1.0)
+    first, second = path[path[:, 0] < 144.5], path[path[:, 0] > 155.5]
+    frame = drawn((first, 60.0), (second, 60.0))
+    (line,) = find_lines(frame, LineSettings())
+    assert 6 < line.gap_px < 30
+    assert np.abs(line.ends_px - path[[0, -1]]).max() < 1.0
+
+
+def five(*bright: float, spacing: float = 22.0) -> list[tuple[FloatArray, float]]:
+    """Arches one above the other, from the lowest up, each with its peak."""
+    return [(arc((130.0, 240.0 - spacing * k), 90.0, 0.7), peak) for k, peak in enumerate(bright)]
+
+
+def test_fringes_are_left_out_and_settle_the_numbers():
+    frame = drawn(*five(9.0, 50.0, 55.0, 60.0, 10.0))
+    seen = number_lines(find_lines(frame, LineSettings()), 3)
+    assert len(seen.lines) == 3
+    assert seen.fringe_below
+    assert seen.fringe_above
+    assert seen.left_out == 2
+    assert list(seen.first_numbers(3, same_order=True)) == [1]
+    assert list(seen.first_numbers(3, same_order=False)) == [3]
+
+
+def test_missing_lines_leave_the_numbers_open_unless_a_fringe_is_seen():
+    alone = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0)), LineSettings()), 5)
+    assert list(alone.first_numbers(5, same_order=True)) == [1, 2, 3]
+    assert list(alone.first_numbers(5, same_order=False)) == [3, 4, 5]
+    above = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0, 10.0)), LineSettings()), 5)
+    assert list(above.first_numbers(5, same_order=True)) == [3]
+    below = number_lines(find_lines(drawn(*five(9.0, 55.0, 60.0, 50.0)), LineSettings()), 5)
+    assert list(below.first_numbers(5, same_order=True)) == [1]
+    assert list(below.first_numbers(5, same_order=False)) == [5]
+
+
+def test_an_empty_frame_has_no_line():
+    frame = 20.0 + np.random.default_rng(1).normal(size=SHAPE)
+    seen = number_lines(find_lines(frame, LineSettings()), 5)
+    assert seen.lines == ()

@@ -1,0 +1,136 @@
+"""`labapp lines`, and the setup files it takes."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.config.line_setup import read_line_setup
+from labapp.config.setup import read_setup
+from labapp.errors import InputError
+from labapp.simulation.camera import CameraView
+from labapp.simulation.line_frames import LineLook, render_lines
+from labapp.simulation.pools import spherical_cap
+from tests.conftest import Run
+
+SETUP = """
+[laser]
+projection_angle_deg = 27.0
+distance_mm = 90.0
+[pattern]
+kind = "lines"
+count = 5
+interline_angle_deg = 0.23
+fan_angle_deg = 5.0
+[electrode]
+height_mm = 5.0
+[imaging_plane]
+distance_mm = 53.6
+s_mm = 32.0
+h_mm = -5.0
+width_mm = 64.0
+height_mm = 84.0
+[image_calibration]
+origin_px = [2.0, 638.0]
+x_axis_px = [452.0, 638.0]
+x_axis_mm = 60.0
+z_axis_px = [2.0, 188.0]
+z_axis_mm = 60.0
+"""
+VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)
+
+pytestmark = pytest.mark.usefixtures("state")
+
+
+@pytest.fixture
+def setup(tmp_path: Path) -> Path:
+    path = tmp_path / "setup.toml"
+    path.write_text(SETUP, "utf-8")
+    return path
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_setup_of_lines(setup: Path):
+    bench = read_line_setup(setup)
+    pattern = bench.rig.pattern
+    assert (pattern.count, pattern.interline_angle_deg, pattern.fan_angle_deg) == (5, 0.23, 5.0)
+    assert bench.rig.laser.projection_angle_deg == 27.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("count = 5", "count = 5.5", "pattern.count"),
+        ("count = 5", "", "pattern.count"),
+        ("count = 5", "count = 5\nrows = 3", "pattern.rows"),
+        ("distance_mm = 90.0", "distance_mm = -1", "laser.distance_mm"),
+        ('kind = "lines"', 'kind = "square"', "pattern.kind"),
+        ("interline_angle_deg = 0.23", "interline_angle_deg = 20", "pattern.interline_angle_deg"),
+    ],
+)
+def test_what_a_setup_must_not_say(setup: Path, old: str, new: str, field: str):
+    setup.write_text(SETUP.replace(old, new, 1), "utf-8")
+    with pytest.raises(InputError) as refused:
+        read_line_setup(setup)
+    assert field in [problem.field for problem in refused.value.problems]
+
+
+def test_a_setup_of_lines_is_none_of_dots(setup: Path):
+    with pytest.raises(InputError) as refused:
+        read_setup(setup)
+    assert refused.value.field == "pattern.kind"
+
+
+@pytest.mark.slow
+def test_frames_become_tables(labapp: Run, setup: Path, tmp_path: Path):
+    pools = (spherical_cap(6.0, 0.25), None)
+    (tmp_path / "frames").mkdir()
+    for k, pool in enumerate(pools):
+        image = render_lines(pool, read_line_setup(setup).rig, VIEW, LineLook(),
+                             np.random.default_rng(k)).image  # fmt: skip
+        cv2.imwrite(str(tmp_path / "frames" / f"frame_{k}.png"), image)
+    out = tmp_path / "out"
+    code, said, _ = labapp("lines", tmp_path / "frames", "--setup", setup, "--out", out)
+    assert code == 0
+    assert "ok 1" in said
+    features = rows(out / "features.csv")
+    assert [row["status"] for row in features] == ["ok", "no-lines"]
+    assert float(features[0]["pool_height_mm"]) == pytest.approx(0.25, rel=0.1)
+    assert features[1]["pool_height_mm"] == ""
+    lines = rows(out / "lines.csv")
+    assert [row["number"] for row in lines] == ["1", "2", "3", "4", "5"]
+    points = rows(out / "line_points.csv")
+    assert {row["line"] for row in points} == {"1", "2", "3", "4", "5"}
+    assert (out / "surface_000000.csv").exists()
+    assert not (out / "surface_000001.csv").exists()
+
+
+def test_without_lines_the_exit_code_says_so(labapp: Run, setup: Path, tmp_path: Path):
+    noise = 20 + np.random.default_rng(1).normal(size=(640, 480))
+    cv2.imwrite(str(tmp_path / "dark.png"), noise.astype(np.uint8))
+    arguments = ("lines", tmp_path / "dark.png", "--setup", setup, "--out", tmp_path / "out")
+    code, _, _ = labapp(*arguments)
+    assert code == 1
+    assert rows(tmp_path / "out" / "features.csv")[0]["state"] == "no-pool"
+
+
+def test_one_line_is_followed(labapp: Run, setup: Path, tmp_path: Path):
+    (tmp_path / "frames").mkdir()
+    v, u = np.mgrid[:120, :160]
+    for k in range(4):
+        light = 20 + 60 * np.exp(-((v - 60 - 0.5 * k - (u - 80) ** 2 / 400) ** 2) / 8)
+        light += np.random.default_rng(k).normal(size=light.shape)
+        cv2.imwrite(str(tmp_path / "frames" / f"frame_{k}.png"), light.astype(np.uint8))
+    arguments = ("lines", tmp_path / "frames", "--setup", setup, "--out", tmp_path / "out")
+    code, _, _ = labapp(*arguments, "--follow")
+    assert code == 0
+    shift = [float(row["shift_px"]) for row in rows(tmp_path / "out" / "track.csv")]
+    assert np.diff(shift) == pytest.approx([0.5, 0.5, 0.5], abs=0.15)
