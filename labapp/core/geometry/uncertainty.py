@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -118,6 +119,17 @@ class RigUncertainty(ReadOnlyArrays):
     def sigma(self) -> FloatArray:
         """Standard uncertainty of each of `QUANTITIES`, shape (q,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """Root of the covariance, shape (q, m): ``root @ root.T``, a column per independent cause.
+
+        A quantity that is known exactly has no part in it, and one that is correlated with no other
+        has a column of its own.
+        """
+        own, causes = np.linalg.eigh(self.correlation)
+        made = self.sigma[:, None] * causes * np.sqrt(np.maximum(own, 0.0))
+        return np.asarray(made[:, own > 1e-12])
 
     @property
     def status(self) -> str:
