@@ -31,8 +31,8 @@ ROBUST = 3.0
 STEP = 1e-3
 """Of the central differences, in prior standard uncertainties: their error is of its square."""
 
-ROUNDS, MOST_STEPS = 12, 60
-"""Of tightening the robust loss; evaluations in each of them."""
+ROUNDS, FEW_STEPS, MOST_STEPS = 12, 3, 40
+"""Of tightening the robust loss; steps in each of them, and in the last."""
 
 PLACES = 9
 """Along X and Y, where a mirror whose place is free may be at first."""
@@ -151,14 +151,16 @@ def adjust(
     factor = known.root if released is None else np.column_stack([known.root, released.T])
     system = _System(rig, tuple(sightings), factor)
     unknown = system.start() if start is None or len(start) != system.size else start
-    found, scale = system.residuals(unknown), np.inf
+    scale = max(1.0, _spread(system.residuals(unknown)))
     for _ in range(ROUNDS):
         # Gross errors first: the loss tightens as the residuals shrink.
-        before, scale = scale, max(1.0, _spread(found))
-        if scale > 0.98 * before:
+        if scale == 1.0:
             break
-        unknown = system.minimised(unknown, scale)
-        found = system.residuals(unknown)
+        unknown = system.minimised(unknown, scale, FEW_STEPS)
+        before, scale = scale, max(1.0, _spread(system.residuals(unknown)))
+        if scale > 0.95 * before:
+            break
+    unknown = system.minimised(unknown, scale, MOST_STEPS)
     return system.adjustment(unknown, scale)
 
 
@@ -210,9 +212,10 @@ class _System:
         known, one = self.rig.uncertainty, self.sightings[k]
         assert known is not None
         offset = self.factor @ bench
-        computed, _ = landing_points(one.mirror, self.pose(k, pose), moved_rig(self.rig, offset))
+        rig, shape = moved_rig(self.rig, offset), self.pose(k, pose)
+        computed, _ = landing_points(one.mirror, shape, rig, tuple(one.ray.T))
         observed = moved_dots(one.plane_mm, self.rig, known.axes, offset)
-        return np.asarray(observed - computed[tuple(one.ray.T)])
+        return np.asarray(observed - computed)
 
     def _standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
         residual = np.einsum("nij,nj->ni", self.roots[k], self.residual_mm(k, bench, pose))
@@ -235,7 +238,7 @@ class _System:
             made[rows, part] = _slopes(lambda x: self._standardised(k, bench, x), pose)
         return made
 
-    def minimised(self, unknown: FloatArray, scale: float) -> FloatArray:
+    def minimised(self, unknown: FloatArray, scale: float, steps: int) -> FloatArray:
         """Unknowns of least cost, with the dots' standard uncertainties times a scale."""
         data = 2 * sum(len(s.ray) for s in self.sightings)
         eye = np.eye(self.size)
@@ -250,9 +253,9 @@ class _System:
             unknown,
             jac=lambda x: np.vstack([self.jacobian(x) / scale, eye]),
             loss=loss,
-            xtol=1e-6,
-            ftol=1e-7,
-            max_nfev=MOST_STEPS,
+            xtol=1e-4,
+            ftol=1e-5,
+            max_nfev=steps,
         )
         return np.asarray(found.x)
 

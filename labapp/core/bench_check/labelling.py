@@ -30,6 +30,9 @@ from labapp.core.values import CannotMeasure, FloatArray, IntArray
 LEAST_DOTS = 12
 """Fewer dots with a ray tell nothing of a bench."""
 
+SURROUNDED = 3
+"""A ray is amid others that have so many lit neighbours of four."""
+
 NEAR = 0.3
 """A dot is taken for a ray's where it is nearer to where it should be than this share of the way to
 the next ray's."""
@@ -44,7 +47,10 @@ MARGIN = 20.0
 MOST_STARTS = 6
 """So many first labels of a kind are tried, those first that leave fewest dots and rays."""
 
-EXPLAINED = 0.7
+MOST_WORSE = 100.0
+"""First labels that cost so much more than the best by the dots and rays that they leave are not."""
+
+EXPLAINED = 0.85
 """Such a share of the dots has a ray where a mirror explains them."""
 
 GRID_MM, LOOSE = 0.25, 0.45
@@ -96,9 +102,13 @@ class Labelled:
 
 
 def label_picture(
-    picture: Picture, rig: Rig, calibration: ImageCalibration, released: FloatArray | None = None
+    picture: Picture,
+    rig: Rig,
+    calibration: ImageCalibration,
+    released: FloatArray | None = None,
+    others: tuple[Sighting, ...] = (),
 ) -> Labelled:
-    """Find the ray of every dot of one picture.
+    """Find the ray of every dot of a picture.
 
     Parameters
     ----------
@@ -108,6 +118,8 @@ def label_picture(
         The set-up before the check.
     released
         See `adjust`.
+    others
+        What other pictures showed, which the bench is adjusted to as well.
 
     Raises
     ------
@@ -127,8 +139,9 @@ def label_picture(
     observed = Observation.of(picture.dots, rig, calibration, picture.frame_shape)
     found: list[Labelled] = []
     for first in (_by_grid, _by_places):
-        starts = sorted(first(observed, picture), key=lambda labels: _penalty(labels, observed))
-        grown = (_grown(observed, picture.mirror, one, released) for one in starts[:MOST_STARTS])
+        starts = _likeliest(first(observed, picture), observed)
+        given = (observed, picture.mirror, released, others)
+        grown = (_grown(*given, one) for one in starts)
         found += [one for one in grown if one is not None]
         if any(_explains(observed, one) for one in found):
             break
@@ -151,6 +164,13 @@ def label_picture(
             f"{picture.name}: a {picture.mirror.name} explains {lit} of {len(picture.dots)} dots",
         )
     return best
+
+
+def _likeliest(starts: list[IntArray], observed: Observation) -> list[IntArray]:
+    """The labels that leave fewest dots and rays, none that leaves many more than the best."""
+    penalties = np.array([_penalty(labels, observed) for labels in starts])
+    order = np.argsort(penalties, kind="stable")[:MOST_STARTS]
+    return [starts[k] for k in order if penalties[k] <= penalties.min() + MOST_WORSE]
 
 
 def _by_grid(observed: Observation, picture: Picture) -> list[IntArray]:
@@ -189,7 +209,7 @@ def _explains(observed: Observation, one: Labelled) -> bool:
 
 def sighting_of(observed: Observation, mirror: Mirror, labels: IntArray) -> Sighting:
     """The pairs of ray and dot that labels are."""
-    at = np.argwhere(labels != UNLABELLED)
+    at = np.argwhere((labels != UNLABELLED) & ~observed.absent)
     dot = labels[tuple(at.T)]
     return Sighting(mirror, at, observed.plane_mm[dot], observed.covariance_mm2[dot])
 
@@ -203,41 +223,49 @@ def relabelled(
 ) -> IntArray:
     """Labels by where a bench that is off and a mirror at a pose put every ray's dot.
 
-    A dot is taken that is nearer to a ray's than a share of the way to the next.
+    A dot is taken that is nearer to a ray's than a share of the way to the next. An absent ray has
+    one where a dot lies in its hole.
     """
     assert observed.rig.uncertainty is not None
     computed, hit = landing_points(mirror, pose, moved_rig(observed.rig, offset))
     axes = observed.rig.uncertainty.axes
     dots = moved_dots(observed.plane_mm, observed.rig, axes, offset)
     labels = np.full(hit.shape, UNLABELLED)
-    expected = hit & ~observed.absent
-    at = np.argwhere(expected)
+    at = np.argwhere(hit)
     if len(at) < 2 or not len(dots):
         return labels
-    near = share * _step(np.where(hit[..., None], computed, np.nan))[expected]
-    distance, dot = scipy.spatial.cKDTree(dots).query(computed[expected])
-    back = scipy.spatial.cKDTree(computed[expected]).query(dots)[1]
+    near = share * _step(np.where(hit[..., None], computed, np.nan))[hit]
+    distance, dot = scipy.spatial.cKDTree(dots).query(computed[hit])
+    back = scipy.spatial.cKDTree(computed[hit]).query(dots)[1]
     mutual = (back[dot] == np.arange(len(at))) & (distance < near)
     labels[tuple(at[mutual].T)] = dot[mutual]
     return labels
 
 
 def _grown(
-    observed: Observation, mirror: Mirror, labels: IntArray, released: FloatArray | None
+    observed: Observation,
+    mirror: Mirror,
+    released: FloatArray | None,
+    others: tuple[Sighting, ...],
+    labels: IntArray,
 ) -> Labelled | None:
-    """Labels that bench and mirror, adjusted to them, lead to."""
+    """Labels that bench and mirror, adjusted to them, lead to; None where these have no hole."""
     start = None
     for _ in range(ROUNDS):
         if (labels != UNLABELLED).sum() < LEAST_DOTS:
             return None
-        made = adjust(observed.rig, [sighting_of(observed, mirror, labels)], released, start)
+        sightings = [*others, sighting_of(observed, mirror, labels)]
+        made = adjust(observed.rig, sightings, released, start)
         start, before = made.unknown, labels
-        labels = relabelled(observed, mirror, made.offset, made.poses[0])
+        labels = relabelled(observed, mirror, made.offset, made.poses[-1])
         if (labels == before).all():
             break
-    else:
-        labels = before
-    return Labelled(labels, made, made.cost + _penalty(labels, observed) + _coarse(made))
+    i, j = observed.rig.pattern.marker or observed.rig.pattern.reference
+    in_hole = labels[i - 1, j - 1] != UNLABELLED
+    if in_hole or _lit_neighbours(labels)[i - 1, j - 1] < SURROUNDED:
+        return None
+    cost = made.cost + _penalty(labels, observed) + _coarse(made)
+    return Labelled(np.where(observed.absent, UNLABELLED, labels), made, cost)
 
 
 def _coarse(made: Adjustment) -> float:
@@ -254,12 +282,18 @@ def _different(found: list[Labelled]) -> list[Labelled]:
 def _penalty(labels: IntArray, observed: Observation) -> float:
     """What dots without a ray cost, and rays without a dot that at least three lit ones surround."""
     lit = labels != UNLABELLED
-    around = np.pad(lit, 1).astype(int)
-    neighbours = around[:-2, 1:-1] + around[2:, 1:-1] + around[1:-1, :-2] + around[1:-1, 2:]
-    missed = int((~lit & ~observed.absent & (neighbours >= 3)).sum())
+    missed = int((~lit & ~observed.absent & (_lit_neighbours(labels) >= SURROUNDED)).sum())
     on_hole = int((lit & observed.absent).sum())
     stray = len(observed.plane_mm) - int(lit.sum()) + on_hole
     return STRAY * stray + MISSED * missed
+
+
+def _lit_neighbours(labels: IntArray) -> IntArray:
+    """How many of the four neighbours of each ray have a dot, shape (rows, columns)."""
+    around = np.pad(labels != UNLABELLED, 1).astype(np.int64)
+    return np.asarray(
+        around[:-2, 1:-1] + around[2:, 1:-1] + around[1:-1, :-2] + around[1:-1, 2:]
+    )
 
 
 def _step(plane_mm: FloatArray) -> FloatArray:

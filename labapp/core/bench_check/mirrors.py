@@ -12,7 +12,7 @@ import numpy as np
 
 from labapp.core.geometry.optics import intersect_imaging_plane, ray_directions, reflect
 from labapp.core.geometry.rig import Rig
-from labapp.core.values import BoolArray, FloatArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 FREE_MM = 10.0
 """Standard uncertainty of a length that is not known, mm."""
@@ -236,17 +236,26 @@ def sphere_radius(diameter_mm: float, height_mm: float) -> float:
     return (diameter_mm**2 / 4 + height_mm**2) / (2 * height_mm)
 
 
-def landing_points(mirror: Mirror, pose: FloatArray, rig: Rig) -> tuple[FloatArray, BoolArray]:
+def landing_points(
+    mirror: Mirror, pose: FloatArray, rig: Rig, of: tuple[IntArray, ...] = ()
+) -> tuple[FloatArray, BoolArray]:
     """Where rays that a mirror reflects meet the imaging plane.
+
+    Parameters
+    ----------
+    mirror, pose, rig
+        The mirror, its pose, shape (d,), and the bench.
+    of
+        Rows and columns of the rays, counted from 0, shapes (n,). Empty: all rays.
 
     Returns
     -------
     plane_mm, hit
-        IPCS (X′, Z′), shape (rows, columns, 2), mm, the plane's edges ignored, NaN where a ray never
-        meets it; whether the ray meets the mirror and the plane, shape (rows, columns). Absent rays
-        are followed like others.
+        IPCS (X′, Z′), shape (rows, columns, 2) or (n, 2), mm, the plane's edges ignored, NaN where
+        a ray never meets it; whether the ray meets the mirror and the plane. Absent rays are followed
+        like others.
     """
-    rays, source = ray_directions(rig.laser, rig.pattern), rig.laser.position_mm
+    rays, source = ray_directions(rig.laser, rig.pattern)[of], rig.laser.position_mm
     point, normal, hit = mirror.meet(source, rays, pose)
     plane = intersect_imaging_plane(point, reflect(rays, normal), rig.imaging_plane)
     return plane, np.asarray(hit & np.isfinite(plane[..., 0]))
