@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -108,11 +109,14 @@ class RigUncertainty(ReadOnlyArrays):
         Of `QUANTITIES`, shape (q, q), in the squares of their units.
     assumed
         Keys of the quantities whose uncertainty nobody told.
+    checked
+        Whether the bench was adjusted to a known mirror, and is as it was then.
     """
 
     axes: AxisPoints
     covariance: FloatArray
     assumed: frozenset[str] = frozenset()
+    checked: bool = False
 
     @property
     def sigma(self) -> FloatArray:
@@ -121,7 +125,11 @@ class RigUncertainty(ReadOnlyArrays):
 
     @property
     def status(self) -> str:
-        """``calibrated`` where laser and image calibration told their own ±, or ``entered``."""
+        """``checked``; ``calibrated`` where laser and image calibration told their own ±, or
+        ``entered``.
+        """
+        if self.checked:
+            return "checked"
         return "entered" if self.assumed & CALIBRATED else "calibrated"
 
     @property
@@ -130,9 +138,12 @@ class RigUncertainty(ReadOnlyArrays):
         sigma = np.where(self.sigma > 0.0, self.sigma, 1.0)
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
-    @property
+    @cached_property
     def root(self) -> FloatArray:
-        """Lower root R of the covariance, shape (q, q): offsets R·n of normal deviates n."""
+        """Lower root R of the covariance, shape (q, q): offsets R·n of normal deviates n.
+
+        The column of a quantity that is known exactly is 0.
+        """
         root, uncertain = np.zeros_like(self.covariance), np.flatnonzero(self.sigma)
         some = np.ix_(uncertain, uncertain)
         correlation = self.correlation[some] + 1e-12 * np.eye(len(uncertain))  # ±1 is singular

@@ -52,7 +52,7 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
         surface.basis, surface.coefficients, level, boundary, boundary_slope
     )
     fitted = Fitted(match, rig, settings, surface, pool.points_mm, level)
-    by_setup = setup_sigma(rig, fitted.setup_changes(sizes.gradient))
+    by_setup = setup_sigma(fitted.setup_changes(sizes.gradient))
     return Reconstruction(
         scheme="fit",
         surface=surface,

@@ -421,7 +421,7 @@ def _sized(
     surface, by_setup = SplineSurface(geometry.basis, coefficients), track.size_sigma_setup
     if track.count % SETUP_EVERY == SETUP_EVERY - 1:
         fitted = Fitted(match, geometry.rig, geometry.settings, surface, points, level)
-        by_setup = setup_sigma(geometry.rig, fitted.setup_changes(sizes.gradient))
+        by_setup = setup_sigma(fitted.setup_changes(sizes.gradient))
     share = np.full(len(ray), 1 / len(ray))
     level_at = kernels.gradient_of_sum(geometry.basis.grid, len(coefficients), points[:, :2], share)
     by_rays = propagate_sigma(lower, sizes.gradient, level_at, level.sigma_mm)

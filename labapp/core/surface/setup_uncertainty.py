@@ -1,8 +1,10 @@
 """What is not known of the bench, in the sizes of a pool: linear propagation (JCGM 100, 5.1.2).
 
-The fit is done anew with each quantity of the bench off by its standard uncertainty either way,
-from where it ended, and with the rays and the witnesses that it had. Half the difference is what
-a size changes by: over the very width that matters, as the level answers few rays in steps.
+The fit is done anew with the bench off either way by each column of a root of its covariance, from
+where it ended, and with the rays and the witnesses that it had. A column is a quantity's standard
+uncertainty, or where quantities are correlated, one of the independent causes of what they are off
+by. Half the difference is what a size changes by: over the very width that matters, as the level
+answers few rays in steps.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ class Fitted:
     level: Level
 
     def setup_changes(self, gradient: FloatArray) -> FloatArray:
-        """Changes of sizes by the standard uncertainty of each quantity of the bench.
+        """Changes of sizes by each independent cause of what the bench is off by.
 
         Parameters
         ----------
@@ -60,25 +62,23 @@ class Fitted:
         Returns
         -------
         FloatArray
-            Shape (m, q), in the sizes' units; the quantities are those of
-            `geometry.uncertainty.QUANTITIES`. None of them where the rig is known exactly; NaN
-            where no surface would be left.
+            Shape (m, q), in the sizes' units; the causes are the columns of `RigUncertainty.root`.
+            None where the rig is known exactly; NaN where no surface would be left.
 
         """
         known = self.rig.uncertainty
         if known is None:
             return np.zeros((len(gradient), 0))
-        changes = np.zeros((len(gradient), len(known.sigma)))
-        for k, sigma in enumerate(known.sigma):
-            if sigma:
-                offset = np.zeros(len(known.sigma))
-                offset[k] = sigma
-                try:
-                    apart = self._refitted(offset) - self._refitted(-offset)
-                except CannotMeasure:
-                    changes[:, k] = np.nan
-                    continue
-                changes[:, k] = gradient @ apart / 2
+        changes = np.zeros((len(gradient), len(known.root)))
+        for k, offset in enumerate(known.root.T):
+            if not offset.any():
+                continue
+            try:
+                apart = self._refitted(offset) - self._refitted(-offset)
+            except CannotMeasure:
+                changes[:, k] = np.nan
+                continue
+            changes[:, k] = gradient @ apart / 2
         return changes
 
     def _refitted(self, offset: FloatArray) -> FloatArray:
@@ -130,6 +130,6 @@ class Fitted:
         return np.asarray((self.match.witness != 0) & inside)
 
 
-def setup_sigma(rig: Rig, changes: FloatArray) -> FloatArray:
+def setup_sigma(changes: FloatArray) -> FloatArray:
     """Standard uncertainty of sizes, shape (m,), from their `Fitted.setup_changes`."""
-    return np.zeros(len(changes)) if rig.uncertainty is None else rig.uncertainty.combined(changes)
+    return np.asarray(np.sqrt(np.sum(changes**2, axis=1)))
