@@ -51,8 +51,7 @@ def draw_bench(
     Parameters
     ----------
     rig, view
-        The set-up: the bench is this, but for the errors. The view's points are where the operator
-        saw them, in the picture as the lens bends it.
+        The set-up: the bench is this, but for the errors, and a lens about the picture's middle.
     errors
         How far it may be off.
     rng
@@ -86,18 +85,13 @@ def draw_bench(
     true_rig = replace(
         rig, laser=true_laser, pattern=true_pattern, imaging_plane=true_plane, uncertainty=None
     )
-    points = rng.normal(0, errors.point_px, (3, 2))
-    return Bench(true_rig, seen_through(view, Lens(FOCAL_PX, float(k1)), points))
-
-
-def seen_through(view: CameraView, lens: Lens, off_px: FloatArray) -> CameraView:
-    """The view whose points, shape (3, 2), are seen through a lens where another has them, and off.
-
-    ``off_px`` is by how much the operator missed them.
-    """
-    seen = np.array([view.origin_px, view.x_axis_px, view.z_axis_px]) - off_px
-    middle = np.array([view.width_px - 1, view.height_px - 1]) / 2
-    origin, on_x, on_z = (middle + lens.straighten(seen - middle)).tolist()
-    return replace(
-        view, origin_px=tuple(origin), x_axis_px=tuple(on_x), z_axis_px=tuple(on_z), lens=lens
+    seen = np.array([view.origin_px, view.x_axis_px, view.z_axis_px])
+    origin, on_x, on_z = (seen + rng.normal(0, errors.point_px, (3, 2))).tolist()
+    true_view = replace(
+        view,
+        origin_px=tuple(origin),
+        x_axis_px=tuple(on_x),
+        z_axis_px=tuple(on_z),
+        lens=Lens(FOCAL_PX, float(k1)),
     )
+    return Bench(true_rig, true_view)

@@ -9,7 +9,7 @@ variance 1, and a quantity that is known exactly has none.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,9 @@ STEP = 1e-3
 
 ROUNDS, FEW_STEPS, MOST_STEPS = 12, 3, 40
 """Of tightening the robust loss; steps in each of them, and in the last."""
+
+SETTLED = 0.95
+"""A scale of the residuals has settled that shrinks by no more than to this share."""
 
 PLACES = 9
 """Along X and Y, where a mirror whose place is free may be at first."""
@@ -146,32 +149,26 @@ def adjust(
     start
         Unknowns to begin with, those of an adjustment to the same mirrors; None: the expected bench.
     """
-    known = rig.uncertainty
-    assert known is not None
-    factor = known.root[:, known.sigma > 0]
-    factor = factor if released is None else np.column_stack([factor, released.T])
-    system = _System(rig, tuple(sightings), factor)
+    system = System.of(rig, sightings, released)
     unknown = system.start() if start is None or len(start) != system.size else start
-    scale = max(1.0, _spread(system.residuals(unknown)))
-    for _ in range(ROUNDS):
-        # Gross errors first: the loss tightens as the residuals shrink.
-        if scale == 1.0:
-            break
-        unknown = system.minimised(unknown, scale, FEW_STEPS)
-        before, scale = scale, max(1.0, _spread(system.residuals(unknown)))
-        if scale > 0.95 * before:
-            break
-    unknown = system.minimised(unknown, scale, MOST_STEPS)
-    return system.adjustment(unknown, scale)
+    return system.solved_from(unknown)
 
 
 @dataclass(frozen=True)
-class _System:
+class System:
     """The equations of an adjustment: the bench's unknowns, and then those of each pose."""
 
     rig: Rig
     sightings: tuple[Sighting, ...]
     factor: FloatArray
+
+    @classmethod
+    def of(cls, rig: Rig, sightings: Sequence[Sighting], released: FloatArray | None) -> System:
+        """The equations with the prior widened, see `adjust`."""
+        known = rig.uncertainty
+        assert known is not None
+        root = known.root if released is None else np.column_stack([known.root, released.T])
+        return cls(rig, tuple(sightings), root)
 
     @cached_property
     def parts(self) -> list[slice]:
@@ -199,7 +196,7 @@ class _System:
         unknown = np.zeros(self.size)
         for k, one in enumerate(self.sightings):
             tried = [unknown[self.parts[k + 1]], *_places(one, self.rig)]
-            costs = [_spread(self._standardised(k, unknown[self.parts[0]], pose)) for pose in tried]
+            costs = [_spread(self.standardised(k, unknown[self.parts[0]], pose)) for pose in tried]
             unknown[self.parts[k + 1]] = tried[int(np.argmin(costs))]
         return unknown
 
@@ -218,7 +215,8 @@ class _System:
         observed = moved_dots(one.plane_mm, self.rig, known.axes, offset)
         return np.asarray(observed - computed)
 
-    def _standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
+    def standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
+        """The same over their standard uncertainties, shape (2n,)."""
         residual = np.einsum("nij,nj->ni", self.roots[k], self.residual_mm(k, bench, pose))
         return np.where(np.isfinite(residual), residual, LOST).ravel()
 
@@ -226,7 +224,7 @@ class _System:
         """Standardised residuals of all sightings, shape (m,)."""
         bench, *poses = (unknown[part] for part in self.parts)
         return np.concatenate(
-            [self._standardised(k, bench, pose) for k, pose in enumerate(poses)]
+            [self.standardised(k, bench, pose) for k, pose in enumerate(poses)]
         )
 
     def jacobian(self, unknown: FloatArray) -> FloatArray:
@@ -235,8 +233,55 @@ class _System:
         made, row = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size)), 0
         for k, (pose, part) in enumerate(zip(poses, self.parts[1:], strict=True)):
             rows = slice(row, row := row + 2 * len(self.sightings[k].ray))
-            made[rows, self.parts[0]] = _slopes(lambda x: self._standardised(k, x, pose), bench)
-            made[rows, part] = _slopes(lambda x: self._standardised(k, bench, x), pose)
+            made[rows, self.parts[0]] = _slopes(lambda x: self.standardised(k, x, pose), bench)
+            made[rows, part] = _slopes(lambda x: self.standardised(k, bench, x), pose)
+        return made
+
+    def solved_from(self, unknown: FloatArray) -> Adjustment:
+        """The adjustment that unknowns lead to."""
+        scale = max(1.0, _spread(self.residuals(unknown)))
+        for _ in range(ROUNDS):
+            # Gross errors first: the loss tightens as the residuals shrink.
+            if scale == 1.0:
+                break
+            unknown = self.minimised(unknown, scale, FEW_STEPS)
+            before, scale = scale, max(1.0, _spread(self.residuals(unknown)))
+            if scale > SETTLED * before:
+                break
+        for _ in range(ROUNDS):
+            unknown = self.minimised(unknown, scale, MOST_STEPS)
+            before, scale = scale, max(1.0, _spread(self.residuals(unknown)))
+            if scale > SETTLED * before:
+                break
+        return self.adjustment(unknown, scale)
+
+    def solved(self, made: Adjustment) -> Adjustment:
+        """The adjustment that another of the same dots leads to, with more let go of."""
+        extra = self.size - len(made.unknown)
+        bench = self.parts[0].stop - extra
+        return self.solved_from(np.insert(made.unknown, bench, np.zeros(extra)))
+
+    def by_bench(self, made: Adjustment, directions: FloatArray) -> FloatArray:
+        """Derivatives of the residuals by directions of the bench's quantities, shape (m, k)."""
+        wide = replace(self, factor=np.eye(len(made.offset)))
+        rows = []
+        for k, pose in enumerate(made.poses):
+            mirror = self.sightings[k].mirror
+            still = k, (pose - mirror.pose) / mirror.sigma
+
+            def along(x: FloatArray, at: tuple[int, FloatArray] = still) -> FloatArray:
+                return wide.standardised(at[0], made.offset + directions @ x, at[1])
+
+            rows.append(_slopes(along, np.zeros(directions.shape[1])))
+        return np.concatenate(rows)
+
+    def by_dots(self, k: int, change_mm: FloatArray) -> FloatArray:
+        """What changes of a sighting's residuals, shape (n, 2, c), mm, are to all, shape (m, c)."""
+        made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), change_mm.shape[2]))
+        first = 2 * sum(len(s.ray) for s in self.sightings[:k])
+        own = np.einsum("nij,njc->nic", self.roots[k], change_mm)
+        own = np.where(np.isfinite(own), own, 0.0).reshape(-1, change_mm.shape[2])
+        made[first : first + len(own)] = own
         return made
 
     def minimised(self, unknown: FloatArray, scale: float, steps: int) -> FloatArray:

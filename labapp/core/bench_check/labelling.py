@@ -44,10 +44,10 @@ likelihood."""
 MARGIN = 20.0
 """Rays that cost less than so much more than the best are as likely."""
 
-MOST_STARTS = 6
+MOST_STARTS = 4
 """So many first labels of a kind are tried, those first that leave fewest dots and rays."""
 
-MOST_WORSE = 100.0
+MOST_WORSE = 40.0
 """First labels that cost so much more than the best by the dots and rays that they leave are not."""
 
 EXPLAINED = 0.85
@@ -56,7 +56,7 @@ EXPLAINED = 0.85
 GRID_MM, LOOSE = 0.25, 0.45
 """Steps between places where a ball or cap is looked for; `NEAR` there, as the bench may be off."""
 
-ROUNDS = 4
+ROUNDS = 3
 """Of adjusting and labelling anew."""
 
 
@@ -106,7 +106,6 @@ def label_picture(
     rig: Rig,
     calibration: ImageCalibration,
     released: FloatArray | None = None,
-    others: tuple[Sighting, ...] = (),
 ) -> Labelled:
     """Find the ray of every dot of a picture.
 
@@ -118,8 +117,6 @@ def label_picture(
         The set-up before the check.
     released
         See `adjust`.
-    others
-        What other pictures showed, which the bench is adjusted to as well.
 
     Raises
     ------
@@ -140,8 +137,7 @@ def label_picture(
     found: list[Labelled] = []
     for first in (_by_grid, _by_places):
         starts = _likeliest(first(observed, picture), observed)
-        given = (observed, picture.mirror, released, others)
-        grown = (_grown(*given, one) for one in starts)
+        grown = (_grown(observed, picture.mirror, released, one) for one in starts)
         found += [one for one in grown if one is not None]
         if any(_explains(observed, one) for one in found):
             break
@@ -246,7 +242,6 @@ def _grown(
     observed: Observation,
     mirror: Mirror,
     released: FloatArray | None,
-    others: tuple[Sighting, ...],
     labels: IntArray,
 ) -> Labelled | None:
     """Labels that bench and mirror, adjusted to them, lead to; None where these have no hole."""
@@ -254,10 +249,9 @@ def _grown(
     for _ in range(ROUNDS):
         if (labels != UNLABELLED).sum() < LEAST_DOTS:
             return None
-        sightings = [*others, sighting_of(observed, mirror, labels)]
-        made = adjust(observed.rig, sightings, released, start)
+        made = adjust(observed.rig, [sighting_of(observed, mirror, labels)], released, start)
         start, before = made.unknown, labels
-        labels = relabelled(observed, mirror, made.offset, made.poses[-1])
+        labels = relabelled(observed, mirror, made.offset, made.poses[0])
         if (labels == before).all():
             break
     i, j = observed.rig.pattern.marker or observed.rig.pattern.reference
