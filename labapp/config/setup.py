@@ -13,8 +13,14 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
+from labapp.config.bench_check import (
+    check_values,
+    checked_covariance,
+    unchecked_values,
+)
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
+from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
@@ -133,6 +139,33 @@ def updated_setup(
     return tomlkit.dumps(document)
 
 
+def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, date: str) -> str:
+    """Text of a setup file with the outcome of a bench check in it; ``path`` is for errors."""
+    values = parse_toml(text, Path(path), A_SETUP)
+    return updated_setup(text, path, check_values(check, values, date))
+
+
+def unchecked_setup(text: str, path: str | os.PathLike[str]) -> str:
+    """Text of a setup file as it was before its bench check; what was changed since then stays.
+
+    A new check begins with it, or the former one's pictures would count twice.
+    """
+    values = unchecked_values(parse_toml(text, Path(path), A_SETUP))
+    if not values:
+        return text
+    del values["bench_check"]
+    return updated_setup(_without_section(text, path, "bench_check"), path, values)
+
+
+def _without_section(text: str, path: str | os.PathLike[str], section: str) -> str:
+    try:
+        document = tomlkit.parse(text)
+    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
+        raise InputError(path, "syntax", error, A_SETUP) from error
+    document.pop(section, None)
+    return tomlkit.dumps(document)
+
+
 def pattern_values(pattern: DotPattern) -> dict[str, object]:
     """Keys of a pattern in a setup file: key → value."""
     values: dict[str, object] = {
@@ -238,12 +271,14 @@ def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
     told = {
         f"{section}.{key}": sigma for section in values for key, sigma in values[section].items()
     }
+    covariance, assumed = covariance_of(told, correlation)
+    covariance, checked = checked_covariance(values, covariance)
     return Rig(
         Laser(**laser),
         dot_pattern(values["pattern"]),
         Electrode(**values["electrode"]),
         _imaging_plane(**_without_sigmas(plane)),
-        RigUncertainty(axes, *covariance_of(told, correlation)),
+        RigUncertainty(axes, covariance, frozenset() if checked else assumed, checked),
     )
 
 
@@ -266,9 +301,13 @@ def _imaging_plane(
 
 
 def _calibration(values: dict[str, Any]) -> ImageCalibration:
-    lens_keys = _without_sigmas(values.get("camera_lens", {}))
+    lens_keys, plane = _without_sigmas(values.get("camera_lens", {})), values["imaging_plane"]
+    percent = lens_keys.pop("distortion_percent", 0.0)
+    half = np.array([plane["width_mm"], plane["height_mm"]]) / 2
     lens = Lens(**{key: tuple(pair) for key, pair in lens_keys.items()}) if lens_keys else None
     keys = _without_sigmas(values["image_calibration"])
     if "homography" in keys:
-        return ImageCalibration(np.array(keys["homography"], float), lens)
-    return ImageCalibration.from_three_points(**keys, lens=lens)
+        made = ImageCalibration(np.array(keys["homography"], float), lens)
+    else:
+        made = ImageCalibration.from_three_points(**keys, lens=lens)
+    return made.with_distortion(percent, half)

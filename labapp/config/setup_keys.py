@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from labapp.config import bench_check
 from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number, within
 from labapp.core.geometry.patterns import PATTERNS
 from labapp.core.geometry.uncertainty import QUANTITIES
@@ -118,12 +119,14 @@ SECTIONS = {
             lambda value: are_numbers(value, 5),
             required=False,
         ),
+        "distortion_percent": within(-50, 50, "%, of the way to the plane's middle"),
         **_sigmas("camera_lens"),
     },
+    "bench_check": bench_check.RULES,
 }
 """Every section and key; `image_calibration` holds the keys of one of its two forms."""
 
-OPTIONAL = ("camera_lens",)
+OPTIONAL = ("camera_lens", "bench_check")
 """Sections that need not be there."""
 
 

@@ -223,9 +223,7 @@ class System:
     def residuals(self, unknown: FloatArray) -> FloatArray:
         """Standardised residuals of all sightings, shape (m,)."""
         bench, *poses = (unknown[part] for part in self.parts)
-        return np.concatenate(
-            [self.standardised(k, bench, pose) for k, pose in enumerate(poses)]
-        )
+        return np.concatenate([self.standardised(k, bench, pose) for k, pose in enumerate(poses)])
 
     def jacobian(self, unknown: FloatArray) -> FloatArray:
         """Their derivatives, shape (m, p): a pose moves the dots of its own mirror alone."""
