@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.geometry.rig import ImagingPlane, Rig
-from labapp.core.values import FloatArray
 from labapp.simulation.camera import CameraView, Lens
 
 FOCAL_PX = 2000.0
@@ -43,9 +42,7 @@ class Bench:
     view: CameraView
 
 
-def draw_bench(
-    rig: Rig, view: CameraView, errors: BenchErrors, rng: np.random.Generator
-) -> Bench:
+def draw_bench(rig: Rig, view: CameraView, errors: BenchErrors, rng: np.random.Generator) -> Bench:
     """Draw a bench whose set-up, as taken down by the operator, is a rig and a view without lens.
 
     Parameters
@@ -78,8 +75,8 @@ def draw_bench(
         inter_beam_angle_deg=rig.pattern.inter_beam_angle_deg + step,
         rotation_deg=rig.pattern.rotation_deg + rng.normal(0, errors.rotation_deg),
     )
-    corner_px = np.hypot(plane.width_mm, plane.height_mm) / 2 * np.sqrt(
-        abs(np.linalg.det(view.px_per_mm))
+    corner_px = (
+        np.hypot(plane.width_mm, plane.height_mm) / 2 * np.sqrt(abs(np.linalg.det(view.px_per_mm)))
     )
     k1 = rng.uniform(-errors.distortion, errors.distortion) / (corner_px / FOCAL_PX) ** 2
     true_rig = replace(

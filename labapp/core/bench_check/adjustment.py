@@ -223,9 +223,7 @@ class System:
     def residuals(self, unknown: FloatArray) -> FloatArray:
         """Standardised residuals of all sightings, shape (m,)."""
         bench, *poses = (unknown[part] for part in self.parts)
-        return np.concatenate(
-            [self.standardised(k, bench, pose) for k, pose in enumerate(poses)]
-        )
+        return np.concatenate([self.standardised(k, bench, pose) for k, pose in enumerate(poses)])
 
     def jacobian(self, unknown: FloatArray) -> FloatArray:
         """Their derivatives, shape (m, p): a pose moves the dots of its own mirror alone."""
@@ -256,10 +254,13 @@ class System:
         return self.adjustment(unknown, scale)
 
     def solved(self, made: Adjustment) -> Adjustment:
-        """The adjustment that another of the same dots leads to, with more let go of."""
+        """The adjustment that another of the same dots leads to, with more let go of.
+
+        Their costs can be compared: the scale of the residuals stays.
+        """
         extra = self.size - len(made.unknown)
-        bench = self.parts[0].stop - extra
-        return self.solved_from(np.insert(made.unknown, bench, np.zeros(extra)))
+        unknown = np.insert(made.unknown, self.parts[0].stop - extra, np.zeros(extra))
+        return self.adjustment(self.minimised(unknown, made.scale, MOST_STEPS), made.scale)
 
     def by_bench(self, made: Adjustment, directions: FloatArray) -> FloatArray:
         """Derivatives of the residuals by directions of the bench's quantities, shape (m, k)."""

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import Adjustment, Sighting, adjust
+from labapp.core.bench_check.adjustment import Adjustment, adjust
 from labapp.core.bench_check.labelling import (
     LEAST_DOTS,
     Picture,
@@ -231,14 +231,14 @@ def _labelled(
     return [labels[k] for k in range(len(pictures))]
 
 
-def adjusted_bench(rig: Rig, made: Adjustment, checked: bool = False) -> tuple[Rig, ImageCalibration]:
+def adjusted_bench(
+    rig: Rig, made: Adjustment, checked: bool = False
+) -> tuple[Rig, ImageCalibration]:
     """The rig and the image calibration that an adjustment leads to, with their uncertainty."""
     after, calibration = moved_bench(rig, made.offset)
     assert after.uncertainty is not None
     assumed = frozenset() if checked else after.uncertainty.assumed
-    known = replace(
-        after.uncertainty, covariance=made.covariance, assumed=assumed, checked=checked
-    )
+    known = replace(after.uncertainty, covariance=made.covariance, assumed=assumed, checked=checked)
     return replace(after, uncertainty=known), calibration
 
 

@@ -285,9 +285,7 @@ def _penalty(labels: IntArray, observed: Observation) -> float:
 def _lit_neighbours(labels: IntArray) -> IntArray:
     """How many of the four neighbours of each ray have a dot, shape (rows, columns)."""
     around = np.pad(labels != UNLABELLED, 1).astype(np.int64)
-    return np.asarray(
-        around[:-2, 1:-1] + around[2:, 1:-1] + around[1:-1, :-2] + around[1:-1, 2:]
-    )
+    return np.asarray(around[:-2, 1:-1] + around[2:, 1:-1] + around[1:-1, :-2] + around[1:-1, 2:])
 
 
 def _step(plane_mm: FloatArray) -> FloatArray:

@@ -106,7 +106,9 @@ def find_suspects(
     found.sort(key=lambda one: -one.drop)
     if found[0].drop < LIMIT:
         return ()
-    return tuple(one for one in found if one.drop > found[0].drop - max(ALIKE, 0.02 * found[0].drop))
+    return tuple(
+        one for one in found if one.drop > found[0].drop - max(ALIKE, 0.02 * found[0].drop)
+    )
 
 
 def _directions(rig: Rig) -> dict[str, tuple[str, FloatArray]]:

@@ -91,7 +91,9 @@ class RadialDistortion(ReadOnlyArrays):
         """Where the calibration without it sees what the picture has at (u, v), (…, 2), px."""
         image_px = image_px if self.lens is None else self.lens.ideal(image_px)
         out = _apply(self.matrix, image_px) - self.half_mm
-        share = self.percent / 100 * np.sum(out**2, axis=-1, keepdims=True) / np.sum(self.half_mm**2)
+        share = (
+            self.percent / 100 * np.sum(out**2, axis=-1, keepdims=True) / np.sum(self.half_mm**2)
+        )
         return _apply(_inverse(self.matrix), self.half_mm + (1 + share) * out)
 
     def distorted(self, ideal_px: FloatArray) -> FloatArray:
