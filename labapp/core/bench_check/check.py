@@ -84,14 +84,14 @@ class BenchCheck(ReadOnlyArrays):
     verdict, patterns
         What the residuals look like, see `judge`.
     suspects
-        Quantities that are off by far more than their ±, the likeliest first; those that explain the
-        dots alike come together.
+        Quantities that are off by far more than their ±, the likeliest first; those that explain
+        the dots alike come together.
     free
         Keys of suspects that the ± was widened of, as was asked for.
     before
         The set-up before the check.
     rig, calibration
-        The set-up after it, with its uncertainty; `RigUncertainty.status` is ``checked`` with ``ok``.
+        The set-up after it, with its uncertainty, which is marked as checked with ``ok``.
     pictures
         What became of each picture, in the order given.
     adjustment
@@ -244,13 +244,13 @@ def adjusted_bench(
 
 REASONS: dict[Verdict, str] = {
     "noise-like": "",
-    "distortion": "the picture is distorted more than the set-up has it: calibrate the camera's lens",
+    "distortion": "the picture is distorted in another way: calibrate the camera's lens",
     "plate-not-flat": "the plate is not flat: take a better one",
-    "wrong-lens": "the rays are not those of the pattern: another lens, or a wrong inter-beam angle",
-    "row-slipped": "the dots fit the rays of the next row or column better: the absent ray is not the "
-    "one that the set-up has, or its hole was mistaken",
-    "unexplained": "no bench and no mirror of this kind explain the dots: is it the mirror that was "
-    "named, and did anything move between the pictures?",
+    "wrong-lens": "the rays are not those of the pattern: is it another lens?",
+    "row-slipped": "the dots fit the rays of the next row or column better: is the absent ray "
+    "another, or its hole mistaken?",
+    "unexplained": "no bench and no mirror of this kind explain the dots: is it the mirror that "
+    "was named, and did anything move between the pictures?",
 }
 
 
