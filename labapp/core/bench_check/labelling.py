@@ -49,7 +49,7 @@ MOST_STARTS = 4
 """So many first labels of a kind are tried, those first that leave fewest dots and rays."""
 
 MOST_WORSE = 40.0
-"""First labels that cost so much more than the best, by dots and rays without a pair, are left out."""
+"""First labels that leave dots and rays which cost so much more than the best's are not tried."""
 
 EXPLAINED = 0.85
 """Such a share of the dots has a ray where a mirror explains them."""
