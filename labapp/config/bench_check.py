@@ -1,7 +1,7 @@
 """The section ``[bench_check]`` of a setup file: what a check against known mirrors gave.
 
-It keeps what every quantity was before and after the check, and all that the check took as given. As
-soon as the file has anything else than that, the set-up no longer counts as checked.
+It keeps what every quantity was before and after the check, and all that the check took as given.
+As soon as the file has anything else than that, the set-up no longer counts as checked.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ class BenchErrors:
     Parameters
     ----------
     angle_deg, length_mm, rotation_deg, inter_beam_angle_deg, point_px
-        Standard deviation of each angle of laser and plane, of each length, of the pattern's rotation
-        and inter-beam angle, and of the image calibration's points along u and v.
+        Standard deviation of each angle of laser and plane, of each length, of the pattern's
+        rotation and inter-beam angle, and of the image calibration's points along u and v.
     distortion
         Largest radial distortion in the plane's corner, either way, as a fraction.
     """

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy
@@ -126,7 +126,7 @@ class Adjustment(ReadOnlyArrays):
         reduced -= across.T @ np.linalg.solve(normal, across)
         slope = weighted.T @ self.standardised
         amplitudes = -np.linalg.solve(reduced, slope)
-        return float(-slope @ amplitudes), amplitudes
+        return float(-slope @ amplitudes), np.asarray(amplitudes, np.float64)
 
 
 def adjust(
@@ -147,7 +147,7 @@ def adjust(
         Directions in the space of the bench's quantities that the prior is widened along, by their
         length, shape (k, q).
     start
-        Unknowns to begin with, those of an adjustment to the same mirrors; None: the expected bench.
+        Unknowns to begin with, of an adjustment to the same mirrors; None: the expected bench.
     """
     system = System.of(rig, sightings, released)
     unknown = system.start() if start is None or len(start) != system.size else start
@@ -231,8 +231,9 @@ class System:
         made, row = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size)), 0
         for k, (pose, part) in enumerate(zip(poses, self.parts[1:], strict=True)):
             rows = slice(row, row := row + 2 * len(self.sightings[k].ray))
-            made[rows, self.parts[0]] = _slopes(lambda x: self.standardised(k, x, pose), bench)
-            made[rows, part] = _slopes(lambda x: self.standardised(k, bench, x), pose)
+            both = partial(self.standardised, k)
+            made[rows, self.parts[0]] = _slopes(partial(_first, both, pose), bench)
+            made[rows, part] = _slopes(partial(both, bench), pose)
         return made
 
     def solved_from(self, unknown: FloatArray) -> Adjustment:
@@ -331,6 +332,12 @@ class System:
             jacobian=jacobian,
             cost=float(loss.sum() + unknown @ unknown),
         )
+
+
+def _first(
+    function: Callable[[FloatArray, FloatArray], FloatArray], second: FloatArray, first: FloatArray
+) -> FloatArray:
+    return function(first, second)
 
 
 def soft_l1(square: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ import numpy as np
 from labapp.core.bench_check.adjustment import Adjustment, adjust
 from labapp.core.bench_check.labelling import (
     LEAST_DOTS,
+    Labelled,
     Picture,
     label_picture,
     relabelled,
@@ -31,6 +32,9 @@ Status = Literal["ok", "quantity-off"] | Verdict
 
 ROUNDS = 3
 """Of adjusting to all pictures and labelling anew."""
+
+WIDE = 10.0
+"""So many times its standard uncertainty a quantity may be off for rays to be found still."""
 
 UNDETERMINED = 0.8
 """A quantity is not determined whose ± after the check is more than this share of that before."""
@@ -84,14 +88,14 @@ class BenchCheck(ReadOnlyArrays):
     verdict, patterns
         What the residuals look like, see `judge`.
     suspects
-        Quantities that are off by far more than their ±, the likeliest first; those that explain the
-        dots alike come together.
+        Quantities that are off by far more than their ±, the likeliest first; those that explain
+        the dots alike come together.
     free
         Keys of suspects that the ± was widened of, as was asked for.
     before
         The set-up before the check.
     rig, calibration
-        The set-up after it, with its uncertainty; `RigUncertainty.status` is ``checked`` with ``ok``.
+        The set-up after it, with its uncertainty, which is marked as checked with ``ok``.
     pictures
         What became of each picture, in the order given.
     adjustment
@@ -224,11 +228,37 @@ def _labelled(
     """Labels of each picture: plates first, as they tell the bench that the others are seen on."""
     order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
     labels: dict[int, IntArray] = {}
+    told = rig, calibration
     for k in order:
-        found = label_picture(pictures[k], rig, calibration, let_go)
+        found = _first_label(
+            pictures[k], [told, (rig, calibration), (_wide(rig), calibration)], let_go
+        )
         labels[k] = found.labels
-        rig, calibration = adjusted_bench(rig, found.adjustment)
+        told = adjusted_bench(told[0], found.adjustment)
     return [labels[k] for k in range(len(pictures))]
+
+
+def _first_label(
+    picture: Picture, benches: Sequence[tuple[Rig, ImageCalibration]], let_go: FloatArray
+) -> Labelled:
+    """Labels by the first bench that has any.
+
+    A mirror that is not what it is said to be, or a quantity that is far off, leads those astray
+    that come after.
+    """
+    for bench in benches[:-1]:
+        try:
+            return label_picture(picture, *bench, let_go)
+        except CannotMeasure:
+            continue
+    return label_picture(picture, *benches[-1], let_go)
+
+
+def _wide(rig: Rig) -> Rig:
+    """The bench, known a good deal worse than it is said to be."""
+    assert rig.uncertainty is not None
+    covariance = WIDE**2 * rig.uncertainty.covariance
+    return replace(rig, uncertainty=replace(rig.uncertainty, covariance=covariance))
 
 
 def adjusted_bench(
@@ -244,13 +274,13 @@ def adjusted_bench(
 
 REASONS: dict[Verdict, str] = {
     "noise-like": "",
-    "distortion": "the picture is distorted more than the set-up has it: calibrate the camera's lens",
+    "distortion": "the picture is distorted in another way: calibrate the camera's lens",
     "plate-not-flat": "the plate is not flat: take a better one",
-    "wrong-lens": "the rays are not those of the pattern: another lens, or a wrong inter-beam angle",
-    "row-slipped": "the dots fit the rays of the next row or column better: the absent ray is not the "
-    "one that the set-up has, or its hole was mistaken",
-    "unexplained": "no bench and no mirror of this kind explain the dots: is it the mirror that was "
-    "named, and did anything move between the pictures?",
+    "wrong-lens": "the rays are not those of the pattern: is it another lens?",
+    "row-slipped": "the dots fit the rays of the next row or column better: is the absent ray "
+    "another, or its hole mistaken?",
+    "unexplained": "no bench and no mirror of this kind explain the dots: is it the mirror that "
+    "was named, and did anything move between the pictures?",
 }
 
 

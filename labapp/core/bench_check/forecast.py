@@ -14,7 +14,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.schemes import fit
 from labapp.core.surface.pool_fit import FitSettings
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray
 
 DOT_MM = 0.03
 """Standard uncertainty of a dot's place on the plane that is expected."""
@@ -89,7 +89,7 @@ def expected_sighting(mirror: Mirror, rig: Rig) -> Sighting | None:
     return Sighting(mirror, np.argwhere(shown), plane[shown], covariance)
 
 
-def _shown(mirror: Mirror, rig: Rig) -> tuple[FloatArray, FloatArray]:
+def _shown(mirror: Mirror, rig: Rig) -> tuple[FloatArray, BoolArray]:
     plane, hit = landing_points(mirror, mirror.pose, rig)
     size = rig.imaging_plane.width_mm, rig.imaging_plane.height_mm
     with np.errstate(invalid="ignore"):

@@ -2,7 +2,8 @@
 
 The rows and columns that the picture shows, with the hole of the absent ray, give the rays of a
 grid at once, however wrong the set-up is. Bench and mirror are adjusted to these, predict where
-every ray's dot should be, and dots get the rays that they are near; and so on until nothing changes.
+every ray's dot should be, and dots get the rays that they are near; this is repeated until nothing
+changes.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ MOST_STARTS = 4
 """So many first labels of a kind are tried, those first that leave fewest dots and rays."""
 
 MOST_WORSE = 40.0
-"""First labels that cost so much more than the best by the dots and rays that they leave are not."""
+"""First labels that leave dots and rays which cost so much more than the best's are not tried."""
 
 EXPLAINED = 0.85
 """Such a share of the dots has a ray where a mirror explains them."""
@@ -121,8 +122,8 @@ def label_picture(
     Raises
     ------
     CannotMeasure
-        ``too-few-dots``, ``no-rows``; ``no-reference`` where no hole amid the dots can be the absent
-        ray's; ``ambiguous-rows`` where several can; ``no-match`` where the mirror explains the dots
+        ``too-few-dots``; ``no-reference`` where no hole amid the dots can be the absent ray's;
+        ``ambiguous-rows`` where several can; ``no-match`` where the mirror explains the dots
         with none.
     """
     pattern = rig.pattern
@@ -144,8 +145,8 @@ def label_picture(
     if not found:
         raise CannotMeasure(
             "no-reference",
-            f"{picture.name}: no hole amid the dots can be the absent ray's: move the mirror or the "
-            "plane until it is seen",
+            f"{picture.name}: no hole amid the dots can be the absent ray's: move the mirror "
+            "or the plane until it is seen",
         )
     best, *others = _different(found)
     if others and others[0].cost < best.cost + MARGIN:
@@ -274,7 +275,7 @@ def _different(found: list[Labelled]) -> list[Labelled]:
 
 
 def _penalty(labels: IntArray, observed: Observation) -> float:
-    """What dots without a ray cost, and rays without a dot that at least three lit ones surround."""
+    """What dots without a ray cost, and rays without a dot that are amid lit ones."""
     lit = labels != UNLABELLED
     missed = int((~lit & ~observed.absent & (_lit_neighbours(labels) >= SURROUNDED)).sum())
     on_hole = int((lit & observed.absent).sum())

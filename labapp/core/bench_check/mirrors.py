@@ -252,8 +252,8 @@ def landing_points(
     -------
     plane_mm, hit
         IPCS (X′, Z′), shape (rows, columns, 2) or (n, 2), mm, the plane's edges ignored, NaN where
-        a ray never meets it; whether the ray meets the mirror and the plane. Absent rays are followed
-        like others.
+        a ray never meets it; whether the ray meets the mirror and the plane. Absent rays are
+        followed like others.
     """
     rays, source = ray_directions(rig.laser, rig.pattern)[of], rig.laser.position_mm
     point, normal, hit = mirror.meet(source, rays, pose)

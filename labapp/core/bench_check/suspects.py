@@ -41,8 +41,8 @@ class Suspect:
     Parameters
     ----------
     key
-        Its key (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for the whole of
-        the image calibration.
+        Its key (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for the whole
+        of the image calibration.
     name
         What it is called.
     drop

@@ -89,8 +89,10 @@ def _causes(rig: Rig, made: Adjustment, system: System) -> Iterator[tuple[Verdic
     """Each cause, with what its amplitudes change the standardised residuals by, shape (m, c)."""
     bench = moved_rig(rig, made.offset)
     every = list(enumerate(zip(system.sightings, made.poses, strict=True)))
-    yield "distortion", sum(system.by_dots(k, _bent_picture(s, rig)) for k, (s, _) in every)
-    yield "wrong-lens", sum(system.by_dots(k, _other_lens(s, p, bench)) for k, (s, p) in every)
+    bent = [system.by_dots(k, _bent_picture(s, rig)) for k, (s, _) in every]
+    yield "distortion", np.sum(bent, axis=0)
+    other = [system.by_dots(k, _other_lens(s, p, bench)) for k, (s, p) in every]
+    yield "wrong-lens", np.sum(other, axis=0)
     for k, (sighting, pose) in every:
         if isinstance(sighting.mirror, Plate):
             yield "plate-not-flat", system.by_dots(k, _bent_plate(sighting, pose, bench))
@@ -153,7 +155,7 @@ def _bent_plate(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
 def _slipped(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
     """All rays a row or a column on, shape (n, 2, 2), mm."""
     plane, _ = landing_points(sighting.mirror, pose, rig)
-    along = np.stack(np.gradient(plane, axis=(0, 1)), axis=-1)
+    along = np.stack([np.gradient(plane, axis=axis) for axis in (0, 1)], axis=-1)
     return np.asarray(along[tuple(sighting.ray.T)])
 
 

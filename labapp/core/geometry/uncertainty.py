@@ -125,8 +125,9 @@ class RigUncertainty(ReadOnlyArrays):
 
     @property
     def status(self) -> str:
-        """``checked``; ``calibrated`` where laser and image calibration told their own ±, or
-        ``entered``.
+        """How far the set-up can be relied on.
+
+        ``checked``; ``calibrated`` where laser and image calibration told their own ±; ``entered``.
         """
         if self.checked:
             return "checked"
