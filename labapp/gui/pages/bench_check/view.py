@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pyqtgraph as pg
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import QAbstractItemView, QHeaderView, QSplitter, QWidget
 
@@ -401,7 +401,10 @@ class _QuantityTable(ReadTable):
         name = "Quantities of the set-up, before and after the check"
         super().__init__(name, f"{name}: Ctrl+C copies it", COLUMNS)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        self.verticalHeader().setDefaultSectionSize(ROW_PX)
+        # Long names take more lines; the header tells of a width before the cells have it.
+        self._narrowed = QTimer(self, singleShot=True, interval=0)
+        self._narrowed.timeout.connect(self.resizeRowsToContents)
+        self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
         self.offer(("Copy table", self.copy_text))
 
     def show_rows(self, rows: Sequence[presenter.QuantityRow]) -> None:
