@@ -277,7 +277,10 @@ def mirror_rows(record: BenchCheckRecord) -> tuple[ResultRow, ...]:
     for picture in record.pictures:
         for name, known, measured, sigma in picture.measured:
             off = f" ({100 * (measured / known - 1):+.2f} %)" if abs(known) > 0.05 else ""
-            note = f"{picture.name}: known {known:.3f} mm, measured {measured:.3f} mm{off}; ± by the noise of the dots alone"
+            note = (
+                f"{picture.name}: known {known:.3f} mm, measured {measured:.3f} mm{off}; "
+                "±: noise of the dots alone"
+            )
             words = f"{names[picture.kind]}, {name} (known {known:.3f})"
             rows.append(ResultRow(words, measured, sigma, "mm", 3, note))
     return tuple(rows)

@@ -378,7 +378,7 @@ class BenchCheckPage(Page):
         dots.setSymbolPen(pg.mkPen("#45a5ff", width=1))
         self._overlays = [arrows, dots]
         for text, u, v, of_row in shown.numbers:
-            anchor = (1.2, 0.5) if of_row else (0.5, 1.2)
+            anchor = (1.2, 0.5) if of_row else (0.5, -0.1)
             number = pg.TextItem(text, color="#8fd0ff", anchor=anchor)
             number.setPos(u, v)
             self._overlays.append(number)
