@@ -19,6 +19,12 @@ SETUP_WORDS = {
 """What `setup_status` means to the operator."""
 
 
+def setup_words(status: str, checked: str = "") -> str:
+    """What a `setup_status` means, with the day of the check (ISO 8601); empty without one."""
+    words = SETUP_WORDS.get(status, "")
+    return f"{words[:-1]} on {checked[:10]}." if status == "checked" and checked else words
+
+
 def now() -> str:
     """Present time, ISO 8601 with the time zone, to the second."""
     return datetime.now().astimezone().isoformat(timespec="seconds")

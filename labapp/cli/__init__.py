@@ -21,7 +21,17 @@ import typer
 import typer.core
 import typer.main
 
-from labapp.cli import advise, analyze, benchmark, cameras, lines, reconstruct, session, simulate
+from labapp.cli import (
+    advise,
+    analyze,
+    bench,
+    benchmark,
+    cameras,
+    lines,
+    reconstruct,
+    session,
+    simulate,
+)
 from labapp.cli.shared import (
     BAD_INPUT,
     FAULT,
@@ -65,9 +75,10 @@ app = typer.Typer(
     "2 bad input or output; 3 a fault in labapp; 130 stopped by Ctrl-C; 143 by SIGTERM.",
 )
 calibrate = typer.Typer(
-    no_args_is_help=True, cls=Commands, help="Calibrate the laser or the imaging plane."
+    no_args_is_help=True, cls=Commands, help="Calibrate laser or imaging plane, or check both."
 )
 app.add_typer(calibrate, name="calibrate")
+calibrate.command("bench")(bench.calibrate_bench)
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
 app.command()(simulate.simulate)

@@ -50,6 +50,7 @@ def _facts(session: Session) -> dict[str, Any]:
 
     seen, recording = session.overview(), session.recording
     laser, plane = session.laser_calibration, session.plane_calibration
+    check = session.bench_check
     statuses = Counter(status or NOT_MEASURED for status in seen.status)
     missing = session.missing_recording
     return {
@@ -74,6 +75,13 @@ def _facts(session: Session) -> dict[str, Any]:
         "plane_calibration": None
         if plane is None
         else {"unit_mm": plane.unit_mm, "px_per_mm": list(plane.found.px_per_mm)},
+        "bench_check": None
+        if check is None
+        else {
+            "date": check.date,
+            "mirrors": [one.kind for one in check.pictures],
+            "in_use": not session.setup_problems and bool(session.setup.checked),
+        },
         "settings": _differences(session.settings, Settings()),
         "scheme": scheme_name(session.settings),
         "frames": len(seen.frame),
@@ -168,6 +176,9 @@ def _calibration_lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     if plane := facts["plane_calibration"]:
         x, z = plane["px_per_mm"]
         lines.append(("plane", f"{x:.4f} px/mm along X′, {z:.4f} px/mm along Z′"))
+    if check := facts["bench_check"]:
+        now = "in use" if check["in_use"] else "the set-up was changed since"
+        lines.append(("bench check", f"{check['date'][:10]}, {', '.join(check['mirrors'])}; {now}"))
     return lines
 
 

@@ -35,7 +35,7 @@ from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
-    from labapp.core.sequence.residual_check import ResidualRecord
+    from labapp.core.recording.residual_check import ResidualRecord
     from labapp.export.summary import Summary
     from labapp.run.runner import Measurer, Sink
     from labapp.run.streams import Stream
@@ -141,7 +141,7 @@ def _measure_recording(
     Parameters are the command's options (`reconstruct`), and sinks for the streams.
     """
     from labapp.config.setup import read_setup
-    from labapp.core.sequence.residual_check import ResidualRecord
+    from labapp.core.recording.residual_check import ResidualRecord
     from labapp.export.results import ResultsWriter
     from labapp.export.summary import Summary
     from labapp.media import open_source

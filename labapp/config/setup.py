@@ -13,8 +13,14 @@ import numpy as np
 import tomlkit
 from tomlkit.items import Table
 
+from labapp.config.bench_check import (
+    check_values,
+    checked_covariance,
+    unchecked_values,
+)
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
+from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
@@ -45,11 +51,15 @@ class Setup:
         Pixel ↔ imaging plane.
     text
         The file as it was read, for the record.
+    checked
+        When the bench was checked against a known mirror, ISO 8601; empty where it was not, or was
+        changed since.
     """
 
     rig: Rig
     calibration: ImageCalibration
     text: str
+    checked: str = ""
 
     @functools.cached_property
     def bench(self) -> Bench:
@@ -95,7 +105,9 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
     if problems:
         raise InputError.gather(problems)
     calibration = _calibration(values)
-    return Setup(_rig(values, calibration), calibration, text)
+    rig = _rig(values, calibration)
+    checked = rig.uncertainty is not None and rig.uncertainty.checked
+    return Setup(rig, calibration, text, values["bench_check"]["date"] if checked else "")
 
 
 def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]) -> None:
@@ -175,6 +187,46 @@ def lens_of(text: str) -> Lens | None:
     if check_keys(Path(), "camera_lens", {name: keys[name] for name in lens}, rules):
         return None
     return Lens(**{name: tuple(keys[name]) for name in lens})
+
+
+def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, date: str) -> str:
+    """Text of a setup file with the outcome of a bench check in it; ``path`` is for errors."""
+    values = parse_toml(text, Path(path), A_SETUP)
+    return updated_setup(text, path, _keeping_sigmas(check_values(check, values, date), values))
+
+
+def unchecked_setup(text: str, path: str | os.PathLike[str]) -> str:
+    """Text of a setup file as it was before its bench check; what was changed since then stays.
+
+    A new check begins with it, or the former one's pictures would count twice.
+    """
+    now = parse_toml(text, Path(path), A_SETUP)
+    values = unchecked_values(now)
+    if not values:
+        return text
+    del values["bench_check"]
+    bare = _without_section(text, path, "bench_check")
+    return updated_setup(bare, path, _keeping_sigmas(values, now))
+
+
+def _keeping_sigmas(
+    values: Mapping[str, Mapping[str, object]], now: Mapping[str, Any]
+) -> dict[str, dict[str, object]]:
+    """Values to set, with the uncertainties that a file has: they hold again without the check."""
+    ends = ("_sigma", "_correlation")
+    return {
+        section: {k: v for k, v in now.get(section, {}).items() if k.endswith(ends)} | dict(keys)
+        for section, keys in values.items()
+    }
+
+
+def _without_section(text: str, path: str | os.PathLike[str], section: str) -> str:
+    try:
+        document = tomlkit.parse(text)
+    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
+        raise InputError(path, "syntax", error, A_SETUP) from error
+    document.pop(section, None)
+    return tomlkit.dumps(document)
 
 
 def pattern_values(pattern: DotPattern) -> dict[str, object]:
@@ -287,12 +339,14 @@ def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
     told = {
         f"{section}.{key}": given for section in values for key, given in values[section].items()
     }
+    covariance, assumed = covariance_of(told, correlation)
+    covariance, checked = checked_covariance(values, covariance)
     return Rig(
         Laser(**laser),
         dot_pattern(values["pattern"]),
         Electrode(**values["electrode"]),
         _imaging_plane(plane),
-        RigUncertainty(axes, *covariance_of(told, correlation)),
+        RigUncertainty(axes, covariance, frozenset() if checked else assumed, checked),
         **values.get("torch", {}),
     )
 
@@ -314,9 +368,13 @@ def _imaging_plane(keys: Mapping[str, Any]) -> ImagingPlane:
 
 
 def _calibration(values: dict[str, Any]) -> ImageCalibration:
-    lens_keys = _without_sigmas(values.get("camera_lens", {}))
+    lens_keys, plane = _without_sigmas(values.get("camera_lens", {})), values["imaging_plane"]
+    percent = lens_keys.pop("distortion_percent", 0.0)
+    half = np.array([plane["width_mm"], plane["height_mm"]]) / 2
     lens = Lens(**{key: tuple(pair) for key, pair in lens_keys.items()}) if lens_keys else None
     keys = _without_sigmas(values["image_calibration"])
     if "homography" in keys:
-        return ImageCalibration(np.array(keys["homography"], float), lens)
-    return ImageCalibration.from_three_points(**keys, lens=lens)
+        made = ImageCalibration(np.array(keys["homography"], float), lens)
+    else:
+        made = ImageCalibration.from_three_points(**keys, lens=lens)
+    return made.with_distortion(percent, half)

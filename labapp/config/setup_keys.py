@@ -6,6 +6,7 @@ from typing import get_args
 
 import numpy as np
 
+from labapp.config import bench_check
 from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number, within
 from labapp.core.geometry.patterns import PATTERNS
 from labapp.core.geometry.rig import Travel
@@ -123,6 +124,7 @@ SECTIONS = {
             lambda value: are_numbers(value, 5),
             required=False,
         ),
+        "distortion_percent": within(-50, 50, "%, of the way to the plane's middle"),
         **_sigmas("camera_lens"),
     },
     "torch": {
@@ -132,10 +134,11 @@ SECTIONS = {
             required=False,
         ),
     },
+    "bench_check": bench_check.RULES,
 }
 """Every section and key; `image_calibration` holds the keys of one of its two forms."""
 
-OPTIONAL = ("camera_lens", "torch")
+OPTIONAL = ("camera_lens", "torch", "bench_check")
 """Sections that need not be there."""
 
 

@@ -24,7 +24,13 @@ if TYPE_CHECKING:
     from labapp.session.file.database import Database
     from labapp.session.frames import Progress
     from labapp.session.measured import Basis, Overview, Result
-    from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
+    from labapp.session.record import (
+        BenchCheckRecord,
+        LaserReadings,
+        PlanePicture,
+        Record,
+        Recording,
+    )
     from labapp.session.signals import Signals
 
 
@@ -113,6 +119,12 @@ class SessionContents:
     def plane_calibration(self) -> PlanePicture | None:
         """The imaging-plane calibration in use, and what it was found from; None before one."""
         found: PlanePicture | None = self._documents.get("plane-calibration")
+        return found
+
+    @property
+    def bench_check(self) -> BenchCheckRecord | None:
+        """The bench check in use, and what it was found from; None before one."""
+        found: BenchCheckRecord | None = self._documents.get("bench-check")
         return found
 
     def picture(self, sha256: str) -> GreyImage:

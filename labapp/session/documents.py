@@ -19,7 +19,7 @@ from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unp
 from labapp.session.file.database import Database
 from labapp.session.file.read_cache import ReadCache
 from labapp.session.file.schema import NO_FRAME
-from labapp.session.record import LaserReadings, PlanePicture, Record
+from labapp.session.record import BenchCheckRecord, LaserReadings, PlanePicture, Record
 from labapp.session.signals import Signals
 from labapp.text import now
 
@@ -29,6 +29,7 @@ Kind = Literal[
     "settings",
     "laser-calibration",
     "plane-calibration",
+    "bench-check",
     "correction",
     "signals",
     "limits",
@@ -42,6 +43,7 @@ CLASSES: dict[str, type] = {
     "settings": Settings,
     "laser-calibration": LaserReadings,
     "plane-calibration": PlanePicture,
+    "bench-check": BenchCheckRecord,
     "correction": Correction,
     "signals": Signals,
     "limits": Limits,

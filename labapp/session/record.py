@@ -1,4 +1,4 @@
-"""What a session notes: the experiment, both calibrations' readings, the recording."""
+"""What a session notes: the experiment, the calibrations' readings, the recording."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,70 @@ class PlanePicture:
     unit_mm: float
     found: PlaneCalibration | BoardCalibration
     picture_sha256: str
+
+
+@dataclass(frozen=True)
+class MirrorPicture(ReadOnlyArrays):
+    """A picture of a known mirror (bench check), and what became of its n dots with a ray.
+
+    Parameters
+    ----------
+    name
+        Of the picture's file.
+    kind
+        Which mirror it shows.
+    height_mm
+        Height of the plate's surface, or of the top of a cap or ball, over the work piece.
+    diameter_mm
+        Of the cap's rim or of the ball; None for a plate.
+    picture_sha256
+        The picture, kept in the session.
+    ray
+        Ray (i, j) of each dot, counted from 1, shape (n, 2).
+    dot_px, computed_px
+        Where it is, and where the adjusted bench has it, (u, v), shape (n, 2), px.
+    residual_mm
+        Observed minus computed dot on the plane, shape (n, 2), mm.
+    measured
+        The mirror, measured with the adjusted bench as if its size were not known: (name, known,
+        measured, standard uncertainty by the noise of the dots), mm.
+    """
+
+    name: str
+    kind: str
+    height_mm: float
+    diameter_mm: float | None
+    picture_sha256: str
+    ray: IntArray
+    dot_px: FloatArray
+    computed_px: FloatArray
+    residual_mm: FloatArray
+    measured: tuple[tuple[str, float, float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class BenchCheckRecord(ReadOnlyArrays):
+    """A bench check and what it was found from.
+
+    Parameters
+    ----------
+    date
+        When it was made, ISO 8601.
+    pictures
+        The mirrors and their dots.
+    quantities
+        Keys of the q quantities that were adjusted (`uncertainty.QUANTITIES`).
+    before, before_sigma, after, after_sigma
+        Their values and standard uncertainties before and after, shape (q,), in their units.
+    """
+
+    date: str
+    pictures: tuple[MirrorPicture, ...]
+    quantities: tuple[str, ...]
+    before: FloatArray
+    before_sigma: FloatArray
+    after: FloatArray
+    after_sigma: FloatArray
 
 
 @dataclass(frozen=True)

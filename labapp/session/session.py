@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from labapp.session.file.schema import NO_FRAME
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from labapp.core.bench_check.check import BenchCheck
     from labapp.core.calibration.board_calibration import BoardCalibration
     from labapp.core.calibration.boards import Board
     from labapp.core.calibration.laser_calibration import (
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from labapp.run.runner import Measurer, Sink
     from labapp.session.documents import Change, Key
     from labapp.session.frames import Progress
-    from labapp.session.record import Record, Recording
+    from labapp.session.record import BenchCheckRecord, Record, Recording
     from labapp.session.signals import Signals
 
 
@@ -223,6 +225,33 @@ class Session(SessionContents):
             ("setup", NO_FRAME): self._updated_setup(found.setup_keys),
         }
         self._documents.change("imaging-plane calibration", values)
+
+    def use_bench_check(
+        self, check: BenchCheck, found: BenchCheckRecord, images: Sequence[GreyImage]
+    ) -> None:
+        """Apply the bench that pictures of known mirrors led to; store both, and the pictures.
+
+        Parameters
+        ----------
+        check
+            The check, made with the set-up as it was before any earlier one (`unchecked_setup`).
+        found
+            What is kept of it; its pictures' ``picture_sha256`` are filled in here.
+        images
+            Its pictures, grey levels, each of shape (rows, columns).
+        """
+        from labapp.config.setup import checked_setup, unchecked_setup
+
+        bare = unchecked_setup(self.setup_text, self.path)
+        pictures = tuple(
+            replace(one, picture_sha256=self._pictures.add(one.name, image))
+            for one, image in zip(found.pictures, images, strict=True)
+        )
+        changed: dict[Key, Any] = {
+            ("bench-check", NO_FRAME): replace(found, pictures=pictures),
+            ("setup", NO_FRAME): checked_setup(bare, self.path, check, found.date),
+        }
+        self._documents.change("bench check", changed)
 
     def set_settings(self, settings: Settings, label: str = "settings") -> None:
         """Set how frames are measured: the scheme, and the settings of every step."""

@@ -11,8 +11,8 @@ from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement
+from labapp.core.recording.residual_check import MOST, ResidualRecord
 from labapp.core.schemes import fit
-from labapp.core.sequence.residual_check import MOST, ResidualRecord
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import Oscillation, egg

@@ -103,7 +103,10 @@ def facts(session: Session) -> dict[tuple[Any, ...], Any]:
             found[key] = call()
         return found.get(key)
 
-    for name in ("record", "setup_text", "settings", "laser_calibration", "plane_calibration"):
+    for name in (
+        *("record", "setup_text", "settings"),
+        *("laser_calibration", "plane_calibration", "bench_check"),
+    ):
         note((name,), functools.partial(_fingerprint_of, session, name))
     numbers = note(("frames",), functools.partial(_numbers, session))
     for frame in numbers or ():
@@ -178,7 +181,7 @@ def look(session: Session, tally: Tally) -> None:
     attempt = tally.attempt
     for name in (
         *("record", "setup_text", "setup", "settings", "laser_calibration", "plane_calibration"),
-        *("recording", "missing_recording", "history", "measured_by", "frames"),
+        *("bench_check", "recording", "missing_recording", "history", "measured_by", "frames"),
     ):
         attempt(functools.partial(getattr, session, name))
     attempt(lambda: "\n".join(_text(_facts(session))))

@@ -59,6 +59,7 @@ PURPOSES = {
     "setup": ("Usual values", "Load…", "Laser goggles are worn", "Water cooling is on"),
     "laser": ("Use these",),
     "plane": ("Load picture…", "Find O′ and the axes", "Use"),
+    "bench_check": ("Add picture…", "Which pictures help most?", "Check", "Use", "Remove"),
     "capture": (
         *("Choose a file …", "New session from this recording …", "Import"),
         *("Start", "● Record", "Mark", "Take a frame", "Learn a pedal"),

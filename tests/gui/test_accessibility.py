@@ -67,6 +67,7 @@ ROLES: tuple[tuple[type[QWidget], set[QAccessible.Role]], ...] = (
 
 CANVASES = {
     "plane": {"Picture of the target"},
+    "bench_check": {"Picture of the mirror"},
     "capture": {"Frame of the recording"},
     "dots": {"Frame with its dots"},
     "surface": {"The pool in 3-D", "Reflected dots on the imaging plane", "Height profile"},

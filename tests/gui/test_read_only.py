@@ -70,9 +70,10 @@ def test_what_is_locked_says_why_and_is_free_in_the_next_session(
     assert not tick.isEnabled()
     assert notes.editor.isReadOnly()  # and can be scrolled and copied from
     assert not window.menus.actions["measure"].isEnabled()
-    for key, button in (("laser", "use_button"), ("plane", "use_button")):
+    for key in ("laser", "plane", "bench_check"):
         window.show_step(key)
-        assert not getattr(window.page, button).isEnabled()
+        assert not window.page.use_button.isEnabled()
+    assert not window.page.add_button.isEnabled()
     window.show_step("surface")
     assert not window.page.side.one.isEnabled()
     assert READ_ONLY in window.page.side.one.toolTip()

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import shutil
+import tomllib
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from labapp.config.setup import read_setup
 from labapp.media import GreyImage
 from labapp.session.copies import copy_sample
 from labapp.session.samples import sample_folder
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import trace
+from labapp.simulation.mirrors import FlatMirror
+from labapp.simulation.render import Look, render
 
 CROSS_MM = (4.65, 6.23, 2.75)
 """l₁, l₂, l₃ that the laser of the sample draws with a fan angle of 10°."""
@@ -37,6 +43,7 @@ def lay_out(folder: Path) -> None:
     for name in ("setup.toml", "calibration.png", "recording.avi"):
         shutil.copyfile(sample_folder("gtaw") / name, measurements / name)
     cv2.imwrite(str(measurements / "cross_hair.png"), cross_hair())
+    cv2.imwrite(str(measurements / "plate.png"), plate(measurements / "setup.toml"))
     blank = np.full((480, 640), 90, np.uint8)
     cv2.imwrite(str(measurements / "no_target.png"), blank)
     (measurements / "current.csv").write_text(logged(), "utf-8")
@@ -57,6 +64,18 @@ def cross_hair() -> GreyImage:
         at = left + mm * PX_PER_MM
         cv2.line(image, (at, line), (at, line + (22 if mm % 5 == 0 else 13)), 0, 2)
     return np.asarray(cv2.GaussianBlur(image, (5, 5), 0))
+
+
+def plate(setup: Path) -> GreyImage:
+    """What the camera sees of a flat plate in place of the work piece, shape (640, 480)."""
+    given = tomllib.loads(setup.read_text("utf-8"))["image_calibration"]
+    points = {key: tuple(x) if isinstance(x, list) else x for key, x in given.items()}
+    reflections = trace(FlatMirror(), read_setup(setup).rig)
+    rng = np.random.default_rng(5)
+    image = render(
+        reflections, CameraView(**points), Look(glow=0.0, speckle=0.1, dot_floor_mm=0.14), rng
+    ).image
+    return np.asarray(image, np.uint8)
 
 
 def places() -> dict[str, tuple[float, float]]:

@@ -10,6 +10,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox, QTabBar, QToolButton
 
 from labapp.gui.live.canvas import PARTS
+from labapp.gui.pages.bench_check import BenchCheckPage
 from labapp.gui.pages.capture import CapturePage
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.laser import LaserPage
@@ -54,6 +55,7 @@ def go_through(hands: Hands, folder: Path) -> None:
     _set_up(hands, files)
     _laser(hands, files)
     _plane(hands, files)
+    _bench_check(hands, files)
     _record(hands, files)
     _film(hands)
     _measure(hands)
@@ -137,6 +139,23 @@ def _plane(hands: Hands, files: Path) -> None:
     hands.press("Use")
     hands.picture("used")
     hands.asked("print-target", lambda: hands.press("Save the target for printing…"))
+
+
+def _bench_check(hands: Hands, files: Path) -> None:
+    hands.do("next_step")
+    page = hands.on(BenchCheckPage)
+    hands.picture("before")
+    hands.press("Which pictures help most?")
+    hands.settle()
+    picture = files / "plate.png"
+    hands.asked("mirror", lambda: hands.press("Add picture…"), give(picture))
+    hands.settle()
+    hands.press("Check")
+    hands.wait(lambda: page.checked, "the bench to be checked")
+    hands.picture("checked")
+    hands.press("Use")
+    hands.picture("used")
+    hands.do("undo")
 
 
 def _record(hands: Hands, files: Path) -> None:

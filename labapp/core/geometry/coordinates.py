@@ -9,6 +9,9 @@ import numpy as np
 
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
+RADIAL_STEPS = 6
+"""Of Newton's method, for the inverse of a radial distortion."""
+
 UNDISTORTED_PX = 1e-6
 """To so much of a pixel a place is freed of a lens's distortion."""
 
@@ -63,6 +66,50 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class RadialDistortion(ReadOnlyArrays):
+    """A distortion of the picture that is known by what it does to places on the imaging plane.
+
+    A place that the calibration without it has at p is at ``p + percent/100·(|p − m|/c)²·(p − m)``,
+    with m the middle of the plane and c half its diagonal.
+
+    Parameters
+    ----------
+    matrix, lens
+        Of the image calibration without it (`ImageCalibration`).
+    half_mm
+        Half the plane's width and height: its middle, shape (2,), mm.
+    percent
+        By how much it moves a dot in the plane's corner, in percent of its way to the middle.
+    """
+
+    matrix: FloatArray
+    lens: Lens | None
+    half_mm: FloatArray
+    percent: float
+
+    def ideal(self, image_px: FloatArray) -> FloatArray:
+        """Where the calibration without it sees what the picture has at (u, v), (…, 2), px."""
+        image_px = image_px if self.lens is None else self.lens.ideal(image_px)
+        out = _apply(self.matrix, image_px) - self.half_mm
+        share = (
+            self.percent / 100 * np.sum(out**2, axis=-1, keepdims=True) / np.sum(self.half_mm**2)
+        )
+        return _apply(_inverse(self.matrix), self.half_mm + (1 + share) * out)
+
+    def distorted(self, ideal_px: FloatArray) -> FloatArray:
+        """Inverse of `ideal`."""
+        far = _apply(self.matrix, np.asarray(ideal_px, float)) - self.half_mm
+        strength = self.percent / 100 / np.sum(self.half_mm**2)
+        length = np.linalg.norm(far, axis=-1, keepdims=True)
+        near = length.copy()
+        for _ in range(RADIAL_STEPS):
+            near -= (near + strength * near**3 - length) / (1 + 3 * strength * near**2)
+        out = far * np.where(length > 0, near / np.where(length > 0, length, 1.0), 1.0)
+        seen = _apply(_inverse(self.matrix), self.half_mm + out)
+        return seen if self.lens is None else self.lens.distorted(seen)
+
+
+@dataclass(frozen=True)
 class ImageCalibration(ReadOnlyArrays):
     """Pixel ↔ imaging plane as a homography; the three-point calibration is its affine case.
 
@@ -81,7 +128,7 @@ class ImageCalibration(ReadOnlyArrays):
     """
 
     matrix: FloatArray
-    lens: Lens | None = None
+    lens: Lens | RadialDistortion | None = None
 
     def __post_init__(self) -> None:
         matrix = np.array(self.matrix, float)
@@ -130,6 +177,22 @@ class ImageCalibration(ReadOnlyArrays):
         if abs(np.linalg.det(to_image)) < 1e-9:
             raise ValueError("O′ and the points on O′X′ and O′Z′ lie on one line")
         return cls(_inverse(to_image), lens)
+
+    def with_distortion(self, percent: float, half_mm: FloatArray) -> ImageCalibration:
+        """Put a radial distortion in place of any that there is, see `RadialDistortion`."""
+        lens = self.plain_lens
+        bent = RadialDistortion(self.matrix, lens, half_mm, percent) if percent else lens
+        return ImageCalibration(self.matrix, bent)
+
+    @property
+    def plain_lens(self) -> Lens | None:
+        """The lens, but for a radial distortion that is known on the plane."""
+        return self.lens.lens if isinstance(self.lens, RadialDistortion) else self.lens
+
+    @property
+    def distortion_percent(self) -> float:
+        """Radial distortion in the plane's corner, percent, see `RadialDistortion`."""
+        return self.lens.percent if isinstance(self.lens, RadialDistortion) else 0.0
 
     def ideal_px(self, image_px: FloatArray) -> FloatArray:
         """(u, v), shape (…, 2), px, freed of the lens's distortion."""

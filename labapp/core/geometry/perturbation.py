@@ -77,11 +77,46 @@ def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatAr
 
 def moved_calibration(axes: AxisPoints, offset: FloatArray) -> ImageCalibration:
     """Image calibration whose three points are off by an offset, shape (q,), lens as it is."""
+    calibration = axes.calibration
+    base = ImageCalibration(calibration.matrix, calibration.plain_lens)
     plane_mm = _axis_points_mm(axes)
-    seen = axes.calibration.to_image(plane_mm) + offset[_POINTS].reshape(3, 2)
-    origin, on_x, on_z = (tuple(point) for point in seen.tolist())
-    lens = axes.calibration.lens
-    return ImageCalibration.from_three_points(origin, on_x, axes.x_mm, on_z, axes.z_mm, lens)
+    true = _with_ones(base.ideal_px(base.to_image(plane_mm)))
+    moved = base.ideal_px(base.to_image(plane_mm) + offset[_POINTS].reshape(3, 2))
+    back = np.linalg.solve(_with_ones(moved), true).T
+    return ImageCalibration(base.matrix @ back, base.lens)
+
+
+def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
+    """Rig and image calibration, with the quantities off by an offset, shape (q,).
+
+    The rig's uncertainty has the new calibration and the covariance that there was.
+    """
+    assert rig.uncertainty is not None
+    axes, plane = rig.uncertainty.axes, rig.imaging_plane
+    percent = axes.calibration.distortion_percent + float(offset[_DISTORTION])
+    half = np.array([plane.width_mm, plane.height_mm]) / 2
+    calibration = moved_calibration(axes, offset).with_distortion(percent, half)
+    uncertainty = replace(rig.uncertainty, axes=replace(axes, calibration=calibration))
+    return replace(moved_rig(rig, offset), uncertainty=uncertainty), calibration
+
+
+def quantity_values(rig: Rig) -> FloatArray:
+    """Values of `QUANTITIES` that a rig with its uncertainty has, shape (q,), in their units."""
+    assert rig.uncertainty is not None
+    axes, plane = rig.uncertainty.axes, rig.imaging_plane
+    x_mm, y_mm, z_mm = plane.origin_mm.tolist()
+    at = {"distance_mm": -y_mm, "s_mm": -x_mm, "h_mm": z_mm}
+    at |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), plane.angles_deg, strict=True))
+    values = np.zeros(len(INDEX))
+    for part, names in ((rig.laser, _LASER), (rig.pattern, _PATTERN)):
+        for name, k in names:
+            values[k] = getattr(part, name)
+    for name, k in _PLANE:
+        values[k] = at[name]
+    base = ImageCalibration(axes.calibration.matrix, axes.calibration.plain_lens)
+    values[_POINTS] = base.to_image(_axis_points_mm(axes)).ravel()
+    values[_DISTORTION] = axes.calibration.distortion_percent
+    return values
 
 
 def _axis_points_mm(axes: AxisPoints) -> FloatArray:

@@ -109,11 +109,14 @@ class RigUncertainty(ReadOnlyArrays):
         Of `QUANTITIES`, shape (q, q), in the squares of their units.
     assumed
         Keys of the quantities whose uncertainty nobody told.
+    checked
+        Whether the bench was adjusted to a known mirror, and is as it was then.
     """
 
     axes: AxisPoints
     covariance: FloatArray
     assumed: frozenset[str] = frozenset()
+    checked: bool = False
 
     @property
     def sigma(self) -> FloatArray:
@@ -122,7 +125,12 @@ class RigUncertainty(ReadOnlyArrays):
 
     @property
     def status(self) -> str:
-        """``calibrated`` where laser and image calibration told their own ±, or ``entered``."""
+        """How far the set-up can be relied on.
+
+        ``checked``; ``calibrated`` where laser and image calibration told their own ±; ``entered``.
+        """
+        if self.checked:
+            return "checked"
         return "entered" if self.assumed & CALIBRATED else "calibrated"
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -106,6 +107,10 @@ class Page(QWidget):
 
         The page is in view.
         """
+
+    def takes_files(self, paths: Sequence[Path]) -> bool:
+        """Take files dropped on the window that are the page's own; whether it did."""
+        return False
 
     @property
     def camera(self) -> LiveView | None:

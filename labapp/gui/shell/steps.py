@@ -138,6 +138,11 @@ class Facts:
     stale: int = 0
 
     @property
+    def checked(self) -> str:
+        """When the bench was checked, see `Setup`."""
+        return "" if self.problems else self.session.setup.checked
+
+    @property
     def to_do(self) -> str:
         """What the set-up lacks, in words; empty if nothing."""
         return setup_to_do(self.problems)
@@ -171,17 +176,32 @@ def _setup(facts: Facts) -> State:
 
 def _laser(facts: Facts) -> State:
     used, _ = calibrations_in_use(facts.session)
-    return _calibrated(facts.session.laser_calibration, used, facts.lacks("laser"))
+    return _calibrated(facts, facts.session.laser_calibration, used, facts.lacks("laser"))
 
 
 def _plane(facts: Facts) -> State:
     _, used = calibrations_in_use(facts.session)
-    return _calibrated(facts.session.plane_calibration, used, facts.lacks("image_calibration"))
+    return _calibrated(
+        facts, facts.session.plane_calibration, used, facts.lacks("image_calibration")
+    )
 
 
-def _calibrated(kept: object, used: bool, needed: bool) -> State:
+def _bench_check(facts: Facts) -> State:
+    kept = facts.session.bench_check
+    if facts.problems:
+        return State(Mark.TODO, f"Set-up: {facts.to_do}")
+    if facts.checked:
+        return State(Mark.DONE, f"Checked against a known mirror on {facts.checked[:10]}")
+    if kept is not None:
+        return State(Mark.ATTENTION, "The set-up was changed after the check: check again")
+    return State(Mark.READY, "Not checked against a known mirror")
+
+
+def _calibrated(facts: Facts, kept: object, used: bool, needed: bool) -> State:
     if used:
         return State(Mark.DONE, "Calibrated")
+    if kept is not None and facts.checked:
+        return State(Mark.DONE, "Calibrated, and adjusted by the bench check")
     if kept is not None:
         return State(Mark.READY, "Other values were entered after the calibration")
     if needed:
@@ -289,6 +309,16 @@ STEPS = (
         "any of them that is not where it should be.",
         "PlanePage",
         _plane,
+        needs_frames=False,
+    ),
+    Step(
+        "bench_check",
+        "Bench check",
+        "Picture a mirror of known shape under the laser: a flat plate, a thumb tack, a bearing "
+        "ball. Its dots tell where laser and plane really stand, and a wrong set-up shows. A plate "
+        "and a cap tell most; the check may be left out.",
+        "BenchCheckPage",
+        _bench_check,
         needs_frames=False,
     ),
     Step(

@@ -457,6 +457,8 @@ class MainWindow(QMainWindow):
         """Open what was dropped, once the other program has its pointer back."""
         paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
         event.acceptProposedAction()
+        if paths and self.page is not None and self.page.takes_files(paths):
+            return
         if len(paths) > 1:
             self.say("Drop one file, or the folder that holds the images", True)
         elif paths:

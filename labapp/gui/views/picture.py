@@ -197,6 +197,12 @@ class PictureView(Drawn):
             rows, columns = self._image.shape
             self.box.setRange(QRectF(-0.5, -0.5, columns, rows), padding=0.01)
 
+    def show_region(self, low: tuple[float, float], high: tuple[float, float]) -> None:
+        """Show what lies between two places (u, v), px, with a margin."""
+        self._stop_fitting()
+        (u, v), (right, down) = low, high
+        self.box.setRange(QRectF(u, v, right - u, down - v), padding=0.12)
+
     def zoom(self, factor: float) -> None:
         """Zoom about the middle; more than 1 makes it larger."""
         self._stop_fitting()

@@ -17,7 +17,7 @@ from labapp.core.calibration.board_calibration import MOST_PICTURES, BoardCalibr
 from labapp.core.calibration.boards import FEWEST_CORNERS, Board, BoardCorners
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
-from labapp.core.geometry.coordinates import ImageCalibration, Lens
+from labapp.core.geometry.coordinates import ImageCalibration, Lens, RadialDistortion
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty
 from labapp.core.images import dots, find_dots, threshold_dots
@@ -32,7 +32,14 @@ from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.run.limits import Limits
-from labapp.session.record import LaserReadings, PlanePicture, Record, Recording
+from labapp.session.record import (
+    BenchCheckRecord,
+    LaserReadings,
+    MirrorPicture,
+    PlanePicture,
+    Record,
+    Recording,
+)
 from labapp.session.signals import Signals
 
 
@@ -122,6 +129,7 @@ STORED = {
     "AxisPoints": Stored(AxisPoints),
     "ImageCalibration": Stored(ImageCalibration, shapes={"matrix": "3 3"}),
     "Lens": Stored(Lens),
+    "RadialDistortion": Stored(RadialDistortion, shapes={"matrix": "3 3", "half_mm": "2"}),
     "LaserReadings": Stored(LaserReadings),
     "LaserCalibration": Stored(LaserCalibration),
     "PlanePicture": Stored(PlanePicture),
@@ -131,6 +139,16 @@ STORED = {
         BoardCorners, shapes={"index": "n", "image_px": "n 2"}, fits=_corners_fit
     ),
     "Board": Stored(Board, fits=lambda value: value.is_possible),
+    "MirrorPicture": Stored(
+        MirrorPicture,
+        shapes=dict.fromkeys(("ray", "dot_px", "computed_px", "residual_mm"), "n 2"),
+        fits=lambda value: value.kind in ("plate", "cap", "ball"),
+    ),
+    "BenchCheckRecord": Stored(
+        BenchCheckRecord,
+        shapes=dict.fromkeys(("before", "before_sigma", "after", "after_sigma"), "q"),
+        fits=lambda value: len(value.quantities) == len(value.before),
+    ),
     # The experiment
     "Record": Stored(Record),
     "Recording": Stored(Recording),

@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 import scipy
 
+from labapp.config.setup import Setup
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.errors import InputError
 from labapp.media.base import format_frame_rate
 from labapp.session.contents import SessionContents
@@ -69,6 +71,7 @@ def report_pdf(
     _set_up(story, report)
     _laser(story, report)
     _plane(story, report)
+    _bench_check(story, report)
     add_results(story, report)
     add_example(story, report)
     add_budget(story, report)
@@ -241,7 +244,12 @@ def _laser(story: Story, report: ReportData) -> None:
         ]
     )
     if report.setup is not None and not _is_laser(found, report.setup.rig):
-        story.text("The rig's laser was changed after this calibration: other values are in use.")
+        story.text(_changed("The rig's laser", report.setup))
+
+
+def _changed(what: str, setup: Setup) -> str:
+    by = "adjusted by the bench check" if setup.checked else "changed"
+    return f"{what} was {by} after this calibration: other values are in use."
 
 
 def _plane(story: Story, report: ReportData) -> None:
@@ -284,7 +292,7 @@ def _plane(story: Story, report: ReportData) -> None:
     if isinstance(found, BoardCalibration) or found.fits is not None:
         story.text("; ".join(" ".join(line.split()) for line in found.fit_lines()) + ".")
     if report.setup is not None and not _is_calibration(found, report.setup.calibration):
-        story.text("The image calibration was changed after this one: other values are in use.")
+        story.text(_changed("The image calibration", report.setup))
     try:
         picture = report.session.picture(plane.picture_sha256)
     except InputError as error:
@@ -294,6 +302,41 @@ def _plane(story: Story, report: ReportData) -> None:
         "The calibration picture with O′ and both axes as found.",
         figures.target_picture(picture, points),
     )
+
+
+def _bench_check(story: Story, report: ReportData) -> None:
+    story.part("Bench check")
+    check = report.session.bench_check
+    if check is None:
+        story.text("The set-up was not checked against a known mirror in this session.")
+        return
+    rows = []
+    known = (check.before, check.before_sigma, check.after, check.after_sigma)
+    for key, *values in zip(check.quantities, *known, strict=True):
+        if key in INDEX:
+            one = QUANTITIES[INDEX[key]]
+            rows.append([f"{one.name} ({one.unit})", *(number(value, 3) for value in values)])
+    names = ", ".join(one.name for one in check.pictures)
+    story.table(
+        f"The set-up before and after it was adjusted on {check.date[:10]} to {names}.",
+        [["quantity", "before", "±", "after", "±"], *rows],
+        "lrrrr",
+        (0.48, 0.13, 0.13, 0.13, 0.13),
+    )
+    sizes = [
+        [one.name, f"{one.kind}, {name}", *(number(value, 3) for value in values)]
+        for one in check.pictures
+        for name, *values in one.measured
+    ]
+    story.table(
+        "The mirrors, measured with the adjusted set-up as if their size were not known; "
+        "±: noise of the dots alone.",
+        [["picture", "mirror", "known (mm)", "measured (mm)", "± (mm)"], *sizes],
+        "llrrr",
+        (0.3, 0.22, 0.16, 0.18, 0.14),
+    )
+    if report.setup is not None and not report.setup.checked:
+        story.text("The set-up was changed after this check: it is not checked.")
 
 
 def _is_laser(found: LaserCalibration, rig: Rig) -> bool:

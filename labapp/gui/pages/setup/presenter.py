@@ -16,7 +16,7 @@ from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM, Fate, SideView, side_view
-from labapp.text import SETUP_WORDS
+from labapp.text import setup_words
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,8 @@ def shown(session: Session) -> SetupState:
     torch = sections.get("torch")
     travel = torch.get("travel", "+y") if isinstance(torch, dict) else "+y"
     found = rig(session)
-    status = "" if found is None else SETUP_WORDS[setup_status(found)]
+    checked = "" if session.setup_problems else session.setup.checked
+    status = "" if found is None else setup_words(setup_status(found), checked)
     problems: dict[str, str] = {}
     others = []
     for problem in session.setup_problems:
@@ -249,6 +250,8 @@ def _number(sections: dict[str, Any], key: str) -> float | None:
 
 def rig(session: Session) -> Rig | None:
     """The rig, as soon as it is complete; the image calibration may still be missing."""
+    if not session.setup_problems:
+        return session.setup.rig
     anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
     points = dict.fromkeys(THREE_POINTS)
     try:

@@ -21,7 +21,7 @@ from labapp.export.scene import Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
-from labapp.text import HEIGHT_SIGMA_OF, SETUP_WORDS, SIGMA_OF
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, setup_words
 
 SCHEMES = scheme_words()
 """Name that results are kept under → words for the operator."""
@@ -170,8 +170,10 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
     if result.stale:
         was = words if failed else "These figures no longer stand."
         return "stale", f"{was} Since then {' and '.join(result.stale)}."
-    about = SETUP_WORDS.get(measurement.setup_status, "")
-    return ("failed" if failed else "measured"), words if failed else f"{words} {about}".strip()
+    if failed:
+        return "failed", words
+    about = setup_words(measurement.setup_status, parse_setup(result.setup, "setup").checked)
+    return "measured", f"{words} {about}".strip()
 
 
 def provenance(result: Result) -> str:

@@ -16,7 +16,7 @@ from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
-from labapp.text import SETUP_WORDS, SIGMA_OF
+from labapp.text import SIGMA_OF, setup_words
 
 MARKS = (
     Mark("●", "measured"),
@@ -110,7 +110,9 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
         rows=tuple(row for course in courses for row in _rows(course)),
         words=_counted(seen, course_of("height_mm")),
-        setup_words="" if session.setup_problems else SETUP_WORDS[setup_status(session.setup.rig)],
+        setup_words=""
+        if session.setup_problems
+        else setup_words(setup_status(session.setup.rig), session.setup.checked),
         spectrum=found,
         spectrum_axis=spectrum_axis,
         spectrum_words=told,

@@ -1,0 +1,175 @@
+"""`labapp calibrate bench`: the set-up checked against pictures of known mirrors."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from labapp.cli.shared import NOTHING_MEASURED, write_file
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.core.bench_check.check import BenchCheck
+    from labapp.core.bench_check.labelling import Picture
+    from labapp.core.bench_check.mirrors import Mirror
+    from labapp.core.geometry.rig import Rig
+
+
+def calibrate_bench(
+    *,
+    setup: Annotated[Path, typer.Option(help="Setup file (TOML), of laser and imaging plane.")],
+    pictures: Annotated[
+        list[Path] | None, typer.Argument(metavar="PICTURE...", help="Pictures of mirrors.")
+    ] = None,
+    mirror: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What the picture at the same place shows: plate:HEIGHT, cap:DIAMETER:HEIGHT, "
+            "ball:DIAMETER:TOP (mm, above the work piece); each number may have its standard "
+            "uncertainty, as 2+-0.01. Repeat for more pictures."
+        ),
+    ] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY",
+            help="Do not hold a quantity by its uncertainty, as laser.distance_mm or picture.u.",
+        ),
+    ] = None,
+    predict: Annotated[
+        bool,
+        typer.Option("--predict", help="Only tell what pictures would help most; none is needed."),
+    ] = False,
+    use: Annotated[
+        bool, typer.Option("--use", help="Write the adjusted set-up into the setup file.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="CSV file for the residual of every dot.")
+    ] = None,
+) -> None:
+    """Check the set-up against pictures of known mirrors, and adjust it.
+
+    Exit code 1: the set-up cannot be adjusted to the pictures, and is not changed.
+    """
+    from labapp.config.mirror_text import parse_mirror
+    from labapp.config.setup import A_SETUP, parse_setup, unchecked_setup
+    from labapp.config.toml_keys import read_text
+    from labapp.core.bench_check.check import check_bench
+    from labapp.core.bench_check.suspects import suspect_keys
+    from labapp.core.values import CannotMeasure
+
+    text = read_text(setup, A_SETUP)
+    parse_setup(text, setup)
+    before = unchecked_setup(text, setup)
+    known = parse_setup(before, setup)
+    mirrors = [parse_mirror(one) for one in mirror or []]
+    if predict:
+        _print_forecast(known.rig, mirrors)
+        return
+    if not pictures:
+        raise InputError("PICTURE", "pictures", "none", "one or more, or --predict")
+    if len(mirrors) != len(pictures):
+        counts = f"{len(mirrors)} for {len(pictures)} pictures"
+        raise InputError("--mirror", "mirrors", counts, "one for each picture, in their order")
+    for key in free or []:
+        if key not in suspect_keys():
+            raise InputError("--free", "key", key, f"one of {', '.join(suspect_keys())}")
+    try:
+        found = [_picture(path, one) for path, one in zip(pictures, mirrors, strict=True)]
+        check = check_bench(found, known.rig, known.calibration, free or [])
+    except CannotMeasure as answer:
+        typer.echo(f"{setup}: {answer}", err=True)
+        raise typer.Exit(NOTHING_MEASURED) from answer
+    _print_check(check)
+    if out is not None:
+        write_file(out, _residuals(check).encode())
+    if check.status != "ok":
+        raise typer.Exit(NOTHING_MEASURED)
+    if use:
+        _write(setup, before, check)
+
+
+def _picture(path: Path, mirror: Mirror) -> Picture:
+    from labapp.core.bench_check.labelling import Picture
+    from labapp.core.images.find_dots import DotSettings, find_dots
+    from labapp.media import open_source
+
+    with open_source(path) as source:
+        image = source.frame(0).image
+    height, width = image.shape
+    return Picture(path.name, mirror, find_dots(image, DotSettings()), (height, width))
+
+
+def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:
+    """What pictures would do for the height of a usual pool."""
+    from labapp.core.bench_check.forecast import CANDIDATES, EXPECTED, forecast
+
+    every = dict(CANDIDATES)
+    if mirrors:
+        every[", ".join(one.name for one in mirrors)] = tuple(mirrors)
+    typer.echo(f"± of the height of a pool like a {EXPECTED.name} (mm)")
+    typer.echo(f"{'pictures':40} {'set-up':>8} {'total':>8}")
+    for one in forecast(rig, every):
+        typer.echo(f"{one.name:40} {one.setup_sigma_mm:8.4f} {one.total_sigma_mm:8.4f}")
+
+
+def _print_check(check: BenchCheck) -> None:
+    from labapp.core.bench_check.forecast import EXPECTED, height_sigma
+    from labapp.core.values import CannotMeasure
+
+    typer.echo(f"{'quantity':40} {'before':>10} {'±':>8} {'after':>10} {'±':>8}")
+    for one in check.changes:
+        typer.echo(
+            f"{one.name + ', ' + one.unit:40} {one.before:10.4f} {one.before_sigma:8.4f} "
+            f"{one.after:10.4f} {one.after_sigma:8.4f}"
+        )
+    if check.undetermined:
+        names = "; ".join(one.name for one in check.undetermined)
+        typer.echo(f"not determined by these pictures: {names}")
+    for picture in check.pictures:
+        typer.echo(
+            f"{picture.picture.name}: {picture.picture.mirror.name}, {len(picture.ray)} dots of "
+            f"{len(picture.picture.dots)} with a ray, residual {1000 * picture.rms_mm:.0f} µm RMS"
+        )
+    typer.echo(f"residuals: {check.verdict}")
+    try:
+        was, now = height_sigma(check.before), height_sigma(check.rig)
+    except CannotMeasure:
+        pass
+    else:
+        typer.echo(
+            f"± of the height of a pool like a {EXPECTED.name}: "
+            f"{was.total_sigma_mm:.4f} → {now.total_sigma_mm:.4f} mm"
+        )
+    if check.status != "ok":
+        typer.echo(f"{check.status}: {check.reason}", err=True)
+        for suspect in check.suspects:
+            typer.echo(f"to adjust with it let go of: --free {suspect.key}", err=True)
+
+
+def _residuals(check: BenchCheck) -> str:
+    """Residual of every dot, CSV."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(
+        ["picture", "ray_row", "ray_column", "plane_x_mm", "plane_z_mm", "residual_x_mm",
+         "residual_z_mm"]
+    )  # fmt: skip
+    for one in check.pictures:
+        columns = one.ray.tolist(), one.plane_mm.tolist(), one.residual_mm.tolist()
+        for ray, place, residual in zip(*columns, strict=True):
+            cells = [f"{value:.6f}" for value in (*place, *residual)]
+            table.writerow([one.picture.name, *ray, *cells])
+    return text.getvalue()
+
+
+def _write(setup: Path, before: str, check: BenchCheck) -> None:
+    from labapp.config.setup import checked_setup
+    from labapp.text import now
+
+    write_file(setup, checked_setup(before, setup, check, now()).encode())
+    typer.echo(f"The adjusted set-up is in {setup.absolute()}")

@@ -1,0 +1,85 @@
+"""Mirrors of a bench check as text: ``plate:0``, ``cap:9.75:0.91``, ``ball:10:1.2+-0.02``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from labapp.core.bench_check.mirrors import FREE_MM, Ball, Cap, Mirror, Plate
+from labapp.errors import InputError
+
+FORMS = "plate:HEIGHT, cap:DIAMETER:HEIGHT, ball:DIAMETER or ball:DIAMETER:TOP (mm)"
+"""How mirrors are written."""
+
+_LARGEST_MM = 1000.0
+
+
+def parse_mirror(text: str) -> Mirror:
+    """Read a mirror.
+
+    Each number may have its standard uncertainty after ``+-`` or ``±``. The height of a plate may
+    be ``free``.
+
+    Raises
+    ------
+    InputError
+        If it is none of `FORMS`, or has an impossible size.
+    """
+    kind, *numbers = text.strip().split(":")
+    makers: dict[tuple[str, int], Callable[..., Mirror]] = {
+        ("plate", 1): _plate,
+        ("cap", 2): _cap,
+        ("ball", 1): _ball,
+        ("ball", 2): _ball,
+    }
+    maker = makers.get((kind, len(numbers)))
+    try:
+        if maker is None:
+            raise ValueError
+        return maker(*(_number(one) for one in numbers))
+    except ValueError:
+        raise InputError("--mirror", "mirror", text, f"one of {FORMS}") from None
+
+
+def _number(text: str) -> tuple[float, float | None]:
+    """A number and its ±, None where it has none."""
+    if text == "free":
+        return 0.0, FREE_MM
+    value, _, sigma = text.replace("±", "+-").partition("+-")
+    made = float(value), float(sigma) if sigma else None
+    if not all(abs(one) <= _LARGEST_MM and math.isfinite(one) for one in made if one is not None):
+        raise ValueError
+    if made[1] is not None and made[1] <= 0:
+        raise ValueError
+    return made
+
+
+def _plate(height: tuple[float, float | None]) -> Plate:
+    value, sigma = height
+    return Plate(value) if sigma is None else Plate(value, sigma)
+
+
+def _cap(diameter: tuple[float, float | None], height: tuple[float, float | None]) -> Cap:
+    usual = Cap(diameter[0], height[0])
+    if not 0 < height[0] <= diameter[0] / 2:
+        raise ValueError
+    return Cap(
+        diameter[0],
+        height[0],
+        diameter[1] or usual.diameter_sigma_mm,
+        height[1] or usual.height_sigma_mm,
+    )
+
+
+def _ball(
+    diameter: tuple[float, float | None], top: tuple[float, float | None] | None = None
+) -> Ball:
+    usual = Ball(diameter[0])
+    if not diameter[0] > 0 or (top is not None and not 0 < top[0] <= 2 * diameter[0]):
+        raise ValueError
+    return Ball(
+        diameter[0],
+        None if top is None else top[0],
+        diameter[1] or usual.diameter_sigma_mm,
+        (top and top[1]) or usual.top_sigma_mm,
+    )

@@ -1,0 +1,296 @@
+"""Pictures of known mirrors → the bench as it stands, what it is known to, and a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.bench_check.adjustment import Adjustment, adjust
+from labapp.core.bench_check.labelling import (
+    LEAST_DOTS,
+    Labelled,
+    Picture,
+    label_picture,
+    relabelled,
+    sighting_of,
+)
+from labapp.core.bench_check.mirrors import Plate
+from labapp.core.bench_check.suspects import Suspect, find_suspects, released
+from labapp.core.bench_check.verdict import Pattern, Verdict, judge
+from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.perturbation import moved_bench, quantity_values
+from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import QUANTITIES
+from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
+
+Status = Literal["ok", "quantity-off"] | Verdict
+
+ROUNDS = 3
+"""Of adjusting to all pictures and labelling anew."""
+
+WIDE = 10.0
+"""So many times its standard uncertainty a quantity may be off for rays to be found still."""
+
+UNDETERMINED = 0.8
+"""A quantity is not determined whose ± after the check is more than this share of that before."""
+
+
+@dataclass(frozen=True)
+class CheckedPicture(ReadOnlyArrays):
+    """A picture and what the adjusted bench makes of it; n dots with a ray.
+
+    Parameters
+    ----------
+    picture
+        The picture.
+    dot
+        Index of each pair's dot in the picture's dots, shape (n,).
+    ray
+        Its ray (i, j), counted from 1, shape (n, 2).
+    plane_mm
+        The dot by the set-up before the check, IPCS, shape (n, 2), mm.
+    residual_mm
+        Observed minus computed dot, shape (n, 2), mm.
+    pose, pose_sigma
+        The mirror's pose (`Mirror.parameters`) and its standard uncertainties, shape (d,).
+    """
+
+    picture: Picture
+    dot: IntArray
+    ray: IntArray
+    plane_mm: FloatArray
+    residual_mm: FloatArray
+    pose: FloatArray
+    pose_sigma: FloatArray
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the residuals' lengths, mm."""
+        return float(np.sqrt(np.mean(np.sum(self.residual_mm**2, axis=-1))))
+
+
+@dataclass(frozen=True)
+class BenchCheck(ReadOnlyArrays):
+    """The result of a bench check.
+
+    Parameters
+    ----------
+    status
+        ``ok``; ``quantity-off`` where a quantity is off by far more than its ± allows; or the
+        verdict, where that is not ``noise-like``. Only with ``ok`` is the new set-up to be used.
+    reason
+        The same in a sentence; empty with ``ok``.
+    verdict, patterns
+        What the residuals look like, see `judge`.
+    suspects
+        Quantities that are off by far more than their ±, the likeliest first; those that explain
+        the dots alike come together.
+    free
+        Keys of suspects that the ± was widened of, as was asked for.
+    before
+        The set-up before the check.
+    rig, calibration
+        The set-up after it, with its uncertainty, which is marked as checked with ``ok``.
+    pictures
+        What became of each picture, in the order given.
+    adjustment
+        The adjustment itself.
+    """
+
+    status: Status
+    reason: str
+    verdict: Verdict
+    patterns: tuple[Pattern, ...]
+    suspects: tuple[Suspect, ...]
+    free: tuple[str, ...]
+    before: Rig
+    rig: Rig
+    calibration: ImageCalibration
+    pictures: tuple[CheckedPicture, ...]
+    adjustment: Adjustment
+
+    @cached_property
+    def changes(self) -> tuple[QuantityChange, ...]:
+        """Each of `QUANTITIES` before and after the check."""
+        known, knows = self.before.uncertainty, self.rig.uncertainty
+        assert known is not None
+        assert knows is not None
+        columns = quantity_values(self.before), known.sigma, quantity_values(self.rig), knows.sigma
+        return tuple(
+            QuantityChange(one.key, one.name, one.unit, *map(float, values))
+            for one, *values in zip(QUANTITIES, *columns, strict=True)
+        )
+
+    @property
+    def undetermined(self) -> tuple[QuantityChange, ...]:
+        """Quantities that the pictures hardly tell: known about as well as before."""
+        return tuple(
+            one
+            for one in self.changes
+            if one.before_sigma > 0 and one.after_sigma > UNDETERMINED * one.before_sigma
+        )
+
+
+@dataclass(frozen=True)
+class QuantityChange:
+    """A quantity before and after the check, with its standard uncertainty, in its unit."""
+
+    key: str
+    name: str
+    unit: str
+    before: float
+    before_sigma: float
+    after: float
+    after_sigma: float
+
+
+def check_bench(
+    pictures: Sequence[Picture], rig: Rig, calibration: ImageCalibration, free: Sequence[str] = ()
+) -> BenchCheck:
+    """Adjust the set-up to pictures of known mirrors.
+
+    Parameters
+    ----------
+    pictures
+        One or several pictures of mirrors, each in its own place.
+    rig, calibration
+        The set-up as it is known; its uncertainty is the prior.
+    free
+        Keys of suspects (`suspects.suspect_keys`) that are not to be held by their uncertainty.
+
+    Raises
+    ------
+    CannotMeasure
+        As `label_picture`.
+    """
+    let_go = released(rig, free)
+    bench = Bench(rig, calibration)
+    observed = [Observation.of(p.dots, bench, p.frame_shape) for p in pictures]
+    labels = _labelled(pictures, rig, calibration, let_go)
+    made: Adjustment | None = None
+    for _ in range(ROUNDS):
+        sightings = [
+            sighting_of(o, p.mirror, found)
+            for o, p, found in zip(observed, pictures, labels, strict=True)
+        ]
+        made = adjust(rig, sightings, let_go, None if made is None else made.unknown)
+        again = [
+            relabelled(o, p.mirror, made.offset, pose)
+            for o, p, pose in zip(observed, pictures, made.poses, strict=True)
+        ]
+        again = [np.where(o.absent, UNLABELLED, a) for o, a in zip(observed, again, strict=True)]
+        if all((new == old).all() for new, old in zip(again, labels, strict=True)):
+            break
+        if any((new != UNLABELLED).sum() < LEAST_DOTS for new in again):
+            raise CannotMeasure("no-match", "no bench explains all pictures together")
+        labels = again
+    assert made is not None
+    suspects = find_suspects(rig, sightings, made, let_go)
+    verdict, patterns = judge(rig, sightings, made, let_go)
+    status, reason = _status(suspects, verdict)
+    after, calibrated = adjusted_bench(rig, made, status == "ok")
+    checked = tuple(
+        CheckedPicture(
+            picture=picture,
+            dot=found[tuple(sighting.ray.T)],
+            ray=sighting.ray + 1,
+            plane_mm=sighting.plane_mm,
+            residual_mm=made.residual_mm[k],
+            pose=made.poses[k],
+            pose_sigma=np.sqrt(np.diag(made.pose_covariances[k])),
+        )
+        for k, (picture, sighting, found) in enumerate(
+            zip(pictures, sightings, labels, strict=True)
+        )
+    )
+    return BenchCheck(
+        status=status,
+        reason=reason,
+        verdict=verdict,
+        patterns=patterns,
+        suspects=suspects,
+        free=tuple(free),
+        before=rig,
+        rig=after,
+        calibration=calibrated,
+        pictures=checked,
+        adjustment=made,
+    )
+
+
+def _labelled(
+    pictures: Sequence[Picture], rig: Rig, calibration: ImageCalibration, let_go: FloatArray
+) -> list[IntArray]:
+    """Labels of each picture: plates first, as they tell the bench that the others are seen on."""
+    order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
+    labels: dict[int, IntArray] = {}
+    told = rig, calibration
+    for k in order:
+        found = _first_label(
+            pictures[k], [told, (rig, calibration), (_wide(rig), calibration)], let_go
+        )
+        labels[k] = found.labels
+        told = adjusted_bench(told[0], found.adjustment)
+    return [labels[k] for k in range(len(pictures))]
+
+
+def _first_label(
+    picture: Picture, benches: Sequence[tuple[Rig, ImageCalibration]], let_go: FloatArray
+) -> Labelled:
+    """Labels by the first bench that has any.
+
+    A mirror that is not what it is said to be, or a quantity that is far off, leads those astray
+    that come after.
+    """
+    for bench in benches[:-1]:
+        try:
+            return label_picture(picture, *bench, let_go)
+        except CannotMeasure:
+            continue
+    return label_picture(picture, *benches[-1], let_go)
+
+
+def _wide(rig: Rig) -> Rig:
+    """The bench, known a good deal worse than it is said to be."""
+    assert rig.uncertainty is not None
+    covariance = WIDE**2 * rig.uncertainty.covariance
+    return replace(rig, uncertainty=replace(rig.uncertainty, covariance=covariance))
+
+
+def adjusted_bench(
+    rig: Rig, made: Adjustment, checked: bool = False
+) -> tuple[Rig, ImageCalibration]:
+    """The rig and the image calibration that an adjustment leads to, with their uncertainty."""
+    after, calibration = moved_bench(rig, made.offset)
+    assert after.uncertainty is not None
+    assumed = frozenset() if checked else after.uncertainty.assumed
+    known = replace(after.uncertainty, covariance=made.covariance, assumed=assumed, checked=checked)
+    return replace(after, uncertainty=known), calibration
+
+
+REASONS: dict[Verdict, str] = {
+    "noise-like": "",
+    "distortion": "the picture is distorted in another way: calibrate the camera's lens",
+    "plate-not-flat": "the plate is not flat: take a better one",
+    "wrong-lens": "the rays are not those of the pattern: is it another lens?",
+    "row-slipped": "the dots fit the rays of the next row or column better: is the absent ray "
+    "another, or its hole mistaken?",
+    "unexplained": "no bench and no mirror of this kind explain the dots: is it the mirror that "
+    "was named, and did anything move between the pictures?",
+}
+
+
+def _status(suspects: Sequence[Suspect], verdict: Verdict) -> tuple[Status, str]:
+    if suspects:
+        names = " or ".join(one.name for one in suspects)
+        sure = np.sqrt(suspects[0].drop)
+        return "quantity-off", (
+            f"{names}: off by far more than the ± in the set-up ({sure:.0f} standard deviations)"
+        )
+    return ("ok" if verdict == "noise-like" else verdict), REASONS[verdict]

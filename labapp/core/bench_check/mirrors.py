@@ -1,0 +1,275 @@
+"""Mirrors of known shape, and where the rays that they reflect meet the imaging plane.
+
+A mirror has a *pose*, a vector of what is not known of it exactly, held by standard uncertainties.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from labapp.core.geometry.optics import intersect_imaging_plane, ray_directions, reflect
+from labapp.core.geometry.rig import Rig
+from labapp.core.values import BoolArray, FloatArray, IntArray
+
+FREE_MM = 10.0
+"""Standard uncertainty of a length that is not known, mm."""
+
+
+class Mirror(Protocol):
+    """What the check needs of a mirror; its pose has d parameters."""
+
+    @property
+    def name(self) -> str:
+        """The mirror in a few words, with its size."""
+        ...
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the pose's parameters, which end in their unit."""
+        ...
+
+    @property
+    def pose(self) -> FloatArray:
+        """The pose that is expected, shape (d,)."""
+        ...
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard uncertainty of each parameter, shape (d,)."""
+        ...
+
+    def meet(
+        self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Where rays meet the mirror at a pose.
+
+        Parameters
+        ----------
+        source_mm, direction
+            The laser, shape (3,), mm; the rays' unit directions, shape (…, 3).
+        pose
+            Shape (d,).
+
+        Returns
+        -------
+        point_mm, normal, hit
+            Point and upward normal, shapes (…, 3), also a little beyond the mirror's edge, so that
+            they are smooth functions of the pose; whether the ray meets the mirror, shape (…).
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A flat polished plate, larger than the dot matrix on it.
+
+    Parameters
+    ----------
+    height_mm
+        Height of its surface over the work piece at the origin.
+    height_sigma_mm
+        How well that is known. The usual one is for a plate in place of the work piece, or a gauge
+        block on it.
+    tilt_sigma_deg
+        How level it lies, along X and along Y: the usual one is for a plate on the work piece or a
+        levelled table.
+    """
+
+    height_mm: float = 0.0
+    height_sigma_mm: float = 0.02
+    tilt_sigma_deg: float = 0.1
+
+    @property
+    def name(self) -> str:
+        """The mirror in a few words."""
+        return f"plate at {self.height_mm:g} mm"
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Height at the origin, and by how much it rises along X and along Y."""
+        return ("height_mm", "tilt_x_deg", "tilt_y_deg")
+
+    @property
+    def pose(self) -> FloatArray:
+        """The pose that is expected."""
+        return np.array([self.height_mm, 0.0, 0.0])
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard uncertainty of each parameter."""
+        return np.array([self.height_sigma_mm, self.tilt_sigma_deg, self.tilt_sigma_deg])
+
+    def meet(
+        self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Where rays meet the plate, see `Mirror`."""
+        normal = np.append(-np.tan(np.radians(pose[1:3])), 1.0)
+        falls = direction @ normal
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = (pose[0] - source_mm @ normal) / falls
+        point = source_mm + way[..., None] * direction
+        return point, np.broadcast_to(normal, point.shape), np.asarray(way > 0)
+
+
+@dataclass(frozen=True)
+class Cap:
+    """A cap of a sphere on the work piece: a thumb tack, or a lens's face.
+
+    Parameters
+    ----------
+    diameter_mm, height_mm
+        Diameter of its rim, which lies on the work piece, and height of its top.
+    diameter_sigma_mm, height_sigma_mm
+        How well these are known: the usual ones are a caliper's and a dial gauge's.
+    place_sigma_mm
+        How near the origin its top is placed, along X and along Y.
+    """
+
+    diameter_mm: float
+    height_mm: float
+    diameter_sigma_mm: float = 0.02
+    height_sigma_mm: float = 0.005
+    place_sigma_mm: float = FREE_MM
+
+    @property
+    def name(self) -> str:
+        """The mirror in a few words."""
+        return f"cap ⌀ {self.diameter_mm:g} mm, {self.height_mm:g} mm high"
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Place of its top, height and diameter."""
+        return ("x_mm", "y_mm", "height_mm", "diameter_mm")
+
+    @property
+    def pose(self) -> FloatArray:
+        """The pose that is expected."""
+        return np.array([0.0, 0.0, self.height_mm, self.diameter_mm])
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard uncertainty of each parameter."""
+        place = self.place_sigma_mm
+        return np.array([place, place, self.height_sigma_mm, self.diameter_sigma_mm])
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius of its sphere, mm."""
+        return sphere_radius(self.diameter_mm, self.height_mm)
+
+    def meet(
+        self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Where rays meet the cap, see `Mirror`."""
+        x, y, top, diameter = pose
+        radius = sphere_radius(diameter, top)
+        center = np.array([x, y, top - radius])
+        point, normal, met = _meet_sphere(source_mm, direction, center, radius)
+        out = np.hypot(point[..., 0] - x, point[..., 1] - y)
+        return point, normal, np.asarray(met & (out < diameter / 2) & (normal[..., 2] > 0))
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A bearing ball, on the work piece or sunk into it.
+
+    Parameters
+    ----------
+    diameter_mm
+        Its diameter.
+    top_mm
+        Height of its top over the work piece. None: it lies on it, and the top is a diameter up.
+    diameter_sigma_mm, top_sigma_mm
+        How well these are known.
+    place_sigma_mm
+        How near it is placed to where the beam axis meets its top, along X and along Y.
+    """
+
+    diameter_mm: float
+    top_mm: float | None = None
+    diameter_sigma_mm: float = 0.002
+    top_sigma_mm: float = 0.01
+    place_sigma_mm: float = FREE_MM
+
+    @property
+    def name(self) -> str:
+        """The mirror in a few words."""
+        return f"ball ⌀ {self.diameter_mm:g} mm, top at {self.pose[2]:g} mm"
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Place and height of its top, and diameter."""
+        return ("x_mm", "y_mm", "height_mm", "diameter_mm")
+
+    @property
+    def pose(self) -> FloatArray:
+        """The pose that is expected."""
+        top = self.diameter_mm if self.top_mm is None else self.top_mm
+        return np.array([0.0, 0.0, top, self.diameter_mm])
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard uncertainty of each parameter."""
+        place = self.place_sigma_mm
+        return np.array([place, place, self.top_sigma_mm, self.diameter_sigma_mm])
+
+    @property
+    def radius_mm(self) -> float:
+        """Radius, mm."""
+        return self.diameter_mm / 2
+
+    def meet(
+        self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Where rays meet the ball above the work piece, see `Mirror`."""
+        x, y, top, diameter = pose
+        center = np.array([x, y, top - diameter / 2])
+        point, normal, met = _meet_sphere(source_mm, direction, center, diameter / 2)
+        return point, normal, np.asarray(met & (point[..., 2] > 0) & (normal[..., 2] > 0))
+
+
+def sphere_radius(diameter_mm: float, height_mm: float) -> float:
+    """Radius of the sphere that a cap of some rim diameter and height is part of, mm."""
+    return (diameter_mm**2 / 4 + height_mm**2) / (2 * height_mm)
+
+
+def landing_points(
+    mirror: Mirror, pose: FloatArray, rig: Rig, of: tuple[IntArray, ...] = ()
+) -> tuple[FloatArray, BoolArray]:
+    """Where rays that a mirror reflects meet the imaging plane.
+
+    Parameters
+    ----------
+    mirror, pose, rig
+        The mirror, its pose, shape (d,), and the bench.
+    of
+        Rows and columns of the rays, counted from 0, shapes (n,). Empty: all rays.
+
+    Returns
+    -------
+    plane_mm, hit
+        IPCS (X′, Z′), shape (rows, columns, 2) or (n, 2), mm, the plane's edges ignored, NaN where
+        a ray never meets it; whether the ray meets the mirror and the plane. Absent rays are
+        followed like others.
+    """
+    rays, source = ray_directions(rig.laser, rig.pattern)[of], rig.laser.position_mm
+    point, normal, hit = mirror.meet(source, rays, pose)
+    plane = intersect_imaging_plane(point, reflect(rays, normal), rig.imaging_plane)
+    return plane, np.asarray(hit & np.isfinite(plane[..., 0]))
+
+
+def _meet_sphere(
+    source_mm: FloatArray, direction: FloatArray, center_mm: FloatArray, radius_mm: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """First point on a sphere and its outward normal; a ray that passes it by has its nearest."""
+    offset = center_mm - source_mm
+    along = direction @ offset
+    square = radius_mm**2 - (offset @ offset - along**2)
+    way = along - np.sqrt(np.maximum(square, 0.0))
+    point = source_mm + way[..., None] * direction
+    normal = point - center_mm
+    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    return point, normal, np.asarray((square > 0) & (way > 0))

@@ -1,0 +1,130 @@
+"""Which quantity is off by far more than its ± allows.
+
+A prior that is wrong pulls every other quantity along. So each quantity, and each way in which the
+whole picture may be off, is let go of in turn: the one that the cost falls most by is suspected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.bench_check.adjustment import Adjustment, Sighting, System
+from labapp.core.geometry.perturbation import quantity_values
+from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
+from labapp.core.values import FloatArray
+
+FREE = {"°": 20.0, "mm": 30.0, "px": 60.0, "%": 20.0}
+"""Standard uncertainty of a quantity that is let go of, in its unit."""
+
+FREE_STEP, FREE_SHIFT_PX, FREE_SCALE = 0.4, 200.0, 0.5
+"""The same of the inter-beam angle, degrees, of the whole picture's place, and of its scale."""
+
+LIMIT = 20.0
+"""A quantity is off by more than its ± allows where the cost falls by more with it let go of: 4.5
+standard deviations."""
+
+TRIED = 8
+"""So many suspects are adjusted with."""
+
+ALIKE = 6.0
+"""Suspects that the cost falls by nearly as much with explain the dots alike."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A quantity that may be off by far more than its ±.
+
+    Parameters
+    ----------
+    key
+        Its key (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for the whole
+        of the image calibration.
+    name
+        What it is called.
+    drop
+        By how much the cost falls with it let go of: the square of how many standard deviations it
+        is off by.
+    """
+
+    key: str
+    name: str
+    drop: float
+
+
+def released(rig: Rig, keys: Sequence[str]) -> FloatArray:
+    """Directions in the space of the quantities that keys of suspects let go of, shape (k, q).
+
+    Raises
+    ------
+    KeyError
+        If a key is unknown.
+    """
+    every = _directions(rig)
+    return np.array([every[key][1] for key in keys]).reshape(-1, len(QUANTITIES))
+
+
+def suspect_keys() -> tuple[str, ...]:
+    """Keys of all that can be let go of."""
+    return (*INDEX, "picture.u", "picture.v", "picture.scale")
+
+
+def find_suspects(
+    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, already: FloatArray
+) -> tuple[Suspect, ...]:
+    """Find what the cost falls most by when it is let go of, most suspect first; empty: nothing.
+
+    Those that explain the dots alike come together: pictures cannot tell them apart.
+
+    Parameters
+    ----------
+    rig, sightings
+        The bench before the check, and the mirrors' dots.
+    made
+        The adjustment to these.
+    already
+        What was let go of in it, see `released`.
+    """
+    directions = _directions(rig)
+    system = System.of(rig, sightings, already)
+    first = {
+        key: made.drop(system.by_bench(made, vector[:, None]))[0]
+        for key, (_, vector) in directions.items()
+    }
+    most = max(first.values())
+    if most < LIMIT:
+        return ()
+    # To first order only, and that far off: the likeliest are adjusted in earnest.
+    likely = sorted(first, key=lambda key: -first[key])[:TRIED]
+    found = []
+    for key in likely:
+        system = System.of(rig, sightings, np.vstack([already, directions[key][1]]))
+        found.append(Suspect(key, directions[key][0], made.cost - system.solved(made).cost))
+    found.sort(key=lambda one: -one.drop)
+    if found[0].drop < LIMIT:
+        return ()
+    return tuple(
+        one for one in found if one.drop > found[0].drop - max(ALIKE, 0.02 * found[0].drop)
+    )
+
+
+def _directions(rig: Rig) -> dict[str, tuple[str, FloatArray]]:
+    """Key → name and direction of what can be let go of."""
+    made = {}
+    for k, one in enumerate(QUANTITIES):
+        free = FREE_STEP if one.key.startswith("pattern.inter") else FREE[one.unit]
+        made[one.key] = (one.name, free * np.eye(len(QUANTITIES))[k])
+    points = [k for key, k in INDEX.items() if key.startswith("image_calibration.")]
+    seen = quantity_values(rig)[points].reshape(3, 2)
+    for name, key, shift in (
+        ("picture, shifted along u", "picture.u", FREE_SHIFT_PX * np.array([1.0, 0.0])),
+        ("picture, shifted along v", "picture.v", FREE_SHIFT_PX * np.array([0.0, 1.0])),
+        ("image calibration, scale", "picture.scale", FREE_SCALE * (seen - seen[0])),
+    ):
+        vector = np.zeros(len(QUANTITIES))
+        vector[points] = np.broadcast_to(shift, (3, 2)).ravel()
+        made[key] = (name, vector)
+    return made

@@ -1,0 +1,166 @@
+"""Whether the residuals of a bench check are noise, or have a pattern, and of what.
+
+Each cause that the model lacks would give residuals of some patterns. They are fitted to what the
+adjustment leaves, together with bench and mirrors (score test); that which explains most, if it is
+much, is the verdict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from labapp.core.bench_check.adjustment import Adjustment, Sighting, System
+from labapp.core.bench_check.mirrors import Plate, landing_points
+from labapp.core.geometry.optics import intersect_imaging_plane, ray_directions, reflect
+from labapp.core.geometry.perturbation import moved_rig
+from labapp.core.geometry.rig import Rig
+from labapp.core.values import FloatArray
+
+Verdict = Literal[
+    "noise-like", "distortion", "plate-not-flat", "wrong-lens", "row-slipped", "unexplained"
+]
+
+PATTERN_MM = 0.012
+"""A pattern of a smaller root mean square is of no consequence."""
+
+SURE = 30.0
+"""A pattern is there where the cost falls by so much more than by its number of amplitudes …"""
+
+SHARE = 0.15
+"""… and by this share of what the dots cost."""
+
+COARSE = 2.0
+"""Residuals so many times as large as their uncertainty are not noise."""
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A cause, and how much of the residuals it explains.
+
+    Parameters
+    ----------
+    cause
+        The cause.
+    drop
+        By how much the cost falls with it, in units of χ².
+    rms_mm
+        Root mean square of what it explains, mm.
+    """
+
+    cause: Verdict
+    drop: float
+    rms_mm: float
+
+
+def judge(
+    rig: Rig, sightings: Sequence[Sighting], made: Adjustment, released: FloatArray
+) -> tuple[Verdict, tuple[Pattern, ...]]:
+    """Judge the residuals of an adjustment: the verdict, and the patterns, the likeliest first.
+
+    Parameters
+    ----------
+    rig, sightings, released
+        What was adjusted, see `adjust`.
+    made
+        The adjustment.
+    """
+    system = System.of(rig, sightings, released)
+    left = float(np.sum(made.weight * (made.standardised / made.scale) ** 2))
+    size = np.sqrt(np.mean(np.concatenate([r.ravel() for r in made.residual_mm]) ** 2))
+    unit = float(size / np.sqrt(np.mean(made.standardised**2)))
+    found, sure = [], []
+    for cause, columns in _causes(rig, made, system):
+        drop, amplitudes = made.drop(columns)
+        pattern = Pattern(cause, drop, float(np.sqrt(np.mean((columns @ amplitudes) ** 2))) * unit)
+        found.append(pattern)
+        if drop > SURE + columns.shape[1] and drop > SHARE * left and pattern.rms_mm > PATTERN_MM:
+            sure.append(pattern)
+    found.sort(key=lambda one: -one.drop)
+    if sure:
+        return max(sure, key=lambda one: one.drop).cause, tuple(found)
+    return ("unexplained" if made.scale > COARSE else "noise-like"), tuple(found)
+
+
+def _causes(rig: Rig, made: Adjustment, system: System) -> Iterator[tuple[Verdict, FloatArray]]:
+    """Each cause, with what its amplitudes change the standardised residuals by, shape (m, c)."""
+    bench = moved_rig(rig, made.offset)
+    every = list(enumerate(zip(system.sightings, made.poses, strict=True)))
+    bent = [system.by_dots(k, _bent_picture(s, rig)) for k, (s, _) in every]
+    yield "distortion", np.sum(bent, axis=0)
+    other = [system.by_dots(k, _other_lens(s, p, bench)) for k, (s, p) in every]
+    yield "wrong-lens", np.sum(other, axis=0)
+    for k, (sighting, pose) in every:
+        if isinstance(sighting.mirror, Plate):
+            yield "plate-not-flat", system.by_dots(k, _bent_plate(sighting, pose, bench))
+        yield "row-slipped", system.by_dots(k, _slipped(sighting, pose, bench))
+
+
+def _bent_picture(sighting: Sighting, rig: Rig) -> FloatArray:
+    """Radial distortion of the third and the fifth power, and decentring, shape (n, 2, 4), mm."""
+    half = np.array([rig.imaging_plane.width_mm, rig.imaging_plane.height_mm]) / 2
+    reach = float(np.linalg.norm(half))
+    x, y = ((sighting.plane_mm - half) / reach).T
+    square = x**2 + y**2
+    radial = [np.stack([x, y], axis=-1) * (square**n)[:, None] for n in (1, 2)]
+    decentred = [
+        np.stack([2 * x * y, square + 2 * y**2], axis=-1),
+        np.stack([square + 2 * x**2, 2 * x * y], axis=-1),
+    ]
+    return reach / 10 * np.stack([*radial, *decentred], axis=-1)
+
+
+def _other_lens(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
+    """Rays whose tangents are stretched, slanted or bent, shape (n, 2, c), mm."""
+    tangents = rig.pattern.tangents[tuple(sighting.ray.T)]
+    reach = float(np.abs(rig.pattern.tangents).max())
+    x, y = (tangents / reach).T
+    zero, square = np.zeros_like(x), x**2 + y**2
+    modes = [(x, -y), (y, x), (x * square, y * square), (x**3, zero), (zero, y**3)]
+    axes = rig.laser.axes
+
+    def landed(by: FloatArray) -> FloatArray:
+        bent = tangents + reach * by
+        rays = axes[0] + bent[:, :1] * axes[1] + bent[:, 1:] * axes[2]
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        source = rig.laser.position_mm
+        point, normal, _ = sighting.mirror.meet(source, rays, pose)
+        return intersect_imaging_plane(point, reflect(rays, normal), rig.imaging_plane)
+
+    return _changes(landed, [np.stack(mode, axis=-1) for mode in modes]) / 10
+
+
+def _bent_plate(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
+    """A plate that is bent as a polynomial of the second and third order, shape (n, 2, 7), mm."""
+    rays = ray_directions(rig.laser, rig.pattern)[tuple(sighting.ray.T)]
+    point, normal, _ = sighting.mirror.meet(rig.laser.position_mm, rays, pose)
+    reach = float(np.ptp(point[:, :2], axis=0).max()) / 2
+    x, y = ((point[:, :2] - point[:, :2].mean(axis=0)) / reach).T
+    zero = np.zeros_like(x)
+    slopes = [
+        (2 * x, zero), (y, x), (zero, 2 * y),
+        (3 * x**2, zero), (2 * x * y, x**2), (y**2, 2 * x * y), (zero, 3 * y**2),
+    ]  # fmt: skip
+
+    def landed(by: FloatArray) -> FloatArray:
+        tilted = normal - np.column_stack([by, zero])
+        return intersect_imaging_plane(point, reflect(rays, tilted), rig.imaging_plane)
+
+    return _changes(landed, [np.stack(slope, axis=-1) for slope in slopes]) / 10
+
+
+def _slipped(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
+    """All rays a row or a column on, shape (n, 2, 2), mm."""
+    plane, _ = landing_points(sighting.mirror, pose, rig)
+    along = np.stack([np.gradient(plane, axis=axis) for axis in (0, 1)], axis=-1)
+    return np.asarray(along[tuple(sighting.ray.T)])
+
+
+def _changes(
+    landed: Callable[[FloatArray], FloatArray], modes: Sequence[FloatArray], step: float = 1e-4
+) -> FloatArray:
+    """Minus the derivatives of computed dots by amplitudes of modes, shape (n, 2, c)."""
+    return np.stack([(landed(-step * m) - landed(step * m)) / (2 * step) for m in modes], axis=-1)

@@ -1,0 +1,424 @@
+"""The bench-check page: pictures of known mirrors, the dots in them, and quantities that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pyqtgraph as pg
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QPalette
+from PySide6.QtWidgets import QAbstractItemView, QHeaderView, QSplitter, QWidget
+
+from labapp.gui.dialogs import ask_file
+from labapp.gui.digits import ResultRow
+from labapp.gui.pages.bench_check import presenter
+from labapp.gui.pages.bench_check.presenter import COLUMNS, KINDS, Checked, Chosen
+from labapp.gui.pages.laser.presenter import read_picture
+from labapp.gui.pages.page import Page
+from labapp.gui.shell.steps import setup_to_do
+from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.layouts import fill, hbox, vbox
+from labapp.gui.widgets.result_table import ResultTable
+from labapp.gui.widgets.tables import ReadTable
+from labapp.gui.workspace import Workspace
+from labapp.session.record import BenchCheckRecord, MirrorPicture
+
+NO_PICTURE = (
+    "Lay a known mirror where the pool will be, take a picture of its dots, and add it here or "
+    "drop it on the window."
+)
+
+COLOR = "#ffb000"
+LIST_ROWS, ROW_PX = 3, 24
+
+
+class BenchCheckPage(Page):
+    """A list of pictures with their mirrors; Check adjusts the set-up to them."""
+
+    key = "bench_check"
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.chosen: list[Chosen] = []
+        self.checked: Checked | None = None
+        self._path: Path | None = None
+        self._kept: BenchCheckRecord | None = None
+        self._found: MirrorPicture | None = None
+        self.view = PictureView("Picture of the mirror")
+        self.view.pointed.connect(lambda u, v, _: self._point(u, v))
+        self._overlays: list[pg.GraphicsObject] = []
+        self.legend, self.pointed = wrapping_label(), wrapping_label()
+        self.quantities = _QuantityTable()
+        left, splitter = QWidget(), QSplitter(Qt.Orientation.Horizontal)
+        vbox((self.view, 1), self.legend, self.pointed, of=left)
+        splitter.setChildrenCollapsible(False)
+        splitter.addWidget(left)
+        splitter.addWidget(self.quantities)
+        splitter.setSizes([400, 500])
+        self.canvas_layout.addWidget(splitter)
+        self._make_panel()
+
+    def refresh(self) -> None:
+        """Show the check that the session keeps when it changed."""
+        session, kept = self.session, self.session.bench_check
+        if session.path != self._path:
+            self._path, self._kept, self.checked = session.path, None, None
+            self.predicted.set_rows(())
+            self._list(())
+        if kept is not self._kept:
+            self._kept = kept
+            if kept is not None and not self._is_kept():
+                self.checked = None
+                self._take_kept()
+        self._follow()
+
+    def _is_kept(self) -> bool:
+        """Whether what is shown is what the session keeps."""
+        kept = self._kept
+        return bool(self.checked and kept and self.checked.record.date == kept.date)
+
+    def _take_kept(self) -> None:
+        session, kept = self.session, self._kept
+
+        def shown(chosen: Sequence[Chosen]) -> None:
+            if session.bench_check is kept:
+                self._list(chosen)
+
+        title = "Showing the pictures of the check"
+        self.workspace.tasks.start(title, lambda _: presenter.kept(session), shown)
+
+    # --- the list -----------------------------------------------------------------------------
+
+    def load(self, *paths: Path) -> None:
+        """Add pictures; each shows a plate at first."""
+
+        def loaded(pictures: Sequence[Chosen]) -> None:
+            self._list([*self.chosen, *pictures], len(self.chosen))
+
+        self.workspace.tasks.start(
+            "Loading the picture",
+            lambda _: [Chosen(path.name, read_picture(path)) for path in paths],
+            loaded,
+            beside=self.refused.setText,
+        )
+
+    def takes_files(self, paths: Sequence[Path]) -> bool:
+        """Add pictures that are dropped."""
+        pictures = [path for path in paths if path.suffix.lower() in presenter.PICTURES]
+        if self.locked or len(pictures) < len(paths):
+            return False
+        self.load(*pictures)
+        return True
+
+    def remove(self) -> None:
+        """Take the selected picture off the list."""
+        if self.chosen:
+            at = self._at()
+            self._list([one for k, one in enumerate(self.chosen) if k != at], max(0, at - 1))
+
+    def change(self, one: Chosen) -> None:
+        """Have the selected picture show another mirror."""
+        at = self._at()
+        self._list([one if k == at else other for k, other in enumerate(self.chosen)], at)
+
+    def _at(self) -> int:
+        return max(0, min(self.list.currentRow(), len(self.chosen) - 1))
+
+    def _list(self, chosen: Sequence[Chosen], at: int = 0) -> None:
+        """Show a list of pictures; what was found with another no longer counts."""
+        self.chosen = list(chosen)
+        if self.checked is not None and self.checked.chosen != tuple(chosen):
+            self.checked = None
+        self.list.setRowCount(len(chosen))
+        for row, one in enumerate(chosen):
+            for column, text in enumerate((f"{row + 1}  {one.name}", one.mirror_words)):
+                self.list.set_cell(row, column, text, number=False)
+        if chosen:
+            self.list.selectRow(min(at, len(chosen) - 1))
+        self._follow()
+
+    # --- the check ----------------------------------------------------------------------------
+
+    def check(self, free: Sequence[str] = ()) -> None:
+        """Adjust the set-up to the pictures."""
+        session, chosen = self.session, tuple(self.chosen)
+        text, path, settings = session.setup_text, session.path, session.settings.dots
+
+        def found(made: Checked) -> None:
+            if tuple(self.chosen) == chosen:
+                self.checked = made
+                self._follow()
+
+        self.workspace.tasks.start(
+            "Checking the bench",
+            lambda control: presenter.check(chosen, (text, path), settings, control.progress, free),
+            found,
+            beside=self.refused.setText,
+        )
+
+    def find_suspect(self) -> None:
+        """Check again, with a quantity found from the pictures alone."""
+        self.check([self.suspect.value()])
+
+    def use(self) -> None:
+        """Use the adjusted set-up."""
+        made = self.checked
+        if made is None or not made.usable:
+            return
+        images = [one.image for one in made.chosen]
+        if self.workspace.attempt(
+            lambda session: session.use_bench_check(made.check, made.record, images)
+        ):
+            self.workspace.notified.emit(
+                "The checked set-up is in use; undo brings the former back", False
+            )
+
+    def predict(self) -> None:
+        """Predict what pictures would do for the ± of the pool's height."""
+        session = self.session
+        setup, record = session.setup, session.record
+        self.workspace.tasks.start(
+            "Predicting what pictures tell",
+            lambda _: presenter.predicted(setup, record),
+            self._show_predicted,
+            beside=self.refused.setText,
+        )
+
+    def _show_predicted(self, rows: Sequence[ResultRow]) -> None:
+        self.predicted.set_rows(rows)
+        for shown in (self.predicted, self.predicted_words):
+            shown.setVisible(bool(rows))
+
+    def leave(self) -> None:
+        """Finish the edit under way."""
+        self.height_field.flush()
+        self.diameter.flush()
+
+    # --- the panel ----------------------------------------------------------------------------
+
+    def _make_panel(self) -> None:
+        self.predict_button = button("Which pictures help most?", "", self.predict)
+        self.predicted = ResultTable("Predicted ± of the pool's height")
+        self.predicted_words = plain_label("Predicted ± of the pool's height after")
+        tip = "Add pictures of a mirror's dots, taken by the camera in its place"
+        self.add_button = button("Add picture…", tip, self._choose)
+        self.remove_button = button("Remove", "Take the picture off the list", self.remove)
+        self.list = ReadTable("Pictures of mirrors", "Pictures and the mirrors that they show")
+        self.list.setColumnCount(2)
+        self.list.setHorizontalHeaderLabels(["Picture", "Mirror"])
+        self.list.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
+        self.list.horizontalHeader().setSectionResizeMode(1, QHeaderView.ResizeMode.Stretch)
+        self.list.itemSelectionChanged.connect(self._follow)
+        self.list.verticalHeader().setDefaultSectionSize(ROW_PX)
+        self.list.setFixedHeight(ROW_PX * (LIST_ROWS + 1) + 8)
+        self.list.offer(("Copy table", self.list.copy_text))
+        self.check_button = button("Check", "", self.check)
+        self.use_button = button("Use", "", self.use)
+        self.words = wrapping_label()
+        self.mirrors = ResultTable("Known mirrors, measured with the adjusted set-up")
+        fill(
+            self.panel_layout,
+            *(hbox((self.add_button, 1), self.remove_button), self.list, self._mirror_form()),
+            *(self.check_button, self.refused, self.words, self._suspect_part(), self.use_button),
+            *(self.mirrors, self.predict_button, self.predicted_words, self.predicted, 1),
+        )
+        self.lock_with_session(self.add_button)
+
+    def _mirror_form(self) -> QWidget:
+        form = FieldForm()
+        tip = "Which mirror the selected picture shows"
+        self.kind = ChoiceField("Mirror", KINDS, tooltip=tip)
+        self.kind.edited.connect(lambda kind: self.change(self._selected().of_kind(kind)))
+        self.diameter = NumberField(
+            "Diameter",
+            "mm",
+            lowest=0.1,
+            highest=1000,
+            step=0.01,
+            decimals=3,
+            tooltip="Of the ball, or of the cap's rim: measure it with a micrometer",
+        )
+        self.diameter.edited.connect(
+            lambda value: self.change(replace(self._selected(), diameter_mm=value))
+        )
+        self.height_field = NumberField(
+            "Height",
+            "mm",
+            lowest=-100,
+            highest=1000,
+            step=0.01,
+            decimals=3,
+            tooltip="Of the plate's surface, or of the top of cap or ball, over the work piece",
+        )
+        self.height_field.edited.connect(
+            lambda value: self.change(replace(self._selected(), height_mm=value))
+        )
+        for field in (self.kind, self.diameter, self.height_field):
+            form.add(field)
+        return form
+
+    def _suspect_part(self) -> QWidget:
+        self.suspect_part = FieldForm()
+        tip = "What the dots say is off; those in the list explain them alike"
+        self.suspect = ChoiceField("Off", tooltip=tip)
+        tip = "Check again, without holding this quantity by its ±"
+        self.suspect_part.add(self.suspect)
+        self.suspect_part.add_wide(button("Find it from the pictures", tip, self.find_suspect))
+        return self.suspect_part
+
+    def _choose(self) -> None:
+        if path := ask_file(self, "Picture of a mirror", self.workspace.folder):
+            self.load(path)
+
+    def _selected(self) -> Chosen:
+        return self.chosen[self._at()]
+
+    # --- what is shown ------------------------------------------------------------------------
+
+    def _record(self) -> BenchCheckRecord | None:
+        """The check that is shown: that made here, or the kept one of the same pictures."""
+        if self.checked is not None:
+            return self.checked.record
+        kept = self._kept
+        if kept is None or len(kept.pictures) != len(self.chosen):
+            return None
+        same = all(
+            (one.name, one.kind, one.height_mm, one.diameter_mm)
+            == (other.name, other.kind, other.height_mm, other.diameter_mm)
+            for one, other in zip(kept.pictures, self.chosen, strict=True)
+        )
+        return kept if same else None
+
+    def _follow(self) -> None:
+        """Show what follows from the list and the check."""
+        if self.workspace.session is None:
+            return
+        if self.checked is not None and not self._is_kept():
+            same = self.checked.setup_text == self.session.setup_text
+            self.checked = self.checked if same else None
+        record, made = self._record(), self.checked
+        self._show_mirror()
+        self._show_picture(None if record is None else record.pictures[self._at()])
+        self.quantities.show_rows(() if record is None else presenter.quantity_rows(record))
+        self.mirrors.set_rows(() if record is None else presenter.mirror_rows(record))
+        self.mirrors.setVisible(record is not None)
+        used = record is not None and (made is None or self._is_kept())
+        words = presenter.kept_words(self.session) if used else made.words if made else ""
+        show_words(self.words, words)
+        self.suspect.set_choices(made.suspects if made else ())
+        self.suspect_part.setVisible(bool(made and made.suspects))
+        self._enable(used)
+
+    def _enable(self, used: bool) -> None:
+        to_do = setup_to_do(self.session.setup_problems)
+        lacking = self.locked or (f"Set-up: {to_do}" if to_do else "")
+        wrong = next((one.problem for one in self.chosen if one.problem), "")
+        why_not = lacking or wrong or ("" if self.chosen else "Add a picture of a mirror first")
+        tip = "Find the dots' rays and adjust the set-up to the known mirrors"
+        self._let(self.check_button, why_not, tip)
+        made = self.checked
+        if used:
+            unusable = "It is in use"
+        elif made is None:
+            unusable = "Check the pictures first"
+        else:
+            unusable = "" if made.usable else "What is off must be put right first"
+        tip = "Measure with the adjusted set-up; undo brings the former back"
+        self._let(self.use_button, self.locked or unusable, tip)
+        tip = "Predicted ± of the height of the expected pool, after each set of pictures"
+        self._let(self.predict_button, lacking, tip)
+        self._show_predicted(self.predicted.rows)
+        self._let(
+            self.remove_button,
+            self.locked or ("" if self.chosen else "No picture"),
+            "Take it off the list",
+        )
+
+    @staticmethod
+    def _let(pressed: QWidget, why_not: str, tip: str) -> None:
+        pressed.setEnabled(not why_not)
+        pressed.setToolTip(plain_tip(why_not or tip))
+
+    def _show_mirror(self) -> None:
+        one = self._selected() if self.chosen else None
+        for field in (self.kind, self.diameter, self.height_field):
+            field.lock(self.locked or ("" if one else "Add a picture first"))
+        if one is None:
+            return
+        self.kind.set_value(one.kind)
+        self.height_field.set_value(one.height_mm)
+        self.height_field.set_problem(one.problem)
+        self.diameter.set_value(one.diameter_mm)
+        if one.kind == "plate":
+            self.diameter.lock("A plate has no diameter")
+
+    def _show_picture(self, found: MirrorPicture | None) -> None:
+        image = self._selected().image if self.chosen else None
+        if image is not self.view.picture or image is None:
+            self.view.show_picture(image, NO_PICTURE)
+        for item in self._overlays:
+            self.view.remove(item)
+        former, self._found, self._overlays = self._found, found, []
+        self.pointed.setText("")
+        if image is None or found is None:
+            show_words(self.legend, "")
+            return
+        shown = presenter.overlay(found, image.shape[0])
+        arrows = pg.PlotDataItem(
+            *shown.arrows_px.T, connect="pairs", pen=pg.mkPen(COLOR, width=2), symbol=None
+        )
+        dots = pg.PlotDataItem(
+            *shown.dot_px.T, pen=None, symbol="o", symbolSize=5, symbolBrush=None
+        )
+        dots.setSymbolPen(pg.mkPen("#45a5ff", width=1))
+        self._overlays = [arrows, dots]
+        for text, u, v, of_row in shown.numbers:
+            anchor = (1.2, 0.5) if of_row else (0.5, -0.1)
+            number = pg.TextItem(text, color="#8fd0ff", anchor=anchor)
+            number.setPos(u, v)
+            self._overlays.append(number)
+        for item in self._overlays:
+            self.view.add(item)
+        show_words(self.legend, shown.words)
+        if found is not former:
+            low, high = shown.dot_px.min(axis=0).tolist(), shown.dot_px.max(axis=0).tolist()
+            self.view.show_region((low[0], low[1]), (high[0], high[1]))
+
+    def _point(self, u: float, v: float) -> None:
+        if self._found is not None:
+            self.pointed.setText(presenter.ray_words(self._found, u, v))
+
+
+class _QuantityTable(ReadTable):
+    """Quantities before and after; those that the pictures do not determine are grey."""
+
+    def __init__(self) -> None:
+        name = "Quantities of the set-up, before and after the check"
+        super().__init__(name, f"{name}: Ctrl+C copies it", COLUMNS)
+        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        # Long names take more lines; the header tells of a width before the cells have it.
+        self._narrowed = QTimer(self, singleShot=True, interval=0)
+        self._narrowed.timeout.connect(self.resizeRowsToContents)
+        self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
+        self.offer(("Copy table", self.copy_text))
+
+    def show_rows(self, rows: Sequence[presenter.QuantityRow]) -> None:
+        """Show quantities."""
+        self.setRowCount(len(rows))
+        usual, grey = (
+            self.palette().color(group, QPalette.ColorRole.Text)
+            for group in (QPalette.ColorGroup.Active, QPalette.ColorGroup.Disabled)
+        )
+        for k, row in enumerate(rows):
+            for column, text in enumerate(row.texts):
+                self.set_cell(k, column, text, number=1 <= column <= 4)
+                item = self.item(k, column)
+                assert item is not None
+                item.setForeground(usual if row.determined else grey)
+        self.resizeRowsToContents()
+        self.setVisible(bool(rows))

@@ -1,0 +1,94 @@
+"""Benches that are not quite as their set-up has them, within its uncertainties."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.geometry.rig import ImagingPlane, Rig
+from labapp.simulation.camera import CameraView, Lens
+
+FOCAL_PX = 2000.0
+"""Of a camera that stands well off."""
+
+
+@dataclass(frozen=True)
+class BenchErrors:
+    """How far a bench may be from its set-up.
+
+    Parameters
+    ----------
+    angle_deg, length_mm, rotation_deg, inter_beam_angle_deg, point_px
+        Standard deviation of each angle of laser and plane, of each length, of the pattern's
+        rotation and inter-beam angle, and of the image calibration's points along u and v.
+    distortion
+        Largest radial distortion in the plane's corner, either way, as a fraction.
+    """
+
+    angle_deg: float = 0.5
+    length_mm: float = 0.5
+    rotation_deg: float = 1.0
+    inter_beam_angle_deg: float = 0.004
+    point_px: float = 0.3
+    distortion: float = 0.01
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The bench as it stands, and how its camera sees the plane."""
+
+    rig: Rig
+    view: CameraView
+
+
+def draw_bench(rig: Rig, view: CameraView, errors: BenchErrors, rng: np.random.Generator) -> Bench:
+    """Draw a bench whose set-up, as taken down by the operator, is a rig and a view without lens.
+
+    Parameters
+    ----------
+    rig, view
+        The set-up: the bench is this, but for the errors, and a lens about the picture's middle.
+    errors
+        How far it may be off.
+    rng
+        Source of the errors.
+    """
+    angle, length = rng.normal(0, errors.angle_deg, 5), rng.normal(0, errors.length_mm, 6)
+    by_angle, by_length = angle.tolist(), length.tolist()
+    laser, plane = rig.laser, rig.imaging_plane
+    true_laser = replace(
+        laser,
+        projection_angle_deg=laser.projection_angle_deg + by_angle[0],
+        azimuth_deg=laser.azimuth_deg + by_angle[1],
+        distance_mm=laser.distance_mm + by_length[0],
+        aim_x_mm=laser.aim_x_mm + by_length[1],
+        aim_y_mm=laser.aim_y_mm + by_length[2],
+    )
+    pitch, yaw, roll = np.add(plane.angles_deg, by_angle[2:]).tolist()
+    true_plane = ImagingPlane.of_angles(
+        plane.origin_mm + length[3:], (pitch, yaw, roll), plane.width_mm, plane.height_mm
+    )
+    step = rng.normal(0, errors.inter_beam_angle_deg)
+    true_pattern = replace(
+        rig.pattern,
+        inter_beam_angle_deg=rig.pattern.inter_beam_angle_deg + step,
+        rotation_deg=rig.pattern.rotation_deg + rng.normal(0, errors.rotation_deg),
+    )
+    corner_px = (
+        np.hypot(plane.width_mm, plane.height_mm) / 2 * np.sqrt(abs(np.linalg.det(view.px_per_mm)))
+    )
+    k1 = rng.uniform(-errors.distortion, errors.distortion) / (corner_px / FOCAL_PX) ** 2
+    true_rig = replace(
+        rig, laser=true_laser, pattern=true_pattern, imaging_plane=true_plane, uncertainty=None
+    )
+    seen = np.array([view.origin_px, view.x_axis_px, view.z_axis_px])
+    origin, on_x, on_z = (seen + rng.normal(0, errors.point_px, (3, 2))).tolist()
+    true_view = replace(
+        view,
+        origin_px=tuple(origin),
+        x_axis_px=tuple(on_x),
+        z_axis_px=tuple(on_z),
+        lens=Lens(FOCAL_PX, float(k1)),
+    )
+    return Bench(true_rig, true_view)

@@ -1,0 +1,173 @@
+"""How well bench checks do on simulated benches: coverage of the height's ±, and its errors.
+
+Run as ``python tests/benchmarks/bench_check.py [--benches N] [--full M] [--seed S]``. Benches are
+drawn about one set-up, pools of two kinds are measured on each before and after the check. Of the
+first M benches dots are matched as in the app; of the others each dot's ray is given, which is some
+ten times as quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+
+from labapp.core.bench_check.adjustment import Sighting, adjust
+from labapp.core.bench_check.check import adjusted_bench, check_bench
+from labapp.core.bench_check.forecast import forecast
+from labapp.core.bench_check.labelling import Picture
+from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.images.dots import Dots
+from labapp.core.pipeline import Settings, reconstruct
+from labapp.core.surface.measures import measure_surface
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.simulation.benches import Bench, BenchErrors, draw_bench
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import PoolSurface, exact_match, trace
+from labapp.simulation.mirrors import FlatMirror
+from labapp.simulation.pools import Pool, egg, spherical_cap
+
+PX_PER_MM, SIGMA_PX, SHAPE = 4.7, 0.12, (640, 480)
+MIDDLE = np.array([SHAPE[1] - 1, SHAPE[0] - 1]) / 2
+# The camera looks at the plane's middle.
+VIEW = CameraView.rolled(
+    (float(MIDDLE[0] - 50.8 * PX_PER_MM), float(MIDDLE[1] + 50.8 * PX_PER_MM)), PX_PER_MM
+)
+CALIBRATION = ImageCalibration.from_three_points(
+    VIEW.origin_px, VIEW.x_axis_px, VIEW.x_axis_mm, VIEW.z_axis_px, VIEW.z_axis_mm
+)
+RIG = Rig(
+    Laser(31.14, 31.48),
+    DotPattern(),
+    Electrode(500.0),  # the torch is out of the way
+    ImagingPlane.vertical(50.0, 45.0, 3.0),
+    RigUncertainty(AxisPoints(CALIBRATION, VIEW.x_axis_mm, VIEW.z_axis_mm), *covariance_of({})),
+)
+CANDIDATES: dict[str, tuple[Mirror, ...]] = {
+    "plate": (Plate(0.0),),
+    "plate, two heights": (Plate(0.0), Plate(2.0)),
+    "plate and cap": (Plate(0.0), Cap(9.75, 0.91)),
+}
+
+
+def surface_like(mirror: Mirror, rng: np.random.Generator) -> PoolSurface:
+    """A mirror as it truly is: off by its uncertainties."""
+    if isinstance(mirror, Plate):
+        rise = np.tan(np.radians(rng.normal(0, mirror.tilt_sigma_deg, 2)))
+        height = mirror.height_mm + rng.normal(0, mirror.height_sigma_mm)
+        return FlatMirror(float(height), *map(float, rise))
+    assert isinstance(mirror, Cap)
+    diameter = mirror.diameter_mm + rng.normal(0, mirror.diameter_sigma_mm)
+    height = mirror.height_mm + rng.normal(0, mirror.height_sigma_mm)
+    x, y = rng.normal(0, 0.4, 2)
+    return spherical_cap(float(diameter), float(height), (float(x), float(y)))
+
+
+def seen(
+    surface: PoolSurface, bench: Bench, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Places of dots in the picture, px, and their rays, counted from 0."""
+    made = trace(surface, bench.rig)
+    place = bench.view.to_image(made.plane_mm)
+    shown = made.visible & ((place > 3) & (place < [SHAPE[1] - 4, SHAPE[0] - 4])).all(axis=-1)
+    return place[shown] + rng.normal(0, SIGMA_PX, (int(shown.sum()), 2)), np.argwhere(shown)
+
+
+def dots_at(place: FloatArray) -> Dots:
+    """Dots at places in the picture."""
+    n = len(place)
+    same = np.full(n, SIGMA_PX)
+    shape = np.full(n, 2.0), np.full(n, 50.0), np.full(n, 20.0)
+    return Dots(place[:, 0], place[:, 1], same, same, *shape)
+
+
+def sighting(mirror: Mirror, place: FloatArray, ray: FloatArray) -> Sighting:
+    """What a perfect matching would give."""
+    covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(place), 1, 1))
+    return Sighting(mirror, ray, CALIBRATION.to_plane(place), covariance)
+
+
+def measured(
+    pool: Pool, bench: Bench, rig: Rig, calibration: ImageCalibration, seed: list[int]
+) -> tuple[float, float]:
+    """A pool's height by a set-up, and its ±, mm; NaN without a surface."""
+    rng = np.random.default_rng(seed)
+    place, ray = seen(pool, bench, rng)
+    match = exact_match(trace(pool, bench.rig), rig)
+    keep = (match.ray[:, None] == ray + 1).all(-1).any(1)
+    covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(place), 1, 1))
+    match = replace(
+        match, dot=match.dot[: keep.sum()], ray=ray + 1, reflected=match.reflected[keep],
+        plane_mm=calibration.to_plane(place), plane_covariance_mm2=covariance,
+    )  # fmt: skip
+    try:
+        made = measure_surface(reconstruct(match, rig, Settings()), match, rig)
+    except CannotMeasure:
+        return np.nan, np.nan
+    return made.height_mm, made.height_sigma_mm
+
+
+def main() -> None:
+    """Run the study and print its tables."""
+    ask = argparse.ArgumentParser()
+    ask.add_argument("--benches", type=int, default=200)
+    ask.add_argument("--full", type=int, default=10)
+    ask.add_argument("--seed", type=int, default=18)
+    given = ask.parse_args()
+    errors: dict[str, list[tuple[float, ...]]] = defaultdict(list)
+    statuses: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+    for n in range(given.benches):
+        rng = np.random.default_rng([given.seed, n])
+        bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
+        width, height = float(rng.uniform(5.5, 7.5)), float(rng.uniform(0.15, 0.35))
+        pool = spherical_cap(width, height) if n % 2 else egg(width, width / 2, 0.6 * width, height)
+        predicted = {
+            one.name: one.total_sigma_mm for one in forecast(RIG, CANDIDATES, Cap(width, height))
+        }
+        seed = [given.seed, n, 1]
+        results = {"as it is": (RIG, CALIBRATION)}
+        for name, mirrors in CANDIDATES.items():
+            shots = [(m, *seen(surface_like(m, rng), bench, rng)) for m in mirrors]
+            if n < given.full:
+                pictures = [Picture(m.name, m, dots_at(place), SHAPE) for m, place, _ in shots]
+                try:
+                    check = check_bench(pictures, RIG, CALIBRATION)
+                except CannotMeasure as why:
+                    statuses[name][why.status] += 1
+                    continue
+                statuses[name][check.status] += 1
+                results[name] = check.rig, check.calibration
+            else:
+                made = adjust(RIG, [sighting(*one) for one in shots])
+                results[name] = adjusted_bench(RIG, made, checked=True)
+        for name, (rig, calibration) in results.items():
+            found, sigma = measured(pool, bench, rig, calibration, seed)
+            errors[name].append((found - height, sigma, predicted[name], height))
+        if n % 10 == 9:
+            report(errors, statuses)
+
+
+def report(errors: dict[str, list[tuple[float, ...]]], statuses: dict[str, dict[str, int]]) -> None:
+    """Print what has come out so far."""
+    print(f"{'':20} {'n':>4} lost covered  RMS error  RMS ±  predicted  (of the height, %)")
+    for name, rows in errors.items():
+        error, sigma, predicted, height = np.array(rows).T
+        known = np.isfinite(error)
+        covered = np.mean(np.abs(error[known]) < 1.96 * sigma[known])
+        percent = [
+            100 * float(np.sqrt(np.mean((part[known] / height[known]) ** 2)))
+            for part in (error, sigma, predicted)
+        ]
+        lost = int((~known).sum())
+        line = " ".join(f"{value:9.2f}" for value in percent)
+        print(f"{name:20} {len(rows):4} {lost:4} {100 * covered:6.1f}% {line}")
+    print({name: dict(each) for name, each in statuses.items()}, flush=True)
+
+
+if __name__ == "__main__":
+    main()

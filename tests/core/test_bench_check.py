@@ -1,0 +1,256 @@
+"""The bench check: a simulated bench that is off is found from pictures of known mirrors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from labapp.config.bench_check import changed_since_check
+from labapp.config.mirror_text import parse_mirror
+from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
+from labapp.config.toml_keys import parse_toml
+from labapp.core.bench_check.adjustment import adjust
+from labapp.core.bench_check.check import BenchCheck, check_bench
+from labapp.core.bench_check.forecast import forecast
+from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
+from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points
+from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
+from labapp.core.matching.observation import Observation
+from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
+from labapp.simulation.benches import Bench, BenchErrors, draw_bench
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import PoolSurface, trace
+from labapp.simulation.mirrors import BallMirror, FlatMirror
+from labapp.simulation.pools import spherical_cap
+from tests.scenes import as_dots
+
+SHAPE = (640, 480)
+VIEW = CameraView.rolled((0.74, 558.26), 4.7)
+TEXT = f"""
+[laser]
+projection_angle_deg = 31.14   # by protractor
+distance_mm = 31.48
+[pattern]
+rows = 19
+columns = 19
+inter_beam_angle_deg = 0.77
+[electrode]
+height_mm = 500.0
+[imaging_plane]
+distance_mm = 50.0
+s_mm = 45.0
+h_mm = 3.0
+width_mm = 101.6
+height_mm = 101.6
+[image_calibration]
+origin_px = {list(VIEW.origin_px)}
+x_axis_px = {list(VIEW.x_axis_px)}
+x_axis_mm = {VIEW.x_axis_mm}
+z_axis_px = {list(VIEW.z_axis_px)}
+z_axis_mm = {VIEW.z_axis_mm}
+"""
+SETUP = parse_setup(TEXT, "setup.toml")
+RIG, CALIBRATION = SETUP.rig, SETUP.calibration
+EXACT = Bench(replace(RIG, uncertainty=None), VIEW)
+
+
+def picture(
+    mirror: Mirror,
+    surface: PoolSurface,
+    bench: Bench,
+    rng: np.random.Generator,
+    *,
+    missing: float = 0.0,
+    false: int = 0,
+) -> tuple[Picture, np.ndarray]:
+    """A mirror's picture, and the ray of each of its dots, counted from 0, −1 for a false one."""
+    made = trace(surface, bench.rig)
+    place = bench.view.to_image(made.plane_mm)
+    shown = made.visible & ((place > 3) & (place < [476, 636])).all(axis=-1)
+    shown &= rng.random(shown.shape) >= missing
+    dots = place[shown] + rng.normal(0, 0.12, (int(shown.sum()), 2))
+    dots = np.vstack([dots, rng.uniform(10, [470, 630], (false, 2))])
+    ray = np.vstack([np.argwhere(shown), np.full((false, 2), -1)])
+    order = rng.permutation(len(dots))
+    return Picture(mirror.name, mirror, as_dots(dots[order], 0.12), SHAPE), ray[order]
+
+
+def check_of(bench: Bench, free: tuple[str, ...] = ()) -> BenchCheck:
+    """A check with a plate and a thumb tack."""
+    rng = np.random.default_rng(11)
+    tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
+    pairs = [(Plate(), FlatMirror(0.01, 0.001, -0.001)), tack]
+    return check_bench(
+        [picture(*each, bench, rng)[0] for each in pairs], RIG, CALIBRATION, list(free)
+    )
+
+
+@pytest.mark.parametrize(
+    ("mirror", "surface"),
+    [
+        (Plate(2.0), FlatMirror(2.0)),
+        (Cap(9.75, 0.91), spherical_cap(9.75, 0.91)),
+        (Ball(10.0, 0.9), BallMirror(10.0, 0.9)),
+    ],
+    ids=["plate", "cap", "ball"],
+)
+def test_mirrors_send_rays_where_the_simulation_has_them(mirror: Mirror, surface: PoolSurface):
+    true = trace(surface, EXACT.rig)
+    plane, hit = landing_points(mirror, mirror.pose, RIG)
+    assert true.hit.sum() > 50
+    np.testing.assert_array_equal(hit & true.hit, true.hit & np.isfinite(true.plane_mm[..., 0]))
+    both = hit & true.hit
+    np.testing.assert_allclose(plane[both], true.plane_mm[both], atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rays_of_a_plate_are_found_on_a_bench_that_is_off(seed: int):
+    rng = np.random.default_rng([5, seed])
+    bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
+    made, ray = picture(Plate(), FlatMirror(), bench, rng, missing=0.05, false=8)
+    labels = label_picture(made, RIG, CALIBRATION).labels
+    at = np.argwhere(labels >= 0)
+    found = ray[labels[tuple(at.T)]]
+    assert len(at) > 0.97 * (ray[:, 0] >= 0).sum()
+    wrong = (found != at).any(axis=-1) & (found[:, 0] >= 0)
+    assert not wrong.any()
+
+
+def test_without_the_hole_of_the_absent_ray_there_is_no_answer():
+    rng = np.random.default_rng(1)
+    made, ray = picture(Cap(9.75, 0.91), spherical_cap(9.75, 0.91), EXACT, rng)
+    high = ray[:, 0] > 10  # rows above the hole alone
+    dots = as_dots(made.dots.image_px[high], 0.12)
+    with pytest.raises(CannotMeasure) as why:
+        label_picture(replace(made, dots=dots), RIG, CALIBRATION)
+    assert why.value.status in ("no-reference", "ambiguous-rows", "no-match")
+
+
+@pytest.mark.slow
+def test_errors_of_the_adjusted_bench_have_the_covariance_told():
+    """The offsets' errors over 12 benches: their χ² is what its degrees of freedom are."""
+    square = []
+    errors = BenchErrors(distortion=0.0, point_px=0.0)
+    told = RIG.uncertainty
+    assert told is not None
+    keys = [k for key, k in INDEX.items() if key.startswith(("image_cal", "camera"))]
+    covariance = told.covariance.copy()
+    covariance[keys] = 0.0
+    covariance[:, keys] = 0.0
+    rig = replace(RIG, uncertainty=replace(told, covariance=covariance))
+    for seed in range(12):
+        rng = np.random.default_rng([8, seed])
+        bench = draw_bench(rig, VIEW, errors, rng)
+        made, ray = picture(Plate(tilt_sigma_deg=1e-3), FlatMirror(), bench, rng)
+        observed = Observation.of(made.dots, rig, CALIBRATION, SHAPE)
+        labels = np.full((19, 19), -1)
+        labels[tuple(ray.T)] = np.arange(len(ray))
+        found = adjust(rig, [sighting_of(observed, made.mirror, labels)])
+        off = found.offset - true_offset(bench.rig)
+        square.append(off @ np.linalg.pinv(found.covariance, rcond=1e-10) @ off)
+    assert 9.0 < np.mean(square) < 17.0  # 13 quantities
+
+
+def true_offset(true: Rig) -> np.ndarray:
+    """By how much a bench is off from the set-up, but for its picture."""
+    made = np.zeros(len(QUANTITIES))
+    for part in ("laser", "pattern"):
+        for key, k in INDEX.items():
+            section, _, name = key.partition(".")
+            if section == part:
+                made[k] = getattr(getattr(true, part), name) - getattr(getattr(RIG, part), name)
+    first = INDEX["imaging_plane.distance_mm"]
+    plane, was = true.imaging_plane, RIG.imaging_plane
+    made[first : first + 3] = (plane.origin_mm - was.origin_mm)[[1, 0, 2]] * [-1, -1, 1]
+    made[first + 3 : first + 6] = np.subtract(plane.angles_deg, was.angles_deg)
+    return made
+
+
+@pytest.mark.slow
+def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
+    bench = draw_bench(RIG, VIEW, BenchErrors(), np.random.default_rng(2))
+    check = check_of(bench)
+    assert check.status == "ok"
+    assert check.verdict == "noise-like"
+    text = checked_setup(TEXT, "setup.toml", check, "2026-11-24T12:00:00+00:00")
+    checked = parse_setup(text, "setup.toml")
+    known = checked.rig.uncertainty
+    assert known is not None
+    assert known.status == "checked"
+    np.testing.assert_allclose(known.covariance, check.adjustment.covariance, atol=1e-8)
+    places = np.array([[100.0, 120.0], [400.0, 300.0]])
+    np.testing.assert_allclose(
+        checked.calibration.to_plane(places), check.calibration.to_plane(places), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        checked.calibration.to_image(checked.calibration.to_plane(places)), places, atol=1e-6
+    )
+    moved = text.replace("width_mm = 101.6", "width_mm = 101.7", 1)
+    for changed in (moved, text.replace("x_axis_mm = 69.85", "x_axis_mm = 69.9")):
+        again = parse_setup(changed, "setup.toml").rig.uncertainty
+        assert again is not None
+        assert again.status == "entered"
+        assert changed_since_check(parse_toml(changed, "a", "b"))  # type: ignore[arg-type]
+    back = parse_setup(unchecked_setup(text, "setup.toml"), "setup.toml")
+    assert back.rig.laser == RIG.laser
+    assert back.calibration.lens is None
+
+
+@pytest.mark.slow
+def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
+    laser = replace(RIG.laser, distance_mm=RIG.laser.distance_mm / 0.8)
+    check = check_of(Bench(replace(EXACT.rig, laser=laser), VIEW))
+    assert check.status == "quantity-off"
+    assert [one.key for one in check.suspects] == ["laser.distance_mm"]
+    known = check.rig.uncertainty
+    assert known is not None
+    assert known.status != "checked"
+    again = check_of(Bench(replace(EXACT.rig, laser=laser), VIEW), ("laser.distance_mm",))
+    assert again.status == "ok"
+    assert again.rig.laser.distance_mm == pytest.approx(laser.distance_mm, abs=0.5)
+
+
+@pytest.mark.slow
+def test_a_bent_plate_is_recognized():
+    rng = np.random.default_rng(4)
+    bent = FlatMirror(bend_per_mm=(0.004, -0.003))
+    pictures = [
+        picture(Plate(), bent, EXACT, rng)[0],
+        picture(Plate(2.0), FlatMirror(2.0), EXACT, rng)[0],
+    ]
+    check = check_bench(pictures, RIG, CALIBRATION)
+    assert check.status != "ok"
+
+
+def test_pictures_are_forecast_to_help():
+    found = {one.name: one.setup_sigma_mm for one in forecast(RIG)}
+    before, plate = found["as it is"], found["plate at 0 mm"]
+    assert 0.03 < before / 0.3 < 0.1
+    assert plate < 0.7 * before
+    assert found["plate at 0 mm, thumb tack"] < 0.6 * plate
+
+
+@pytest.mark.parametrize(
+    ("text", "mirror"),
+    [
+        ("plate:0", Plate(0.0)),
+        ("plate:2+-0.01", Plate(2.0, 0.01)),
+        ("cap:9.75±0.05:0.91", Cap(9.75, 0.91, 0.05)),
+        ("ball:10:1.2", Ball(10.0, 1.2)),
+        ("ball:10", Ball(10.0)),
+    ],
+)
+def test_mirrors_are_read(text: str, mirror: Mirror):
+    assert parse_mirror(text) == mirror
+
+
+@pytest.mark.parametrize(
+    "text", ["", "plate", "plate:nan", "cap:5:4", "ball:-1", "ball:10:30", "tack:1:2", "plate:1+-0"]
+)
+def test_impossible_mirrors_are_refused(text: str):
+    with pytest.raises(InputError):
+        parse_mirror(text)

@@ -1,0 +1,253 @@
+"""Bench check: pictures of known mirrors, the check, what is shown of it, used and undone."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PySide6.QtWidgets import QPushButton
+from pytestqt.qtbot import QtBot
+
+from labapp.config.setup import read_setup
+from labapp.core.bench_check.mirrors import Ball, Cap, Plate
+from labapp.core.geometry.uncertainty import INDEX
+from labapp.core.images.find_dots import DotSettings
+from labapp.core.values import CannotMeasure
+from labapp.gui.pages.bench_check import BenchCheckPage, presenter
+from labapp.gui.pages.bench_check.presenter import Checked, Chosen
+from labapp.gui.shell.steps import Mark, states
+from labapp.gui.workspace import Workspace
+from labapp.media import GreyImage
+from labapp.session.session import Session
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import trace
+from labapp.simulation.mirrors import FlatMirror
+from labapp.simulation.render import Look, render
+from tests.gui.conftest import KEPT
+
+SETUP = Path(__file__).parents[3] / "sample_sessions" / "gtaw" / "setup.toml"
+
+TRUE_ANGLE_DEG, TRUE_ROTATION_DEG = 31.54, 1.2
+"""Of the bench that the pictures are taken on; the set-up has 31.14 and 0."""
+
+
+@pytest.fixture(scope="module")
+def plate() -> GreyImage:
+    """A plate in place of the work piece, on a bench that is not quite as its set-up has it."""
+    given = tomllib.loads(SETUP.read_text("utf-8"))["image_calibration"]
+    view = CameraView(**{k: tuple(x) if isinstance(x, list) else x for k, x in given.items()})
+    rig = read_setup(SETUP).rig
+    laser = replace(rig.laser, projection_angle_deg=TRUE_ANGLE_DEG)
+    rig = replace(rig, laser=laser, pattern=replace(rig.pattern, rotation_deg=TRUE_ROTATION_DEG))
+    look, rng = Look(glow=0.0, speckle=0.1, dot_floor_mm=0.14), np.random.default_rng(3)
+    return np.asarray(render(trace(FlatMirror(), rig), view, look, rng).image, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def checked(plate: GreyImage) -> Checked:
+    chosen = [Chosen("plate.png", plate)]
+    text = SETUP.read_text("utf-8")
+    return presenter.check(chosen, (text, SETUP), DotSettings(), lambda *_: None)
+
+
+# --- the presenter ------------------------------------------------------------------------------
+
+
+def test_a_picture_shows_the_mirror_that_is_entered() -> None:
+    one = Chosen("a", np.zeros((2, 2), np.uint8))
+    assert one.mirror == Plate(0.0)
+    cap = replace(one.of_kind("cap"), height_mm=0.5, diameter_mm=8.0)
+    assert cap.mirror == Cap(8.0, 0.5)
+    assert one.of_kind("ball").mirror == Ball(10.0, 10.0)
+    assert not cap.problem
+    assert replace(cap, height_mm=0.0).problem
+    assert not one.problem
+
+
+@pytest.mark.slow
+def test_the_check_finds_what_is_off_and_what_it_cannot_tell(checked: Checked) -> None:
+    assert checked.usable
+    record = checked.record
+    k = INDEX["pattern.rotation_deg"]
+    assert abs(record.after[k] - TRUE_ROTATION_DEG) < 3 * record.after_sigma[k]
+    rows = {row.texts[0]: row for row in presenter.quantity_rows(record)}
+    assert len(rows) == len(INDEX)
+    rotation = rows["Pattern, rotation"]
+    assert rotation.determined
+    assert rotation.texts[-1] == presenter.DETERMINED
+    undetermined = {name for name, row in rows.items() if not row.determined}
+    sigma = dict(zip(record.quantities, record.after_sigma / record.before_sigma, strict=True))
+    assert len(undetermined) == sum(share > 0.8 for share in sigma.values()) > 0
+
+
+@pytest.mark.slow
+def test_the_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) -> None:
+    ((name, known, measured, sigma),) = checked.record.pictures[0].measured
+    assert (name, known) == ("height", 0.0)
+    assert 0 < sigma < 0.05
+    assert abs(measured) < 0.05
+    (row,) = presenter.mirror_rows(checked.record)
+    assert row.value == measured
+
+
+@pytest.mark.slow
+def test_dots_are_drawn_where_they_are_and_arrows_as_enlarged(checked: Checked) -> None:
+    (picture,) = checked.record.pictures
+    shown = presenter.overlay(picture, 640)
+    times = float(shown.words.split("×")[1].split(",")[0])
+    begin, end = shown.arrows_px[::2], shown.arrows_px[1::2]
+    np.testing.assert_allclose(begin, picture.dot_px)
+    np.testing.assert_allclose((end - begin) / times, picture.computed_px - picture.dot_px)
+    rows = [text for text, _, _, of_row in shown.numbers if of_row]
+    assert rows == ["i1", "i5", "i10", "i15", "i19"]
+    u, v = picture.dot_px[7]
+    i, j = picture.ray[7]
+    assert f"({i}, {j})" in presenter.ray_words(picture, u + 0.5, v)
+    assert presenter.ray_words(picture, -100.0, 0.0) == ""
+
+
+def test_dark_pictures_are_refused_with_the_cause() -> None:
+    dark = Chosen("dark.png", np.zeros((640, 480), np.uint8))
+    text = SETUP.read_text("utf-8")
+    with pytest.raises(CannotMeasure):
+        presenter.check([dark], (text, SETUP), DotSettings(), lambda *_: None)
+
+
+@pytest.mark.slow
+def test_pictures_are_predicted_to_help(tmp_path: Path) -> None:
+    with Session.create(tmp_path / "new.labsession") as session:
+        record = session.record
+    rows = presenter.predicted(read_setup(SETUP), record)
+    values = [float(row.value) for row in rows if not isinstance(row.value, str | None)]
+    assert len(values) == len(rows) > 3
+    assert all(value < values[0] for value in values[1:])
+
+
+# --- the page -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[BenchCheckPage]:
+    workspace = Workspace()
+    workspace.show(Session.open(copy_sample("gtaw")))
+    made = BenchCheckPage(workspace)
+    KEPT.extend([workspace, made, made.panel])
+    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
+    made.refresh()
+    made.show()
+    made.panel.show()
+    qtbot.waitUntil(lambda: not workspace.tasks.active)
+    yield made
+    workspace.close()
+    made.hide()
+    made.panel.hide()
+
+
+def add(qtbot: QtBot, page: BenchCheckPage, folder: Path, *images: GreyImage) -> None:
+    for n, image in enumerate(images):
+        path = folder / f"mirror {n}.png"
+        cv2.imwrite(str(path), image)
+        page.load(path)
+        qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+
+
+def test_pictures_are_listed_changed_and_removed(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
+) -> None:
+    assert not page.check_button.isEnabled()
+    blank = np.zeros((64, 48), np.uint8)
+    add(qtbot, page, tmp_path, blank, blank)
+    assert page.list.rowCount() == 2
+    assert page.check_button.isEnabled()
+    assert not page.use_button.isEnabled()
+    page.list.selectRow(1)
+    page.kind.edited.emit("cap")
+    page.height_field.edited.emit(0.5)
+    page.diameter.edited.emit(8.0)
+    assert [one.mirror for one in page.chosen] == [Plate(0.0), Cap(8.0, 0.5)]
+    page.height_field.edited.emit(0.0)
+    assert not page.check_button.isEnabled()
+    page.remove_button.click()
+    assert [one.mirror for one in page.chosen] == [Plate(0.0)]
+    assert not page.diameter.editor.isEnabled()
+
+
+def test_pictures_can_be_dropped_and_nothing_else(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 48), np.uint8))
+    assert page.takes_files([tmp_path / "a.png"])
+    qtbot.waitUntil(lambda: len(page.chosen) == 1)
+    assert not page.takes_files([tmp_path / "a.labsession"])
+
+
+def test_a_refusal_stands_beside_the_button(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
+) -> None:
+    add(qtbot, page, tmp_path, np.zeros((640, 480), np.uint8))
+    page.check_button.click()
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active)
+    assert page.refused.text()
+    assert page.checked is None
+    assert not page.use_button.isEnabled()
+
+
+@pytest.mark.slow
+def test_a_bench_is_checked_used_kept_and_undone(
+    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path, plate: GreyImage
+) -> None:
+    session = page.session
+    before = session.setup_text
+    assert states(session)["bench_check"].mark is Mark.READY
+    add(qtbot, page, tmp_path, plate)
+    page.check_button.click()
+    qtbot.waitUntil(lambda: page.checked is not None)
+    assert page.quantities.rowCount() == len(INDEX)
+    page.use_button.click()
+    setup = session.setup
+    assert setup.rig.uncertainty is not None
+    assert setup.rig.uncertainty.status == "checked"
+    assert states(session)["bench_check"].mark is Mark.DONE
+    kept = session.bench_check
+    assert kept is not None
+    (picture,) = kept.pictures
+    np.testing.assert_array_equal(session.picture(picture.picture_sha256), plate)
+    assert session.problems(recording=False) == []
+    assert not page.use_button.isEnabled()
+
+    session.update_setup({"laser": {"aim_x_mm": 0.25}})
+    assert states(session)["bench_check"].mark is Mark.ATTENTION
+    session.undo()
+    assert states(session)["bench_check"].mark is Mark.DONE
+    page.workspace.undo()
+    assert session.setup_text == before
+    assert session.bench_check is None
+    assert states(session)["bench_check"].mark is Mark.READY
+    assert page.use_button.isEnabled()
+
+
+@pytest.mark.slow
+def test_a_kept_check_is_shown_when_its_session_is_opened(
+    qtbot: QtBot, page: BenchCheckPage, checked: Checked
+) -> None:
+    workspace, path = page.workspace, page.session.path
+    image = checked.chosen[0].image
+    page.session.use_bench_check(checked.check, checked.record, [image])
+    workspace.close()
+    workspace.show(Session.open(path))
+    page.refresh()
+    qtbot.waitUntil(lambda: len(page.chosen) == 1)
+    assert page.view.picture is not None
+    assert page.quantities.rowCount() == len(INDEX)
+    assert "In use" in page.words.text()
+
+
+def test_every_button_says_what_it_does(page: BenchCheckPage) -> None:
+    buttons = page.panel.findChildren(QPushButton)
+    assert len(buttons) == 6
+    assert all(button.toolTip() for button in buttons)

@@ -1,0 +1,53 @@
+"""`labapp calibrate bench`: mirrors' pictures in, an adjusted setup file out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from labapp.cli import app
+from labapp.config.setup import read_setup
+from labapp.simulation.forward import trace
+from labapp.simulation.mirrors import FlatMirror
+from labapp.simulation.render import Look, render
+from tests.core.test_bench_check import EXACT, TEXT, VIEW
+
+
+@pytest.fixture
+def setup(tmp_path: Path) -> Path:
+    path = tmp_path / "setup.toml"
+    path.write_text(TEXT, "utf-8")
+    return path
+
+
+@pytest.mark.slow
+def test_a_rendered_plate_adjusts_the_setup_file(setup: Path, tmp_path: Path):
+    look = Look(glow=0.0, speckle=0.1, dot_floor_mm=0.2)
+    laser = replace(EXACT.rig.laser, aim_x_mm=0.6)
+    made = trace(FlatMirror(), replace(EXACT.rig, laser=laser))
+    image = render(made, VIEW, look, np.random.default_rng(1)).image
+    cv2.imwrite(str(tmp_path / "plate.png"), image)
+    given = ["calibrate", "bench", str(tmp_path / "plate.png"), "--mirror", "plate:0"]
+    table = tmp_path / "residuals.csv"
+    done = CliRunner().invoke(app, [*given, "--setup", str(setup), "--use", "--out", str(table)])
+    assert done.exit_code == 0, done.output
+    known = read_setup(setup).rig.uncertainty
+    assert known is not None
+    assert known.status == "checked"
+    assert len(table.read_text("utf-8").splitlines()) > 300
+
+
+def test_it_predicts_without_a_picture(setup: Path):
+    done = CliRunner().invoke(app, ["calibrate", "bench", "--setup", str(setup), "--predict"])
+    assert done.exit_code == 0, done.output
+    assert "plate at 0 mm" in done.output
+
+
+def test_every_picture_needs_its_mirror(setup: Path):
+    done = CliRunner().invoke(app, ["calibrate", "bench", "a.png", "--setup", str(setup)])
+    assert done.exit_code != 0
