@@ -13,6 +13,7 @@ from labapp.cli.shared import NOTHING_MEASURED, write_file
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
+    from labapp.config.setup import Setup
     from labapp.core.bench_check.check import BenchCheck
     from labapp.core.bench_check.labelling import Picture
     from labapp.core.bench_check.mirrors import Mirror
@@ -58,9 +59,6 @@ def calibrate_bench(
     from labapp.config.mirror_text import parse_mirror
     from labapp.config.setup import A_SETUP, parse_setup, unchecked_setup
     from labapp.config.toml_keys import read_text
-    from labapp.core.bench_check.check import check_bench
-    from labapp.core.bench_check.suspects import suspect_keys
-    from labapp.core.values import CannotMeasure
 
     text = read_text(setup, A_SETUP)
     parse_setup(text, setup)
@@ -70,20 +68,7 @@ def calibrate_bench(
     if predict:
         _print_forecast(known.rig, mirrors)
         return
-    if not pictures:
-        raise InputError("PICTURE", "pictures", "none", "one or more, or --predict")
-    if len(mirrors) != len(pictures):
-        counts = f"{len(mirrors)} for {len(pictures)} pictures"
-        raise InputError("--mirror", "mirrors", counts, "one for each picture, in their order")
-    for key in free or []:
-        if key not in suspect_keys():
-            raise InputError("--free", "key", key, f"one of {', '.join(suspect_keys())}")
-    try:
-        found = [_picture(path, one) for path, one in zip(pictures, mirrors, strict=True)]
-        check = check_bench(found, known.rig, known.calibration, free or [])
-    except CannotMeasure as answer:
-        typer.echo(f"{setup}: {answer}", err=True)
-        raise typer.Exit(NOTHING_MEASURED) from answer
+    check = _checked(setup, known, pictures or [], mirrors, free or [])
     _print_check(check)
     if out is not None:
         write_file(out, _residuals(check).encode())
@@ -91,6 +76,29 @@ def calibrate_bench(
         raise typer.Exit(NOTHING_MEASURED)
     if use:
         _write(setup, before, check)
+
+
+def _checked(
+    setup: Path, known: Setup, pictures: list[Path], mirrors: list[Mirror], free: list[str]
+) -> BenchCheck:
+    from labapp.core.bench_check.check import check_bench
+    from labapp.core.bench_check.suspects import suspect_keys
+    from labapp.core.values import CannotMeasure
+
+    if not pictures:
+        raise InputError("PICTURE", "pictures", "none", "one or more, or --predict")
+    if len(mirrors) != len(pictures):
+        counts = f"{len(mirrors)} for {len(pictures)} pictures"
+        raise InputError("--mirror", "mirrors", counts, "one for each picture, in their order")
+    for key in free:
+        if key not in suspect_keys():
+            raise InputError("--free", "key", key, f"one of {', '.join(suspect_keys())}")
+    try:
+        found = [_picture(path, one) for path, one in zip(pictures, mirrors, strict=True)]
+        return check_bench(found, known.rig, known.calibration, free)
+    except CannotMeasure as answer:
+        typer.echo(f"{setup}: {answer}", err=True)
+        raise typer.Exit(NOTHING_MEASURED) from answer
 
 
 def _picture(path: Path, mirror: Mirror) -> Picture:
