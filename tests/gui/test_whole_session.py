@@ -127,7 +127,7 @@ def calibrate(hand: Hand, qtbot: QtBot) -> None:
 
 
 def take_frames(hand: Hand, qtbot: QtBot, recording: Path) -> None:
-    hand.press(Qt.Key.Key_4, CONTROL)
+    hand.press(Qt.Key.Key_5, CONTROL)
     capture = page(hand, CapturePage)
     hand.answer(recording)
     hand.button("Choose a file …")
@@ -142,7 +142,7 @@ def take_frames(hand: Hand, qtbot: QtBot, recording: Path) -> None:
 
 def correct(hand: Hand, qtbot: QtBot) -> None:
     """Move a dot with the arrow keys and delete another; the fit follows by itself."""
-    hand.press(Qt.Key.Key_5, CONTROL)
+    hand.press(Qt.Key.Key_6, CONTROL)
     dots = page(hand, DotsPage)
     hand.click(dots.view)
     hand.press(Qt.Key.Key_Escape)  # the click may have met a dot, which the arrow would move
@@ -179,11 +179,11 @@ def by_hand(hand: Hand, qtbot: QtBot, recording: Path, folder: Path) -> None:
     hand.press(Qt.Key.Key_F5)
     settle(hand, qtbot)
     correct(hand, qtbot)
-    hand.press(Qt.Key.Key_6, CONTROL)
+    hand.press(Qt.Key.Key_7, CONTROL)
     hand.choose(page(hand, SurfacePage).side.scheme, "ERS: extrapolation")
     hand.press(Qt.Key.Key_F5)
     settle(hand, qtbot)
-    hand.press(Qt.Key.Key_8, CONTROL)
+    hand.press(Qt.Key.Key_9, CONTROL)
     hand.tick("PLY", True)
     export(hand, qtbot, folder / "ers by hand", "ERS (as in the settings)")
     export(hand, qtbot, folder / "fit by hand", "fit")

@@ -13,7 +13,13 @@ import pytest
 from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
-from labapp.config.setup import read_setup
+from labapp.config.setup import (
+    checked_setup,
+    parse_setup,
+    read_setup,
+    unchecked_setup,
+    updated_setup,
+)
 from labapp.core.bench_check.mirrors import Ball, Cap, Plate
 from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
@@ -251,3 +257,16 @@ def test_every_button_says_what_it_does(page: BenchCheckPage) -> None:
     buttons = page.panel.findChildren(QPushButton)
     assert len(buttons) == 6
     assert all(button.toolTip() for button in buttons)
+
+
+@pytest.mark.slow
+def test_what_was_known_before_holds_again_once_the_bench_is_unchecked(checked: Checked) -> None:
+    known = {"projection_angle_deg_sigma": 0.3, "angle_distance_correlation": 0.9}
+    text = updated_setup(SETUP.read_text("utf-8"), SETUP, {"laser": known})
+    after = checked_setup(text, SETUP, checked.check, "2026-01-31T12:00:00+00:00")
+    assert parse_setup(after, SETUP).checked.startswith("2026-01-31")
+    back = unchecked_setup(after, SETUP)
+    assert not parse_setup(back, SETUP).checked
+    laser = tomllib.loads(back)["laser"]
+    assert laser["projection_angle_deg"] == pytest.approx(31.14)
+    assert {key: laser[key] for key in known} == known

@@ -21,7 +21,7 @@ from labapp.gui.shell.steps import setup_to_do
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
@@ -52,7 +52,7 @@ class BenchCheckPage(Page):
         self.view = PictureView("Picture of the mirror")
         self.view.pointed.connect(lambda u, v, _: self._point(u, v))
         self._overlays: list[pg.GraphicsObject] = []
-        self.legend, self.pointed = wrapping_label(), wrapping_label()
+        self.legend, self.pointed = Message(2), Message(1)
         self.quantities = _QuantityTable()
         left, splitter = QWidget(), QSplitter(Qt.Orientation.Horizontal)
         vbox((self.view, 1), self.legend, self.pointed, of=left)
@@ -224,8 +224,9 @@ class BenchCheckPage(Page):
         fill(
             self.panel_layout,
             *(hbox((self.add_button, 1), self.remove_button), self.list, self._mirror_form()),
-            *(self.check_button, self.refused, self.words, self._suspect_part(), self.use_button),
-            *(self.mirrors, self.predict_button, self.predicted_words, self.predicted, 1),
+            *(hbox((self.check_button, 1), (self.use_button, 1)), self.predict_button),
+            *(self.refused, self.words, self._suspect_part(), self.mirrors),
+            *(self.predicted_words, self.predicted, 1),
         )
         self.lock_with_session(self.add_button)
 
@@ -366,7 +367,7 @@ class BenchCheckPage(Page):
         former, self._found, self._overlays = self._found, found, []
         self.pointed.setText("")
         if image is None or found is None:
-            show_words(self.legend, "")
+            self.legend.setText("")
             return
         shown = presenter.overlay(found, image.shape[0])
         arrows = pg.PlotDataItem(
@@ -384,7 +385,7 @@ class BenchCheckPage(Page):
             self._overlays.append(number)
         for item in self._overlays:
             self.view.add(item)
-        show_words(self.legend, shown.words)
+        self.legend.setText(shown.words)
         if found is not former:
             low, high = shown.dot_px.min(axis=0).tolist(), shown.dot_px.max(axis=0).tolist()
             self.view.show_region((low[0], low[1]), (high[0], high[1]))
