@@ -13,6 +13,7 @@ import numpy as np
 
 from labapp.core.images.dots import Grey, Image
 from labapp.core.images.ridges import Ridges, RidgeSettings, find_ridges
+from labapp.core.images.smooth_path import SmoothPath
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 TANGENT_POINTS = 20
@@ -333,7 +334,7 @@ def _line(
     width = float(np.sqrt(max(spread2 - scale**2, (0.75 * scale) ** 2)))
     smooth_px = min(max(settings.smooth_widths * width, settings.smooth_px), len(place) / 8)
     # What wavers in the path would stay in the line: it is smoother than the line.
-    path = _Path.through(place, PATH_SMOOTHER * smooth_px)
+    path = SmoothPath.through(place, PATH_SMOOTHER * smooth_px)
     off, sigma = _centers(picture, path, width, smooth_px)
     # A bent line's light, blurred, has its ridge on the inner side: by σ²κ/2.
     off -= path.curvature * width**2 / 2
@@ -362,62 +363,8 @@ def _line(
     )
 
 
-@dataclass(frozen=True)
-class _Path:
-    """A smooth path at every pixel of its length, each array with n rows.
-
-    ``seen`` is where ridge points are near.
-    """
-
-    place: FloatArray
-    tangent: FloatArray
-    curvature: FloatArray
-    seen: BoolArray
-
-    @classmethod
-    def through(cls, points: FloatArray, smooth_px: float) -> _Path:
-        """Smooth a line of points, shape (m, 2), px."""
-        along = _length_along(points)
-        # Points that jump to and fro make a longer line than the path.
-        rough = _local_fit(along, points, along, np.ones(len(along)), smooth_px)[0]
-        along = _length_along(rough)
-        weights = _robust_weights(points, rough)
-        at = np.linspace(0.0, along[-1], max(round(along[-1]) + 1, 3))
-        seen = np.min(np.abs(at[:, None] - along), axis=1) < 1.5
-        return cls._of(_local_fit(along, points, at, weights, smooth_px), seen)
-
-    @classmethod
-    def _of(cls, fit: tuple[FloatArray, FloatArray, FloatArray], seen: BoolArray) -> _Path:
-        place, slope, bend = fit
-        speed = np.linalg.norm(slope, axis=-1)
-        turn = slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]
-        return cls(place, slope / speed[:, None], turn / speed**3, seen)
-
-    @property
-    def across(self) -> FloatArray:
-        """Unit vector across it, to the right of ``tangent`` as seen, shape (n, 2)."""
-        return np.stack([-self.tangent[:, 1], self.tangent[:, 0]], axis=-1)
-
-    @property
-    def longest_gap(self) -> float:
-        """Length of the longest part that is not seen, px."""
-        on = np.flatnonzero(self.seen)
-        return float(np.max(np.diff(on), initial=1) - 1)
-
-    def moved(self, off: FloatArray, smooth_px: float) -> _Path:
-        """The path moved across itself by ``off``, shape (n,), px."""
-        place = self.place + off[:, None] * self.across
-        at = _length_along(place)
-        fit = _local_fit(at, place, at, np.ones(len(at)), smooth_px / 2)
-        return self._of((place, *fit[1:]), self.seen)
-
-
-def _length_along(points: FloatArray) -> FloatArray:
-    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1)))
-
-
 def _centers(
-    picture: Grey, path: _Path, width: float, smooth_px: float
+    picture: Grey, path: SmoothPath, width: float, smooth_px: float
 ) -> tuple[FloatArray, float]:
     """Offset of the light's middle from a path, across it, shape (n,), px, and its uncertainty.
 
@@ -453,7 +400,7 @@ def _centers(
     return off, float(np.sqrt(np.median(variance[path.seen])))
 
 
-def _end(smooth: Grey, path: _Path, end: int, height: float) -> FloatArray:
+def _end(smooth: Grey, path: SmoothPath, end: int, height: float) -> FloatArray:
     """Where the light ahead of a path's end falls to half, (u, v), px."""
     sign = -1.0 if end == 0 else 1.0
     inward = slice(0, round(END_PX)) if end == 0 else slice(-round(END_PX), None)
@@ -473,34 +420,3 @@ def _end(smooth: Grey, path: _Path, end: int, height: float) -> FloatArray:
     before, after = light[len(inside) + k - 1 : len(inside) + k + 1]
     share = float((before - level) / (before - after))
     return np.asarray(ahead[k - 1] + share * (ahead[k] - ahead[k - 1]))
-
-
-def _local_fit(
-    along: FloatArray, values: FloatArray, at: FloatArray, weights: FloatArray, width: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Value and first two derivatives at places of parabolas fitted locally, shape (m, 2) each.
-
-    Parameters
-    ----------
-    along, values, weights
-        Place along the line, shape (n,), values there, shape (n, 2), and their weights, shape (n,).
-    at
-        Places along the line, shape (m,).
-    width
-        Standard deviation of the Gaussian weights.
-    """
-    step = (along - at[:, None]) / width
-    bell = np.exp(-(step**2) / 2) * weights
-    moments = np.stack([(bell * step**k).sum(axis=1) for k in range(5)], axis=-1)
-    normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
-    normal = normal + 1e-9 * np.eye(3) * moments[:, :1, None]
-    right = np.stack([(bell * step**k) @ values for k in range(3)], axis=1)
-    value, slope, half_bend = np.moveaxis(np.linalg.solve(normal, right), 1, 0)
-    return value, slope / width, 2 * half_bend / width**2
-
-
-def _robust_weights(points: FloatArray, smooth: FloatArray) -> FloatArray:
-    """Tukey's weights of points by their distance from the smoothed line, shape (n,)."""
-    away = np.linalg.norm(points - smooth, axis=-1)
-    limit = 4.685 * 1.4826 * float(np.median(away)) + 1e-6
-    return np.asarray(np.maximum(1 - (away / limit) ** 2, 0.0) ** 2 + 1e-6)

@@ -1,0 +1,101 @@
+"""Smooth paths through points: where a line of light runs, its direction and its curvature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
+
+
+@dataclass(frozen=True)
+class SmoothPath(ReadOnlyArrays):
+    """A smooth path at every pixel of its length, n of them.
+
+    Parameters
+    ----------
+    place, tangent
+        (u, v), px, and unit vectors along the path, shape (n, 2).
+    curvature
+        Of the path, shape (n,), px⁻¹.
+    seen
+        Where points are near, shape (n,).
+    """
+
+    place: FloatArray
+    tangent: FloatArray
+    curvature: FloatArray
+    seen: BoolArray
+
+    @classmethod
+    def through(cls, points: FloatArray, smooth_px: float) -> SmoothPath:
+        """Smooth a line of points, shape (m, 2), px."""
+        along = _length_along(points)
+        # Points that jump to and fro make a longer line than the path.
+        rough = _local_fit(along, points, along, np.ones(len(along)), smooth_px)[0]
+        along = _length_along(rough)
+        weights = _robust_weights(points, rough)
+        at = np.linspace(0.0, along[-1], max(round(along[-1]) + 1, 3))
+        seen = np.min(np.abs(at[:, None] - along), axis=1) < 1.5
+        return cls._of(_local_fit(along, points, at, weights, smooth_px), seen)
+
+    @classmethod
+    def _of(cls, fit: tuple[FloatArray, FloatArray, FloatArray], seen: BoolArray) -> SmoothPath:
+        place, slope, bend = fit
+        speed = np.linalg.norm(slope, axis=-1)
+        turn = slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]
+        return cls(place, slope / speed[:, None], turn / speed**3, seen)
+
+    @property
+    def across(self) -> FloatArray:
+        """Unit vector across it, to the right of ``tangent`` as seen, shape (n, 2)."""
+        return np.stack([-self.tangent[:, 1], self.tangent[:, 0]], axis=-1)
+
+    @property
+    def longest_gap(self) -> float:
+        """Length of the longest part that is not seen, px."""
+        on = np.flatnonzero(self.seen)
+        return float(np.max(np.diff(on), initial=1) - 1)
+
+    def moved(self, off: FloatArray, smooth_px: float) -> SmoothPath:
+        """The path moved across itself by ``off``, shape (n,), px."""
+        place = self.place + off[:, None] * self.across
+        at = _length_along(place)
+        fit = _local_fit(at, place, at, np.ones(len(at)), smooth_px / 2)
+        return self._of((place, *fit[1:]), self.seen)
+
+
+def _length_along(points: FloatArray) -> FloatArray:
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1)))
+
+
+def _local_fit(
+    along: FloatArray, values: FloatArray, at: FloatArray, weights: FloatArray, width: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Value and first two derivatives at places of parabolas fitted locally, shape (m, 2) each.
+
+    Parameters
+    ----------
+    along, values, weights
+        Place along the line, shape (n,), values there, shape (n, 2), and their weights, shape (n,).
+    at
+        Places along the line, shape (m,).
+    width
+        Standard deviation of the Gaussian weights.
+    """
+    step = (along - at[:, None]) / width
+    bell = np.exp(-(step**2) / 2) * weights
+    moments = np.stack([(bell * step**k).sum(axis=1) for k in range(5)], axis=-1)
+    normal = moments[:, np.add.outer(np.arange(3), np.arange(3))]
+    normal = normal + 1e-9 * np.eye(3) * moments[:, :1, None]
+    right = np.stack([(bell * step**k) @ values for k in range(3)], axis=1)
+    value, slope, half_bend = np.moveaxis(np.linalg.solve(normal, right), 1, 0)
+    return value, slope / width, 2 * half_bend / width**2
+
+
+def _robust_weights(points: FloatArray, smooth: FloatArray) -> FloatArray:
+    """Tukey's weights of points by their distance from the smoothed line, shape (n,)."""
+    away = np.linalg.norm(points - smooth, axis=-1)
+    limit = 4.685 * 1.4826 * float(np.median(away)) + 1e-6
+    return np.asarray(np.maximum(1 - (away / limit) ** 2, 0.0) ** 2 + 1e-6)
