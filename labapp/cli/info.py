@@ -178,7 +178,7 @@ def _calibration_lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
         lines.append(("plane", f"{x:.4f} px/mm along X′, {z:.4f} px/mm along Z′"))
     if check := facts["bench_check"]:
         now = "in use" if check["in_use"] else "the set-up was changed since"
-        lines.append(("bench check", f"{check['date'][:10]}, {', '.join(check['mirrors'])}; {now}"))
+        lines.append(("checked", f"{check['date'][:10]}, {', '.join(check['mirrors'])}; {now}"))
     return lines
 
 
