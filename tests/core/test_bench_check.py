@@ -16,6 +16,7 @@ from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.forecast import forecast
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points
+from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.matching.observation import Observation
@@ -146,7 +147,7 @@ def test_errors_of_the_adjusted_bench_have_the_covariance_told():
         rng = np.random.default_rng([8, seed])
         bench = draw_bench(rig, VIEW, errors, rng)
         made, ray = picture(Plate(tilt_sigma_deg=1e-3), FlatMirror(), bench, rng)
-        observed = Observation.of(made.dots, rig, CALIBRATION, SHAPE)
+        observed = Observation.of(made.dots, Bench(rig, CALIBRATION), SHAPE)
         labels = np.full((19, 19), -1)
         labels[tuple(ray.T)] = np.arange(len(ray))
         found = adjust(rig, [sighting_of(observed, made.mirror, labels)])
