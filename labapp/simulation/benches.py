@@ -35,14 +35,16 @@ class BenchErrors:
 
 
 @dataclass(frozen=True)
-class Bench:
+class SimulatedBench:
     """The bench as it stands, and how its camera sees the plane."""
 
     rig: Rig
     view: CameraView
 
 
-def draw_bench(rig: Rig, view: CameraView, errors: BenchErrors, rng: np.random.Generator) -> Bench:
+def draw_bench(
+    rig: Rig, view: CameraView, errors: BenchErrors, rng: np.random.Generator
+) -> SimulatedBench:
     """Draw a bench whose set-up, as taken down by the operator, is a rig and a view without lens.
 
     Parameters
@@ -91,4 +93,4 @@ def draw_bench(rig: Rig, view: CameraView, errors: BenchErrors, rng: np.random.G
         z_axis_px=tuple(on_z),
         lens=Lens(FOCAL_PX, float(k1)),
     )
-    return Bench(true_rig, true_view)
+    return SimulatedBench(true_rig, true_view)

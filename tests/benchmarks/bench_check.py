@@ -26,7 +26,7 @@ from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray
-from labapp.simulation.benches import Bench, BenchErrors, draw_bench
+from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, exact_match, trace
 from labapp.simulation.mirrors import FlatMirror
@@ -69,7 +69,7 @@ def surface_like(mirror: Mirror, rng: np.random.Generator) -> PoolSurface:
 
 
 def seen(
-    surface: PoolSurface, bench: Bench, rng: np.random.Generator
+    surface: PoolSurface, bench: SimulatedBench, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Places of dots in the picture, px, and their rays, counted from 0."""
     made = trace(surface, bench.rig)
@@ -93,7 +93,7 @@ def sighting(mirror: Mirror, place: FloatArray, ray: FloatArray) -> Sighting:
 
 
 def measured(
-    pool: Pool, bench: Bench, rig: Rig, calibration: ImageCalibration, seed: list[int]
+    pool: Pool, bench: SimulatedBench, rig: Rig, calibration: ImageCalibration, seed: list[int]
 ) -> tuple[float, float]:
     """A pool's height by a set-up, and its ±, mm; NaN without a surface."""
     rng = np.random.default_rng(seed)

@@ -22,7 +22,7 @@ from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.simulation.benches import Bench, BenchErrors, draw_bench
+from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
 from labapp.simulation.mirrors import BallMirror, FlatMirror
@@ -56,13 +56,13 @@ z_axis_mm = {VIEW.z_axis_mm}
 """
 SETUP = parse_setup(TEXT, "setup.toml")
 RIG, CALIBRATION = SETUP.rig, SETUP.calibration
-EXACT = Bench(replace(RIG, uncertainty=None), VIEW)
+EXACT = SimulatedBench(replace(RIG, uncertainty=None), VIEW)
 
 
 def picture(
     mirror: Mirror,
     surface: PoolSurface,
-    bench: Bench,
+    bench: SimulatedBench,
     rng: np.random.Generator,
     *,
     missing: float = 0.0,
@@ -80,7 +80,7 @@ def picture(
     return Picture(mirror.name, mirror, as_dots(dots[order], 0.12), SHAPE), ray[order]
 
 
-def check_of(bench: Bench, free: tuple[str, ...] = ()) -> BenchCheck:
+def check_of(bench: SimulatedBench, free: tuple[str, ...] = ()) -> BenchCheck:
     """A check with a plate and a thumb tack."""
     rng = np.random.default_rng(11)
     tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
@@ -204,13 +204,13 @@ def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
 @pytest.mark.slow
 def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
     laser = replace(RIG.laser, distance_mm=RIG.laser.distance_mm / 0.8)
-    check = check_of(Bench(replace(EXACT.rig, laser=laser), VIEW))
+    check = check_of(SimulatedBench(replace(EXACT.rig, laser=laser), VIEW))
     assert check.status == "quantity-off"
     assert [one.key for one in check.suspects] == ["laser.distance_mm"]
     known = check.rig.uncertainty
     assert known is not None
     assert known.status != "checked"
-    again = check_of(Bench(replace(EXACT.rig, laser=laser), VIEW), ("laser.distance_mm",))
+    again = check_of(SimulatedBench(replace(EXACT.rig, laser=laser), VIEW), ("laser.distance_mm",))
     assert again.status == "ok"
     assert again.rig.laser.distance_mm == pytest.approx(laser.distance_mm, abs=0.5)
 

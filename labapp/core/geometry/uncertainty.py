@@ -27,7 +27,7 @@ class Quantity:
     name, unit
         What it is called, and what it is measured in.
     assumed
-        Its standard uncertainty where nobody tells one: tape, protractor and a look at the picture.
+        Its standard uncertainty where none is given: tape, protractor and a look at the picture.
     """
 
     key: str
@@ -108,7 +108,7 @@ class RigUncertainty(ReadOnlyArrays):
     covariance
         Of `QUANTITIES`, shape (q, q), in the squares of their units.
     assumed
-        Keys of the quantities whose uncertainty nobody told.
+        Keys of the quantities whose uncertainty was not given.
     checked
         Whether the bench was adjusted to a known mirror, and is as it was then.
     """
@@ -127,7 +127,7 @@ class RigUncertainty(ReadOnlyArrays):
     def status(self) -> str:
         """How far the set-up can be relied on.
 
-        ``checked``; ``calibrated`` where laser and image calibration told their own ±; ``entered``.
+        ``checked``; ``calibrated`` where laser and image calibration gave their own ±; ``entered``.
         """
         if self.checked:
             return "checked"
@@ -158,19 +158,19 @@ class RigUncertainty(ReadOnlyArrays):
 
 
 def covariance_of(
-    told: Mapping[str, float], laser_correlation: float = 0.0
+    given: Mapping[str, float], laser_correlation: float = 0.0
 ) -> tuple[FloatArray, frozenset[str]]:
     """Covariance of `QUANTITIES`, shape (q, q), and the keys of those that are assumed.
 
     Parameters
     ----------
-    told
+    given
         Standard uncertainties by `Quantity.sigma_key`, in their units.
     laser_correlation
         Of projection angle and distance, which Appendix I takes from the same lengths.
     """
-    sigma = np.array([told.get(one.sigma_key, one.assumed) for one in QUANTITIES], float)
+    sigma = np.array([given.get(one.sigma_key, one.assumed) for one in QUANTITIES], float)
     covariance = np.diag(sigma**2)
     shared = laser_correlation * sigma[ANGLE] * sigma[DISTANCE]
     covariance[ANGLE, DISTANCE] = covariance[DISTANCE, ANGLE] = shared
-    return covariance, frozenset(one.key for one in QUANTITIES if one.sigma_key not in told)
+    return covariance, frozenset(one.key for one in QUANTITIES if one.sigma_key not in given)

@@ -31,6 +31,13 @@ SURE_MARGIN = 6.0
 BETWEEN = 6
 """A change is not interrupted for fewer frames."""
 
+STEADY_FRAMES, SLOPING_FRAMES, CORNER_REACH = 25, 12, 8
+"""A corner is sought so near to where a change seems to begin, from so many frames before it and in
+it."""
+
+LEAST_FRAMES = 8
+"""A change lasts so long at least."""
+
 TUKEY = 3.0
 """Values farther than so many standard deviations from the local line have little weight."""
 
@@ -97,9 +104,9 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
     width, growth, growth_sigma = local_line(series.width_mm, lit, window)
     curvature, bending, bending_sigma = local_line(series.curvature_per_mm, lit, window)
     grows = _changes(growth, growth_sigma, settings.least_growth_mm, settings)
-    grows &= lit
+    grows = lit & _with_corners(grows, series.width_mm, lit)
     flattens = _changes(bending, bending_sigma, settings.least_change_per_mm, settings)
-    flattens &= lit & ~grows & (growth <= 0.0)
+    flattens = lit & ~grows & _with_corners(flattens, series.curvature_per_mm, lit)
     # Lines that have just appeared may be too few for a surface.
     unknown = lit & ~np.isfinite(width)
     states: list[State] = []
@@ -182,7 +189,41 @@ def _changes(
     # Where a change begins and ends, its rate is half and less sure: what adjoins a sure change.
     fast = np.nan_to_num(rate) > settings.share * largest
     parts, _ = label(known & (fast | _closed(fast)))
-    return np.asarray(np.isin(parts, np.unique(parts[real])) & (parts > 0))
+    sure = [part for part in np.unique(parts[real]) if np.sum(parts == part) >= LEAST_FRAMES]
+    return np.asarray(np.isin(parts, sure) & (parts > 0))
+
+
+def _with_corners(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
+    """Changes that begin and end at the corners of the values, steady outside and a line inside."""
+    parts, count = label(change)
+    result = np.zeros(len(change), bool)
+    for part in range(1, count + 1):
+        first, last = np.flatnonzero(parts == part)[[0, -1]]
+        begin = _corner(values, on, int(first))
+        end = _corner(values[::-1], on[::-1], len(values) - 1 - int(last))
+        result[begin : len(values) - end] = True
+    return result
+
+
+def _corner(values: FloatArray, on: BoolArray, near: int) -> int:
+    """First frame of a change near ``near``: before, values are constant, then on a line."""
+    window = np.arange(max(near - STEADY_FRAMES, 0), min(near + SLOPING_FRAMES, len(values)))
+    window = window[on[window] & np.isfinite(values[window])]
+    if np.sum(window < near) < 5 or np.sum(window >= near) < 5:
+        return near
+    best, least = near, np.inf
+    for corner in range(near - CORNER_REACH, near + CORNER_REACH + 1):
+        terms = np.stack([np.ones(len(window)), np.maximum(window - corner + 0.5, 0.0)], axis=-1)
+        weights = np.ones(len(window))
+        for _ in range(3):
+            fit = np.linalg.lstsq(terms * weights[:, None], values[window] * weights, rcond=None)[0]
+            off = np.abs(values[window] - terms @ fit)
+            limit = TUKEY * 1.4826 * float(np.median(off)) + 1e-9
+            weights = np.sqrt(np.minimum(1.0, limit / np.maximum(off, 1e-12)))
+        cost = float(np.sum(np.minimum(off, limit)))
+        if cost < least:
+            best, least = corner, cost
+    return max(best, 0)
 
 
 def _closed(on: BoolArray) -> BoolArray:

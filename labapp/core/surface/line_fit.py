@@ -137,8 +137,10 @@ class LineSurface(ReadOnlyArrays):
     def curvature_per_mm(self) -> float:
         """Mean curvature of the quadric nearest to the surface, 1/mm; positive when convex."""
         x, y = self.point_mm[:, 0], self.point_mm[:, 1]
-        terms = _monomials(x - x.mean(), y - y.mean())
-        fitted = np.linalg.lstsq(terms, self.surface.height(x, y), rcond=None)[0]
+        z = self.surface.height(x, y)
+        known = np.isfinite(z)  # a ray may meet the surface beyond its splines
+        terms = _monomials(x - x.mean(), y - y.mean())[known]
+        fitted = np.linalg.lstsq(terms, z[known], rcond=None)[0]
         return float(-fitted[3] - fitted[5])
 
 

@@ -173,7 +173,7 @@ def add_budget(story: Story, report: ReportData) -> None:
     contributions = setup_budget(result.measurement, setup, result.settings)
     story.table(
         f"What each ± (one σ) changes in the sizes. Set-up: frame {line.frame}, measured anew with "
-        "the quantity moved by its ± either way, the correspondence kept. *: nobody told the ±; a "
+        "the quantity moved by its ± either way, the correspondence kept. *: no ± was given; a "
         "usual one is assumed. Correlations of the quantities count in the last row.",
         data.budget_cells(report.lines, contributions, setup.rig),
         "lrrrrrrr",
