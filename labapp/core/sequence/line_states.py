@@ -35,6 +35,9 @@ STEADY_FRAMES, SLOPING_FRAMES, CORNER_REACH = 25, 12, 8
 """A corner is sought so near to where a change seems to begin, from so many frames before it and in
 it."""
 
+APPEARING_FRAMES = 15
+"""Growth that shows so soon after the first lines began with them."""
+
 LEAST_FRAMES = 8
 """A change lasts so long at least."""
 
@@ -105,6 +108,7 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
     curvature, bending, bending_sigma = local_line(series.curvature_per_mm, lit, window)
     grows = _changes(growth, growth_sigma, settings.least_growth_mm, settings)
     grows = lit & _with_corners(grows, series.width_mm, lit)
+    grows |= _just_appeared(lit, grows)
     flattens = _changes(bending, bending_sigma, settings.least_change_per_mm, settings)
     flattens = lit & ~grows & _with_corners(flattens, series.curvature_per_mm, lit)
     # Lines that have just appeared may be too few for a surface.
@@ -232,6 +236,16 @@ def _closed(on: BoolArray) -> BoolArray:
     last = np.maximum.accumulate(np.where(on, frames, -BETWEEN))
     after = np.minimum.accumulate(np.where(on, frames, len(on) + BETWEEN)[::-1])[::-1]
     return np.asarray(after - last <= BETWEEN)
+
+
+def _just_appeared(lit: BoolArray, grows: BoolArray) -> BoolArray:
+    """Frames between the first lines of a pool and the first frames that show its growth."""
+    result = np.zeros(len(lit), bool)
+    for first in np.flatnonzero(np.diff(lit.astype(int)) == 1) + 1:
+        later = np.flatnonzero(grows[first : first + APPEARING_FRAMES])
+        if len(later):
+            result[first : first + later[0]] = True
+    return result
 
 
 def _steady(on: BoolArray) -> BoolArray:

@@ -43,6 +43,11 @@ AGREES = 3.0
 """A point or an end farther off than so many of its standard uncertainties does not agree."""
 
 
+UNMODELLED = 1.25
+"""Standard uncertainties are larger by this factor than points, ends and roughness give: ends have
+errors in common, and so have points of a bent line. So measured on the twin."""
+
+
 @dataclass(frozen=True)
 class LineFitSettings:
     """How the fit decides.
@@ -343,7 +348,7 @@ def _refined(
     agrees = np.abs(linear.residual) <= AGREES
     surface = LineSurface(
         SplineSurface(basis, coefficients),
-        covariance,
+        UNMODELLED**2 * covariance,
         np.rint(start.numbers).astype(np.int64),
         linear.point_mm[agrees] if agrees.sum() > 3 else linear.point_mm,
         float(np.sum(_cauchy(linear.residual))) / max(len(linear.residual) - 8, 1),
