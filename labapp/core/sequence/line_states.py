@@ -93,9 +93,10 @@ class LineSeries(ReadOnlyArrays):
         count = np.array([one.features.count for one in frames], np.int64)
         width, curvature = np.full(len(frames), np.nan), np.full(len(frames), np.nan)
         for k, one in enumerate(frames):
-            if one.surface is not None and one.surface.margin >= SURE_MARGIN:
-                width[k] = one.surface.width_mm
-                curvature[k] = one.surface.curvature_per_mm
+            surface = one.surface
+            if surface is not None and surface.margin >= SURE_MARGIN and len(surface.numbers) > 2:
+                width[k] = surface.width_mm
+                curvature[k] = surface.curvature_per_mm
         return cls(count, width, curvature)
 
 

@@ -43,6 +43,9 @@ AGREES = 3.0
 """A point or an end farther off than so many of its standard uncertainties does not agree."""
 
 
+LEAST_LINES = 3
+"""Two lines and their ends are met by surfaces of both curvatures: they determine none."""
+
 UNMODELLED = 1.25
 """Standard uncertainties are larger by this factor than points, ends and roughness give: ends have
 errors in common, and so have points of a bent line. So measured on the twin."""
@@ -203,7 +206,8 @@ def fit_lines(
 def _status(one: LineSurface, margin: float, settings: LineFitSettings) -> str:
     sure = one.height_sigma_mm <= settings.most_relative_sigma * abs(one.height_mm)
     fits = one.misfit <= settings.most_misfit
-    return "ok" if sure and fits and margin >= settings.margin else "profile"
+    enough = len(one.numbers) >= LEAST_LINES
+    return "ok" if enough and sure and fits and margin >= settings.margin else "profile"
 
 
 def _differ(one: LineSurface, other: LineSurface) -> bool:
