@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
@@ -31,12 +31,13 @@ from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.schemes import SCHEMES, ers, fit, irs
-from labapp.core.sequence.following import TrackLost, follow
-from labapp.core.sequence.prior import Prior
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import CannotMeasure
+
+if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
+    from labapp.core.sequence.prior import Prior
 
 Passed = Callable[[str], None]
 
@@ -155,6 +156,8 @@ def measure(
             match, near = match_corrected(dots, lattice, bench, shape, limits)
             lattice = lattice_of_corrected(match, rig, lattice)
         elif prior is not None:
+            from labapp.core.sequence.following import follow
+
             dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
             result = replace(result, dots=dots)
             passed("dots")
@@ -187,6 +190,8 @@ def measure(
     result = replace(result, reconstruction=made, measures=size)
     if prior is not None and followed is not None:
         return result, prior.followed_by(followed, made)
+    from labapp.core.sequence.prior import Prior
+
     if tuning is None or rig.pattern.marker is None:
         return result, None
     return result, Prior.of(bench, tuning, match, pool, made)
@@ -195,6 +200,8 @@ def measure(
 def _as_before(image: Image, prior: Prior) -> Image:
     """The image, which must have the size of the one before."""
     if image.shape != prior.tuning.noise.shape:
+        from labapp.core.sequence.following import TrackLost
+
         raise TrackLost("the frame has another size than the one before")
     return image
 

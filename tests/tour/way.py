@@ -138,7 +138,7 @@ def _plane(hands: Hands, files: Path) -> None:
     hands.picture("found")
     hands.press("Use")
     hands.picture("used")
-    hands.asked("print-target", lambda: hands.press("Save the target for printing…"))
+    hands.asked("print-target", lambda: hands.press("Save for printing…"))
 
 
 def _bench_check(hands: Hands, files: Path) -> None:
