@@ -156,7 +156,7 @@ def _print_check(check: BenchCheck) -> None:
     if check.status != "ok":
         typer.echo(f"{check.status}: {check.reason}", err=True)
         for suspect in check.suspects:
-            typer.echo(f"to adjust with it let go of: --free {suspect.key}", err=True)
+            typer.echo(f"to adjust with it free: --free {suspect.key}", err=True)
 
 
 def _residuals(check: BenchCheck) -> str:

@@ -336,10 +336,10 @@ def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
         points.get("x_axis_mm", plane["width_mm"] / 2),
         points.get("z_axis_mm", plane["height_mm"] / 2),
     )
-    told = {
-        f"{section}.{key}": given for section in values for key, given in values[section].items()
+    given = {
+        f"{section}.{key}": sigma for section in values for key, sigma in values[section].items()
     }
-    covariance, assumed = covariance_of(told, correlation)
+    covariance, assumed = covariance_of(given, correlation)
     covariance, checked = checked_covariance(values, covariance)
     return Rig(
         Laser(**laser),

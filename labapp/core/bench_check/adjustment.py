@@ -255,7 +255,7 @@ class System:
         return self.adjustment(unknown, scale)
 
     def solved(self, made: Adjustment) -> Adjustment:
-        """The adjustment that another of the same dots leads to, with more let go of.
+        """The adjustment that another of the same dots leads to, with more quantities free.
 
         Their costs can be compared: the scale of the residuals stays.
         """

@@ -169,17 +169,17 @@ def check_bench(
     CannotMeasure
         As `label_picture`.
     """
-    let_go = released(rig, free)
+    free_directions = released(rig, free)
     bench = Bench(rig, calibration)
     observed = [Observation.of(p.dots, bench, p.frame_shape) for p in pictures]
-    labels = _labelled(pictures, rig, calibration, let_go)
+    labels = _labelled(pictures, rig, calibration, free_directions)
     made: Adjustment | None = None
     for _ in range(ROUNDS):
         sightings = [
             sighting_of(o, p.mirror, found)
             for o, p, found in zip(observed, pictures, labels, strict=True)
         ]
-        made = adjust(rig, sightings, let_go, None if made is None else made.unknown)
+        made = adjust(rig, sightings, free_directions, None if made is None else made.unknown)
         again = [
             relabelled(o, p.mirror, made.offset, pose)
             for o, p, pose in zip(observed, pictures, made.poses, strict=True)
@@ -191,8 +191,8 @@ def check_bench(
             raise CannotMeasure("no-match", "no bench explains all pictures together")
         labels = again
     assert made is not None
-    suspects = find_suspects(rig, sightings, made, let_go)
-    verdict, patterns = judge(rig, sightings, made, let_go)
+    suspects = find_suspects(rig, sightings, made, free_directions)
+    verdict, patterns = judge(rig, sightings, made, free_directions)
     status, reason = _status(suspects, verdict)
     after, calibrated = adjusted_bench(rig, made, status == "ok")
     checked = tuple(
@@ -225,23 +225,26 @@ def check_bench(
 
 
 def _labelled(
-    pictures: Sequence[Picture], rig: Rig, calibration: ImageCalibration, let_go: FloatArray
+    pictures: Sequence[Picture],
+    rig: Rig,
+    calibration: ImageCalibration,
+    free_directions: FloatArray,
 ) -> list[IntArray]:
     """Labels of each picture: plates first, as they tell the bench that the others are seen on."""
     order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
     labels: dict[int, IntArray] = {}
-    told = rig, calibration
+    near = rig, calibration
     for k in order:
         found = _first_label(
-            pictures[k], [told, (rig, calibration), (_wide(rig), calibration)], let_go
+            pictures[k], [near, (rig, calibration), (_wide(rig), calibration)], free_directions
         )
         labels[k] = found.labels
-        told = adjusted_bench(told[0], found.adjustment)
+        near = adjusted_bench(near[0], found.adjustment)
     return [labels[k] for k in range(len(pictures))]
 
 
 def _first_label(
-    picture: Picture, benches: Sequence[tuple[Rig, ImageCalibration]], let_go: FloatArray
+    picture: Picture, benches: Sequence[tuple[Rig, ImageCalibration]], free_directions: FloatArray
 ) -> Labelled:
     """Labels by the first bench that has any.
 
@@ -250,10 +253,10 @@ def _first_label(
     """
     for bench in benches[:-1]:
         try:
-            return label_picture(picture, *bench, let_go)
+            return label_picture(picture, *bench, free_directions)
         except CannotMeasure:
             continue
-    return label_picture(picture, *benches[-1], let_go)
+    return label_picture(picture, *benches[-1], free_directions)
 
 
 def _wide(rig: Rig) -> Rig:

@@ -1,7 +1,7 @@
 """Which quantity is off by far more than its ± allows.
 
 A prior that is wrong pulls every other quantity along. So each quantity, and each way in which the
-whole picture may be off, is let go of in turn: the one that the cost falls most by is suspected.
+whole picture may be off, is freed in turn: the one that the cost falls most by is suspected.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.values import FloatArray
 
 FREE = {"°": 20.0, "mm": 30.0, "px": 60.0, "%": 20.0}
-"""Standard uncertainty of a quantity that is let go of, in its unit."""
+"""Standard uncertainty of a quantity that is freed, in its unit."""
 
 FREE_STEP, FREE_SHIFT_PX, FREE_SCALE = 0.4, 200.0, 0.5
 """The same of the inter-beam angle, degrees, of the whole picture's place, and of its scale."""
 
 LIMIT = 20.0
-"""A quantity is off by more than its ± allows where the cost falls by more with it let go of: 4.5
+"""A quantity is off by more than its ± allows where the cost falls by more with it free: 4.5
 standard deviations."""
 
 TRIED = 8
@@ -46,7 +46,7 @@ class Suspect:
     name
         What it is called.
     drop
-        By how much the cost falls with it let go of: the square of how many standard deviations it
+        By how much the cost falls with it free: the square of how many standard deviations it
         is off by.
     """
 
@@ -56,7 +56,7 @@ class Suspect:
 
 
 def released(rig: Rig, keys: Sequence[str]) -> FloatArray:
-    """Directions in the space of the quantities that keys of suspects let go of, shape (k, q).
+    """Directions in the space of the quantities that keys of suspects free, shape (k, q).
 
     Raises
     ------
@@ -68,14 +68,14 @@ def released(rig: Rig, keys: Sequence[str]) -> FloatArray:
 
 
 def suspect_keys() -> tuple[str, ...]:
-    """Keys of all that can be let go of."""
+    """Keys of all that can be freed."""
     return (*INDEX, "picture.u", "picture.v", "picture.scale")
 
 
 def find_suspects(
     rig: Rig, sightings: Sequence[Sighting], made: Adjustment, already: FloatArray
 ) -> tuple[Suspect, ...]:
-    """Find what the cost falls most by when it is let go of, most suspect first; empty: nothing.
+    """Find what the cost falls most by when it is free, most suspect first; empty: nothing.
 
     Those that explain the dots alike come together: pictures cannot tell them apart.
 
@@ -86,7 +86,7 @@ def find_suspects(
     made
         The adjustment to these.
     already
-        What was let go of in it, see `released`.
+        What was free in it, see `released`.
     """
     directions = _directions(rig)
     system = System.of(rig, sightings, already)
@@ -112,7 +112,7 @@ def find_suspects(
 
 
 def _directions(rig: Rig) -> dict[str, tuple[str, FloatArray]]:
-    """Key → name and direction of what can be let go of."""
+    """Key → name and direction of what can be freed."""
     made = {}
     for k, one in enumerate(QUANTITIES):
         free = FREE_STEP if one.key.startswith("pattern.inter") else FREE[one.unit]
