@@ -48,21 +48,22 @@ def test_nothing_shows_without_a_pool():
 
 
 def test_gaps_interrupt_lines_and_fringes_add_light():
-    def light(**look: object) -> float:
-        made = LineLook(**look)  # type: ignore[arg-type]
+    def light(look: LineLook) -> float:
         rng = np.random.default_rng(3)
-        frame = render_lines(spherical_cap(6.0, 0.2), RIG, VIEW, made, rng, gain=1.0)
+        frame = render_lines(spherical_cap(6.0, 0.2), RIG, VIEW, look, rng, gain=1.0)
         return float(frame.light_px.sum())
 
-    bare = light(fringes=())
-    assert light(fringes=(), gaps=6, gap_mm=1.0) < 0.95 * bare
-    assert 1.05 * bare < light(fringes=(0.18, 0.08)) < 1.4 * bare
+    bare = light(LineLook(fringes=()))
+    assert light(LineLook(fringes=(), gaps=6, gap_mm=1.0)) < 0.95 * bare
+    assert 1.05 * bare < light(LineLook(fringes=(0.18, 0.08))) < 1.4 * bare
 
 
 def test_a_run_goes_through_its_phases_in_order():
     run = penetration_run(80, np.random.default_rng(1))
     states = [one.state for one in run]
     assert [s for k, s in enumerate(states) if k == 0 or states[k - 1] != s] == list(PHASES)
-    assert run[0].pool is None
-    assert run[-1].pool is not None
-    assert run[-1].pool.peak_mm > 0 > run[40].pool.peak_mm  # type: ignore[union-attr]
+    first, early, last = (run[k].pool for k in (0, 40, -1))
+    assert first is None
+    assert early is not None
+    assert last is not None
+    assert last.peak_mm > 0 > early.peak_mm
