@@ -57,10 +57,9 @@ def calibrate_bench(
     Exit code 1: the set-up cannot be adjusted to the pictures, and is not changed.
     """
     from labapp.config.mirror_text import parse_mirror
-    from labapp.config.setup import A_SETUP, parse_setup, unchecked_setup
-    from labapp.config.toml_keys import read_text
+    from labapp.config.setup import parse_setup, read_setup_text, unchecked_setup
 
-    text = read_text(setup, A_SETUP)
+    text = read_setup_text(setup)
     parse_setup(text, setup)
     before = unchecked_setup(text, setup)
     known = parse_setup(before, setup)
