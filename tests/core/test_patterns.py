@@ -39,7 +39,7 @@ def stretched(rows: int, columns: int, step: float) -> np.ndarray:
 
 @pytest.fixture(autouse=True)
 def one_kind_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PATTERNS, "stretched", PatternKind(stretched))
+    monkeypatch.setitem(PATTERNS, "stretched", PatternKind("stretched", stretched))
 
 
 @pytest.mark.parametrize("kind", [*PATTERNS, "stretched"])
@@ -140,7 +140,7 @@ def ray_table(rig: Rig, universal: bool) -> str:
 def test_measured_rays_come_from_a_table_beside_the_setup_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, universal: bool
 ) -> None:
-    monkeypatch.setitem(PATTERNS, "bent", PatternKind(bent))
+    monkeypatch.setitem(PATTERNS, "bent", PatternKind("bent", bent))
     path = tmp_path / "setup.toml"
     path.write_text(SETUP.read_text("utf-8"), "utf-8")
     update_setup(path, {"pattern": {"kind": "bent", "rotation_deg": 1.5}})
@@ -210,7 +210,7 @@ def test_what_is_no_table_of_rays_is_refused(
 def test_frames_of_other_patterns_are_measured(
     pattern: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(PATTERNS, "bent", PatternKind(bent))
+    monkeypatch.setitem(PATTERNS, "bent", PatternKind("bent", bent))
     true, known = {
         "hexagonal": (DotPattern(21, 21, 0.72, kind="hexagonal"),) * 2,
         "directions": (DotPattern(kind="bent"), measured_pattern(DotPattern(kind="bent"))),

@@ -28,12 +28,15 @@ class PatternKind:
 
     Parameters
     ----------
+    title
+        What people call it.
     tangents
         Where its rays go.
     outline
         Rows and columns → which rays it has, shape (rows, columns); None: all of them.
     """
 
+    title: str
     tangents: Tangents
     outline: Callable[[int, int], BoolArray] | None = None
 
@@ -82,8 +85,8 @@ def _tangents(row: FloatArray, column: FloatArray, step: float) -> FloatArray:
 
 
 PATTERNS: dict[str, PatternKind] = {
-    "square": PatternKind(square),
-    "hexagonal": PatternKind(hexagonal, hexagon),
+    "square": PatternKind("square grid", square),
+    "hexagonal": PatternKind("hexagonal grid", hexagonal, hexagon),
 }
 """All kinds with rays at given angles, by their name in setup files."""
 
