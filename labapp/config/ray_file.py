@@ -124,6 +124,16 @@ def read_rays(path: Path, setup: Mapping[str, Any]) -> tuple[IntArray, FloatArra
     return np.array(rays), directions[:, :2] / directions[:, 2:]
 
 
+def ray_table(ray: IntArray, tangents: FloatArray) -> str:
+    """Table of rays (i, j), shape (n, 2), by their tangents to the beam axis, shape (n, 2)."""
+    direction = np.column_stack([tangents, np.ones(len(tangents))])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    lines = [",".join((*LABELS, *BEAM))]
+    for (i, j), way in zip(ray.tolist(), direction.tolist(), strict=True):
+        lines.append(f"{i},{j}," + ",".join(f"{part:.9f}" for part in way))
+    return "\n".join(lines) + "\n"
+
+
 def _numbers(path: Path, line: int, cells: list[str], at: list[int]) -> tuple[Any, ...]:
     """Row, column and the direction's three components in a line."""
     values = [parse_number(cells[k].strip(), ",") if k < len(cells) else None for k in at]
