@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from labapp.cli.bench import mirror_picture
@@ -39,6 +38,8 @@ def calibrate_pattern(
     Laser, imaging plane and camera are taken as the setup file has them: check the bench first.
     Exit code 1: the rays cannot be told, or the heights contradict each other.
     """
+    import numpy as np
+
     from labapp.config.ray_file import ray_table
     from labapp.config.setup import read_setup, update_setup
     from labapp.core.bench_check.mirrors import Plate
