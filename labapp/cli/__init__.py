@@ -28,6 +28,7 @@ from labapp.cli import (
     benchmark,
     cameras,
     lines,
+    pattern,
     reconstruct,
     session,
     simulate,
@@ -79,6 +80,7 @@ calibrate = typer.Typer(
 )
 app.add_typer(calibrate, name="calibrate")
 calibrate.command("bench")(bench.calibrate_bench)
+calibrate.command("pattern")(pattern.calibrate_pattern)
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
 app.command()(simulate.simulate)

@@ -57,10 +57,9 @@ def calibrate_bench(
     Exit code 1: the set-up cannot be adjusted to the pictures, and is not changed.
     """
     from labapp.config.mirror_text import parse_mirror
-    from labapp.config.setup import A_SETUP, parse_setup, unchecked_setup
-    from labapp.config.toml_keys import read_text
+    from labapp.config.setup import parse_setup, read_setup_text, unchecked_setup
 
-    text = read_text(setup, A_SETUP)
+    text = read_setup_text(setup)
     parse_setup(text, setup)
     before = unchecked_setup(text, setup)
     known = parse_setup(before, setup)
@@ -94,14 +93,15 @@ def _checked(
         if key not in suspect_keys():
             raise InputError("--free", "key", key, f"one of {', '.join(suspect_keys())}")
     try:
-        found = [_picture(path, one) for path, one in zip(pictures, mirrors, strict=True)]
+        found = [mirror_picture(path, one) for path, one in zip(pictures, mirrors, strict=True)]
         return check_bench(found, known.rig, known.calibration, free)
     except CannotMeasure as answer:
         typer.echo(f"{setup}: {answer}", err=True)
         raise typer.Exit(NOTHING_MEASURED) from answer
 
 
-def _picture(path: Path, mirror: Mirror) -> Picture:
+def mirror_picture(path: Path, mirror: Mirror) -> Picture:
+    """The dots of a picture of a mirror."""
     from labapp.core.bench_check.labelling import Picture
     from labapp.core.images.find_dots import DotSettings, find_dots
     from labapp.media import open_source

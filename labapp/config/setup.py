@@ -18,6 +18,7 @@ from labapp.config.bench_check import (
     checked_covariance,
     unchecked_values,
 )
+from labapp.config.ray_file import with_rays
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
 from labapp.core.bench_check.check import BenchCheck
@@ -76,8 +77,20 @@ def read_setup(path: str | os.PathLike[str]) -> Setup:
         If the file cannot be read or anything in it is unknown, missing or impossible; all that
         was found is reported together (`InputError.problems`).
     """
+    return parse_setup(read_setup_text(path), Path(path))
+
+
+def read_setup_text(path: str | os.PathLike[str]) -> str:
+    """Text of a setup file; rays of the table that it names stand in it.
+
+    Raises
+    ------
+    InputError
+        If the file or the table cannot be read.
+    """
     path = Path(path)
-    return parse_setup(read_text(path, A_SETUP), path)
+    text = read_text(path, A_SETUP)
+    return with_rays(text, path, parse_toml(text, path, A_SETUP))
 
 
 @functools.lru_cache(maxsize=64)
@@ -231,22 +244,32 @@ def _without_section(text: str, path: str | os.PathLike[str], section: str) -> s
 
 def pattern_values(pattern: DotPattern) -> dict[str, object]:
     """Keys of a pattern in a setup file: key → value."""
+    assert pattern.absent is not None
     values: dict[str, object] = {
         "rows": pattern.rows,
         "columns": pattern.columns,
         "inter_beam_angle_deg": pattern.inter_beam_angle_deg,
-        "absent": [list(ray) for ray in sorted(pattern.absent_rays)],
+        "absent": [list(ray) for ray in sorted(pattern.absent)],
     }
     if pattern.rotation_deg:
         values["rotation_deg"] = pattern.rotation_deg
+    if pattern.measured:
+        i, j = pattern.reference
+        values["rays"] = [[i + row, j + column, *to] for row, column, *to in pattern.measured]
     return values if pattern.kind == DotPattern.kind else values | {"kind": pattern.kind}
 
 
 def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
     """Pattern of the keys of a setup file; inverse of `pattern_values`."""
-    absent = keys.get("absent")
-    rays = None if absent is None else frozenset((i, j) for i, j in absent)
-    return DotPattern(**{**_without_sigmas(keys), "absent": rays})
+    given = _without_sigmas(keys)
+    absent, rays = given.pop("absent", None), given.pop("rays", [])
+    pattern = DotPattern(**given)
+    i, j = pattern.reference
+    return replace(
+        pattern,
+        absent=None if absent is None else frozenset((i, j) for i, j in absent),
+        measured=tuple((row - i, column - j, aside, up) for row, column, aside, up in rays),
+    )
 
 
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
@@ -262,6 +285,11 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
             f"rays [row, column] from [1, 1] to [{rows}, {columns}]",
         )
         for i, j in pattern.get("absent", [])
+        if not (1 <= i <= rows and 1 <= j <= columns)
+    ]
+    problems += [
+        InputError(path, "pattern.rays", [i, j], f"rows to {rows} and columns to {columns}")
+        for i, j, *_ in pattern.get("rays", [])
         if not (1 <= i <= rows and 1 <= j <= columns)
     ]
     plane = values["imaging_plane"]

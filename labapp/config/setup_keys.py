@@ -7,8 +7,9 @@ from typing import get_args
 import numpy as np
 
 from labapp.config import bench_check
+from labapp.config.ray_file import FEWEST_RAYS
 from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number, within
-from labapp.core.geometry.patterns import PATTERNS
+from labapp.core.geometry.patterns import MEASURED, PATTERNS
 from labapp.core.geometry.rig import Travel
 from labapp.core.geometry.uncertainty import QUANTITIES
 
@@ -37,6 +38,13 @@ def _is_rays(value: object) -> bool:
         isinstance(ray, list) and len(ray) == 2 and all(type(index) is int for index in ray)
         for ray in value
     )
+
+
+def _are_measured(value: object) -> bool:
+    if not isinstance(value, list) or not all(are_numbers(ray, 4) for ray in value):
+        return False
+    whole = all(type(index) is int for ray in value for index in ray[:2])
+    return whole and len({tuple(ray[:2]) for ray in value}) == len(value) >= FEWEST_RAYS
 
 
 def _is_matrix(value: object) -> bool:
@@ -72,6 +80,13 @@ THREE_POINTS = {
 HOMOGRAPHY = {
     "homography": Rule("3 rows of 3 numbers (px to mm) that can be inverted", _is_matrix),
 }
+RAYS = {
+    "rays": Rule(
+        f"at least {FEWEST_RAYS} measured rays [row, column, aside, up], each once, with their "
+        "tangents to the beam axis in those of the inter-beam angle; or file, a table of rays",
+        _are_measured,
+    ),
+}
 SECTIONS = {
     "laser": {
         "projection_angle_deg": between(0, 90, "degrees"),
@@ -92,8 +107,8 @@ SECTIONS = {
             required=False,
         ),
         "kind": Rule(
-            f"one of {', '.join(PATTERNS)}",
-            lambda value: isinstance(value, str) and value in PATTERNS,
+            f"one of {', '.join([*PATTERNS, MEASURED])}",
+            lambda value: isinstance(value, str) and (value in PATTERNS or value == MEASURED),
             required=False,
         ),
         "rotation_deg": _TILT,
@@ -143,7 +158,12 @@ OPTIONAL = ("camera_lens", "torch", "bench_check")
 
 
 def rules_for(section: str, keys: object) -> dict[str, Rule]:
-    """Rules of a section, given the keys it holds: a homography replaces the three points."""
+    """Rules of a section, given the keys it holds.
+
+    A homography replaces the three points; only a pattern of measured rays has these.
+    """
+    if section == "pattern" and isinstance(keys, dict) and keys.get("kind") == MEASURED:
+        return SECTIONS[section] | RAYS
     if section != "image_calibration":
         return SECTIONS[section]
     form = HOMOGRAPHY if isinstance(keys, dict) and "homography" in keys else THREE_POINTS

@@ -30,7 +30,7 @@ from labapp.core.matching.observation import Observation
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
-from labapp.core.schemes import SCHEMES, ers, fit, irs
+from labapp.core.schemes import SCHEMES, ers, fit, irs, modal, zonal
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.reconstruction import Reconstruction
@@ -56,7 +56,7 @@ class Settings:
         ``auto``, or the orientation to use (`match.Orientation`). It goes before that of ``match``.
     dots, lattice, match
         Settings of steps 1 to 3.
-    fit, ers, irs
+    fit, ers, irs, zonal, modal
         Settings of the schemes; only those of ``scheme`` count.
     """
 
@@ -69,6 +69,8 @@ class Settings:
     fit: FitSettings = field(default_factory=FitSettings)
     ers: ers.ErsSettings = field(default_factory=ers.ErsSettings)
     irs: irs.IrsSettings = field(default_factory=irs.IrsSettings)
+    zonal: zonal.ZonalSettings = field(default_factory=zonal.ZonalSettings)
+    modal: modal.ModalSettings = field(default_factory=modal.ModalSettings)
 
 
 @dataclass(frozen=True)

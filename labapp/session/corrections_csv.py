@@ -18,17 +18,17 @@ from typing import TextIO
 import numpy as np
 import scipy
 
-from labapp.core.images.dots import Dots
-from labapp.core.rows.correction import MOST, PLACED_PX, Correction, set_reference
-from labapp.core.rows.lattice import Lattice
-from labapp.core.values import FloatArray, IntArray
-from labapp.errors import InputError
-from labapp.session.csv_tables import (
+from labapp.config.csv_tables import (
     PROBLEMS_SHOWN,
     bounded_lines,
     open_table,
     parse_number,
 )
+from labapp.core.images.dots import Dots
+from labapp.core.rows.correction import MOST, PLACED_PX, Correction, set_reference
+from labapp.core.rows.lattice import Lattice
+from labapp.core.values import FloatArray, IntArray
+from labapp.errors import InputError
 
 NEEDED = ("u_px", "v_px", "reflected_row", "reflected_column")
 A_TABLE = f"a table of dots (CSV, UTF-8) with the columns {', '.join(NEEDED)}"

@@ -15,14 +15,14 @@ from typing import TextIO
 
 import numpy as np
 
-from labapp.core.values import FloatArray, ReadOnlyArrays
-from labapp.errors import InputError
-from labapp.session.csv_tables import (
+from labapp.config.csv_tables import (
     PROBLEMS_SHOWN,
     bounded_lines,
     open_table,
     parse_number,
 )
+from labapp.core.values import FloatArray, ReadOnlyArrays
+from labapp.errors import InputError
 
 A_TABLE = "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), a current, a voltage"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
-from labapp.simulation.forward import PoolSurface, Reflections, trace
+from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import ellipsoidal_cap
 
 USUAL_WIDTH_MM, USUAL_LENGTH_MM = 5.0, 6.0
@@ -159,39 +159,36 @@ def side_view(
     along = np.linspace(-1, 1, 81) * edge
     plane = rig.imaging_plane
     middle = np.array([[plane.width_mm / 2, 0.0], [plane.width_mm / 2, plane.height_mm]])
+    seen = trace(pool, rig)
     return SideView(
-        rays=_central_rays(pool, rig),
+        rays=_central_rays(seen, rig),
         pool_mm=np.stack([along, pool.height(np.zeros_like(along), along)], axis=-1),
         plane_mm=plane.to_universal(middle)[:, 1:],
         laser_mm=rig.laser.position_mm[1:],
         tip_mm=np.array([0.0, rig.electrode.height_mm]),
         clearance=clearance(rig, float(np.degrees(np.arctan(-slope)))),
-        tally=_tally(trace(pool, rig)),
+        tally=_tally(seen),
     )
 
 
-def _central_rays(pool: PoolSurface, rig: Rig) -> tuple[SideRay, ...]:
-    pattern = rig.pattern
-    column = (pattern.columns + 1) // 2
-    absent = frozenset((i, 1) for i, j in pattern.absent_rays if j == column)
-    alone = replace(rig, pattern=replace(pattern, columns=1, absent=absent))
-    seen = trace(pool, alone)
-    fates = _fates(seen)
+def _central_rays(seen: Reflections, rig: Rig) -> tuple[SideRay, ...]:
+    column = (rig.pattern.columns - 1) // 2
+    fates = _fates(seen)[:, column]
     return tuple(
-        SideRay(row + 1, fates[row, 0], _path(seen, row, alone))
-        for row in range(pattern.rows)
-        if not seen.absent[row, 0] and seen.incident[row, 0, 2] < 0
+        SideRay(row + 1, fates[row], _path(seen, (row, column), rig))
+        for row in range(rig.pattern.rows)
+        if not seen.absent[row, column] and seen.incident[row, column, 2] < 0
     )
 
 
-def _path(seen: Reflections, row: int, rig: Rig) -> FloatArray:
+def _path(seen: Reflections, ray: tuple[int, int], rig: Rig) -> FloatArray:
     laser = rig.laser.position_mm
-    if not seen.hit[row, 0]:
-        incident = seen.incident[row, 0]
+    if not seen.hit[ray]:
+        incident = seen.incident[ray]
         ground = laser - laser[2] / incident[2] * incident
         return np.stack([laser, ground])[:, 1:]
-    point, place = seen.point_mm[row, 0], seen.plane_mm[row, 0]
-    end = point + RUN_OUT_MM * seen.reflected[row, 0]
+    point, place = seen.point_mm[ray], seen.plane_mm[ray]
+    end = point + RUN_OUT_MM * seen.reflected[ray]
     if np.isfinite(place).all():
         end = rig.imaging_plane.to_universal(place)
     return np.stack([laser, point, end])[:, 1:]

@@ -21,7 +21,7 @@ import numpy as np
 from labapp.core.geometry.rig import DotPattern, Laser, Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.schemes import ers, irs
+from labapp.core.schemes import ers, irs, modal, zonal
 from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace
@@ -65,6 +65,8 @@ def circle_settings(scheme: str) -> Settings:
         scheme=scheme,
         ers=ers.ErsSettings(boundary="circle"),
         irs=irs.IrsSettings(boundary="circle"),
+        zonal=zonal.ZonalSettings(boundary="circle"),
+        modal=modal.ModalSettings(boundary="circle"),
     )
 
 

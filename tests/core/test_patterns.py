@@ -9,11 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.config.setup import parse_setup, pattern_values, updated_setup
+from labapp.config.setup import (
+    parse_setup,
+    pattern_values,
+    read_setup,
+    update_setup,
+    updated_setup,
+)
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.optics import ray_directions
-from labapp.core.geometry.patterns import PATTERNS, square
-from labapp.core.geometry.rig import DotPattern
+from labapp.core.geometry.patterns import PATTERNS, PatternKind, square
+from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.pipeline import Settings, measure
 from labapp.errors import InputError
 from labapp.simulation.forward import trace
@@ -23,31 +29,31 @@ from labapp.studies.image_error import BENCH, VIEW, axes_of, rendered
 SETUP = Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "setup.toml"
 
 
-def staggered(rows: int, columns: int, step: float) -> np.ndarray:
-    """Every other row half a step aside: a ray has six neighbours, all as far."""
+def stretched(rows: int, columns: int, step: float) -> np.ndarray:
+    """Rows nearer to each other than columns, and each a little aside of the one above it."""
     tangents = square(rows, columns, step)
-    row = np.arange(rows) - (rows - 1) // 2
-    column = np.arange(columns) - (columns - 1) // 2 + row[:, None] % 2 / 2
-    tangents[..., 0] = np.tan(column * step)
-    tangents[..., 1] = np.tan(-row * step * np.sqrt(3) / 2)[:, None]
+    tangents[..., 1] *= 0.9
+    tangents[..., 0] += 0.2 * tangents[..., 1]
     return tangents
 
 
 @pytest.fixture(autouse=True)
 def one_kind_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(PATTERNS, "staggered", staggered)
+    monkeypatch.setitem(PATTERNS, "stretched", PatternKind("stretched", stretched))
 
 
-@pytest.mark.parametrize("kind", [*PATTERNS, "staggered"])
+@pytest.mark.parametrize("kind", [*PATTERNS, "stretched"])
 def test_a_kind_is_rows_and_columns_about_the_axis(kind: str) -> None:
     step = np.radians(0.77)
-    tangents = PATTERNS[kind](19, 17, step)
+    tangents = PATTERNS[kind].tangents(19, 17, step)
     assert tangents.shape == (19, 17, 2)
     np.testing.assert_allclose(tangents[9, 8], 0, atol=1e-15)
     assert (np.diff(tangents[..., 0], axis=1) > 0).all()
     assert (np.diff(tangents[..., 1], axis=0) < 0).all()
     # The boundary asks for the rays that would come next, all round.
-    np.testing.assert_allclose(PATTERNS[kind](21, 19, step)[1:-1, 1:-1], tangents, atol=1e-15)
+    np.testing.assert_allclose(
+        PATTERNS[kind].tangents(21, 19, step)[1:-1, 1:-1], tangents, atol=1e-15
+    )
     # What a setup file may hold is reckoned from the angle: no neighbours are farther apart.
     assert np.abs(np.diff(tangents[9, :, 0])).min() <= np.tan(step) * (1 + 1e-9)
     assert np.abs(np.diff(tangents[:, 8, 1])).min() <= np.tan(step) * (1 + 1e-9)
@@ -58,16 +64,16 @@ def test_a_setup_file_names_the_kind() -> None:
     usual = parse_setup(text, SETUP)
     assert usual.rig.pattern.kind == "square"
     assert "kind" not in pattern_values(usual.rig.pattern)
-    other = parse_setup(updated_setup(text, SETUP, {"pattern": {"kind": "staggered"}}), SETUP)
-    assert other.rig.pattern == replace(usual.rig.pattern, kind="staggered")
+    other = parse_setup(updated_setup(text, SETUP, {"pattern": {"kind": "stretched"}}), SETUP)
+    assert other.rig.pattern == replace(usual.rig.pattern, kind="stretched")
     again = updated_setup(text, SETUP, {"pattern": pattern_values(other.rig.pattern)})
-    assert tomllib.loads(again)["pattern"]["kind"] == "staggered"
+    assert tomllib.loads(again)["pattern"]["kind"] == "stretched"
     with pytest.raises(InputError, match=r"pattern\.kind: .rings.; expected one of square"):
         parse_setup(updated_setup(text, SETUP, {"pattern": {"kind": "rings"}}), SETUP)
 
 
 def test_the_twin_and_the_measurement_have_the_same_rays() -> None:
-    rig = replace(BENCH, pattern=DotPattern(kind="staggered"))
+    rig = replace(BENCH, pattern=DotPattern(kind="stretched"))
     assert not np.allclose(
         ray_directions(rig.laser, rig.pattern), ray_directions(rig.laser, DotPattern())
     )
@@ -80,7 +86,7 @@ def test_the_twin_and_the_measurement_have_the_same_rays() -> None:
 
 @pytest.mark.slow
 def test_a_frame_of_another_kind_is_measured() -> None:
-    rig = replace(BENCH, pattern=DotPattern(kind="staggered"))
+    rig = replace(BENCH, pattern=DotPattern(kind="stretched"))
     frame = rendered(spherical_cap(6.0, 0.3), rig, 0)
     found = measure(frame.image, Bench(rig, axes_of(VIEW).calibration), Settings())[0]
     assert found.status == "ok", found.reason
@@ -91,3 +97,148 @@ def test_a_frame_of_another_kind_is_measured() -> None:
     assert found.dots is not None
     assert np.abs(found.dots.image_px[found.match.dot] - true_px).max() < 3
     assert found.measures.height_mm == pytest.approx(0.3, abs=0.01)
+
+
+def test_a_hexagonal_pattern_is_a_hexagon_of_rays_with_six_neighbours() -> None:
+    pattern = DotPattern(21, 21, 0.7, kind="hexagonal")
+    there = [
+        ray for ray in np.ndindex(21, 21) if (ray[0] + 1, ray[1] + 1) not in pattern.absent_rays
+    ]
+    assert len(there) == 331 - 1
+    assert pattern.marker == (11, 11)
+    tangents = pattern.tangents
+    places = np.array([tangents[ray] for ray in there])
+    apart = np.sort(np.linalg.norm(places - tangents[12, 12], axis=-1))[1:8]
+    np.testing.assert_allclose(apart[:6], np.tan(np.radians(0.7)), rtol=0.02)
+    assert apart[6] > 1.5 * apart[5]
+    corners = [tangents[10, 0], tangents[10, 20], tangents[0, 5], tangents[20, 15]]
+    np.testing.assert_allclose(np.linalg.norm(corners, axis=-1), np.tan(np.radians(7.0)), rtol=0.02)
+
+
+def bent(rows: int, columns: int, step: float) -> np.ndarray:
+    """A square pattern of a lens that stretches its fan towards the rim, by 3 % at the corners."""
+    tangents = square(rows, columns, step)
+    share = np.sum(tangents**2, axis=-1, keepdims=True) / np.sum(tangents[0, 0] ** 2)
+    return np.asarray(tangents * (1 + 0.03 * share))
+
+
+def ray_table(rig: Rig, universal: bool) -> str:
+    """Table of the rays that a rig has, in the UCS or about the beam axis."""
+    directions = ray_directions(rig.laser, rig.pattern)
+    if not universal:
+        axis, aside, up = rig.laser.axes
+        directions = directions @ np.array([aside, up, axis]).T
+    names = "x,y,z" if universal else "aside,up,along"
+    lines = [f"ray_row,ray_column,{names}"]
+    for i, j in np.ndindex(directions.shape[:2]):
+        if (i + 1, j + 1) not in rig.pattern.absent_rays:
+            lines.append(f"{i + 1},{j + 1}," + ",".join(f"{v:.9f}" for v in directions[i, j]))
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("universal", [True, False])
+def test_measured_rays_come_from_a_table_beside_the_setup_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, universal: bool
+) -> None:
+    monkeypatch.setitem(PATTERNS, "bent", PatternKind("bent", bent))
+    path = tmp_path / "setup.toml"
+    path.write_text(SETUP.read_text("utf-8"), "utf-8")
+    update_setup(path, {"pattern": {"kind": "bent", "rotation_deg": 1.5}})
+    true = read_setup(path).rig
+    (tmp_path / "rays.csv").write_text(ray_table(true, universal), "utf-8")
+    whole = {"rows": None, "columns": None, "inter_beam_angle_deg": None}
+    update_setup(path, {"pattern": {"kind": "directions", "file": "rays.csv", **whole}})
+    if not universal:  # a table about the beam axis holds what rotation the lens has
+        update_setup(path, {"pattern": {"rotation_deg": None}})
+    setup = read_setup(path)
+    pattern = setup.rig.pattern
+    assert (pattern.rows, pattern.columns) == (19, 19)
+    assert pattern.absent_rays == true.pattern.absent_rays
+    assert pattern.marker == true.pattern.marker
+    there = np.ones((19, 19), bool)
+    there[tuple(np.array(sorted(true.pattern.absent_rays)).T - 1)] = False
+    np.testing.assert_allclose(
+        ray_directions(setup.rig.laser, pattern)[there],
+        ray_directions(true.laser, true.pattern)[there],
+        atol=1e-8,
+    )
+    # The absent ray and those beyond the rim are where their neighbours say.
+    wider = replace(pattern, rows=21, columns=21), replace(true.pattern, rows=21, columns=21)
+    rays = [ray_directions(true.laser, one) for one in wider]
+    assert np.abs(rays[0] - rays[1]).max() < 0.15 * np.radians(pattern.inter_beam_angle_deg)
+    # Its text holds the rays: a session needs no table.
+    (tmp_path / "rays.csv").unlink()
+    assert parse_setup(setup.text, "elsewhere").rig.pattern == pattern
+    again = updated_setup(setup.text, path, {"pattern": pattern_values(pattern)})
+    assert parse_setup(again, path).rig.pattern == pattern
+
+
+@pytest.mark.parametrize(
+    ("keys", "table", "field"),
+    [
+        ({"file": "../rays.csv"}, "", "pattern.file"),
+        ({"file": "/etc/passwd"}, "", "pattern.file"),
+        ({"file": "c:\\rays.csv"}, "", "pattern.file"),
+        ({"file": "other.csv"}, "", "file"),
+        ({}, "ray_row,ray_column,x,y\n", "line 1, names"),
+        ({}, "ray_row,ray_column,x,y,z\n1,1,0,0,-1\n1,1,0,0,-1\n", "line 3"),
+        ({}, "ray_row,ray_column,x,y,z\n1,0,0,0,-1\n", "line 2, ray"),
+        ({}, "ray_row,ray_column,x,y,z\n1,1,0,0,-0.5\n", "line 2, direction"),
+        ({}, "ray_row,ray_column,x,y,z\n1,1,0,nan,-1\n", "line 2, direction"),
+        ({}, "ray_row,ray_column,x,y,z\n1,1,0,0,-1\n", "rays"),
+        ({"rows": 17}, None, "pattern.rays"),
+        ({"rows": 18}, None, "pattern.rows"),
+        ({"file": None}, None, "pattern.rays"),
+    ],
+)
+def test_what_is_no_table_of_rays_is_refused(
+    tmp_path: Path, keys: dict[str, object], table: str | None, field: str
+) -> None:
+    path = tmp_path / "setup.toml"
+    text = SETUP.read_text("utf-8")
+    rig = parse_setup(text, SETUP).rig
+    (tmp_path / "rays.csv").write_text(ray_table(rig, True) if table is None else table, "utf-8")
+    pattern = {"kind": "directions", "file": "rays.csv"} | keys
+    path.write_text(updated_setup(text, path, {"pattern": pattern}), "utf-8")
+    with pytest.raises(InputError) as refused:
+        read_setup(path)
+    assert refused.value.field == field
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pattern", ["hexagonal", "directions", "two markers", "denser"])
+def test_frames_of_other_patterns_are_measured(
+    pattern: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(PATTERNS, "bent", PatternKind("bent", bent))
+    true, known = {
+        "hexagonal": (DotPattern(21, 21, 0.72, kind="hexagonal"),) * 2,
+        "directions": (DotPattern(kind="bent"), measured_pattern(DotPattern(kind="bent"))),
+        "two markers": (DotPattern(absent=frozenset({(10, 10), (8, 13)})),) * 2,
+        "denser": (DotPattern(37, 37, 0.385),) * 2,
+    }[pattern]
+    rig = replace(BENCH, pattern=true)
+    frame = rendered(spherical_cap(6.0, 0.3), rig, 3)
+    bench = Bench(replace(rig, pattern=known), axes_of(VIEW).calibration)
+    found = measure(frame.image, bench, Settings())[0]
+    assert found.status == "ok", found.reason
+    assert found.match is not None
+    assert found.measures is not None
+    assert found.dots is not None
+    assert len(found.match.ray) > 0.9 * frame.shown.sum()
+    true_px = frame.dot_px[tuple(found.match.ray.T - 1)]
+    assert np.abs(found.dots.image_px[found.match.dot] - true_px).max() < 2.5
+    assert found.measures.height_mm == pytest.approx(0.3, abs=0.01)
+
+
+def measured_pattern(pattern: DotPattern) -> DotPattern:
+    """The rays of a pattern as if they were measured one by one."""
+    steps = pattern.tangents / np.tan(np.radians(pattern.inter_beam_angle_deg))
+    i, j = pattern.reference
+    rays = (ray for ray in np.ndindex(steps.shape[:2]))
+    measured = tuple(
+        (a + 1 - i, b + 1 - j, *steps[a, b].tolist())
+        for a, b in rays
+        if (a + 1, b + 1) not in pattern.absent_rays
+    )
+    return replace(pattern, kind="directions", measured=measured, absent=frozenset())

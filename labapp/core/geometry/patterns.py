@@ -1,16 +1,17 @@
 """The kinds of dot pattern: where the rays of a lens go. Here is their list.
 
-A kind is a function and an entry of `PATTERNS`. It gives the tangents of the rays to the beam axis:
-where they pass through a screen across the axis at distance 1, to the side (with X) and upwards.
+A kind is an entry of `PATTERNS`. It gives the tangents of the rays to the beam axis: where they
+pass through a screen across the axis at distance 1, to the side (with X) and upwards.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.values import FloatArray
+from labapp.core.values import BoolArray, FloatArray
 
 Tangents = Callable[[int, int, float], FloatArray]
 """Rows, columns, angle between neighbours at the centre (rad) → tangents (aside, up), shape
@@ -21,13 +22,105 @@ or two columns more, the rays amid them are the same.
 """
 
 
+@dataclass(frozen=True)
+class PatternKind:
+    """A kind of dot pattern.
+
+    Parameters
+    ----------
+    title
+        What people call it.
+    tangents
+        Where its rays go.
+    outline
+        Rows and columns → which rays it has, shape (rows, columns); None: all of them.
+    """
+
+    title: str
+    tangents: Tangents
+    outline: Callable[[int, int], BoolArray] | None = None
+
+    def beyond(self, rows: int, columns: int) -> frozenset[tuple[int, int]]:
+        """Rays ``(i, j)`` of the rows and columns that lie outside the outline."""
+        if self.outline is None:
+            return frozenset()
+        outside = np.argwhere(~self.outline(rows, columns)) + 1
+        return frozenset((int(i), int(j)) for i, j in outside)
+
+
 def square(rows: int, columns: int, step: float) -> FloatArray:
     """Rays at equal angles along the middle row and the middle column (Fig. 4-14)."""
-    tangents = np.empty((rows, columns, 2))
-    tangents[..., 0] = np.tan((np.arange(columns) - (columns - 1) / 2) * step)
-    tangents[..., 1] = np.tan(((rows - 1) / 2 - np.arange(rows)) * step)[:, None]
-    return tangents
+    return _tangents(*_from_center(rows, columns), step)
 
 
-PATTERNS: dict[str, Tangents] = {"square": square}
-"""All kinds, by their name in setup files."""
+def hexagonal(rows: int, columns: int, step: float) -> FloatArray:
+    """Rays with six neighbours, all as far: every other row is half a step aside (with X).
+
+    The middle row is not; rows are √3/2 of a step apart.
+    """
+    row, column = _from_center(rows, columns)
+    return _tangents(row * np.sqrt(3.0) / 2.0, column + row % 2 / 2.0, step)
+
+
+def hexagon(rows: int, columns: int) -> BoolArray:
+    """Rays of a hexagonal pattern within the hexagon on its middle row, shape (rows, columns).
+
+    With as many rows as columns it is regular: n rays on each side, 2n − 1 rows, and
+    3n(n − 1) + 1 rays in all. With fewer rows its upper and lower corners are cut off.
+    """
+    row, column = _from_center(rows, columns)
+    aside = np.abs(column + row % 2 / 2.0) + np.abs(row) / 2.0
+    return np.asarray(aside <= (columns - 1) / 2)
+
+
+def _from_center(rows: int, columns: int) -> tuple[FloatArray, FloatArray]:
+    """Numbers of rows, shape (rows, 1), and columns, shape (1, columns), from the centre ray."""
+    row, column = np.arange(float(rows)), np.arange(float(columns))
+    return (row - (rows - 1) // 2)[:, None], (column - (columns - 1) // 2)[None]
+
+
+def _tangents(row: FloatArray, column: FloatArray, step: float) -> FloatArray:
+    aside, up = np.broadcast_arrays(np.tan(column * step), np.tan(-row * step))
+    return np.stack([aside, up], axis=-1)
+
+
+PATTERNS: dict[str, PatternKind] = {
+    "square": PatternKind("square grid", square),
+    "hexagonal": PatternKind("hexagonal grid", hexagonal, hexagon),
+}
+"""All kinds with rays at given angles, by their name in setup files."""
+
+MEASURED = "directions"
+"""The kind whose rays were measured one by one: `measured_steps` says where they go."""
+
+MeasuredRay = tuple[int, int, float, float]
+"""Row and column of a ray from the centre ray; its tangents over that of the inter-beam angle."""
+
+
+def measured_steps(rays: tuple[MeasuredRay, ...], rows: int, columns: int) -> FloatArray:
+    """Tangents of measured rays over that of the inter-beam angle, shape (rows, columns, 2).
+
+    Where no ray was measured, the next ones of its row say where it would be, by straight lines;
+    in rows of fewer than two, the rows two and four above or below: so rows may be staggered.
+    """
+    steps = np.full((rows, columns, 2), np.nan)
+    for row, column, *place in rays:
+        steps[row + (rows - 1) // 2, column + (columns - 1) // 2] = place
+    for i in range(rows):
+        steps[i] = _filled(steps[i])
+    for first in (0, 1):
+        for column in range(columns):
+            steps[first::2, column] = _filled(steps[first::2, column])
+    return steps
+
+
+def _filled(line: FloatArray) -> FloatArray:
+    """Places in a line, shape (n, 2), with those that are NaN between and beyond the others."""
+    at, known = np.arange(len(line)), np.flatnonzero(np.isfinite(line[:, 0]))
+    if len(known) < 2:
+        return line
+    left = known[np.clip(np.searchsorted(known, at, "right") - 1, 0, len(known) - 2)]
+    right = known[np.clip(np.searchsorted(known, at, "right"), 1, len(known) - 1)]
+    share = ((at - left) / (right - left))[:, None]
+    made = line[left] + share * (line[right] - line[left])
+    return np.where(np.isfinite(line), line, made)

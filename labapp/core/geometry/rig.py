@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.geometry.patterns import PATTERNS
+from labapp.core.geometry.patterns import MEASURED, PATTERNS, MeasuredRay, measured_steps
 from labapp.core.geometry.uncertainty import RigUncertainty
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
@@ -60,6 +60,10 @@ class Laser:
         return np.asarray(aim - self.distance_mm * self.axes[0])
 
 
+def _rays(rows: int, columns: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(1, rows + 1) for j in range(1, columns + 1)]
+
+
 @dataclass(frozen=True)
 class DotPattern:
     """The projected dot matrix: rays in rows and columns (Fig. 4-14).
@@ -73,10 +77,12 @@ class DotPattern:
     absent
         Rays ``(i, j)``, counted from 1, that the lens does not make. None: the centre.
     kind
-        How the rays lie to each other, one of `PATTERNS`.
+        How the rays lie to each other: one of `PATTERNS`, or `MEASURED`.
     rotation_deg
         By how much the pattern is turned about the beam axis, degrees: where it is positive, rays
         of a row go the higher the larger their j.
+    measured
+        The rays of the kind `MEASURED`, all that there are; of other kinds none.
     """
 
     rows: int = 19
@@ -85,10 +91,12 @@ class DotPattern:
     absent: frozenset[tuple[int, int]] | None = None
     kind: str = "square"
     rotation_deg: float = 0.0
+    measured: tuple[MeasuredRay, ...] = ()
 
     def __post_init__(self) -> None:
         if self.absent is None:
-            object.__setattr__(self, "absent", frozenset({self.reference}))
+            absent = frozenset[tuple[int, int]]() if self.measured else {self.reference}
+            object.__setattr__(self, "absent", frozenset(absent))
 
     @property
     def reference(self) -> tuple[int, int]:
@@ -100,7 +108,7 @@ class DotPattern:
         """The absent ray whose hole tells the rows: the one nearest the centre, or None."""
         center = np.array(self.reference)
         return min(
-            sorted(self.absent_rays),
+            sorted(self.absent_rays - self._outside),
             key=lambda ray: float(np.linalg.norm(np.array(ray) - center)),
             default=None,
         )
@@ -109,18 +117,47 @@ class DotPattern:
     def tangents(self) -> FloatArray:
         """Tangents of the rays to the beam axis, see `Tangents`, shape (rows, columns, 2)."""
         step = np.radians(self.inter_beam_angle_deg)
-        tangents = PATTERNS[self.kind](self.rows, self.columns, step)
+        if self.kind == MEASURED:
+            steps = measured_steps(self.measured, self.rows, self.columns)
+            tangents = np.asarray(steps * np.tan(step))
+        else:
+            tangents = PATTERNS[self.kind].tangents(self.rows, self.columns, step)
         if not self.rotation_deg:
             return tangents
         turn = np.radians(self.rotation_deg)
         sin, cos = np.sin(turn), np.cos(turn)
         return np.asarray(tangents @ np.array([[cos, sin], [-sin, cos]]))
 
-    @property
+    @cached_property
     def absent_rays(self) -> frozenset[tuple[int, int]]:
-        """Rays ``(i, j)`` that are not there."""
+        """Rays ``(i, j)`` that are not there: absent, outside the outline, or not measured."""
         assert self.absent is not None
-        return self.absent
+        return self.absent | self._outside | self._within - self._listed
+
+    @cached_property
+    def _listed(self) -> frozenset[tuple[int, int]]:
+        """Measured rays; of other kinds all within the outline."""
+        if self.kind != MEASURED:
+            return self._within
+        i, j = self.reference
+        return frozenset((i + row, j + column) for row, column, *_ in self.measured)
+
+    @cached_property
+    def _within(self) -> frozenset[tuple[int, int]]:
+        """Rays within the outline."""
+        return frozenset(_rays(self.rows, self.columns)) - self._outside
+
+    @cached_property
+    def _outside(self) -> frozenset[tuple[int, int]]:
+        """Rays outside the outline: of measured ones those not between others of their row."""
+        if self.kind != MEASURED:
+            return PATTERNS[self.kind].beyond(self.rows, self.columns)
+        ends = {i: [j for row, j in self._listed if row == i] for i in range(1, self.rows + 1)}
+        return frozenset(
+            (i, j)
+            for i, j in _rays(self.rows, self.columns)
+            if not ends[i] or not min(ends[i]) <= j <= max(ends[i])
+        )
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,18 @@ SCHEMES: dict[str, Scheme] = {
             },
             "IrsSettings",
         ),
+        Scheme(
+            "zonal",
+            "zonal integration of slopes (Southwell)",
+            Words("zonal", "Zonal: slopes integrated between neighbours"),
+            "ZonalSettings",
+        ),
+        Scheme(
+            "modal",
+            "modal integration of slopes (Zernike)",
+            Words("modal", "Modal: Zernike polynomials fitted to slopes"),
+            "ModalSettings",
+        ),
     )
 }
 """All schemes by name, in the order in which they are offered."""

@@ -22,6 +22,8 @@ from tests.gui.conftest import KEPT
 
 SAMPLES = Path(__file__).parents[3] / "sample_sessions"
 
+GRID = [(i, j) for i in range(1, 20) for j in range(1, 20) if (i, j) != (10, 10)]
+
 KEYS = [entry.key for _, entries in RIG for entry in entries]
 
 
@@ -189,6 +191,27 @@ def test_the_welding_direction_is_chosen(page: SetupPage) -> None:
     assert page.travel.value() == "-y"
     page.workspace.undo()
     assert session.setup.rig.travel == "+y"
+
+
+def test_the_grid_of_dots_is_chosen(page: SetupPage) -> None:
+    session = page.workspace.session
+    assert session is not None
+    page.kind.edited.emit("hexagonal")
+    assert session.setup.rig.pattern.kind == "hexagonal"
+    assert page.kind.value() == "hexagonal"
+    page.workspace.undo()
+    assert session.setup.rig.pattern.kind == "square"
+    # Measured rays come with a setup file; another grid has none of them.
+    page.kind.edited.emit("directions")
+    assert any("pattern.rays" in words for words in presenter.shown(session).others)
+    page.workspace.undo()
+    keys = {"kind": "directions", "rays": [[i, j, j - 10.0, 10.0 - i] for i, j in GRID]}
+    page.workspace.attempt(lambda session: session.update_setup({"pattern": keys}, "rays"))
+    assert page.kind.value() == "directions"
+    page.kind.edited.emit("square")
+    assert not session.setup_problems
+    page.workspace.undo()
+    assert len(session.setup.rig.pattern.measured) == len(GRID)
 
 
 def test_a_refusal_stays_while_other_fields_are_accepted(

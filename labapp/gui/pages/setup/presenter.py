@@ -8,7 +8,8 @@ from typing import Any
 
 from labapp.config.setup import parse_setup, updated_setup
 from labapp.config.setup_keys import SECTIONS, THREE_POINTS
-from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.patterns import MEASURED, PATTERNS
+from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.pipeline import setup_status
 from labapp.errors import InputError
@@ -121,6 +122,12 @@ ASSUMED = {one.sigma_key: one.assumed for one in QUANTITIES}
 
 TRAVELS = (("+y", "towards +Y"), ("-y", "towards −Y"))
 
+KINDS = (
+    *((name, kind.title) for name, kind in PATTERNS.items()),
+    (MEASURED, "measured rays"),
+)
+"""Kinds of dot pattern, and how they are called."""
+
 
 def sigma_entry(entry: Entry) -> Entry | None:
     """The field of a value's standard uncertainty; None where it has none."""
@@ -189,8 +196,8 @@ class SetupState:
         By the keys of `RIG`; None where there is none.
     sigmas
         Standard uncertainties by the keys of `ASSUMED`; None where one is assumed.
-    travel
-        Which way the torch moves, of `TRAVELS`.
+    kind, travel
+        The dot pattern's, of `KINDS`; which way the torch moves, of `TRAVELS`.
     status
         How far the set-up can be relied on, in words; empty while it is not complete.
     problems
@@ -203,6 +210,7 @@ class SetupState:
 
     values: dict[str, float | None]
     sigmas: dict[str, float | None]
+    kind: str
     travel: str
     status: str
     problems: dict[str, str]
@@ -216,8 +224,11 @@ def shown(session: Session) -> SetupState:
     keys = [entry.key for _, entries in RIG for entry in entries]
     values = {key: _number(sections, key) for key in keys}
     sigmas = {key: _number(sections, key) for key in ASSUMED}
-    torch = sections.get("torch")
-    travel = torch.get("travel", "+y") if isinstance(torch, dict) else "+y"
+    tables = {key: sections.get(key) for key in ("pattern", "torch")}
+    kind, travel = (
+        table.get(key, usual) if isinstance(table := tables[section], dict) else usual
+        for section, key, usual in (("pattern", "kind", DotPattern.kind), ("torch", "travel", "+y"))
+    )
     found = rig(session)
     checked = "" if session.setup_problems else session.setup.checked
     status = "" if found is None else setup_words(setup_status(found), checked)
@@ -236,9 +247,8 @@ def shown(session: Session) -> SetupState:
             others.append("The imaging plane is not calibrated: that is step 3.")
         else:
             others.append(f"{problem.field}: {words}")
-    return SetupState(
-        values, sigmas, travel, status, problems, tuple(dict.fromkeys(others)), session.record
-    )
+    unique = tuple(dict.fromkeys(others))
+    return SetupState(values, sigmas, kind, travel, status, problems, unique, session.record)
 
 
 def _number(sections: dict[str, Any], key: str) -> float | None:
@@ -341,6 +351,12 @@ def put(session: Session, key: str, value: float | None) -> None:
     label = next(entry.label for entry in entries if entry.key in (key, value_key))
     label += " ±" if key in ASSUMED else ""
     session.update_setup({section: {name: value}}, f"set-up, {label}")
+
+
+def put_kind(session: Session, kind: str) -> None:
+    """Enter the kind of dot pattern; measured rays are those of a pattern that is left."""
+    rays = {} if kind == MEASURED else {"rays": None}
+    session.update_setup({"pattern": {"kind": kind, **rays}}, "set-up, dot pattern")
 
 
 def put_travel(session: Session, travel: str) -> None:

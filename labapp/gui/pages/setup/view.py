@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import (
     ASSUMED,
     EXPERIMENT,
+    KINDS,
     POOL,
     RIG,
     SAFETY,
@@ -28,6 +30,7 @@ from labapp.gui.widgets.labels import Message, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
 
 SETUP_FILES = "Set-up files (*.toml)"
 
@@ -64,7 +67,7 @@ class SetupPage(Page):
         show_tab(EXPERIMENT_TAB)
         self.panel_layout.addWidget(self.tabs)
         self.lock_with_session(
-            *(*self.rig_fields.values(), *self.sigma_fields.values(), self.travel),
+            *(*self.rig_fields.values(), *self.sigma_fields.values(), self.kind, self.travel),
             *(*self.record_fields.values(), *self.ticks.values(), *self._filling),
         )
         self.panel_layout.setContentsMargins(0, 0, 0, 0)
@@ -80,6 +83,7 @@ class SetupPage(Page):
             field.set_value(shown.sigmas[key])
             if shown.problems.get(key):
                 field.set_problem(shown.problems[key])
+        self.kind.set_value(shown.kind)
         self.travel.set_value(shown.travel)
         self.status.setText(shown.status)
         for name, noted in self.record_fields.items():
@@ -188,14 +192,13 @@ class SetupPage(Page):
             form.add_heading(heading)
             for entry in entries:
                 form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
+            if heading == "Dot pattern":
+                tip = "How the dots lie to each other. Measured rays come with a setup file: Load…"
+                self.kind = self._choice("Grid", KINDS, tip, presenter.put_kind)
+                form.add(self.kind)
             if heading == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie low"
-                self.travel = ChoiceField("Welding", TRAVELS, tooltip=tip)
-                self.travel.edited.connect(
-                    lambda way: self.workspace.attempt(
-                        lambda session: presenter.put_travel(session, way)
-                    )
-                )
+                self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
                 form.add(self.travel)
         heading, entries = UNCERTAIN_ONLY
         form.add_heading(f"{heading}, ±")
@@ -218,6 +221,19 @@ class SetupPage(Page):
         self.others = wrapping_label()
         form.add_wide(self.others)
         return form
+
+    def _choice(
+        self,
+        label: str,
+        options: Sequence[tuple[str, str]],
+        tooltip: str,
+        put: Callable[[Session, str], None],
+    ) -> ChoiceField:
+        field = ChoiceField(label, options, tooltip=tooltip)
+        field.edited.connect(
+            lambda value: self.workspace.attempt(lambda session: put(session, value))
+        )
+        return field
 
     def _rig_field(self, entry: Entry) -> NumberField:
         field = self.rig_fields[entry.key] = _number(entry)

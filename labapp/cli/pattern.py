@@ -1,0 +1,84 @@
+"""`labapp calibrate pattern`: the rays of a lens, one by one, from pictures on flat mirrors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from labapp.cli.bench import mirror_picture
+from labapp.cli.shared import NOTHING_MEASURED, write_file
+from labapp.errors import InputError
+
+CONTRADICTING = 3.0
+"""Pictures that differ by so many times what the dots' noise allows contradict each other."""
+
+
+def calibrate_pattern(
+    *,
+    setup: Annotated[Path, typer.Option(help="Setup file (TOML), of laser and imaging plane.")],
+    pictures: Annotated[
+        list[Path], typer.Argument(metavar="PICTURE...", help="Pictures of a flat mirror.")
+    ],
+    height: Annotated[
+        list[float],
+        typer.Option(
+            help="Height of the mirror over the work piece in the picture at the same place, mm. "
+            "Repeat for each picture; two heights or more."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Table of rays (CSV), beside the setup file.")],
+    use: Annotated[
+        bool, typer.Option("--use", help="Name the table in the setup file, as its pattern.")
+    ] = False,
+) -> None:
+    """Measure the direction of every ray from pictures of the dots on a flat mirror.
+
+    Laser, imaging plane and camera are taken as the setup file has them: check the bench first.
+    Exit code 1: the rays cannot be told, or the heights contradict each other.
+    """
+    import numpy as np
+
+    from labapp.config.ray_file import ray_table
+    from labapp.config.setup import read_setup, update_setup
+    from labapp.core.bench_check.mirrors import Plate
+    from labapp.core.bench_check.pattern_calibration import LEAST_PICTURES
+    from labapp.core.bench_check.pattern_calibration import calibrate_pattern as calibrated
+    from labapp.core.geometry.patterns import MEASURED
+    from labapp.core.values import CannotMeasure
+
+    known = read_setup(setup)
+    if len(height) != len(pictures) or len(set(height)) < LEAST_PICTURES:
+        counts = f"{len(set(height))} for {len(pictures)} pictures"
+        raise InputError("--height", "heights", counts, "one for each picture, two that differ")
+    if not all(abs(one) <= 1000 for one in height):
+        raise InputError("--height", "height", height, "heights to 1000 mm")
+    if use and out.absolute().parent != setup.absolute().parent:
+        raise InputError("--out", "folder", out, f"that of {setup}, which is to name the table")
+    try:
+        found = calibrated(
+            [mirror_picture(path, Plate(z)) for path, z in zip(pictures, height, strict=True)],
+            known.bench,
+        )
+    except CannotMeasure as answer:
+        typer.echo(f"{setup}: {answer}", err=True)
+        raise typer.Exit(NOTHING_MEASURED) from answer
+    sigma_deg = np.degrees(np.median(found.sigma))
+    typer.echo(f"{len(found.ray)} rays, ± {sigma_deg:.4f}° (median, from the dots' noise)")
+    typer.echo(f"off from the set-up's: {found.off_deg:.4f}° RMS")
+    typer.echo(f"heights differ by {found.disagreement:.1f} times what the noise allows")
+    if not found.disagreement <= CONTRADICTING:
+        typer.echo(
+            "the heights contradict each other: is the mirror level, and at the heights given? "
+            "Is the imaging plane upright? labapp calibrate bench checks the set-up",
+            err=True,
+        )
+        raise typer.Exit(NOTHING_MEASURED)
+    write_file(out, ray_table(found.ray, found.tangents).encode())
+    typer.echo(f"The rays are in {out.absolute()}")
+    if use:
+        left = dict.fromkeys(("rays", "absent", "rotation_deg"))
+        values = {"kind": MEASURED, "file": out.name, **left}
+        update_setup(setup, {"pattern": values})
+        typer.echo(f"They are the pattern of {setup.absolute()}")

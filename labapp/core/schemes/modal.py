@@ -1,0 +1,95 @@
+"""Modal integration of slopes: polynomials over the pool whose gradients fit them best.
+
+As wave-front sensors do it with Zernike polynomials (Southwell 1980; R. J. Noll, J. Opt. Soc. Am.
+66, 207–211, 1976). Those up to a radial order span the polynomials of that degree, so any other
+basis of them gives the same fit; products of Chebyshev polynomials are used here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
+from labapp.core.schemes.integration import reconstruct_by
+from labapp.core.schemes.slopes import ReflectedRays
+from labapp.core.surface.boundary import BoundaryModel
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.values import FloatArray
+
+
+@dataclass(frozen=True)
+class ModalSettings:
+    """Settings of modal integration.
+
+    Parameters
+    ----------
+    order
+        Radial order of the highest Zernike polynomials; with few points a lower one, so that there
+        are at least three slopes for each polynomial.
+    loops
+        How many loops at most; they end when the reflection points have settled.
+    boundary
+        Boundary model: ``piecewise`` (§6.3.2) or ``circle`` (§8.2.1).
+    """
+
+    order: int = 6
+    loops: int = 100
+    boundary: BoundaryModel = "piecewise"
+
+
+def reconstruct(match: Match, rig: Rig, settings: ModalSettings | None = None) -> Reconstruction:
+    """Reconstruct the pool surface by modal integration; `CannotMeasure` as `reconstruct_by`."""
+    settings = settings or ModalSettings()
+
+    def integrate(_: ReflectedRays, place: FloatArray, gradient: FloatArray) -> FloatArray:
+        return heights(place, gradient, settings.order)
+
+    return reconstruct_by("modal", integrate, match, rig, settings.loops, settings.boundary)
+
+
+def heights(place: FloatArray, gradient: FloatArray, order: int) -> FloatArray:
+    """Heights of the polynomial whose gradients fit best, but for a constant, shape (n,), mm.
+
+    Parameters
+    ----------
+    place, gradient
+        (x, y) of n points, mm, and the gradients there, shape (n, 2).
+    order
+        See `ModalSettings`.
+    """
+    while order > 1 and 3 * _terms(order) > 2 * len(place):
+        order -= 1
+    center = (place.min(axis=0) + place.max(axis=0)) / 2
+    radius = float(np.linalg.norm(place - center, axis=-1).max())
+    x, y = ((place - center) / radius).T
+    degree = np.add.outer(np.arange(order + 1), np.arange(order + 1))
+    kept = np.flatnonzero((degree <= order) & (degree > 0))
+    values, slopes = (_chebyshev(at, order) for at in (x, y)), (_slopes(at, order) for at in (x, y))
+    (value_x, value_y), (slope_x, slope_y) = values, slopes
+    products = (
+        np.einsum("na,nb->nab", *pair).reshape(len(place), -1)[:, kept]
+        for pair in ((value_x, value_y), (slope_x, value_y), (value_x, slope_y))
+    )
+    basis, by_x, by_y = products
+    coefficients = np.linalg.lstsq(np.vstack([by_x, by_y]), radius * gradient.T.ravel())[0]
+    return np.asarray(basis @ coefficients)
+
+
+def _terms(order: int) -> int:
+    """How many polynomials there are up to an order, the constant apart."""
+    return (order + 1) * (order + 2) // 2 - 1
+
+
+def _chebyshev(at: FloatArray, order: int) -> FloatArray:
+    """Chebyshev polynomials T₀ … at places, shape (n, order + 1)."""
+    return np.asarray(chebyshev.chebvander(at, order))
+
+
+def _slopes(at: FloatArray, order: int) -> FloatArray:
+    """Their derivatives, shape (n, order + 1)."""
+    derived = [chebyshev.chebval(at, chebyshev.chebder(one)) for one in np.eye(order + 1)]
+    return np.stack(derived, axis=-1)
