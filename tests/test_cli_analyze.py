@@ -150,3 +150,22 @@ def test_what_cannot_be_is_refused(
     assert told in " ".join(err.split())
     assert (folder / "file").read_text() == "mine"
     assert [path.name for path in folder.iterdir()] == ["file"]
+
+
+@pytest.mark.slow
+def test_a_frame_is_compared_by_algorithm(labapp: Run, tmp_path: Path) -> None:
+    recording = SETUP.with_name("recording.avi")
+    given = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "3"]
+    code, _, err = labapp(*given, "--out", str(tmp_path))
+    assert code == 0, err
+    assert len(table(tmp_path / "figure_6_10_edge_points.csv")) == 9
+    rows = table(tmp_path / "figure_6_13_base_height.csv")
+    assert len({row["base_height_mm"] for row in rows}) == 11
+
+
+def test_a_frame_that_is_not_there_is_refused(labapp: Run) -> None:
+    recording = SETUP.with_name("recording.avi")
+    given = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "30"]
+    code, _, err = labapp(*given, "--tables")
+    assert code == 2
+    assert "--frame" in err

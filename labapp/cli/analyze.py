@@ -8,6 +8,7 @@ from typing import Annotated, Literal, TypeVar
 import typer
 
 from labapp.cli.shared import (
+    NOTHING_MEASURED,
     Commands,
     progress_shown,
     results_folder,
@@ -31,7 +32,7 @@ T = TypeVar("T", bound=str)
 app = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    help="Reproduce the tables and figures of chapters 4 and 8, and the error budget of a set-up.",
+    help="Reproduce tables and figures of chapters 4, 6 and 8; the error budget of a set-up.",
 )
 
 Out = Annotated[
@@ -122,6 +123,37 @@ def errors(
     with progress_shown() as progress:
         for made in analyze_errors(options, progress):
             _keep(folder, made)
+
+
+@app.command()
+def frame(
+    source: Annotated[Path, typer.Argument(help="A recording, or one image.")],
+    setup: Annotated[Path, typer.Option(help="Setup file (TOML).")],
+    number: Annotated[int, typer.Option("--frame", min=0, help="Which frame.")] = 0,
+    out: Out = None,
+    tables: Tables = False,
+) -> None:
+    """Compare algorithms, correspondences and base heights of IRS on a frame (Fig. 6-10, 6-13).
+
+    Exit code 1: the frame's dots have no rays.
+    """
+    from labapp.config.setup import read_setup
+    from labapp.core.pipeline import Settings, measure
+    from labapp.media import open_source
+    from labapp.studies.frame_comparison import comparison_tables
+
+    known = read_setup(setup)
+    with open_source(source) as recording:
+        if number >= len(recording):
+            allowed = f"frames 0 to {len(recording) - 1} of {source}"
+            raise InputError("--frame", "frame", number, allowed)
+        image = recording.frame(number).image
+    found = measure(image, known.bench, Settings())[0]
+    if found.match is None:
+        typer.echo(f"{source}: {found.status}: {found.reason}", err=True)
+        raise typer.Exit(NOTHING_MEASURED)
+    made = comparison_tables(found.match, known.rig)
+    _keep(results_folder(out, tables), AnalysisPart(made, {}, made if tables else ()))
 
 
 @app.command()

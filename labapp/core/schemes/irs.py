@@ -72,18 +72,27 @@ def reconstruct(match: Match, rig: Rig, settings: IrsSettings | None = None) -> 
     """
     settings = settings or IrsSettings()
     rays = reflected_rays(match, rig)
+    best = _best(estimates(match, rig, rays, settings), settings.are_margin)
+    boundary = boundary_on_work_piece(match, rig, settings.boundary)
+    return reconstruction_within("irs", match, rays, best, boundary)
+
+
+def estimates(
+    match: Match, rig: Rig, rays: ReflectedRays, settings: IrsSettings
+) -> list[tuple[float, Estimate]]:
+    """The best estimate for every height of the base point, mm, that has one (Fig. 6-13).
+
+    The edge-points algorithm has one base height, 0.
+    """
     if settings.algorithm == "opa":
         moves = _one_point(match, rays, settings.base_heights_mm)
     else:
         moves = [(0.0, _edge_points(rays, settings.algorithm))]
-    estimates: list[tuple[float, Estimate]] = []
-    for height, move in moves:
-        estimate = best_of_loops(match, rig, rays, move, CloughTocherSurface, settings.loops)
-        if estimate is not None:
-            estimates.append((height, estimate))
-    best = _best(estimates, settings.are_margin)
-    boundary = boundary_on_work_piece(match, rig, settings.boundary)
-    return reconstruction_within("irs", match, rays, best, boundary)
+    made = (
+        (height, best_of_loops(match, rig, rays, move, CloughTocherSurface, settings.loops))
+        for height, move in moves
+    )
+    return [(height, estimate) for height, estimate in made if estimate is not None]
 
 
 def lower_left(match: Match) -> int:
@@ -101,12 +110,12 @@ def lower_left(match: Match) -> int:
     return int(np.argmin(np.where(lowest, match.plane_mm[:, 0], np.inf)))
 
 
-def _best(estimates: list[tuple[float, Estimate]], are_margin: float) -> Estimate:
+def _best(found: list[tuple[float, Estimate]], are_margin: float) -> Estimate:
     """Of (base height, estimate), the one of least ARE; of equals the one nearest z = 0."""
-    if not estimates:
+    if not found:
         raise CannotMeasure("no-surface", "the reflection points diverge from the first loop on")
-    least = min(estimate.are_mm for _, estimate in estimates)
-    equals = [pair for pair in estimates if pair[1].are_mm <= least * (1 + are_margin)]
+    least = min(estimate.are_mm for _, estimate in found)
+    equals = [pair for pair in found if pair[1].are_mm <= least * (1 + are_margin)]
     return min(equals, key=lambda pair: (abs(pair[0]), pair[1].are_mm))[1]
 
 

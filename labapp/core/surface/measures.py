@@ -194,7 +194,7 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
     scale = reflection_scale(match, rig)
     error = np.hypot(*(reconstruction.residual_mm * scale).T)
     met = np.isfinite(error)
-    every, inner = error[met], error[met & _inner(reconstruction.ray)]
+    every, inner = error[met], error[met & inside_points(reconstruction.ray)]
     return ReflectionErrors(
         are_mm=float(every.mean()) if len(every) else math.nan,
         mre_mm=float(every.max()) if len(every) else math.nan,
@@ -205,7 +205,7 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
     )
 
 
-def _inner(ray: IntArray) -> BoolArray:
+def inside_points(ray: IntArray) -> BoolArray:
     """Which points are neither in the first or last row nor at an end of their row, shape (n,)."""
     order = np.lexsort(ray.T[::-1])
     row = ray[order, 0]

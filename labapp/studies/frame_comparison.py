@@ -1,0 +1,92 @@
+"""IRS on one frame by algorithm, correspondence and base height (Fig. 6-10, 6-13, 6-16).
+
+The dots keep their rows and columns; each correspondence gives them other rays. Dots whose rays lie
+beyond the pattern are left out. Errors are those of the scheme's own points, step 4 of §6.3.1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
+from labapp.core.schemes.irs import Algorithm, IrsSettings, estimates
+from labapp.core.schemes.slopes import Estimate, ReflectedRays, reflected_rays
+from labapp.core.surface.measures import inside_points, reflection_scale
+from labapp.core.values import CannotMeasure
+from labapp.studies.tables import Cell, Table
+
+COLUMNS = ("are_mm", "mre_mm", "are_inner_mm", "mre_inner_mm")
+
+
+def with_orientation(match: Match, rig: Rig, orientation: Orientation) -> Match:
+    """The same dots with the rays of another correspondence, mirrored about the marker's.
+
+    No ray is a witness then: which of the others came back is not known.
+    """
+    center = np.array(rig.pattern.marker or rig.pattern.reference)
+    ray = center + (match.ray - center) * ways(match.orientation) * ways(orientation)
+    there = ((ray >= 1) & (ray <= (rig.pattern.rows, rig.pattern.columns))).all(axis=-1)
+    return replace(
+        match,
+        orientation=orientation,
+        dot=match.dot[there],
+        ray=ray[there],
+        reflected=match.reflected[there],
+        plane_mm=match.plane_mm[there],
+        plane_covariance_mm2=match.plane_covariance_mm2[there],
+        witness=np.zeros_like(match.witness),
+    )
+
+
+def comparison_tables(match: Match, rig: Rig) -> tuple[Table, Table]:
+    """Reflection errors of a frame, by algorithm (Fig. 6-10) and by base height (Fig. 6-13, 6-16).
+
+    A row a correspondence and algorithm or base height; empty cells where there is no surface.
+    """
+    edge: list[tuple[Cell, ...]] = []
+    one: list[tuple[Cell, ...]] = []
+    for orientation in ORIENTATIONS:
+        turned = with_orientation(match, rig, orientation)
+        for algorithm in get_args(Algorithm):
+            settings = IrsSettings(algorithm=algorithm)
+            try:
+                rays = reflected_rays(turned, rig)
+                found = dict(estimates(turned, rig, rays, settings))
+            except CannotMeasure:
+                rays, found = None, {}
+            errors = {h: _errors(turned, rig, rays, found[h]) for h in found if rays is not None}
+            nothing: tuple[Cell, ...] = (None,) * len(COLUMNS)
+            if algorithm == "opa":
+                one += [(orientation, h, *errors.get(h, nothing)) for h in settings.base_heights_mm]
+            else:
+                edge.append((orientation, algorithm, *errors.get(0.0, nothing)))
+    return (
+        Table(
+            "figure_6_10_edge_points",
+            "Reflection errors of the edge-points algorithms (Fig. 6-10)",
+            ("correspondence", "algorithm", *COLUMNS),
+            tuple(edge),
+        ),
+        Table(
+            "figure_6_13_base_height",
+            "Reflection errors of the one-point algorithm by base height (Fig. 6-13, 6-16)",
+            ("correspondence", "base_height_mm", *COLUMNS),
+            tuple(one),
+        ),
+    )
+
+
+def _errors(match: Match, rig: Rig, rays: ReflectedRays, estimate: Estimate) -> tuple[Cell, ...]:
+    """`COLUMNS` of an estimate (Eq. 6-3 … 6-8)."""
+    captured, gradient = rays.plane_mm, estimate.surface.point_gradient
+    residual = (rays.reflected(estimate.points_mm, gradient) - captured)[: rays.measured]
+    error = np.hypot(*(residual * reflection_scale(match, rig)).T)
+    met = np.isfinite(error)
+    parts = error[met], error[met & inside_points(match.ray)]
+    return tuple(
+        float(of(part)) if len(part) else None for part in parts for of in (np.mean, np.max)
+    )

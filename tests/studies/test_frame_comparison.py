@@ -1,0 +1,41 @@
+"""IRS by algorithm, correspondence and base height on a known pool (Fig. 6-10, 6-13)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.simulation.forward import exact_match, trace
+from labapp.simulation.pools import egg
+from labapp.studies.correspondence_table import OPEN_BENCH
+from labapp.studies.frame_comparison import comparison_tables, with_orientation
+
+MATCH = exact_match(trace(egg(6.0, 2.7, 3.4, 0.3), OPEN_BENCH), OPEN_BENCH)
+
+
+def test_rays_are_mirrored_about_the_marker() -> None:
+    assert MATCH.orientation == "S/S"
+    turned = with_orientation(MATCH, OPEN_BENCH, "I/I")
+    assert turned.orientation == "I/I"
+    np.testing.assert_array_equal(turned.ray, 20 - MATCH.ray)
+    back = with_orientation(turned, OPEN_BENCH, "S/S")
+    np.testing.assert_array_equal(back.ray, MATCH.ray)
+    rows = with_orientation(MATCH, OPEN_BENCH, "S/I")
+    np.testing.assert_array_equal(rows.ray, np.abs(MATCH.ray - [20, 0]))
+
+
+@pytest.mark.slow
+def test_the_true_correspondence_has_the_least_error_with_every_algorithm() -> None:
+    edge, one = comparison_tables(MATCH, OPEN_BENCH)
+    assert len(edge.rows) == 9
+    assert len(one.rows) == 3 * 11
+    for algorithm in ("epa-r", "epa-c", "epa-rc"):
+        errors = {row[0]: row[2] for row in edge.rows if row[1] == algorithm}
+        assert min(errors, key=lambda way: errors[way] or np.inf) == "S/S"
+    for height in {row[1] for row in one.rows}:
+        errors = {row[0]: row[2] for row in one.rows if row[1] == height}
+        assert min(errors, key=lambda way: errors[way] or np.inf) == "S/S"
+    # Points inside are better than those at the edges (Fig. 6-16).
+    own = np.array([row[2:] for row in one.rows if row[0] == "S/S"], float)
+    assert (own[:, 2] < own[:, 0]).all()
+    assert (own[:, 3] <= own[:, 1]).all()
