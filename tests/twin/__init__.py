@@ -1,0 +1,1 @@
+"""Parts of the twin that tests and benchmarks alone use: mirrors, wrong benches, line patterns."""
