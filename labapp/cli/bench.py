@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +9,7 @@ import typer
 
 from labapp.cli.shared import NOTHING_MEASURED, write_file
 from labapp.errors import InputError
+from labapp.text import csv_text
 
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
@@ -161,18 +160,16 @@ def _print_check(check: BenchCheck) -> None:
 
 def _residuals(check: BenchCheck) -> str:
     """Residual of every dot, CSV."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(
+    rows: list[list[object]] = [
         ["picture", "ray_row", "ray_column", "plane_x_mm", "plane_z_mm", "residual_x_mm",
          "residual_z_mm"]
-    )  # fmt: skip
+    ]  # fmt: skip
     for one in check.pictures:
         columns = one.ray.tolist(), one.plane_mm.tolist(), one.residual_mm.tolist()
         for ray, place, residual in zip(*columns, strict=True):
             cells = [f"{value:.6f}" for value in (*place, *residual)]
-            table.writerow([one.picture.name, *ray, *cells])
-    return text.getvalue()
+            rows.append([one.picture.name, *ray, *cells])
+    return csv_text(rows)
 
 
 def _write(setup: Path, before: str, check: BenchCheck) -> None:

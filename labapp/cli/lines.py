@@ -20,6 +20,7 @@ from labapp.cli.shared import (
     write_file,
 )
 from labapp.errors import InputError
+from labapp.text import csv_text
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -85,15 +86,13 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: LineSetup)
             times_s.append(frame.time_s)
             written.write(number, one)
             if one.status == "ok" and one.surface is not None:
-                rows = tables.surface_rows(one.surface)
-                text = tables.csv_text(tables.SURFACE_COLUMNS, rows)
+                text = csv_text([tables.SURFACE_COLUMNS, *tables.surface_rows(one.surface)])
                 write_file(folder / f"surface_{number:06d}.csv", text.encode())
             progress(source.name, k + 1, len(frames))
     series = LineSeries.of(found)
     states = line_states(series)
     rows = tables.feature_rows(frames, times_s, found, states)
-    text = tables.csv_text(tables.FEATURE_COLUMNS, rows)
-    write_file(folder / "features.csv", text.encode())
+    write_file(folder / "features.csv", csv_text([tables.FEATURE_COLUMNS, *rows]).encode())
     for name, counts in (("frames", [one.status for one in found]), ("states", states)):
         shown = ", ".join(f"{what} {n}" for what, n in Counter(counts).most_common())
         typer.echo(f"{name}: {shown}")
@@ -121,7 +120,7 @@ def _follow(source: FrameSource, frames: range, folder: Path) -> bool:
 
         film = track_line(images(), rate)
     rows = tables.track_rows(frames, times_s, film)
-    write_file(folder / "track.csv", tables.csv_text(tables.TRACK_COLUMNS, rows).encode())
+    write_file(folder / "track.csv", csv_text([tables.TRACK_COLUMNS, *rows]).encode())
     off = [one for one, pulse in zip(film.lines, film.pulses.on, strict=True) if not pulse]
     followed = sum(one is not None for one in off)
     typer.echo(f"{len(off)} of {len(frames)} frames are without a pulse; line in {followed}")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+
+from labapp.text import csv_text
 
 MINUS = "−"
 """As wide as a digit's plus; a hyphen reads as a dash."""
@@ -104,11 +104,8 @@ def as_text(rows: Iterable[ResultRow]) -> str:
 
 def as_csv(rows: Iterable[ResultRow]) -> str:
     """Result rows for a program: comma-separated, numbers in full."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("quantity", "value", "sigma", "unit"))
-    writer.writerows((row.name, row.value, row.sigma, row.unit) for row in rows)
-    return text.getvalue()
+    cells = ((row.name, row.value, row.sigma, row.unit) for row in rows)
+    return csv_text([("quantity", "value", "sigma", "unit"), *cells])
 
 
 UNITS = {"mm": "mm", "deg": "°", "px": "px", "pct": "%", "um per unit": "µm per mm or °"}

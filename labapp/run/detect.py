@@ -13,9 +13,10 @@ from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.export.tables import PX_DIGITS, as_csv, number
+from labapp.export.tables import PX_DIGITS, number
 from labapp.files import write_atomically
 from labapp.media import open_source
+from labapp.text import csv_text
 
 COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".split()
 
@@ -69,6 +70,6 @@ def write_detected(path: Path, dots: Dots, lattice: Lattice | None) -> None:
     ]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, as_csv([COLUMNS, *rows]).encode())
+        write_atomically(path, csv_text([COLUMNS, *rows]).encode())
     except OSError as error:
         raise InputError(path, "--out", error.strerror, "a file that can be written") from error

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
+
+from labapp.text import csv_text
 
 Cell = str | int | float | None
 
@@ -33,11 +33,7 @@ class Table:
 
     def csv(self) -> str:
         """CSV with a header row; an unknown value is an empty cell."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows([_text(cell, 6) for cell in row] for row in self.rows)
-        return out.getvalue()
+        return csv_text([self.columns, *([_text(cell, 6) for cell in row] for row in self.rows)])
 
     def markdown(self) -> str:
         """The caption in bold, and the table with its columns in line."""
