@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, progress_shown, writable_folder, write_file
+from labapp.cli.shared import NOTHING_MEASURED, progress_shown, writable_folder
 from labapp.errors import InputError
+from labapp.files import write_file
 
 if TYPE_CHECKING:
     from labapp.studies.adviser.bench_limits import BenchLimits

@@ -13,9 +13,9 @@ from labapp.cli.shared import (
     results_folder,
     writable_folder,
     write_figure,
-    write_file,
 )
 from labapp.errors import InputError
+from labapp.files import write_file
 from labapp.studies import SCHEMES
 from labapp.studies.analysis import (
     PARTS,

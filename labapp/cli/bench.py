@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, write_file
+from labapp.cli.shared import NOTHING_MEASURED
 from labapp.errors import InputError
+from labapp.files import write_file
 from labapp.text import csv_text
 
 if TYPE_CHECKING:

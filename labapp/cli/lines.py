@@ -17,9 +17,9 @@ from labapp.cli.shared import (
     RECORDING_HELP,
     progress_shown,
     writable_folder,
-    write_file,
 )
-from labapp.errors import InputError
+from labapp.errors import os_errors_as_input
+from labapp.files import write_file
 from labapp.text import csv_text
 
 if TYPE_CHECKING:
@@ -56,13 +56,11 @@ def lines(
     with open_source(source) as recording:
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
-        try:
+        with os_errors_as_input(folder, "results", "room on its disk"):
             if follow or bench.rig.pattern.count == 1:
                 done = _follow(recording, chosen, folder)
             else:
                 done = _measure(recording, chosen, folder, bench)
-        except OSError as error:
-            raise InputError(folder, "results", error.strerror, "room on its disk") from error
     typer.echo(f"Results are in {folder.absolute()}")
     if not done:
         raise typer.Exit(NOTHING_MEASURED)

@@ -30,7 +30,7 @@ from labapp.core.geometry.uncertainty import (
     RigUncertainty,
     covariance_of,
 )
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_atomically
 
 A_SETUP = "a setup file (TOML, UTF-8)"
@@ -130,12 +130,10 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
     """
     path = Path(path)
     text = updated_setup(read_text(path, A_SETUP) if path.exists() else "", path, values)
-    try:
+    with os_errors_as_input(path, "file", "a file that can be written"):
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(13, "write-protected")
         write_atomically(path, text.encode())
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that can be written") from error
 
 
 def updated_setup(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import Frame, FrameSource, GreyImage
 from labapp.media.formats.cine import CINE_MAGIC, CineSource
 from labapp.media.formats.images import IMAGE_SUFFIXES, ImageSequence, files_in, images_in
@@ -43,15 +43,12 @@ def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> Fra
     """
     quiet_opencv()
     path = Path(path)
-    try:
+    with os_errors_as_input(path, "source", "an image, a folder of images or a video"):
         if path.is_dir():
             return _open_folder(path, index)
         size = regular_size(path)
         with path.open("rb") as file:
             head = file.read(12)
-    except OSError as error:
-        expected = "an image, a folder of images or a video"
-        raise InputError(path, "source", error.strerror, expected) from error
     if size == 0:
         raise InputError(path, "size", "0 bytes", "an image or a video with something in it")
     return _by_content(path, head, index) or _by_name(path, index)

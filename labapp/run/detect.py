@@ -12,7 +12,7 @@ from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.values import CannotMeasure
-from labapp.errors import InputError
+from labapp.errors import os_errors_as_input
 from labapp.export.tables import PX_DIGITS, number
 from labapp.files import write_atomically
 from labapp.media import open_source
@@ -68,8 +68,6 @@ def write_detected(path: Path, dots: Dots, lattice: Lattice | None) -> None:
         ]
         for k in range(len(dots))
     ]
-    try:
+    with os_errors_as_input(path, "--out", "a file that can be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, csv_text([COLUMNS, *rows]).encode())
-    except OSError as error:
-        raise InputError(path, "--out", error.strerror, "a file that can be written") from error

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from labapp.config.scenario import Scenario
 from labapp.config.scenario_keys import RECORDINGS
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
@@ -58,7 +58,7 @@ def simulate(
     recording = scenario.recording
     if workers is None:
         workers = min(os.cpu_count() or 1, len(recording.pools))
-    try:
+    with os_errors_as_input(out, "--out", "a folder that can be written"):
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as beside:
             part = Path(beside) / out.name
@@ -68,9 +68,6 @@ def simulate(
             if out.exists():
                 shutil.rmtree(out)
             part.rename(out)
-    except OSError as error:
-        expected = "a folder that can be written"
-        raise InputError(out, "--out", error.strerror or error, expected) from error
 
 
 def _check_replaceable(out: Path) -> None:

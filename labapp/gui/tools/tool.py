@@ -12,7 +12,9 @@ from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtWidgets import QDialog, QHBoxLayout, QProgressBar, QPushButton, QVBoxLayout, QWidget
 
-from labapp.gui.dialogs import ask_folder, refused_as_input, write_file
+from labapp.errors import os_errors_as_input
+from labapp.files import write_file
+from labapp.gui.dialogs import ask_folder
 from labapp.gui.shell.messages import PROBLEM
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
@@ -204,7 +206,7 @@ class ToolWindow(QDialog):
         """Write what was found, as the command does; each file is whole."""
 
         def write() -> Path:
-            with refused_as_input(folder, "folder"):
+            with os_errors_as_input(folder, "folder", "one that can be written"):
                 folder.mkdir(parents=True, exist_ok=True)
             for name, content in self.files.items():
                 write_file(folder / name, content)

@@ -20,7 +20,7 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import Frame, FrameSource, check_index, format_frame_rate
 from labapp.media.formats.boxes import mp4_formats
 from labapp.media.formats.ffv1 import slices_whole
@@ -415,14 +415,11 @@ class VideoSource(FrameSource):
 def _fingerprint(path: Path) -> tuple[int, int]:
     """Size, bytes, and checksum of both ends of a file, to tell whether it is the same."""
     part = 1 << 16
-    try:
-        with path.open("rb") as file:
-            ends = file.read(part)
-            size = file.seek(0, 2)
-            file.seek(max(0, size - part))
-            ends += file.read(part)
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that may be read") from error
+    with os_errors_as_input(path, "file", "a file that may be read"), path.open("rb") as file:
+        ends = file.read(part)
+        size = file.seek(0, 2)
+        file.seek(max(0, size - part))
+        ends += file.read(part)
     return size, zlib.crc32(ends)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from av.error import FFmpegError
 from av.video.stream import VideoStream
 
-from labapp.errors import InputError
+from labapp.errors import os_errors_as_input
 from labapp.media.base import GreyImage
 
 Codec = Literal["ffv1", "raw"]
@@ -170,7 +170,5 @@ def _levels(bit_depth: int, codec: Codec) -> int:
 
 
 def _create(path: Path) -> ByteFile:
-    try:
+    with os_errors_as_input(path, "recording", "a file that can be made"):
         return path.open("xb", buffering=0)
-    except OSError as error:
-        raise InputError(path, "recording", error.strerror, "a file that can be made") from error

@@ -13,7 +13,8 @@ from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.imaging_plane import Calibration
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
-from labapp.gui.dialogs import ask_file, ask_save, write_file
+from labapp.files import write_file
+from labapp.gui.dialogs import ask_file, ask_save
 from labapp.gui.pages.laser.presenter import read_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
