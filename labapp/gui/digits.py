@@ -22,30 +22,19 @@ EXTRA_DECIMALS = 3
 
 @dataclass(frozen=True)
 class ResultRow:
-    """One line of a result table.
-
-    Parameters
-    ----------
-    name
-        The quantity.
-    value
-        A number, or words; None or NaN where there is none.
-    sigma
-        Its standard uncertainty; None where there is none.
-    unit
-        "mm", "°", "px/mm" …
-    decimals
-        How many to show where no σ says it.
-    note
-        More about it, as a tooltip.
-    """
+    """One line of a result table."""
 
     name: str
     value: float | str | None
+    """A number, or words; None or NaN where there is none."""
     sigma: float | None = None
+    """Its standard uncertainty; None where there is none."""
     unit: str = ""
+    """"mm", "°", "px/mm" …"""
     decimals: int = 3
+    """How many to show where no σ says it."""
     note: str = ""
+    """More about it, as a tooltip."""
 
     @property
     def texts(self) -> tuple[str, str, str, str]:

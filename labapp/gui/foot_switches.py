@@ -62,21 +62,14 @@ class InUse:
 
 @dataclass(frozen=True)
 class DevicesFound:
-    """What was found plugged in.
-
-    Parameters
-    ----------
-    usable
-        Names of the foot switches that are known and can be read.
-    closed
-        Devices that may not be read, those that are known first.
-    problem
-        Why nothing could be looked for; empty if it could.
-    """
+    """What was found plugged in."""
 
     usable: tuple[str, ...] = ()
+    """Names of the foot switches that are known and can be read."""
     closed: tuple[HidInfo, ...] = ()
+    """Devices that may not be read, those that are known first."""
     problem: str = ""
+    """Why nothing could be looked for; empty if it could."""
 
     @property
     def words(self) -> str:
@@ -98,17 +91,6 @@ class FootSwitches(QObject):
     Nothing runs while none is in use. Devices are read in threads of their own; what they tell is
     taken from a queue.
 
-    Signals
-    -------
-    changed
-        Something that is shown of them is otherwise.
-    kept
-        Others are in use, or their pedals do something else: as plain values, to be remembered.
-    pressed
-        The name of the menus' action that a pedal was pressed for.
-    notified
-        Something for the operator to read: a sentence, and whether it is a problem.
-
     Attributes
     ----------
     in_use
@@ -120,9 +102,13 @@ class FootSwitches(QObject):
     """
 
     changed = Signal()
+    """What is shown of them changed."""
     kept = Signal(object)
+    """The foot switches in use or their actions changed: as plain values, to be stored."""
     pressed = Signal(str)
+    """The name of the menus' action that a pedal was pressed for."""
     notified = Signal(str, bool)
+    """Something for the operator to read: a sentence, and whether it is a problem."""
 
     def __init__(self, tasks: Tasks, parent: QObject | None = None) -> None:
         super().__init__(parent)

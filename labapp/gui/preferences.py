@@ -28,28 +28,18 @@ LOCK_S = 2.0
 
 @dataclass(frozen=True)
 class Preferences:
-    """What is remembered.
-
-    Parameters
-    ----------
-    recent
-        Session files, the last opened first.
-    theme
-        One of `THEMES`.
-    geometry, layout
-        Of the window, as Qt tells them, base64; empty for the default.
-    last_folder
-        Where a file was chosen last; empty for the documents folder.
-    foot_switches
-        What their pedals do, each as `PedalMap.as_dict` has it.
-    """
+    """What is remembered."""
 
     recent: tuple[str, ...] = ()
+    """Session files, the last opened first."""
     theme: str = "system"
     geometry: str = ""
     layout: str = ""
+    """Geometry and state of the window as Qt gives them, base64; empty for the default."""
     last_folder: str = ""
+    """Where a file was chosen last; empty for the documents folder."""
     foot_switches: tuple[Mapping[str, Any], ...] = ()
+    """What their pedals do, each as `PedalMap.as_dict` has it."""
 
     def with_recent(self, path: Path) -> Preferences:
         """The same with a session as the last opened."""
@@ -84,17 +74,12 @@ class PreferencesStore(QObject):
     ----------
     current
         The preferences that hold now.
-
-    Signals
-    -------
-    changed
-        Something was remembered.
-    failed
-        It could not be written: why. It holds in this window all the same.
     """
 
     changed = Signal()
+    """A preference was stored."""
     failed = Signal(str)
+    """A preference could not be written, and why. It still applies to this window."""
 
     def __init__(self, preferences: Preferences, path: Path) -> None:
         super().__init__()

@@ -22,27 +22,17 @@ THUMBNAIL_PX = (128, 96)
 
 @dataclass(frozen=True)
 class Recent:
-    """A session opened before.
-
-    Parameters
-    ----------
-    path
-        Its file.
-    title
-        Of the experiment, or the file's name.
-    about
-        Date, frames, what is measured; or why it cannot be opened.
-    thumbnail
-        Its first frame, small; None where it cannot be read.
-    there
-        Whether it can be opened.
-    """
+    """A session opened before."""
 
     path: Path
     title: str
+    """Of the experiment, or the file's name."""
     about: str
+    """Date, frames, what is measured; or why it cannot be opened."""
     thumbnail: GreyImage | None = None
+    """Its first frame, small; None where it cannot be read."""
     there: bool = True
+    """Whether it can be opened."""
 
 
 def look_at(path: Path) -> Recent:

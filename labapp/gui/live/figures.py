@@ -42,23 +42,16 @@ NO_SETUP = "Sizes stand here, too, when the set-up is complete (steps 1 to 3)"
 
 @dataclass(frozen=True)
 class Figure:
-    """A size as it is shown.
-
-    Parameters
-    ----------
-    name, value, sigma
-        Texts; value and sigma in mm.
-    told
-        How it stands to its limits, in words after a sign; empty where it has none.
-    look
-        In red, or pale.
-    """
+    """A size as it is shown."""
 
     name: str
     value: str
     sigma: str
+    """Texts; value and sigma in mm."""
     told: str = ""
+    """How it stands to its limits, in words after a sign; empty where it has none."""
     look: Look = "plain"
+    """Red or pale."""
 
 
 def figures(

@@ -76,34 +76,21 @@ def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """What was found in a frame.
-
-    Parameters
-    ----------
-    dots_px
-        (u, v) of its dots, shape (n, 2); None where they come with the frames that are shown.
-    quality
-        Whether it is fit to be measured.
-    """
+    """What was found in a frame."""
 
     dots_px: FloatArray | None
+    """(u, v) of its dots, shape (n, 2); None where they come with the frames that are shown."""
     quality: Quality
+    """Whether it can be measured."""
 
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A frame to be shown.
-
-    Parameters
-    ----------
-    frame
-        As the camera gave it.
-    dots_px
-        (u, v) of its dots, shape (n, 2); None where it is not known how to find them quickly.
-    """
+    """A frame to be shown."""
 
     frame: CameraFrame
     dots_px: FloatArray | None
+    """(u, v) of its dots, shape (n, 2); None where it is not known how to find them quickly."""
 
 
 class Live:

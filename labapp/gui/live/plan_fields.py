@@ -22,15 +22,10 @@ SHARE = 0.5
 
 
 class PlanFields(QObject):
-    """Fields for a `Plan`.
-
-    Signals
-    -------
-    edited
-        Another plan was entered.
-    """
+    """Fields for a `Plan`."""
 
     edited = Signal()
+    """Another plan was entered."""
 
     def __init__(self, form: FieldForm) -> None:
         super().__init__(form)

@@ -60,13 +60,6 @@ RING, RING_PX = "#2fd39b", 15
 class LiveView(QObject):
     """A camera that is watched in the page's picture and recorded from.
 
-    Signals
-    -------
-    changed
-        A camera was started or stopped.
-    recorded
-        A recording was written to its end: a `Take`.
-
     Attributes
     ----------
     group
@@ -82,7 +75,9 @@ class LiveView(QObject):
     """
 
     changed = Signal()
+    """A camera was started or stopped."""
     recorded = Signal(object)
+    """A recording was written to its end: a `Take`."""
 
     def __init__(self, workspace: Workspace, picture: PictureView, exposure: ExposureBars) -> None:
         super().__init__(picture)

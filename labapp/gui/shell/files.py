@@ -23,15 +23,10 @@ if TYPE_CHECKING:
 
 
 class Files(QObject):
-    """What the window opens and makes.
-
-    Signals
-    -------
-    recording_requested
-        The step Recording is to be shown, and to take this file or folder, unless it is None.
-    """
+    """What the window opens and makes."""
 
     recording_requested = Signal(object)
+    """The step Recording is to be shown, and to take this file or folder, unless it is None."""
 
     def __init__(
         self,

@@ -84,14 +84,10 @@ class StatusLine(QWidget):
     """The last message, and how far the work under way is.
 
     A problem stays until it was read, or is over, whatever is said after it.
-
-    Signals
-    -------
-    read
-        The operator has read the problems, and wants to see them all.
     """
 
     read = Signal()
+    """The operator has read the problems, and wants to see them all."""
 
     def __init__(self, tasks: Tasks) -> None:
         super().__init__()

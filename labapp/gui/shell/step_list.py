@@ -80,15 +80,10 @@ def _drawn(mark: Mark, colour: QColor, ground: QColor) -> QPixmap:
 
 
 class StepList(FollowsTheme, QListWidget):
-    """The steps that have a page.
-
-    Signals
-    -------
-    chosen
-        The operator chose a step: its key.
-    """
+    """The steps that have a page."""
 
     chosen = Signal(str)
+    """The operator chose a step: its key."""
 
     def __init__(self, steps: Sequence[Step]) -> None:
         super().__init__()

@@ -14,21 +14,14 @@ from labapp.simulation.recording import RecordedFrame
 
 @dataclass(frozen=True)
 class ScenarioPreview:
-    """A scenario with its first frame.
-
-    Parameters
-    ----------
-    scenario
-        As it was read, with one frame.
-    frames
-        How many it asks for itself.
-    frame
-        The first one, with its truth.
-    """
+    """A scenario with its first frame."""
 
     scenario: Scenario
+    """As it was read, with one frame."""
     frames: int
+    """Number of frames that it asks for."""
     frame: RecordedFrame
+    """The first one, with its truth."""
 
     @property
     def dots_px(self) -> FloatArray:

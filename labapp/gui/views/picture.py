@@ -79,11 +79,6 @@ class Tool:
 class PictureView(Drawn):
     """A grey picture; overlays are pyqtgraph items that `add` puts over it, in px.
 
-    Signals
-    -------
-    pointed
-        Where the pointer is and the level there: u, v, level (None outside the picture).
-
     Attributes
     ----------
     tool
@@ -93,6 +88,7 @@ class PictureView(Drawn):
     """
 
     pointed = Signal(float, float, object)
+    """Where the pointer is and the level there: u, v, level (None outside the picture)."""
 
     def __init__(self, name: str = "Picture") -> None:
         super().__init__(name, KEYS)

@@ -53,15 +53,10 @@ Role = QPalette.ColorRole
 
 
 class PlotStack(Plotted):
-    """Plots under each other.
-
-    Signals
-    -------
-    chosen
-        The operator chose a point, with the pointer or the keys: its key.
-    """
+    """Plots under each other."""
 
     chosen = Signal(int)
+    """The operator chose a point, with the pointer or the keys: its key."""
 
     def __init__(self, name: str = "Plots") -> None:
         super().__init__(name, KEYS)

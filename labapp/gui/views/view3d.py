@@ -88,14 +88,10 @@ class View3d(Drawn):
 
     The mouse turns it, the wheel zooms, Shift or the middle button moves it. Arrow keys turn, + and
     − zoom, 1 to 4 look from the top, the side, the front and obliquely.
-
-    Signals
-    -------
-    camera_changed
-        The operator looks from elsewhere: its `Camera`.
     """
 
     camera_changed = Signal(object)
+    """The direction of view changed: its `Camera`."""
 
     def __init__(self, name: str = "3-D view") -> None:
         super().__init__(name, KEYS_TOLD)

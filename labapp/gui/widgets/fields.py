@@ -39,11 +39,6 @@ STEP_PAUSE_MS = 300
 class Field(QWidget):
     """An editor with its label, its unit and room for a problem in words.
 
-    Signals
-    -------
-    edited
-        The operator has entered another value: the value, None where it was emptied.
-
     Attributes
     ----------
     label
@@ -53,6 +48,7 @@ class Field(QWidget):
     """
 
     edited = Signal(object)
+    """The operator has entered another value: the value, None where it was emptied."""
 
     def __init__(self, label: str, editor: QWidget, tooltip: str, unit: str = "") -> None:
         super().__init__()

@@ -29,18 +29,14 @@ class Timeline(FollowsTheme, QWidget):
     """The scrubber with its buttons, the frame's number and time.
 
     It knows no session: numbers, times and kinds of frames are given to it.
-
-    Signals
-    -------
-    moved
-        The operator went to a frame: its number.
-    jumped
-        The operator asked for the next frame in doubt or corrected: ``doubtful`` or
-        ``corrected``, and whether forward.
     """
 
     moved = Signal(int)
+    """The operator went to a frame: its number."""
     jumped = Signal(str, bool)
+    """The operator asked for the next frame in doubt or corrected: ``doubtful`` or ``corrected``,
+    and whether forward.
+    """
 
     def __init__(self, ticks: Sequence[Tick]) -> None:
         super().__init__()

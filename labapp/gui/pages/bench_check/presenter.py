@@ -43,23 +43,16 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """A picture in the list.
-
-    Parameters
-    ----------
-    name
-        Of its file.
-    image
-        Grey levels, shape (rows, columns).
-    kind, height_mm, diameter_mm
-        The mirror in it, see `MirrorPicture`.
-    """
+    """A picture in the list."""
 
     name: str
+    """Of its file."""
     image: GreyImage
+    """Grey levels, shape (rows, columns)."""
     kind: str = "plate"
     height_mm: float = 0.0
     diameter_mm: float | None = None
+    """The mirror in it, see `MirrorPicture`."""
 
     @property
     def mirror(self) -> Mirror:
@@ -105,22 +98,14 @@ def kept(session: Session) -> tuple[Chosen, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A check that was made here.
-
-    Parameters
-    ----------
-    chosen, setup_text
-        The pictures and the set-up that it was made with.
-    check
-        Its result.
-    record
-        The same, as a session keeps it; its pictures are not kept yet.
-    """
+    """A check that was made here."""
 
     chosen: tuple[Chosen, ...]
     setup_text: str
+    """The pictures and the set-up that it was made with."""
     check: BenchCheck
     record: BenchCheckRecord
+    """The check as a session stores it; its pictures are not stored yet."""
 
     @property
     def words(self) -> str:
@@ -232,17 +217,10 @@ def kept_words(session: Session) -> str:
 
 @dataclass(frozen=True)
 class QuantityRow:
-    """A line of the table of quantities.
-
-    Parameters
-    ----------
-    texts
-        Name, value and ± before, value and ± after, unit, and whether the pictures determine it.
-    determined
-        The same.
-    """
+    """A line of the table of quantities."""
 
     texts: tuple[str, str, str, str, str, str, str]
+    """Name, value and ± before, value and ± after, unit, and whether the pictures determine it."""
     determined: bool
 
 
@@ -288,25 +266,18 @@ def mirror_rows(record: BenchCheckRecord) -> tuple[ResultRow, ...]:
 
 @dataclass(frozen=True)
 class Overlay:
-    """What lies over a picture.
-
-    Parameters
-    ----------
-    dot_px
-        The dots with a ray, shape (n, 2).
-    arrows_px
-        From each dot towards where the adjusted bench has it, enlarged, shape (2n, 2): beginnings
-        and ends in turn.
-    numbers
-        Words at places: (text, u, v, whether it is a row's); each at its first dot.
-    words
-        What is drawn, and how much the arrows are enlarged.
-    """
+    """What is drawn over a picture."""
 
     dot_px: FloatArray
+    """The dots with a ray, shape (n, 2)."""
     arrows_px: FloatArray
+    """From each dot towards where the adjusted bench has it, enlarged, shape (2n, 2): beginnings
+    and ends in turn.
+    """
     numbers: tuple[tuple[str, float, float, bool], ...]
+    """Words at places: (text, u, v, whether it is a row's); each at its first dot."""
     words: str
+    """What is drawn, and how much the arrows are enlarged."""
 
 
 def overlay(picture: MirrorPicture, height_px: int) -> Overlay:

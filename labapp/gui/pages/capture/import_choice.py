@@ -28,15 +28,10 @@ NEXT_TIP = (
 
 
 class ImportChoice(Group):
-    """Which frames to import; seen while a recording is looked at.
-
-    Signals
-    -------
-    edited
-        Something else was chosen.
-    """
+    """Which frames to import; seen while a recording is looked at."""
 
     edited = Signal()
+    """Something else was chosen."""
 
     def __init__(
         self,

@@ -21,24 +21,15 @@ from labapp.text import format_bytes
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame to look at.
-
-    Parameters
-    ----------
-    title
-        Which it is, in words.
-    image
-        Grey levels, shape (rows, columns); None where it cannot be read.
-    exposure
-        How it is exposed; None where it cannot be read, or was not judged yet.
-    words
-        Why it cannot be read; empty if it can.
-    """
+    """A frame to look at."""
 
     title: str
     image: GreyImage | None
+    """Grey levels, shape (rows, columns); None where it cannot be read."""
     exposure: Exposure | None
+    """How it is exposed; None where it cannot be read, or was not judged yet."""
     words: str = ""
+    """Why it cannot be read; empty if it can."""
 
 
 class Preview:
@@ -102,23 +93,16 @@ def _judged(
 
 @dataclass(frozen=True)
 class Choice:
-    """Which frames of a recording to import, and how.
-
-    Parameters
-    ----------
-    first, last, every
-        Frames ``first``, ``first + every`` … up to ``last``.
-    rate_hz
-        The rate it was filmed at; None: the recording's own.
-    embed
-        Whether the session keeps the frames itself.
-    """
+    """Which frames of a recording to import, and how."""
 
     first: int
     last: int
     every: int = 1
+    """Frames ``first``, ``first + every`` … up to ``last``."""
     rate_hz: float | None = None
+    """The rate it was filmed at; None: the recording's own."""
     embed: bool = False
+    """Whether the session keeps the frames itself."""
 
     @property
     def frames(self) -> str:

@@ -21,11 +21,6 @@ class Looking(QObject):
 
     One task at a time: when it ends, what is wanted by then comes next.
 
-    Signals
-    -------
-    ready
-        There is something new to show.
-
     Attributes
     ----------
     frame
@@ -39,6 +34,7 @@ class Looking(QObject):
     """
 
     ready = Signal()
+    """There is something new to show."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()

@@ -53,19 +53,10 @@ SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (800, 600))
 
 @dataclass(frozen=True)
 class Item:
-    """Something that can be ticked.
-
-    Parameters
-    ----------
-    key
-        ``tables:dots``, ``surfaces:stl``, ``solid``, ``together:hdf5``, ``report``.
-    name
-        Its words.
-    tip
-        What it is.
-    """
+    """Something that can be ticked."""
 
     key: str
+    """``tables:dots``, ``surfaces:stl``, ``solid``, ``together:hdf5``, ``report``."""
     name: str
     tip: str
 
@@ -131,34 +122,24 @@ USUAL = frozenset(
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What the operator wants to take along.
-
-    Parameters
-    ----------
-    ticked
-        Keys of the `Item` that are ticked.
-    which
-        ``all``, ``view`` (the frame in view) or ``part``.
-    first, last, every
-        The part: frames ``first``, ``first + every`` … up to ``last``.
-    scheme
-        Whose results; empty: that of the settings.
-    spacing_mm
-        Distance of the surfaces' nodes.
-    view, size_px, film_rate_hz
-        As in `ExportChoice`.
-    """
+    """What the operator wants to export."""
 
     ticked: frozenset[str] = USUAL
+    """Keys of the `Item` that are ticked."""
     which: str = "all"
+    """``all``, ``view`` (the frame in view) or ``part``."""
     first: int = 0
     last: int = 0
     every: int = 1
+    """The part: frames ``first``, ``first + every`` … up to ``last``."""
     scheme: str = ""
+    """Scheme whose results are written; empty: that of the settings."""
     spacing_mm: float = SPACING_MM
+    """Distance of the surfaces' nodes."""
     view: Direction = "free"
     size_px: tuple[int, int] = PICTURE_PX
     film_rate_hz: float | None = None
+    """As in `ExportChoice`."""
 
     def some(self, kind: str) -> frozenset[str]:
         """What is ticked of a kind."""
@@ -191,30 +172,20 @@ class ExportRequest:
 
 @dataclass(frozen=True)
 class ExportPlan:
-    """What would be written.
-
-    Parameters
-    ----------
-    scheme
-        Whose results.
-    frames
-        Numbers of the frames that are measured and chosen, shape (n,).
-    again
-        Frames to be measured for the choice to be whole: stale or unmeasured ones, shape (k,).
-    why_not
-        Why nothing can be written; empty if it can.
-    notes
-        What to know otherwise, a sentence each.
-    files
-        What would be in the folder, a line each.
-    """
+    """What would be written."""
 
     scheme: str
+    """Whose results."""
     frames: IntArray
+    """Numbers of the frames that are measured and chosen, shape (n,)."""
     again: IntArray
+    """Chosen frames that are stale or unmeasured, shape (k,)."""
     why_not: str
+    """Why nothing can be written; empty if it can."""
     notes: tuple[str, ...]
+    """What to know otherwise, a sentence each."""
     files: tuple[str, ...]
+    """What would be in the folder, a line each."""
 
 
 def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
@@ -350,21 +321,12 @@ def folder_within(folder: Path, session: Session) -> Path:
 
 @dataclass(frozen=True)
 class Written:
-    """What came of an export.
-
-    Parameters
-    ----------
-    folder
-        Where it is.
-    files
-        What is in it.
-    problems
-        What in it differs from its manifest; empty if nothing does.
-    """
+    """What came of an export."""
 
     folder: Path
     files: tuple[ExportedFile, ...]
     problems: tuple[str, ...]
+    """What in it differs from its manifest; empty if nothing does."""
 
     @property
     def words(self) -> str:

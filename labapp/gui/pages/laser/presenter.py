@@ -40,43 +40,28 @@ SCALE = ("scale 1", "scale 2")
 
 @dataclass(frozen=True)
 class Readings:
-    """Lengths as they were typed.
-
-    Parameters
-    ----------
-    lengths_mm
-        Readings of l₁, l₂, l₃, mm; any number of each.
-    fan_angle_deg
-        Of the cross-hair lens.
-    settings
-        How well the fan angle and a reading are known.
-    wrong
-        What was typed and is no length, a sentence each.
-    """
+    """Lengths as they were typed."""
 
     lengths_mm: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] = ((), (), ())
+    """Readings of l₁, l₂, l₃, mm; any number of each."""
     fan_angle_deg: float = FAN_ANGLE_DEG
+    """Of the cross-hair lens."""
     settings: LaserCalibrationSettings = field(default_factory=LaserCalibrationSettings)
+    """How well the fan angle and a reading are known."""
     wrong: tuple[str, ...] = ()
+    """What was typed and is no length, a sentence each."""
 
 
 @dataclass(frozen=True)
 class LaserResult:
-    """What follows from readings.
-
-    Parameters
-    ----------
-    found
-        The laser; None where none follows.
-    why_not
-        Then why, in words.
-    rows
-        Means of the lengths, and the laser.
-    """
+    """What follows from readings."""
 
     found: LaserCalibration | None
+    """The laser; None where none follows."""
     why_not: str
+    """Why none follows, in words."""
     rows: tuple[ResultRow, ...]
+    """Means of the lengths, and the laser."""
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -100,21 +100,14 @@ def places(found: Calibration) -> tuple[Place, Place, Place]:
 
 @dataclass(frozen=True)
 class PlaneResult:
-    """What follows from the points and the marks.
-
-    Parameters
-    ----------
-    rows
-        Scales and angle with ±, and the residuals.
-    why_not
-        Why they cannot be used; empty if they can.
-    warnings
-        What the operator should look at.
-    """
+    """What follows from the points and the marks."""
 
     rows: tuple[ResultRow, ...] = ()
+    """Scales and angle with ±, and the residuals."""
     why_not: str = ""
+    """Why they cannot be used; empty if they can."""
     warnings: tuple[str, ...] = ()
+    """What the operator should look at."""
 
 
 def result(found: Calibration | None) -> PlaneResult:
@@ -238,22 +231,15 @@ def _capital(found: PlaneCalibration) -> list[str]:
 
 @dataclass(frozen=True)
 class ResidualMap:
-    """Where the model has the marks, against where they are, enlarged.
-
-    Parameters
-    ----------
-    begin_px, end_px
-        Arrows from the marks towards where the model has them, shape (n, 2), px.
-    share
-        Length of each over the longest, shape (n,), 0 … 1.
-    words
-        How much they are enlarged, and the longest.
-    """
+    """Residuals of the marks, enlarged."""
 
     begin_px: FloatArray
     end_px: FloatArray
+    """Arrows from the marks towards their modelled places, shape (n, 2), px."""
     share: FloatArray
+    """Length of each over the longest, shape (n,), 0 … 1."""
     words: str
+    """How much they are enlarged, and the longest."""
 
 
 def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | None:

@@ -100,15 +100,10 @@ class DotsChart(Chart):
 
 
 class PlanChart(Chart):
-    """The pool from above; both ends of the section line can be dragged, or the whole line.
-
-    Signals
-    -------
-    dragged
-        The line runs elsewhere now: its angle, degrees, and offset, mm (see `profile`).
-    """
+    """The pool from above; both ends of the section line can be dragged, or the whole line."""
 
     dragged = Signal(float, float)
+    """The line was moved: its angle, degrees, and offset, mm (see `profile`)."""
 
     def __init__(self) -> None:
         super().__init__("Section line", "X (mm)", "Y (mm)", equal=True)

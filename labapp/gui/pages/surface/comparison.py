@@ -34,27 +34,18 @@ def other_scheme(scheme: str) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A frame by two schemes.
-
-    Parameters
-    ----------
-    scenes
-        Of the first and the second; None where that finds no surface.
-    words
-        Why not; empty where it does.
-    difference
-        The first's surface coloured by how it differs; None where they do not overlap.
-    rows
-        Figures of both and their difference.
-    told
-        All of it in a sentence.
-    """
+    """A frame by two schemes."""
 
     scenes: tuple[Scene | None, Scene | None]
+    """Result of the first and the second; None where it has no surface."""
     words: tuple[str, str]
+    """Why it has none; empty where it has."""
     difference: Scene | None
+    """Surface of the first, coloured by the difference; None where they do not overlap."""
     rows: tuple[Row, ...]
+    """Figures of both and their difference."""
     told: str
+    """The comparison in a sentence."""
 
 
 def compared(

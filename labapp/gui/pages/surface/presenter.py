@@ -71,21 +71,7 @@ def with_scheme(settings: Settings, name: str) -> Settings:
 
 @dataclass(frozen=True)
 class Options:
-    """What the 3-D view shows, as the operator ticked it.
-
-    Parameters
-    ----------
-    colour
-        By ``height``, or by its ``sigma``.
-    points, boundary, rays, electrode
-        Whether they are drawn.
-    same_colours
-        Whether all frames share one scale of colours.
-    exaggeration
-        Heights are drawn so many times as high.
-    section
-        Angle, degrees, and offset, mm, of the section line; None without one.
-    """
+    """What the 3-D view shows, as the operator ticked it."""
 
     colour: Literal["height", "sigma"] = "height"
     points: bool = True
@@ -93,40 +79,31 @@ class Options:
     rays: bool = False
     electrode: bool = True
     same_colours: bool = False
+    """Whether all frames share one scale of colours."""
     exaggeration: float = 3.0
+    """Heights are drawn so many times as high."""
     section: tuple[float, float] | None = (90.0, 0.0)
+    """Angle, degrees, and offset, mm, of the section line; None without one."""
 
 
 @dataclass(frozen=True)
 class SurfaceState:
-    """What the page shows of one frame.
-
-    Parameters
-    ----------
-    result
-        What the session holds of it; None if it was not measured by the scheme.
-    state
-        ``measured``, ``stale``, ``failed`` or ``unmeasured``.
-    words
-        The same for the operator; why, where there is no surface or it no longer stands.
-    provenance
-        Frame, scheme, version, time, and whether dots were corrected by hand.
-    sizes, errors
-        Lines of the tables; empty without a surface.
-    trials
-        The correspondences that were tried, and their errors.
-    verdict
-        How clearly one of them was chosen.
-    """
+    """What the page shows of one frame."""
 
     result: Result | None
+    """Its stored result; None if it was not measured by the scheme."""
     state: Literal["measured", "stale", "failed", "unmeasured"]
     words: str
+    """The result in words; where there is no surface or it is stale, the reason."""
     provenance: str = ""
+    """Frame, scheme, version, time, and whether dots were corrected by hand."""
     sizes: tuple[ResultRow, ...] = ()
     errors: tuple[ResultRow, ...] = ()
+    """Lines of the tables; empty without a surface."""
     trials: tuple[ResultRow, ...] = ()
+    """The correspondences that were tried, and their errors."""
     verdict: str = ""
+    """How clearly one of them was chosen."""
 
     @property
     def reconstruction(self) -> Reconstruction | None:

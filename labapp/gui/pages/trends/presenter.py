@@ -33,57 +33,38 @@ SIGNALS = {"current": ("Current", "A"), "voltage": ("Voltage", "V")}
 
 @dataclass(frozen=True)
 class TrendOptions:
-    """What the operator wants to see.
-
-    Parameters
-    ----------
-    shown
-        Measures, and ``current``, ``voltage``.
-    without_doubtful
-        Whether frames in doubt are left out of statistics and spectrum.
-    spectrum_of
-        A measure; empty for no spectrum.
-    """
+    """What the operator wants to see."""
 
     shown: tuple[str, ...] = (*FIRST_SHOWN, *SIGNALS)
+    """Measures, and ``current``, ``voltage``."""
     without_doubtful: bool = False
+    """Whether frames in doubt are left out of statistics and spectrum."""
     spectrum_of: str = ""
+    """A measure; empty for no spectrum."""
 
 
 @dataclass(frozen=True)
 class TrendsState:
-    """What the page shows.
-
-    Parameters
-    ----------
-    curves, axis
-        Of the course over time; the axis holds all frames.
-    places
-        Where every frame is on the axis, by its number.
-    rows
-        Mean ± standard deviation, range, and ± of the mean where it has one: rows of a measure.
-    words
-        How many frames count, and why others do not.
-    setup_words
-        How far the set-up can be relied on; empty where it is not complete.
-    spectrum, spectrum_axis
-        Of the measure asked for; no curve where there is none.
-    spectrum_words
-        The strongest oscillation, or why there is no spectrum.
-    signals_words
-        Of current and voltage.
-    """
+    """What the page shows."""
 
     curves: tuple[Curve, ...]
     axis: Axis
+    """Of the course over time; the axis holds all frames."""
     places: dict[int, float]
+    """Where every frame is on the axis, by its number."""
     rows: tuple[ResultRow, ...]
+    """Mean ± standard deviation, range, and ± of the mean where it has one: rows of a measure."""
     words: str
+    """How many frames count, and why others do not."""
     setup_words: str
+    """How far the set-up can be relied on; empty where it is not complete."""
     spectrum: tuple[Curve, ...]
     spectrum_axis: Axis
+    """Of the measure asked for; no curve where there is none."""
     spectrum_words: str
+    """The strongest oscillation, or why there is no spectrum."""
     signals_words: str
+    """Of current and voltage."""
 
 
 def show(session: Session, options: TrendOptions, seen: Overview | None = None) -> TrendsState:
