@@ -19,23 +19,13 @@ Kind = Literal["note", "warning", "loss"]
 
 @dataclass(frozen=True)
 class Event:
-    """An event.
-
-    Parameters
-    ----------
-    source
-        A camera's id, a recording's file, a pedal's name.
-    kind
-        Severity.
-    words
-        One sentence for the operator.
-    at
-        When.
-    """
+    """An event."""
 
     source: str
+    """A camera's id, a recording's file, a pedal's name."""
     kind: Kind
     words: str
+    """One sentence for the operator."""
     at: datetime = field(default_factory=lambda: datetime.now().astimezone())
 
     def __str__(self) -> str:

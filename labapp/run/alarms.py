@@ -26,31 +26,21 @@ NOT_MEASURED, SILENT = "not-measured", "silent"
 
 @dataclass(frozen=True)
 class Alarm:
-    """Something that the operator must see.
-
-    Parameters
-    ----------
-    code
-        ``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``.
-    words
-        What is wrong, a sentence without its full stop.
-    frame, time_s
-        The camera's number of the frame that raised it, and its time by the camera's clock, s.
-    holds
-        Whether it is so still.
-    acknowledged
-        Whether the operator has acknowledged it.
-    at
-        When it was raised.
-    """
+    """Something that the operator must see."""
 
     code: str
+    """``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``."""
     words: str
+    """What is wrong, a sentence without its full stop."""
     frame: int
     time_s: float
+    """The camera's number of the frame that raised it, and its time by the camera's clock, s."""
     holds: bool = True
+    """Whether its condition still holds."""
     acknowledged: bool = False
+    """Whether the operator has acknowledged it."""
     at: datetime = field(default_factory=lambda: datetime.now().astimezone())
+    """When it was raised."""
 
     @property
     def description(self) -> str:

@@ -31,25 +31,18 @@ class LiveMeasuringEnded(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveResult(FrameResult):
-    """What a live frame gave: status, reason and measures, without dots, rays and surface.
-
-    Parameters
-    ----------
-    time_s
-        By the camera's clock, s.
-    arrived_s
-        `time.monotonic` when it came, s: the sizes are as old.
-    quality
-        How fit the frame is to be measured; of a followed one, that of a frame at most `JUDGED_S`
-        before.
-    scene
-        Its surface to be drawn, if wanted; None where it could not be measured.
-    """
+    """What a live frame gave: status, reason and measures, without dots, rays and surface."""
 
     time_s: float
+    """By the camera's clock, s."""
     arrived_s: float
+    """`time.monotonic` when it came, s: the sizes are as old."""
     quality: Quality
+    """How fit the frame is to be measured; of a followed one, that of a frame at most `JUDGED_S`
+    before.
+    """
     scene: Scene | None = None
+    """Its surface to be drawn, if wanted; None where it could not be measured."""
 
 
 class LiveMeasuring:

@@ -27,13 +27,7 @@ CUT_MM, TICK_MM = 0.1, 1.6
 
 @dataclass(frozen=True)
 class PrintedBoard:
-    """A board on white, IPCS about its O′.
-
-    Parameters
-    ----------
-    board
-        The board.
-    """
+    """A board on white, IPCS about its O′."""
 
     board: Board
 

@@ -19,21 +19,16 @@ class Lens:
     With x, y from the middle of the picture over the focal length and r² = x² + y²:
     ``x′ = x·(1 + k₁r² + k₂r⁴ + k₃r⁶) + 2p₁xy + p₂(r² + 2x²)``, and
     ``y′ = y·(1 + k₁r² + k₂r⁴ + k₃r⁶) + p₁(r² + 2y²) + 2p₂xy``.
-
-    Parameters
-    ----------
-    focal_px
-        Focal length over the size of a pixel.
-    k1, k2, p1, p2, k3
-        Coefficients; k₁ < 0 makes a barrel.
     """
 
     focal_px: float
+    """Focal length over the size of a pixel."""
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    """Coefficients; k₁ < 0 makes a barrel."""
 
     def _radial(self, r2: FloatArray) -> FloatArray:
         return np.asarray(1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3)))
@@ -174,25 +169,16 @@ class CameraView:
 
 @dataclass(frozen=True)
 class PosedView(ReadOnlyArrays):
-    """A pinhole camera, with a lens, that sees the imaging plane from anywhere.
-
-    Parameters
-    ----------
-    matrix
-        Shape (3, 3): (X′, Z′, 1) in mm to homogeneous (u, v, 1) in px of the straight picture.
-    width_px, height_px
-        Size of the picture.
-    lens
-        What bends the picture. None: nothing.
-    axis_px
-        (u, v) of the lens's axis. None: the middle of the picture.
-    """
+    """A pinhole camera, with a lens, that sees the imaging plane from anywhere."""
 
     matrix: FloatArray
+    """Shape (3, 3): (X′, Z′, 1) in mm to homogeneous (u, v, 1) in px of the straight picture."""
     width_px: int = 480
     height_px: int = 640
     lens: Lens | None = None
+    """What bends the picture. None: nothing."""
     axis_px: tuple[float, float] | None = None
+    """(u, v) of the lens's axis. None: the middle of the picture."""
 
     @classmethod
     def at(

@@ -102,28 +102,20 @@ def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str)
 
 @dataclass(frozen=True)
 class ErrorSurvey(ReadOnlyArrays):
-    """Errors of the schemes on caps, with the laser at one or more places.
-
-    Parameters
-    ----------
-    kind
-        ``CE``, ``LE`` or ``ME``.
-    caps
-        The known surfaces, n of them.
-    schemes
-        The schemes, s of them.
-    errors
-        `ERRORS` of each cap by each scheme, shape (n, s, 4), as fractions and mm: the least over
-        the laser's places, each on its own; NaN where no place gives a surface.
-    lost
-        How often a scheme found no surface, shape (s,).
-    """
+    """Errors of the schemes on caps, with the laser at one or more places."""
 
     kind: str
+    """``CE``, ``LE`` or ``ME``."""
     caps: tuple[Pool, ...]
+    """The known surfaces, n of them."""
     schemes: tuple[str, ...]
+    """The schemes, s of them."""
     errors: FloatArray
+    """`ERRORS` of each cap by each scheme, shape (n, s, 4), as fractions and mm: the least over the
+    laser's places, each on its own; NaN where no place gives a surface.
+    """
     lost: FloatArray
+    """How often a scheme found no surface, shape (s,)."""
 
     def of(self, scheme: str, error: str, surface: str = "all") -> FloatArray:
         """One of `ERRORS` of the caps: ``convex``, ``concave`` or ``all``."""

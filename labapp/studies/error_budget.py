@@ -18,26 +18,17 @@ from labapp.studies.parameter_deviation import move
 
 @dataclass(frozen=True)
 class Contribution(ReadOnlyArrays):
-    """What one quantity's ± does to the sizes.
-
-    Parameters
-    ----------
-    name
-        The quantity.
-    sigma, unit
-        Its standard uncertainty.
-    assumed
-        Whether that is assumed, as nobody told it.
-    change
-        What each of `SIZES` changes by with the quantity, shape (6,); NaN where there is then no
-        surface.
-    """
+    """What one quantity's ± does to the sizes."""
 
     name: str
     sigma: float
     unit: str
     assumed: bool
+    """Whether it is assumed, because none was entered."""
     change: FloatArray
+    """What each of `SIZES` changes by with the quantity, shape (6,); NaN where there is then no
+    surface.
+    """
 
 
 def setup_budget(

@@ -70,28 +70,19 @@ TACK_TEXT = {"irs": (0.1777, 0.014903, 0.220807), "ers": (0.0912, 0.014903, 0.18
 
 @dataclass(frozen=True)
 class FrameErrors(ReadOnlyArrays):
-    """What one rendered frame gave, by each scheme; s of them.
-
-    Parameters
-    ----------
-    status
-        Of the frame.
-    errors
-        Relative errors of height (or depth) and diameter, signed, and ARE in mm, shape (s, 3);
-        NaN without a surface.
-    exact
-        The same of exact reflections, shape (s, 3).
-    off_px
-        Distance of each matched dot to where it truly is, shape (n,).
-    missed
-        Dots that show and were given no ray.
-    """
+    """What one rendered frame gave, by each scheme; s of them."""
 
     status: str
     errors: FloatArray
+    """Relative errors of height (or depth) and diameter, signed, and ARE in mm, shape (s, 3); NaN
+    without a surface.
+    """
     exact: FloatArray
+    """The same of exact reflections, shape (s, 3)."""
     off_px: FloatArray
+    """Distance of each matched dot to where it truly is, shape (n,)."""
     missed: int
+    """Dots that show and were given no ray."""
 
     @property
     def wrong(self) -> int:

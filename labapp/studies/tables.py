@@ -12,24 +12,16 @@ Cell = str | int | float | None
 
 @dataclass(frozen=True)
 class Table:
-    """A table that a command prints and writes.
-
-    Parameters
-    ----------
-    name
-        Name of its file, without the ending.
-    caption
-        One line that says what it shows, and which table or figure of the text it stands beside.
-    columns
-        Names of the columns, units in them.
-    rows
-        Cells; None or NaN where a value is unknown.
-    """
+    """A table that a command prints and writes."""
 
     name: str
+    """Name of its file, without the ending."""
     caption: str
+    """One line that says what it shows, and which table or figure of the text it stands beside."""
     columns: tuple[str, ...]
+    """Names of the columns, units in them."""
     rows: tuple[tuple[Cell, ...], ...]
+    """Cells; None or NaN where a value is unknown."""
 
     def csv(self) -> str:
         """CSV with a header row; an unknown value is an empty cell."""

@@ -40,21 +40,14 @@ class BrokenFrame(CameraError):
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A camera that was found.
-
-    Parameters
-    ----------
-    id
-        What it is opened by: "uvc:0", "aravis:Vendor-Serial", "simulated:cap.toml".
-    name
-        Maker and model, as it says itself.
-    kind
-        How it is connected: "USB video", "GigE Vision", "USB3 Vision", "simulated".
-    """
+    """A camera that was found."""
 
     id: str
+    """What it is opened by: "uvc:0", "aravis:Vendor-Serial", "simulated:cap.toml"."""
     name: str
+    """Maker and model, as it reports them."""
     kind: str
+    """How it is connected: "USB video", "GigE Vision", "USB3 Vision", "simulated"."""
 
 
 @dataclass(frozen=True)
@@ -67,51 +60,30 @@ class Range:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What can be set on a camera; None for what cannot.
-
-    Parameters
-    ----------
-    exposure_us, gain_db, rate_hz
-        From where to where.
-    sensor
-        (width, height) of the whole picture, px.
-    least_region
-        (width, height) of the smallest region, px; None where no region can be set.
-    triggers
-        The triggers it knows, "free" among them.
-    gain_unit
-        Of the gain, for people; empty where it is in the driver's own steps.
-    """
+    """What can be set on a camera; None for what cannot."""
 
     exposure_us: Range | None = None
     gain_db: Range | None = None
     rate_hz: Range | None = None
+    """Lowest and highest value."""
     sensor: tuple[int, int]
+    """(width, height) of the whole picture, px."""
     least_region: tuple[int, int] | None = None
+    """(width, height) of the smallest region, px; None where no region can be set."""
     triggers: tuple[Trigger, ...] = ("free",)
+    """The triggers it knows, "free" among them."""
     gain_unit: str = "dB"
+    """Of the gain, for people; empty where it is in the driver's own steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """What a camera is set to, or is to be; None: unknown, or left as it is.
-
-    Parameters
-    ----------
-    exposure_us
-        How long light is gathered for a frame, µs.
-    gain_db
-        Amplification, dB (of USB video the driver's own number).
-    rate_hz
-        Frames a second.
-    region
-        See `Region`.
-    trigger
-        See `Trigger`.
-    """
+    """What a camera is set to, or is to be; None: unknown, or left as it is."""
 
     exposure_us: float | None = None
+    """How long light is gathered for a frame, µs."""
     gain_db: float | None = None
+    """Amplification, dB (of USB video the driver's own number)."""
     rate_hz: float | None = None
     region: Region | None = None
     trigger: Trigger | None = None
@@ -133,24 +105,16 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class CameraFrame(ReadOnlyArrays):
-    """A frame as a camera gave it.
-
-    Parameters
-    ----------
-    number
-        The camera's own count; a gap tells of frames that were lost on the way.
-    time_s
-        The camera's clock, s; by the computer's where the camera has none.
-    arrived_s
-        `time.monotonic` when it was here, s.
-    image
-        Grey levels, shape (rows, columns), uint8 or uint16, read-only.
-    """
+    """A frame as a camera gave it."""
 
     number: int
+    """The camera's own count; a gap tells of frames that were lost on the way."""
     time_s: float
+    """The camera's clock, s; by the computer's where the camera has none."""
     arrived_s: float
+    """`time.monotonic` at its arrival, s."""
     image: GreyImage = field(repr=False)
+    """Grey levels, shape (rows, columns), uint8 or uint16, read-only."""
 
 
 class Camera(Protocol):
@@ -234,23 +198,18 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class CameraKind:
-    """What cameras of a kind are found and opened by.
-
-    Parameters
-    ----------
-    form
-        How an id is written: what all ids of the kind begin with, to the colon, and a word for the
-        rest: "uvc:NUMBER".
-    find
-        Lists those that are connected; may raise `CameraError` where that is unknown.
-    open
-        Opens the camera of an id; may raise `InputError` for an id that no camera has, and
-        `CameraError` where the camera is not there or cannot be opened.
-    """
+    """What cameras of a kind are found and opened by."""
 
     form: str
+    """How an id is written: what all ids of the kind begin with, to the colon, and a word for the
+    rest: "uvc:NUMBER".
+    """
     find: Callable[[], list[CameraInfo]]
+    """Lists those that are connected; may raise `CameraError` where that is unknown."""
     open: Callable[[str], Camera]
+    """Opens the camera of an id; may raise `InputError` for an id that no camera has, and
+    `CameraError` where the camera is not there or cannot be opened.
+    """
 
     @property
     def prefix(self) -> str:

@@ -47,24 +47,16 @@ State = Literal["opening", "running", "stalled", "lost", "ended"]
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of a feed so far.
-
-    Parameters
-    ----------
-    frames
-        Complete frames delivered.
-    broken
-        Incomplete frames, left out.
-    dropped
-        Frames that never arrived, by gaps in the camera's numbers and its driver's count.
-    lost
-        How often the camera was lost.
-    """
+    """Counts of a feed so far."""
 
     frames: int
+    """Complete frames delivered."""
     broken: int
+    """Incomplete frames, left out."""
     dropped: int
+    """Frames that never arrived, by gaps in the camera's numbers and its driver's count."""
     lost: int
+    """How often the camera was lost."""
 
 
 class Feed:

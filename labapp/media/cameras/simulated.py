@@ -43,28 +43,18 @@ def there_and_back(images: Sequence[GreyImage]) -> Callable[[int], GreyImage]:
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong by itself; everything random follows from the seed.
-
-    Parameters
-    ----------
-    garbage
-        Part of the frames that arrive cut off, of another size or of another type, 0 … 1.
-    dropped
-        Part of the frames that never arrive, 0 … 1.
-    unplug_every, unplugged_s
-        After so many frames the cable is out for so long, s; 0: never.
-    stall_every, stalled_s
-        After so many frames none come for so long, s; 0: never.
-    seed
-        Of what is random.
-    """
+    """What goes wrong by itself; everything random follows from the seed."""
 
     garbage: float = 0.0
+    """Part of the frames that arrive cut off, of another size or of another type, 0 … 1."""
     dropped: float = 0.0
+    """Part of the frames that never arrive, 0 … 1."""
     unplug_every: int = 0
     unplugged_s: float = 0.2
+    """After so many frames the cable is out for so long, s; 0: never."""
     stall_every: int = 0
     stalled_s: float = 0.5
+    """After so many frames none come for so long, s; 0: never."""
     seed: int = 0
 
 

@@ -42,24 +42,15 @@ MODIFIERS = 0xE0
 
 @dataclass(frozen=True)
 class PedalMap:
-    """A foot switch and what its pedals do.
-
-    Parameters
-    ----------
-    device
-        Its `HidInfo.key`.
-    name
-        What to call it.
-    keyboard
-        Whether it tells of keys.
-    actions
-        Pedal's number → what it does.
-    """
+    """A foot switch and what its pedals do."""
 
     device: str
+    """Its `HidInfo.key`."""
     name: str
     keyboard: bool
+    """Whether it sends keys."""
     actions: Mapping[int, Action] = field(default_factory=dict)
+    """Pedal's number → what it does."""
 
     def with_action(self, pedal: int, action: Action | None) -> PedalMap:
         """Copy with another action of a pedal; None: no action."""

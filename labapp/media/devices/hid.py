@@ -50,26 +50,18 @@ class HidError(Exception):
 
 @dataclass(frozen=True)
 class HidInfo:
-    """A device, or one of the several that it shows itself as.
-
-    Parameters
-    ----------
-    path
-        Where the system has it now: "/dev/hidraw3".
-    vendor, product, interface
-        USB's numbers.
-    usage
-        (page, usage) of HID: (1, 6) is a keyboard, (1, 8) a 3-D controller.
-    name
-        As it calls itself.
-    """
+    """A device, or one of the several that it shows itself as."""
 
     path: str
+    """Its device file: "/dev/hidraw3"."""
     vendor: int
     product: int
     interface: int
+    """USB's numbers."""
     usage: tuple[int, int]
+    """(page, usage) of HID: (1, 6) is a keyboard, (1, 8) a 3-D controller."""
     name: str
+    """Its own name."""
 
     @property
     def key(self) -> str:

@@ -30,25 +30,18 @@ TRANSLATION, ROTATION, BUTTONS = 1, 2, 3
 
 @dataclass(frozen=True)
 class SixAxes:
-    """How a controller is held; each axis −1 … 1.
-
-    Parameters
-    ----------
-    right, near, down
-        Pushed to the right, towards the operator, down.
-    pitch, roll, yaw
-        Turned about the first, the second, the third of these, right-handed.
-    buttons
-        Those that are down, by number from 0.
-    """
+    """How a controller is held; each axis −1 … 1."""
 
     right: float = 0.0
     near: float = 0.0
     down: float = 0.0
+    """Pushed to the right, towards the operator, down."""
     pitch: float = 0.0
     roll: float = 0.0
     yaw: float = 0.0
+    """Turned about the first, the second, the third of these, right-handed."""
     buttons: frozenset[int] = frozenset()
+    """Those that are down, by number from 0."""
 
     def after(self, number: int, report: bytes) -> SixAxes:
         """How it is held after a report of this number; as before where it tells nothing.
