@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from labapp.bundled import bundled
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
-from labapp.media.formats.cine_levels import LINEAR_12_BIT
 from labapp.media.formats.stored import (
     StoredFrames,
     ends_early,
@@ -167,12 +168,18 @@ class CineSource(StoredFrames):
         return InputError(self._path, f"frame {index}", value, expected)
 
 
+@cache
+def _linear_12_bit() -> npt.NDArray[np.uint16]:
+    """Published level with 12 bits, linear, for every level with 10 bits; shape (1024,)."""
+    return np.loadtxt(bundled("resources/formats/cine_10_to_12_bit.txt"), np.uint16)
+
+
 def _decode(content: bytes, form: _Format, stride: int) -> GreyImage:
     """Grey levels, shape (rows, columns), the first row at the top."""
     if form.packed_bits:
         levels = unpack_bits(content, form.packed_bits)[: form.rows * form.columns]
         image: npt.NDArray[np.uint16] = levels.reshape(form.rows, form.columns)
-        return LINEAR_12_BIT[image] if form.packed_bits == 10 else image
+        return _linear_12_bit()[image] if form.packed_bits == 10 else image
     kind = np.dtype("u1") if form.bit_count in (8, 24) else np.dtype("<u2")
     channels = 3 if form.bit_count in (24, 48) else 1
     used = form.row_bits // 8
