@@ -22,14 +22,18 @@ from filelock import FileLock, Timeout
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.export.drawing import VIEWS, Direction
-from labapp.export.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, mesh_formats
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
-from labapp.export.pictures import write_frame_picture, write_surface_picture, write_trend_picture
+from labapp.export.rendering.drawing import VIEWS, Direction
+from labapp.export.rendering.film import TICKS_HZ, Extent, film_times, write_film
+from labapp.export.rendering.pictures import (
+    write_frame_picture,
+    write_surface_picture,
+    write_trend_picture,
+)
+from labapp.export.rendering.studio import PICTURE_PX, drawing_errors, drawing_process
 from labapp.export.results import SURFACES, surface_files
-from labapp.export.studio import PICTURE_PX, drawing_errors, drawing_process
 from labapp.export.summary import Summary
 from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
 from labapp.files import as_bytes, beside
@@ -146,16 +150,8 @@ class ExportChoice:
 class ExportedFile:
     """A file of an export, as its manifest lists it.
 
-    Parameters
-    ----------
-    name
-        Its name in the folder.
-    size
-        In bytes.
-    sha256
-        Of its content, in hex.
-    rows
-        Of a CSV file, without its header; None of any other.
+    ``size`` is in bytes, ``sha256`` in hex; ``rows`` of a CSV file, its header not counted, else
+    None.
     """
 
     name: str
@@ -354,8 +350,7 @@ def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
 
 
 def _made() -> dict[str, object]:
-    made = {"program": "labapp", "version": VERSION, "created": now()}
-    return {**made, "sigma_of": SIGMA_OF}
+    return {"program": "labapp", "version": VERSION, "created": now(), "sigma_of": SIGMA_OF}
 
 
 def _about(provenance: Mapping[str, object]) -> dict[str, object]:

@@ -13,7 +13,7 @@ from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import Quality, judge_quality
 from labapp.export.frame_result import FrameResult, without_surface
-from labapp.export.scene import Scene, scene_of
+from labapp.export.rendering.scene import Scene, scene_of
 from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import end_processes, start_worker
 
@@ -46,17 +46,7 @@ class LiveResult(FrameResult):
 
 
 class LiveMeasuring:
-    """Measures frames in one process; each call waits for its frame.
-
-    Parameters
-    ----------
-    setup
-        Rig and image calibration.
-    settings
-        Of the measurement.
-    bit_depth
-        Significant bits of a grey level.
-    """
+    """Measures frames in one process; each call waits for its frame."""
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
         spawn = multiprocessing.get_context("spawn")

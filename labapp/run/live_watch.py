@@ -10,7 +10,7 @@ from collections.abc import Callable
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.export.frame_result import FrameResult
-from labapp.export.scene import Scene
+from labapp.export.rendering.scene import Scene
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.run.alarms import Alarm, Alarms

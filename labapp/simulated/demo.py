@@ -7,7 +7,7 @@ from pathlib import Path
 
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import os_errors_as_input
-from labapp.export.pictures import write_surface_picture
+from labapp.export.rendering.pictures import write_surface_picture
 from labapp.session.samples import begin_session
 from labapp.session.session import Session
 

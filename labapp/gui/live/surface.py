@@ -8,7 +8,7 @@ from functools import partial
 
 from PySide6.QtWidgets import QWidget
 
-from labapp.export.scene import Scene
+from labapp.export.rendering.scene import Scene
 from labapp.gui.live.figures import OLD_S
 from labapp.gui.views.view3d import LOOKS, make_view3d
 from labapp.gui.widgets.buttons import button

@@ -30,8 +30,8 @@ from PySide6.QtGui import (
 )
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
-from labapp.export.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
-from labapp.export.scene import Scene
+from labapp.export.rendering.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
+from labapp.export.rendering.scene import Scene
 from labapp.gui.views.canvas import Drawn
 
 LOOKS: dict[Direction, tuple[str, str]] = {

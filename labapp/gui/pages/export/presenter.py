@@ -11,8 +11,6 @@ from threadpoolctl import threadpool_limits
 
 from labapp.core.schemes import scheme_words
 from labapp.core.values import FloatArray, IntArray
-from labapp.export.drawing import Direction
-from labapp.export.film import UNTIMED_HZ, film_times
 from labapp.export.folder import (
     FILM_FILE,
     MANIFEST,
@@ -29,7 +27,9 @@ from labapp.export.formats import (
     mesh_formats,
 )
 from labapp.export.meshes import SPACING_MM
-from labapp.export.studio import PICTURE_PX
+from labapp.export.rendering.drawing import Direction
+from labapp.export.rendering.film import UNTIMED_HZ, film_times
+from labapp.export.rendering.studio import PICTURE_PX
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.session import Session

@@ -9,7 +9,7 @@ import numpy as np
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure
-from labapp.export.scene import Scene, difference_scene
+from labapp.export.rendering.scene import Scene, difference_scene
 from labapp.gui.digits import rounded
 from labapp.gui.pages.surface.presenter import (
     ERRORS,

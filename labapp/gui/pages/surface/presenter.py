@@ -17,7 +17,7 @@ from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
-from labapp.export.scene import Scene, rays_of, scene_of
+from labapp.export.rendering.scene import Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session

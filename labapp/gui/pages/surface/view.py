@@ -31,8 +31,8 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.errors import InputError
-from labapp.export.drawing import Direction
 from labapp.export.heights import profile
+from labapp.export.rendering.drawing import Direction
 from labapp.gui.dialogs import ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.surface.charts import DotsChart, PlanChart, ProfileChart

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray, IntArray
-from labapp.export.scene import EMPTY, Scene
+from labapp.export.rendering.scene import EMPTY, Scene
 from labapp.system import IS_LINUX
 
 VIEW_ANGLE_DEG = 30.0

@@ -24,8 +24,8 @@ from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
-from labapp.export.scene import Scene, empty_scene, scene_of
-from labapp.export.studio import Picture, draw_there
+from labapp.export.rendering.scene import Scene, empty_scene, scene_of
+from labapp.export.rendering.studio import Picture, draw_there
 from labapp.files import atomic_file
 
 CODEC = "mpeg4"
