@@ -342,12 +342,9 @@ def _calibrated(
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
     from labapp.core.calibration.plane_calibration import PlaneCalibrationSettings
     from labapp.core.values import CannotMeasure
-    from labapp.media import open_source
+    from labapp.media import read_picture
 
-    pictures = []
-    for path in images:
-        with open_source(path) as source:
-            pictures.append(source.frame(0).image)
+    pictures = [read_picture(path) for path in images]
     try:
         named = None if board is None else parse_board(board)
     except ValueError as error:

@@ -104,10 +104,9 @@ def _checked(
 def _picture(path: Path, mirror: Mirror) -> Picture:
     from labapp.core.bench_check.labelling import Picture
     from labapp.core.images.find_dots import DotSettings, find_dots
-    from labapp.media import open_source
+    from labapp.media import read_picture
 
-    with open_source(path) as source:
-        image = source.frame(0).image
+    image = read_picture(path)
     height, width = image.shape
     return Picture(path.name, mirror, find_dots(image, DotSettings()), (height, width))
 

@@ -97,6 +97,12 @@ def as_csv(rows: Iterable[ResultRow]) -> str:
     return csv_text([("quantity", "value", "sigma", "unit"), *cells])
 
 
+def round_factor(most: float) -> float:
+    """1, 2 or 5 times a power of ten, the largest that is not above ``most`` (positive)."""
+    power: float = 10.0 ** math.floor(math.log10(most))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
+
+
 UNITS = {"mm": "mm", "deg": "°", "px": "px", "pct": "%", "um per unit": "µm per mm or °"}
 """How the name of a table's column ends, and the unit that it means."""
 

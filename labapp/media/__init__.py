@@ -17,7 +17,7 @@ from labapp.media.formats.stored import regular_size
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.media.quiet import quiet_opencv
 
-__all__ = ["Frame", "FrameSource", "GreyImage", "open_source"]
+__all__ = ["Frame", "FrameSource", "GreyImage", "open_source", "read_picture"]
 
 VIDEO_SUFFIXES = frozenset(
     ".avi .mkv .mp4 .m4v .mov .nut .mpg .mpeg .ts .wmv .asf .webm .ogv .flv .mxf .dv .gif".split()
@@ -52,6 +52,12 @@ def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> Fra
     if size == 0:
         raise InputError(path, "size", "0 bytes", "an image or a video with something in it")
     return _by_content(path, head, index) or _by_name(path, index)
+
+
+def read_picture(path: str | os.PathLike[str]) -> GreyImage:
+    """Grey levels of a picture, or of a recording's first frame; raises as `open_source` does."""
+    with open_source(path) as source:
+        return source.frame(0).image
 
 
 def _by_content(path: Path, head: bytes, index: bytes | None) -> FrameSource | None:

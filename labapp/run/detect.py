@@ -15,7 +15,7 @@ from labapp.core.values import CannotMeasure
 from labapp.errors import os_errors_as_input
 from labapp.export.tables import PX_DIGITS, number
 from labapp.files import write_atomically
-from labapp.media import open_source
+from labapp.media import read_picture
 from labapp.text import csv_text
 
 COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".split()
@@ -38,8 +38,7 @@ def detect_dots(
     InputError
         If the source cannot be read.
     """
-    with open_source(path) as source:
-        image = source.frame(0).image
+    image = read_picture(path)
     settings = DotSettings(band_pass=BandPassSettings(size_px=size_px))
     dots = Dots(*np.empty((7, 0)))
     try:

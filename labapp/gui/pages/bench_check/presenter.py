@@ -18,7 +18,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.values import FloatArray
-from labapp.gui.digits import ResultRow, rounded
+from labapp.gui.digits import ResultRow, round_factor, rounded
 from labapp.media import GreyImage
 from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, MirrorPicture, Record
@@ -284,10 +284,8 @@ def overlay(picture: MirrorPicture, height_px: int) -> Overlay:
     """Dots, their rays' numbers, and residuals to be seen in a picture of such a height."""
     residual = picture.computed_px - picture.dot_px
     length = np.hypot(*residual.T)
-    # 1, 2 or 5 times a power of ten: nine in ten become a thirtieth of the picture at most.
-    room = height_px / 30 / max(float(np.quantile(length, 0.9)), 1e-6)
-    power = 10.0 ** np.floor(np.log10(room))
-    times = max(step for step in (1, 2, 5) if step * power <= room) * power
+    # Nine in ten become a thirtieth of the picture at most.
+    times = round_factor(height_px / 30 / max(float(np.quantile(length, 0.9)), 1e-6))
     ends = picture.dot_px + times * residual
     arrows = np.stack([picture.dot_px, ends], axis=1).reshape(-1, 2)
     longest_um = 1000 * float(np.hypot(*picture.residual_mm.T).max())

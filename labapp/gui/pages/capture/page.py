@@ -289,12 +289,8 @@ class CapturePage(Page):
             self._look()
             self.workspace.changed.emit()
 
-        self._opening = self.workspace.tasks.start(
-            f"Opening {path.name}",
-            lambda _: Preview(path),
-            opened,
-            beside=self.refused.setText,
-            kind="Opening a recording",
+        self._opening = self.start_task(
+            f"Opening {path.name}", lambda _: Preview(path), opened, kind="Opening a recording"
         )
 
     def choice(self) -> Choice | None:
@@ -339,9 +335,7 @@ class CapturePage(Page):
             self.workspace.notified.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
             self.workspace.changed.emit()
 
-        self._importing = self.workspace.tasks.start(
-            f"Importing {path.name}", work, done, beside=self.refused.setText, kind="Importing"
-        )
+        self._importing = self.start_task(f"Importing {path.name}", work, done, kind="Importing")
         self._listed = None  # one of them may be the session's own then
         self._show_import()
 
@@ -386,12 +380,8 @@ class CapturePage(Page):
             self.workspace.notified.emit(f"The recording is found at {path}", False)
             self.workspace.changed.emit()
 
-        self.workspace.tasks.start(
-            f"Comparing {path.name}",
-            lambda _: session.relink(path),
-            done,
-            beside=self.refused.setText,
-            kind="Comparing",
+        self.start_task(
+            f"Comparing {path.name}", lambda _: session.relink(path), done, kind="Comparing"
         )
 
     # --- the panel ----------------------------------------------------------------------------

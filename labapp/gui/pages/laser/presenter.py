@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
 from labapp.gui.shell.steps import calibrations_in_use
-from labapp.media import GreyImage, open_source
 from labapp.session.session import Session
 
 NAMES = ("l₁", "l₂", "l₃")
@@ -151,12 +149,6 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
 
 
 # --- a picture of the cross -------------------------------------------------------------------
-
-
-def read_picture(path: Path) -> GreyImage:
-    """Read a picture, or the first frame of a recording; an `InputError` says why not."""
-    with open_source(path) as source:
-        return source.frame(0).image
 
 
 def first_places(shape: tuple[int, int]) -> dict[str, Place]:

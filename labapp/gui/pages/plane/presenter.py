@@ -15,7 +15,7 @@ from labapp.core.calibration.mark_fit import Model, root_mean_square
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.values import FloatArray
-from labapp.gui.digits import ResultRow
+from labapp.gui.digits import ResultRow, round_factor
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage
 from labapp.session.session import Session
@@ -253,10 +253,7 @@ def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | Non
         begin = np.array(found.marks)[:, 2:4]
     length = np.hypot(*residual.T)
     longest = max(float(length.max()), 1e-9)
-    # 1, 2 or 5 times a power of ten: the longest becomes a tenth of the picture at most.
-    room = 0.1 * height_px / longest
-    power = 10.0 ** np.floor(np.log10(room))
-    times = max(step for step in (1, 2, 5) if step * power <= room) * power
+    times = round_factor(0.1 * height_px / longest)  # the longest: at most a tenth of the picture
     words = f"Arrows: residuals × {times:g}, the longest {longest:.2f} px"
     return ResidualMap(begin, begin + times * residual, length / longest, words)
 
