@@ -58,11 +58,6 @@ HEARTBEAT_MS = 300
 def main(arguments: Sequence[str]) -> int:
     """Open the app, and a session or a recording in it; returns when its window was closed.
 
-    Parameters
-    ----------
-    arguments
-        Nothing, or one file or folder.
-
     Raises
     ------
     InputError

@@ -32,13 +32,6 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
     The copy refers to the same recording, which is read through once to verify it, unless the copy
     is in the same folder.
 
-    Parameters
-    ----------
-    source
-        The session file.
-    path
-        The new one.
-
     Raises
     ------
     InputError
@@ -69,13 +62,6 @@ def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
 
     Record, set-up, calibrations with their pictures, settings and limits are copied; the safety
     list, the recording and what was measured from it are not.
-
-    Parameters
-    ----------
-    session
-        The template; it is not changed.
-    path
-        The new file.
 
     Raises
     ------

@@ -42,13 +42,7 @@ PAIRED = frozenset({".cih", ".cihx", ".mraw"})
 
 
 class Frames:
-    """The recording of a session and its frames; may be used from several threads.
-
-    Parameters
-    ----------
-    database
-        The session file.
-    """
+    """The recording of a session and its frames; may be used from several threads."""
 
     def __init__(self, database: Database) -> None:
         self._database = database

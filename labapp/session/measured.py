@@ -129,13 +129,7 @@ class _Row(NamedTuple):
 
 
 class Results:
-    """The results of a session.
-
-    Parameters
-    ----------
-    database
-        The session file.
-    """
+    """The results of a session."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -178,13 +172,7 @@ class Results:
             _replace(connection, frame, basis.scheme, row, measurement)
 
     def restore(self, changed: Collection[tuple[str, int]]) -> None:
-        """Restore the stashed results of frames whose correction was changed.
-
-        Parameters
-        ----------
-        changed
-            Kind and frame of the documents that were set.
-        """
+        """Restore stashed results where a ``("correction", frame)`` was changed."""
         for kind, frame in changed:
             if kind == "correction":
                 self._restore(frame)

@@ -68,13 +68,7 @@ class _Table:
 
 
 class Overviews:
-    """The overviews of a session, one per scheme; thread-safe.
-
-    Parameters
-    ----------
-    database, results
-        The session file, and its results.
-    """
+    """The overviews of a session, one per scheme; thread-safe."""
 
     def __init__(self, database: Database, results: Results) -> None:
         self._database = database

@@ -38,13 +38,6 @@ def setup_budget(
 
     Which ray made which dot stays as it was found. Half the difference is what a size changes by,
     as in `core.surface.setup_uncertainty`, which the default scheme has in its own ±.
-
-    Parameters
-    ----------
-    measurement
-        A frame with a surface.
-    setup, settings
-        What it was measured with.
     """
     match, known = measurement.match, setup.rig.uncertainty
     if match is None or measurement.measures is None:

@@ -78,11 +78,6 @@ def find_genicam() -> list[CameraInfo]:
 class GenicamCamera(Camera):
     """A GenICam camera that is open; see `Camera`.
 
-    Parameters
-    ----------
-    info
-        One of `find_genicam`.
-
     Raises
     ------
     CameraError

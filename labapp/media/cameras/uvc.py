@@ -108,13 +108,6 @@ class UvcCamera(Camera):
     Its driver numbers no frames: what is lost on the way does not show. OpenCV's own driver
     chooses the nearest size and rate that the camera has.
 
-    Parameters
-    ----------
-    info
-        One of `find_uvc`.
-    capture, query, present
-        OpenCV and the driver; in tests others.
-
     Raises
     ------
     CameraError

@@ -104,11 +104,6 @@ class Pedals:
 
     A keyboard's report lists its keys; of any other device every bit may be a pedal, and those
     that are set without one, as by a joystick's axes, count for nothing.
-
-    Parameters
-    ----------
-    keyboard
-        Whether the device is a keyboard.
     """
 
     def __init__(self, keyboard: bool) -> None:

@@ -88,11 +88,6 @@ class CineSource(StoredFrames):
     Levels are those of the sensor, in its bits (RealBPP); packed 10 bit levels are made linear
     with 12 bits by the published table. Times are the recorded time stamps (block 1002).
 
-    Parameters
-    ----------
-    path
-        The file.
-
     Raises
     ------
     InputError

@@ -27,13 +27,6 @@ AN_IMAGE = f"a whole image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PG
 class ImageSequence(StoredFrames):
     """Pictures of one shape, read one at a time.
 
-    Parameters
-    ----------
-    path
-        The file or folder, for its name.
-    pictures
-        The files in order, at least one.
-
     Raises
     ------
     InputError

@@ -67,11 +67,6 @@ class NumpyStack(StoredFrames):
     file, mapped; a compressed one is held in memory. Booleans become 0 and 255; types other than
     uint8 and uint16 become float32. A .npz may give ``time_s`` or ``frame_rate_hz``.
 
-    Parameters
-    ----------
-    path
-        The file.
-
     Raises
     ------
     InputError

@@ -82,14 +82,7 @@ def pack(value: object) -> bytes:
 
 
 def unpack(blob: object, kind: Any = Any) -> Any:
-    """Deserialise a value; numbers and arrays bit for bit, arrays read-only.
-
-    Parameters
-    ----------
-    blob
-        Output of `pack`.
-    kind
-        Its expected class or type hint.
+    """Deserialise what `pack` gave, of a class or type; numbers bit for bit, arrays read-only.
 
     Raises
     ------
