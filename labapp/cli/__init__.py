@@ -229,8 +229,8 @@ def detect(
     if doubt:
         typer.echo(f"{image}: {doubt}", err=True)
     placed = 0 if lattice is None else int((lattice.row > 0).sum())
-    told = placed or "none"
-    typer.echo(f"{len(dots)} dots, {told} with a row and a column, in {out.absolute()}")
+    message = placed or "none"
+    typer.echo(f"{len(dots)} dots, {message} with a row and a column, in {out.absolute()}")
     if not placed:
         raise typer.Exit(NOTHING_MEASURED)
 

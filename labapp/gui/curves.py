@@ -89,14 +89,14 @@ def point_text(curve: Curve, index: int, axis: Axis) -> str:
     """A point for the read-out and the screen reader."""
     sigma = float(curve.sigma[index]) if len(curve.sigma) else None
     value, spread = rounded(float(curve.y[index]), sigma, curve.decimals)
-    told = f"{curve.name} {value}{f' ± {spread}' if spread else ''} {curve.unit}".strip()
+    message = f"{curve.name} {value}{f' ± {spread}' if spread else ''} {curve.unit}".strip()
     place, _ = rounded(float(curve.x[index]), None, axis.decimals)
     where = f"{axis.name.lower()} {place} {axis.unit}".strip()
     if len(curve.key):
         where = f"{axis.key_name} {curve.key[index]}" + (f", {place} s" * (axis.unit == "s"))
         mark = curve.mark[index]
         where += f", {curve.marks[mark].words}" if mark else ""
-    return f"{where[0].upper()}{where[1:]}: {told}"
+    return f"{where[0].upper()}{where[1:]}: {message}"
 
 
 def nearest(curve: Curve, x: float) -> int | None:

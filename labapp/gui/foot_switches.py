@@ -76,13 +76,13 @@ class DevicesFound:
         """What was found, a sentence or two."""
         if self.problem:
             return self.problem
-        told = [f"Found: {', '.join(self.usable)}."] if self.usable else []
+        parts = [f"Found: {', '.join(self.usable)}."] if self.usable else []
         known = [info.name for info in self.closed if info.is_pedal or info.is_3d]
         if known:
-            told.append(f"▲ May not be read: {', '.join(known)}.")
-        if not told:
-            told = ["No foot switch that is known is plugged in; any other can be learned."]
-        return "\n".join(told)
+            parts.append(f"▲ May not be read: {', '.join(known)}.")
+        if not parts:
+            parts = ["No foot switch that is known is plugged in; any other can be learned."]
+        return "\n".join(parts)
 
 
 class FootSwitches(QObject):

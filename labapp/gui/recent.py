@@ -58,8 +58,8 @@ def _counted(statuses: Sequence[str]) -> str:
     measured = sum(status == "ok" for status in statuses)
     without = sum(status not in ("", "ok") for status in statuses)
     some = "all" if measured == len(statuses) else measured or "none"
-    told = f"{pluralize(len(statuses), 'frame')}, {some} measured"
-    return f"{told}, {without} could not be" if without else told
+    message = f"{pluralize(len(statuses), 'frame')}, {some} measured"
+    return f"{message}, {without} could not be" if without else message
 
 
 def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:

@@ -239,17 +239,17 @@ class Workspace(QObject):
         pool = self._pool
 
         def work(control: Control) -> int:
-            done, told = 0, 0.0
+            done, emitted_s = 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
                 for done, (number, _) in enumerate(session.measure(numbers, pool), 1):
                     control.progress(done, len(numbers))
                     if number == self.frame:
                         control.part(None)
-                    elif time.monotonic() - told > MEASURED_S:
+                    elif time.monotonic() - emitted_s > MEASURED_S:
                         # Looked up here: the window would wait for results that are being saved.
                         control.part(session.overview())
-                        told = time.monotonic()
+                        emitted_s = time.monotonic()
             except (BrokenProcessPool, CancelledError) as error:
                 control.check()  # ended on purpose
                 self._pool = None

@@ -193,12 +193,12 @@ def error_table(surveys: Sequence[ErrorSurvey]) -> Table:
     for one in surveys:
         for letter, error in (("D", "depth"), ("B", "boundary")):
             for surface in ("convex", "concave", "all"):
-                told = TEXT.get((one.kind, letter, surface), (None, None))
+                published = TEXT.get((one.kind, letter, surface), (None, None))
                 row: list[Cell] = [f"{one.kind}-{letter}", surface]
                 for scheme in one.schemes:
                     values = 100 * one.of(scheme, error, surface)
                     row += [float(np.nanmean(values)), float(np.nanmax(values))]
-                rows.append((*row, *(None if v is None else 100 * v for v in told)))
+                rows.append((*row, *(None if v is None else 100 * v for v in published)))
     schemes = surveys[0].schemes
     columns = [f"{scheme}_{what}_pct" for scheme in schemes for what in ("mean", "worst")]
     return Table(

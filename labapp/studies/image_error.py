@@ -170,10 +170,10 @@ def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCH
     for k, scheme in enumerate(schemes):
         exact = np.abs(frames[0].exact[k])
         each = np.abs([frame.errors[k] for frame in frames])
-        told = TACK_TEXT.get(scheme, (None,) * 3)
+        published = TACK_TEXT.get(scheme, (None,) * 3)
         for name, n, unit in (("height", 0, 100), ("diameter", 1, 100), ("ARE", 2, 1)):
             known = each[np.isfinite(each[:, n]), n] * unit
-            text = told[n]
+            text = published[n]
             rows.append(
                 (
                     scheme,

@@ -250,8 +250,8 @@ class Drawing:
         mark = _polydata(top if scene.electrode else EMPTY, "lines", 2)
         self._put("electrode", mark, scene.foreground, line_width=1)
         high = scene.exaggeration
-        told = [f"heights drawn {high:g} times as high"] if high != 1 else []
-        words = "\n".join(told + ["upright line: the electrode's axis"] * scene.electrode)
+        parts = [f"heights drawn {high:g} times as high"] if high != 1 else []
+        words = "\n".join(parts + ["upright line: the electrode's axis"] * scene.electrode)
         self._set_text("caption", words, scene.foreground, **self._in_corner("upper_left"))
 
     def _in_corner(self, position: str) -> dict[str, Any]:

@@ -358,10 +358,10 @@ class Live:
         if self.feed is None:
             return ""
         counts = self.feed.counts
-        told = [pluralize(counts.frames, "frame")]
-        told += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
-        told += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
-        return ", ".join(told)
+        parts = [pluralize(counts.frames, "frame")]
+        parts += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
+        parts += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
+        return ", ".join(parts)
 
     def ring(self) -> tuple[float, str]:
         """How full the memory of what comes before a trigger is, 0 … 1, and that in words."""
@@ -374,19 +374,19 @@ class Live:
 
     def recording_text(self) -> str:
         """What is being recorded, or became of the last recording, and for how long is room."""
-        take, told = self.running, []
+        take, parts = self.running, []
         if take is not None:
-            told = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
-            told += [f"▲ {take.trouble}"] * bool(take.trouble)
+            parts = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
+            parts += [f"▲ {take.trouble}"] * bool(take.trouble)
         elif self.takes and not self.takes[-1].finished.is_set():
-            told = [f"Writing the rest of {self.takes[-1].path.name}"]
+            parts = [f"Writing the rest of {self.takes[-1].path.name}"]
         elif self.takes:
-            told = [f"{self.takes[-1].path.name}: {self.takes[-1].summary.words}"]
+            parts = [f"{self.takes[-1].path.name}: {self.takes[-1].summary.words}"]
         rate = self.rate_hz()
         if self.room_byte is not None and rate:
             room_s = self.room_byte / (self._frame_byte * rate / self.plan.every)
-            told.append(f"room for {_lasting(room_s)} ({format_bytes(self.room_byte)})")
-        return "; ".join(told)
+            parts.append(f"room for {_lasting(room_s)} ({format_bytes(self.room_byte)})")
+        return "; ".join(parts)
 
     # --- to do --------------------------------------------------------------------------------
 

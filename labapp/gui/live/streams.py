@@ -148,8 +148,8 @@ class LiveStreams(QWidget):
         watch = self._watch()
         for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
-            told = stream_text(stream, self._is_at_work(kind), self._problems.get(kind, ""))
-            self.words[kind].setText(told)
+            message = stream_text(stream, self._is_at_work(kind), self._problems.get(kind, ""))
+            self.words[kind].setText(message)
         show_words(self.warning, WARNING if self.anywhere.isChecked() else "")
 
 
@@ -160,9 +160,9 @@ def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
     if stream is None:
         return "○ One moment …" if at_work else "○ Off"
     listen = "program listens" if stream.listeners == 1 else "programs listen"
-    told = pluralize(stream.sent, "frame")
+    message = pluralize(stream.sent, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
-    return f"● {where or stream.address}: {stream.listeners} {listen}, {told} told"
+    return f"● {where or stream.address}: {stream.listeners} {listen}, {message} told"
 
 
 def problem_text(error: InputError) -> str:

@@ -116,8 +116,8 @@ class LiveView(QObject):
             found, problems = answer
             self._choices = choices(found)
             self.camera.set_choices(self._choices)
-            told = f"{pluralize(len(found), 'camera')} found"
-            self.workspace.notified.emit(". ".join([told, *problems]), False)
+            message = f"{pluralize(len(found), 'camera')} found"
+            self.workspace.notified.emit(". ".join([message, *problems]), False)
 
         if self._finding not in self.workspace.tasks.active:
             self._finding = self.workspace.tasks.start(

@@ -50,15 +50,15 @@ class LogPanel(QListWidget):
     def add(self, text: str, problem: bool) -> None:
         """Add what was said; the same again in the same line, with how often."""
         now = datetime.datetime.now().strftime("%H:%M:%S")
-        told = f"{PROBLEM + ' ' if problem else ''}{text}"
+        message = f"{PROBLEM + ' ' if problem else ''}{text}"
         last = self.item(self.count() - 1) if self.count() else None
-        if last is not None and last.data(TOLD)[0] == told:
+        if last is not None and last.data(TOLD)[0] == message:
             _, first, times = last.data(TOLD)
-            last.setData(TOLD, (told, first, times + 1))
-            last.setText(f"{now}  {told} ({times + 1} times since {first})")
+            last.setData(TOLD, (message, first, times + 1))
+            last.setText(f"{now}  {message} ({times + 1} times since {first})")
             return
-        item = QListWidgetItem(f"{now}  {told}")
-        item.setData(TOLD, (told, now, 1))
+        item = QListWidgetItem(f"{now}  {message}")
+        item.setData(TOLD, (message, now, 1))
         font = item.font()
         font.setBold(problem)
         item.setFont(font)

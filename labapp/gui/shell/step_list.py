@@ -119,8 +119,8 @@ class StepList(FollowsTheme, QListWidget):
             state, item = states[step.key], self.item(row)
             item.setIcon(mark_icon(state.mark, dark, selected))
             item.setToolTip(plain_tip(f"{state.mark.value.capitalize()}: {state.why}"))
-            told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
-            item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
+            message = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
+            item.setData(Qt.ItemDataRole.AccessibleTextRole, message)
 
     def take_colours(self) -> None:
         """Draw the marks in the window's colours."""

@@ -56,8 +56,8 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
         elif problem.value == "missing":
             enter.append(f"{PARTS[part]} ({key.replace('_', ' ')})" if key else PARTS[part])
         else:
-            told = f"{PARTS[part]}, {key.replace('_', ' ')}"
-            wrong.append(f"correct {told}: {problem.value} is not {problem.expected}")
+            message = f"{PARTS[part]}, {key.replace('_', ' ')}"
+            wrong.append(f"correct {message}: {problem.value} is not {problem.expected}")
     typed = [f"enter {', '.join(dict.fromkeys(enter))}"] if enter else []
     words = "; ".join([*wrong, *typed, *calibrate])
     return words[:1].upper() + words[1:]

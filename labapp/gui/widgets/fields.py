@@ -101,11 +101,11 @@ class Field(QWidget):
     def _show_problem_text(self) -> None:
         """Make or take its room; not while a button of the mouse is down, or a click is lost."""
         words = self._refusal or self._fault
-        told = f"⚠ {words}" if words else ""
-        if told != self.problem.text() and QGuiApplication.mouseButtons():
+        message = f"⚠ {words}" if words else ""
+        if message != self.problem.text() and QGuiApplication.mouseButtons():
             QTimer.singleShot(MOUSE_MS, self, self._show_problem_text)
             return
-        show_words(self.problem, told)
+        show_words(self.problem, message)
 
 
 class NumberField(Field):

@@ -238,13 +238,13 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
             continue
         one = QUANTITIES[INDEX[key]]
         before, before_sigma, after, after_sigma = map(float, values)
-        told = after_sigma <= UNDETERMINED * before_sigma
+        determined = after_sigma <= UNDETERMINED * before_sigma
         texts = (
             *(_sentence(one.name, ""), *rounded(before, before_sigma)),
             *(*rounded(after, after_sigma), one.unit),
-            DETERMINED if told else NOT_DETERMINED,
+            DETERMINED if determined else NOT_DETERMINED,
         )
-        rows.append(QuantityRow(texts, told))
+        rows.append(QuantityRow(texts, determined))
     return tuple(rows)
 
 

@@ -85,8 +85,8 @@ class ImportChoice(Group):
             field.highest = max(1, last)
             field.set_value(value)
         self.rate.set_value(None)
-        told = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
-        self.source_words.setText(f"{preview.path.name}\n{told}")
+        message = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
+        self.source_words.setText(f"{preview.path.name}\n{message}")
 
     def choice(self) -> Choice:
         """What is chosen."""

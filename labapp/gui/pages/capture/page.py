@@ -103,8 +103,10 @@ class CapturePage(Page):
         """How far the step is: a recording may be chosen that the session does not have yet."""
         session = self.workspace.session
         if self.live_view.live is not None:
-            told = "A camera is watched: Space here, Ctrl+R and the pedal begin and end a recording"
-            return State(Mark.READY, told)
+            message = (
+                "A camera is watched: Space here, Ctrl+R and the pedal begin and end a recording"
+            )
+            return State(Mark.READY, message)
         if self.preview is None or session is None or session.recording is not None:
             return found
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
@@ -204,8 +206,8 @@ class CapturePage(Page):
             return  # else the verdict on the frame before stays until this one is judged
         self.exposure.show()
         verdict = seen.exposure.verdict
-        told = f"{verdict.capitalize()}. {seen.exposure.advice}"
-        self.exposure.show_exposure(seen.exposure, told, verdict == "good")
+        message = f"{verdict.capitalize()}. {seen.exposure.advice}"
+        self.exposure.show_exposure(seen.exposure, message, verdict == "good")
 
     # --- frames to look at --------------------------------------------------------------------
 
@@ -331,8 +333,10 @@ class CapturePage(Page):
             if self.workspace.frame not in frames:
                 self.workspace.show_frame(frames[0])
             self._seen = None
-            told = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
-            self.workspace.notified.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
+            message = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
+            self.workspace.notified.emit(
+                f"{message}. {' '.join(recording.warnings)}".strip(), False
+            )
             self.workspace.changed.emit()
 
         self._importing = self.start_task(f"Importing {path.name}", work, done, kind="Importing")

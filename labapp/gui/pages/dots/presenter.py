@@ -189,13 +189,13 @@ def sentence(seen: DotsState) -> str:
     lattice, dots = seen.correction.lattice, seen.correction.dots
     doubtful = int((~seen.correction.sited).sum())
     rows = len(set(lattice.row[lattice.row > 0].tolist()))
-    told = {
+    message = {
         "corrected": "Corrected by hand",
         "measured": "As measured",
         "found": "As found, not measured",
         "looked for": "",
     }[seen.origin]
-    words = f"{told}: {pluralize(len(dots), 'dot')} in {pluralize(rows, 'row')}"
+    words = f"{message}: {pluralize(len(dots), 'dot')} in {pluralize(rows, 'row')}"
     words += f", {doubtful} in doubt" if doubtful else ", none in doubt"
     if lattice.reference is None:
         words += ". The reference is not known"
@@ -295,12 +295,12 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
         values = [math.nan if f is None else getattr(f, name) for f in (before, after)]
         return pair([plain(v, digits) if math.isfinite(v) else "–" for v in values])
 
-    told = [("–", "–") if f is None else (f.status, str(f.matched)) for f in (before, after)]
+    texts = [("–", "–") if f is None else (f.status, str(f.matched)) for f in (before, after)]
     sigma = math.nan if after is None or pending else after.height_sigma_mm
     height = length("height_mm") + (f" ± {plain(sigma, 3)}" if math.isfinite(sigma) else "")
     return [
-        ResultRow("Fit", pair([t[0] for t in told]), note="Status before the edit, and now"),
-        ResultRow("Dots matched", pair([t[1] for t in told])),
+        ResultRow("Fit", pair([t[0] for t in texts]), note="Status before the edit, and now"),
+        ResultRow("Dots matched", pair([t[1] for t in texts])),
         ResultRow("ARE", length("are_mm"), unit="mm", note="Average reflection error (Eq. 6-3)"),
         ResultRow("MRE", length("mre_mm"), unit="mm", note="Largest reflection error (Eq. 6-4)"),
         ResultRow(

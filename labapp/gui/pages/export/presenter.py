@@ -227,12 +227,12 @@ def film_note(frames: IntArray, time_s: FloatArray, rate_hz: float | None) -> st
     """How long the film takes, and what to do where that is too short to see anything."""
     timed = [(int(k), t if np.isfinite(t) else None) for k, t in zip(frames, time_s, strict=True)]
     lasts_s = float(film_times(timed, rate_hz)[-1])
-    told = f"The film lasts {lasts_s:.3g} s."
+    message = f"The film lasts {lasts_s:.3g} s."
     if rate_hz is None and not np.isfinite(time_s).all():
-        return f"{told} The recording has no time base: {UNTIMED_HZ:g} frames/s."
+        return f"{message} The recording has no time base: {UNTIMED_HZ:g} frames/s."
     if rate_hz is None and len(frames) > 1 and lasts_s < BRIEF_S:
-        return f"{told} To see it slowed, enter its frames/s: 10, say."
-    return told
+        return f"{message} To see it slowed, enter its frames/s: 10, say."
+    return message
 
 
 def _chosen(
@@ -332,11 +332,11 @@ class Written:
     def words(self) -> str:
         """For the operator."""
         size = format_bytes(sum(file.size for file in self.files))
-        told = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
+        message = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
         if not self.problems:
-            return f"✓ {told} Read again and compared with the manifest: all as written."
+            return f"✓ {message} Read again and compared with the manifest: all as written."
         shown = "; ".join(self.problems[:SHOWN_PROBLEMS])
-        return f"▲ {told} But not all is as it was written: {shown}."
+        return f"▲ {message} But not all is as it was written: {shown}."
 
 
 def write(

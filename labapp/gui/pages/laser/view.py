@@ -292,8 +292,8 @@ class LaserPage(Page):
         except ValueError as error:
             self.lengths.setText(f"⚠ {error}")
             return None
-        told = (f"{name} {length:.2f} mm" for name, length in zip(NAMES, lengths, strict=True))
-        self.lengths.setText(",  ".join(told))
+        parts = (f"{name} {length:.2f} mm" for name, length in zip(NAMES, lengths, strict=True))
+        self.lengths.setText(",  ".join(parts))
         return lengths
 
     def _dragged(self) -> None:

@@ -210,8 +210,8 @@ def choices(found: Calibration | None) -> tuple[tuple[Model, str], ...]:
     named: list[tuple[Model, str]] = [("affine", "Affine")]
     if found.fits.homography is not None:
         named.append(("homography", "Homography"))
-    told = [(model, f"{words} (proposed)" if model == best else words) for model, words in named]
-    return (*told, ("three points", "Three points"))
+    models = [(model, f"{words} (proposed)" if model == best else words) for model, words in named]
+    return (*models, ("three points", "Three points"))
 
 
 def why(found: Calibration | None) -> str:

@@ -365,8 +365,8 @@ class PlanePage(Page):
         self.result.set_rows(result.rows)
         self.result.setVisible(bool(result.rows))
         why_not = (result.why_not,) if result.why_not else ()
-        told = (f"⚠ {words}" for words in (*why_not, *result.warnings))
-        show_words(self.words, "\n".join(told))
+        parts = (f"⚠ {words}" for words in (*why_not, *result.warnings))
+        show_words(self.words, "\n".join(parts))
         unusable = result.why_not or self.locked
         self.use_button.setEnabled(not unusable)
         tip = "Measure with this; undo brings the former back"

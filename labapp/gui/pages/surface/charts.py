@@ -86,8 +86,8 @@ class DotsChart(Chart):
         self._computed.setData(pos=computed)
         ends = np.stack([captured, captured + scale * (computed - captured)], axis=1).reshape(-1, 2)
         self._errors.setData(ends[:, 0], ends[:, 1])
-        told = f"○ captured, + computed; lines: errors × {scale:g}"
-        self.say(told if dots is not None else "No reflected dots to compare")
+        message = f"○ captured, + computed; lines: errors × {scale:g}"
+        self.say(message if dots is not None else "No reflected dots to compare")
         self.plot.autoRange()
 
     def take_colours(self) -> None:

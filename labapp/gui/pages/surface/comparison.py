@@ -73,21 +73,21 @@ def compared(
         limits = min(each.depth_mm for each in measures), max(each.height_mm for each in measures)
     scenes = [None if each is None else scene(each, rig, options, limits, None) for each in found]
     rows: tuple[Row, ...] = ()
-    difference, told = None, "There are no two surfaces to compare."
+    difference, message = None, "There are no two surfaces to compare."
     if first and second and first.measures and second.measures:
         assert first.reconstruction is not None
         assert second.reconstruction is not None
         plain = difference_scene(first.reconstruction, second.reconstruction)
         rows = compared_rows(first.measures, second.measures)
         names = [SCHEMES[scheme].title for scheme in schemes]
-        told = f"{names[0]} minus {names[1]}, from the same dots: "
+        message = f"{names[0]} minus {names[1]}, from the same dots: "
         if len(plain.values):
             difference = replace(plain, exaggeration=options.exaggeration)
             largest = float(np.abs(plain.values).max())
-            told += f"the heights differ by {largest:.3f} mm at most."
+            message += f"the heights differ by {largest:.3f} mm at most."
         else:
-            told += "the two surfaces do not overlap."
-    return Comparison((scenes[0], scenes[1]), (words[0], words[1]), difference, rows, told)
+            message += "the two surfaces do not overlap."
+    return Comparison((scenes[0], scenes[1]), (words[0], words[1]), difference, rows, message)
 
 
 def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
@@ -131,9 +131,9 @@ def compared_rows(one: Measures, other: Measures) -> tuple[Row, ...]:
         sigmas = [getattr(each, of_sigma) for each in (one, other)]
         rows.append(_row(name, [getattr(each, value) for each in (one, other)], sigmas, unit))
     for name, value, _ in ERRORS:
-        told = [getattr(each, value) for each in (one, other)]
-        if value != "own_are_mm" or np.isfinite(told).any():
-            rows.append(_row(name, told, [], "mm"))
+        values = [getattr(each, value) for each in (one, other)]
+        if value != "own_are_mm" or np.isfinite(values).any():
+            rows.append(_row(name, values, [], "mm"))
     return tuple(rows)
 
 
@@ -143,10 +143,10 @@ def _row(name: str, values: list[float], sigmas: list[float], unit: str) -> Row:
     first, second, difference = (
         rounded(number, largest, decimals)[0] for number in (*values, values[0] - values[1])
     )
-    told = [
+    texts = [
         f"{text} ± {rounded(value, sigma)[1]}" if np.isfinite(sigma) and sigma > 0 else text
         for text, value, sigma in zip(
             (first, second), values, sigmas or [np.nan, np.nan], strict=True
         )
     ]
-    return name, told[0], told[1], difference, unit
+    return name, texts[0], texts[1], difference, unit

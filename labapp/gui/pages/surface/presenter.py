@@ -128,7 +128,7 @@ def shown(session: Session, frame: int) -> SurfaceState:
         scheme = SCHEMES[scheme_name(session.settings)].title
         return SurfaceState(None, "unmeasured", f"Frame {frame} is not measured by {scheme} yet.")
     measurement = result.measurement
-    told = SurfaceState(
+    return SurfaceState(
         result,
         *_state(result),
         provenance=provenance(result),
@@ -137,7 +137,6 @@ def shown(session: Session, frame: int) -> SurfaceState:
         trials=trial_rows(measurement.match),
         verdict=verdict(measurement.match),
     )
-    return told
 
 
 def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]:
@@ -189,8 +188,8 @@ def _sigma_words(measures: Measures, value: str, unit: str) -> str:
         return f"±: one σ, {HEIGHT_SIGMA_OF}"
     noise = np.sqrt(max(total**2 - np.nan_to_num(level) ** 2 - setup**2, 0.0))
     parts = (("noise", noise), ("level", level), ("set-up", setup))
-    told = ", ".join(f"{name} {part:.2g}" for name, part in parts)
-    return f"±: one σ, {SIGMA_OF} ({told} {unit})"
+    sizes = ", ".join(f"{name} {part:.2g}" for name, part in parts)
+    return f"±: one σ, {SIGMA_OF} ({sizes} {unit})"
 
 
 def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
@@ -227,8 +226,8 @@ def verdict(match: Match | None) -> str:
     if not np.isfinite(match.margin):
         return f"{match.orientation}: no other correspondence has a surface."
     times = match.margin
-    told = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
-    return f"{match.orientation}: the next best is off {told} times as far."
+    factor = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
+    return f"{match.orientation}: the next best is off {factor} times as far."
 
 
 def rig_of(result: Result) -> Rig:
