@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from labapp.core.calibration.plane_calibration import PlaneCalibration
 
 IMPATIENT_S = 2.0
-"""Asked to stop again within this time, nothing more happens: the first is being obeyed."""
+"""A second request to stop within this time is ignored: the first is being carried out."""
 
 app = typer.Typer(
     name="labapp",

@@ -369,7 +369,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _words(text: str) -> frozenset[str]:
-    """Split ``a,b,c``; ``none`` stands for nothing."""
+    """Split ``a,b,c``; ``none`` means nothing."""
     return frozenset() if text == "none" else frozenset(map(str.strip, text.split(",")))
 
 

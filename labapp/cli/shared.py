@@ -106,7 +106,7 @@ def note(console: Console, text: str) -> None:
 
 
 def progress_sink(progress: Progress, name: str, count: int) -> Sink:
-    """A sink that shows how many results of so many there are, and why a frame gave no surface."""
+    """A sink that shows the number of results so far, and why a frame gave no surface."""
     task = progress.add_task(name, total=count)
 
     def show(result: FrameResult) -> None:
@@ -216,7 +216,7 @@ def _results(results: Collection[tuple[int, str]]) -> str:
 
 
 def results_folder(out: Path | None, tables: bool = True) -> Path | None:
-    """The folder for tables and pictures, made if it is not there; None where none is asked for.
+    """The folder for tables and pictures, made if it is not there; None where none is requested.
 
     Raises
     ------

@@ -100,7 +100,7 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
             )
         ),
     ]
-    # How values fit each other can be asked once each is right by itself.
+    # Values are compared with each other once each is valid by itself.
     problems = problems or _contradictions(path, values)
     if problems:
         raise InputError.gather(problems)

@@ -74,7 +74,7 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def are_numbers(value: object, count: int) -> TypeGuard[list[float]]:
-    """Whether this is a list of so many finite numbers."""
+    """Whether this is a list of finite numbers of the given length."""
     return isinstance(value, list) and len(value) == count and all(map(is_number, value))
 
 

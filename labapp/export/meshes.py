@@ -22,7 +22,7 @@ SPACING_MM = 0.1
 """Distance between the rings of a mesh, and between the nodes of a surface as CSV, mm."""
 
 SMALLEST_SPACING_MM = 0.05
-"""STL's 32-bit numbers cannot tell apart the vertices of smaller rings."""
+"""STL's 32-bit numbers cannot distinguish the vertices of smaller rings."""
 
 MOST_NODES = 10_000_000
 """A surface that is written has no more nodes: one in a stranger's session may be any size."""

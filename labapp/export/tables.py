@@ -46,7 +46,7 @@ class Column:
     digits
         Decimals in CSV; 0 for whole numbers, None for text.
     is_part
-        Whether it is a part of a standard uncertainty: in CSV files where these are asked for.
+        Whether it is a part of a standard uncertainty: in CSV files where these are requested.
     """
 
     name: str

@@ -109,7 +109,7 @@ def nearest(curve: Curve, x: float) -> int | None:
 
 
 def next_key(curves: Sequence[Curve], current: int, step: int) -> int | None:
-    """The key so many points after the present one (before: negative); None without points."""
+    """The key a number of points after the present one (before: negative); None without points."""
     keyed = [curve.key for curve in curves if len(curve.key)]
     if not keyed:
         return None

@@ -17,7 +17,7 @@ NOTHING = "–"
 """Stands where there is no number."""
 
 EXTRA_DECIMALS = 3
-"""A number with this many decimals more than its field shows was typed so: it is shown whole."""
+"""A number with this many decimals more than its field shows was typed so: all are shown."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tupl
 
 
 def plain(value: float, decimals: int) -> str:
-    """A number with so many decimals (negative: rounded to tens …), without a negative zero."""
+    """A number with the given decimals (negative: rounded to tens …), without a negative zero."""
     text = f"{round(value, decimals):.{max(decimals, 0)}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", MINUS)
 

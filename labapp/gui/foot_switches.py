@@ -23,7 +23,7 @@ POLL_MS = 20
 """What is pressed is done within this."""
 
 DEAF_S = 0.5
-"""A press that was learned does nothing besides: so long nothing else is heard."""
+"""Time, s, in which presses are ignored after one that was learned."""
 
 DOES: dict[Action, str] = {
     "trigger": "record, or end it",
@@ -86,7 +86,7 @@ class DevicesFound:
 
 
 class FootSwitches(QObject):
-    """Foot switches: what is pressed is asked of the window's menus.
+    """Foot switches: a pressed pedal runs an action of the window's menus.
 
     Nothing runs while none is in use. Devices are read in threads of their own; what they tell is
     taken from a queue.
@@ -98,7 +98,7 @@ class FootSwitches(QObject):
     found
         What was plugged in at the last look; None before one.
     learned
-        The pedal that was pressed to be learned, until it is said what it does.
+        The pedal that was pressed to be learned, until its action is chosen.
     """
 
     changed = Signal()
@@ -129,7 +129,7 @@ class FootSwitches(QObject):
     # --- in use -------------------------------------------------------------------------------
 
     def use(self, kept: Iterable[Mapping[str, Any]]) -> None:
-        """Take up the foot switches that were remembered; one that is damaged is said."""
+        """Start the foot switches that were stored; a damaged entry is reported."""
         for values in kept:
             try:
                 pedals = PedalMap.from_dict(values)
@@ -298,7 +298,7 @@ def _found() -> DevicesFound:
 
 
 def _learned(control: Control) -> Learned | str | None:
-    """Wait for a pedal; why none can be heard, as words."""
+    """Wait for a pedal; why none can be read, in words."""
 
     def told(problems: list[str]) -> None:
         if not control.cancelled.is_set():

@@ -23,7 +23,7 @@ KEPT_RECENT = 12
 THEMES = ("system", "light", "dark")
 LARGEST_BYTES = 1_000_000
 LOCK_S = 2.0
-"""So long a window waits for another one's change."""
+"""Time, s, that a window waits for the change of another."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def read_preferences(path: Path) -> tuple[Preferences, str]:
     Returns
     -------
     preferences, problem
-        ``problem`` tells the operator what was wrong; empty if nothing was.
+        ``problem`` is the message for the operator; empty if nothing was wrong.
     """
     try:
         if path.stat().st_size > LARGEST_BYTES:

@@ -69,7 +69,7 @@ def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:
         return None
     try:
         image = session.frame(int(frames[0])).image
-    except InputError:  # the recording is elsewhere; the session is whole all the same
+    except InputError:  # the recording is elsewhere; the session can be used without it
         return None
     rows, columns = image.shape
     scale = min(THUMBNAIL_PX[0] / columns, THUMBNAIL_PX[1] / rows)

@@ -26,7 +26,7 @@ PROGRESS_MS = 100
 """Progress is reported no more often."""
 
 STOP_S = 5.0
-"""A cancelled task is waited for so long."""
+"""Time, s, that a cancelled task is waited for."""
 
 
 class Cancelled(Exception):
@@ -57,7 +57,7 @@ class Control:
         self.reached, self.stage = (done, total), stage
 
     def part(self, value: object) -> None:
-        """Hand over a part of the result: it reaches ``on_part`` on the GUI thread."""
+        """Pass a part of the result to ``on_part``, on the GUI thread."""
         self.check()
         self.events.put(("part", value))
 
@@ -137,7 +137,7 @@ class Tasks(QObject):
         work
             Called with its `Control`; touches no widget.
         on_done, on_part
-            Called on the GUI thread with what ``work`` returns, and with each part it hands over.
+            Called on the GUI thread with what ``work`` returns, and with each `Control.part`.
             Not called after a cancel or a failure.
         beside
             Shows why it failed beside what was pressed, too; called with nothing at the beginning.

@@ -76,7 +76,7 @@ class Workspace(QObject):
 
     @cached_property
     def foot_switches(self) -> FootSwitches:
-        """The foot switches in use; what they need is loaded when they are first asked for."""
+        """The foot switches in use; what they need is loaded on first use."""
         from labapp.gui.foot_switches import FootSwitches
 
         made = FootSwitches(self.tasks, self)

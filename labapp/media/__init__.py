@@ -26,7 +26,7 @@ RECORDING_SUFFIXES = VIDEO_SUFFIXES | {".cine", ".npy", ".npz"} | PHOTRON_SUFFIX
 
 
 def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> FrameSource:
-    """Open a recording: what it is, its content tells before its name does.
+    """Open a recording; its type is recognised by its content first, then by its name.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def _open_folder(path: Path, index: bytes | None) -> FrameSource:
         return ImageSequence(path, images)
     recordings = [entry for entry in files_in(path) if entry.suffix.lower() in RECORDING_SUFFIXES]
     headers = {entry.stem for entry in recordings if entry.suffix.lower() in (".cih", ".cihx")}
-    # A Photron recording is two files; its header stands for both.
+    # A Photron recording is two files; its header represents both.
     recordings = [
         entry
         for entry in recordings

@@ -1,4 +1,4 @@
-"""Read a recording through once at import, and check that any frame can be asked for."""
+"""Read a recording through once at import, and check that any frame can be read."""
 
 from __future__ import annotations
 

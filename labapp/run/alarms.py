@@ -17,7 +17,7 @@ from labapp.run.limits import NAMES, Limits, Size, Standing, sizes_of, standing
 from labapp.text import pluralize
 
 CALM_S = 1.0
-"""An alarm is over when its cause has been away for so long, by the camera's clock."""
+"""Time without its cause, s by the camera's clock, after which an alarm is over."""
 
 NOT_MEASURED, SILENT = "not-measured", "silent"
 """Codes of the alarms of frames that cannot be measured, and of none that is; others are as

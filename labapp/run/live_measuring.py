@@ -18,7 +18,7 @@ from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import end_processes, start_worker
 
 JUDGED_S = 0.2
-"""How long the quality of a frame stands for those that follow, s."""
+"""How long the quality of a frame applies to those that follow, s."""
 
 SOUGHT_S = 1.0
 """For so long after a frame that was measured, s, frames that cannot be followed are left out: the

@@ -16,7 +16,7 @@ from labapp.run.limits import NAMES, Limits, beyond, sizes_of
 from labapp.run.live_measuring import LiveResult
 
 RATE_S = 2.0
-"""Rates are those of so long."""
+"""Time over which rates are taken, s."""
 
 TREND_S = 120.0
 """The trend goes back so far."""
@@ -44,7 +44,7 @@ class Trend(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Pace:
-    """How measuring keeps up, of late."""
+    """How measuring keeps up at present."""
 
     measured_hz: float
     """Frames measured a second."""
@@ -96,7 +96,7 @@ class LiveTrend:
         return Pace((len(late) - failed) / RATE_S, len(late), failed)
 
     def over(self, last_s: float, limits: Limits) -> Trend:
-        """Sizes of the frames that came in the last so many seconds, compared with limits."""
+        """Sizes of the frames of the last seconds, compared with limits."""
         now_s = time.monotonic()
         with self._turn:
             late = [each for each in self._frames if each.arrived_s > now_s - last_s]

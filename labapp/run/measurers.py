@@ -37,7 +37,7 @@ from labapp.simulation.parallel import NICE, start_worker
 T = TypeVar("T")
 
 AHEAD = 8
-"""So many frames are submitted to a pool of processes beyond the one whose result is awaited."""
+"""Number of frames submitted to a pool of processes beyond the one whose result is awaited."""
 
 VOTERS, WAITS = 3, 5
 """A frame is judged with two more that have a surface, so that of three that disagree two decide;
@@ -182,7 +182,7 @@ def measuring_pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
-    """Results in their order, so many begun ahead, which are cancelled if it is closed early."""
+    """Results in their order, some begun ahead, which are cancelled if it is closed early."""
     waiting: deque[Future[T]] = deque()
     try:
         for future in begun:

@@ -241,7 +241,7 @@ class Results:
         frame, scheme
             Which result.
         basis, correction
-            Present inputs, to tell whether it is stale; basis None where the setup is incomplete.
+            Present inputs, to see whether it is stale; basis None where the setup is incomplete.
 
         Raises
         ------

@@ -57,7 +57,7 @@ class LaserReadings:
     picture_sha256
         The picture of the cross-hair, kept in the session; None where lengths were typed.
     fan_angle_sigma_deg
-        Standard uncertainty of the fan angle, degrees; None in files of before it was asked for.
+        Standard uncertainty of the fan angle, degrees; None in older files.
     resolution_mm
         Smallest step of the callipers, mm; None likewise.
     """

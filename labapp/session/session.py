@@ -100,7 +100,7 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If a section is not one; whether values are possible is told by `setup`.
+            If a section is not one; whether values are possible is checked by `setup`.
         """
         self._documents.change(label, {("setup", NO_FRAME): self._updated_setup(values)})
 

@@ -29,7 +29,7 @@ A_TABLE = "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), a cur
 LARGEST_FILE = 1 << 28
 MOST_ROWS = 500_000
 LINES_ABOVE = 60
-"""Loggers tell of themselves in so many lines before the names at most."""
+"""Largest number of lines before the names, in which loggers describe themselves."""
 
 NAMES = {
     "time": "time|zeit|t|seconds",

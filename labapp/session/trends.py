@@ -14,7 +14,7 @@ from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.session.measured import Overview
 
 NEIGHBOURS = 15
-"""A frame is compared with the median of so many frames around it …"""
+"""Number of frames around a frame with whose median it is compared …"""
 
 FEWEST = 8
 """… and with none where there are fewer in all."""
@@ -141,7 +141,7 @@ class Spectrum(ReadOnlyArrays):
     Parameters
     ----------
     frequency
-        From the lowest that the series tells to half the rate, shape (k,), Hz, or 1/frame where
+        From the lowest that the series resolves to half the rate, shape (k,), Hz, or 1/frame where
         times are not known.
     amplitude
         Of a sine of that frequency, shape (k,), in the measure's unit.
@@ -152,7 +152,7 @@ class Spectrum(ReadOnlyArrays):
     count
         How many they are.
     resolution
-        Sines nearer to each other than this cannot be told apart: two steps of the frequency, the
+        Sines nearer to each other than this cannot be resolved: two steps of the frequency, the
         half width of the Hann window's main lobe.
     """
 

@@ -33,7 +33,7 @@ def simulate(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Render a scenario's recording into a folder, which is whole or not there.
+    """Render a scenario's recording into a folder, which is complete or absent.
 
     A former simulation in it is replaced.
 
@@ -46,7 +46,7 @@ def simulate(
     workers
         How many processes render; None: one a core. The result is the same.
     progress
-        Told of each frame, and while one is waited for; what it raises leaves nothing.
+        Called for each frame, and while one is waited for; what it raises leaves nothing.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def begin_session(
     path
         The session file.
     progress
-        Told how much of the recording is imported; what it raises leaves no session.
+        Called with how much of the recording is imported; what it raises leaves no session.
 
     Raises
     ------

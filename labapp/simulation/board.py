@@ -168,7 +168,7 @@ def _sheet(printed: PrintedBoard) -> list[tuple[float, float, float, float]]:
 
 
 def _words(printed: PrintedBoard) -> list[tuple[float, float, float, str]]:
-    """Words on the plate: left and foot of each from its lower left, size, mm, and what is said."""
+    """Texts on the plate: left and foot of each from its lower left, size, mm, and the text."""
     (width, height), (x, z) = printed.plate_mm, printed.origin_mm
     edge = printed.board.square_mm
     size = 2.0 if width < 150 else 3.4

@@ -157,7 +157,7 @@ def exact_match(
     Raises
     ------
     ValueError
-        If noise is asked for without ``rng``.
+        If there is noise but no ``rng``.
     """
     visible = reflections.visible
     ray = np.argwhere(visible) + 1
@@ -182,7 +182,7 @@ def exact_match(
 
 
 def seen_orientation(reflections: Reflections) -> Orientation:
-    """Tell the correspondence from how most neighbouring dots lie to each other on the plane."""
+    """The correspondence by how most neighbouring dots lie to each other on the plane."""
     dots = np.where(reflections.visible[..., None], reflections.plane_mm, np.nan)
     across = np.sign(np.diff(dots[..., 0], axis=1))
     upward = np.sign(np.diff(dots[..., 1], axis=0))

@@ -15,7 +15,7 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.pools import PoolSize, size_of
 
 STEP = 1e-4
-"""Step of the differences that stand for a gradient, over the pool's longer side."""
+"""Step of the differences that approximate a gradient, over the pool's longer side."""
 
 MARGIN = 3
 """Nodes beyond the known ones that continue the surface; the spline sees no farther."""

@@ -161,7 +161,7 @@ def survey(
 
 
 def aside(caps: Sequence[Pool], centers: int) -> tuple[Pool, ...]:
-    """Each cap at so many centres near the origin (`ASIDE_MM`), the same ones each time."""
+    """Each cap at a number of centres near the origin (`ASIDE_MM`), the same ones each time."""
     rng = np.random.default_rng(83)
     at = rng.uniform(-ASIDE_MM, ASIDE_MM, (len(caps), centers, 2)).tolist()
     return tuple(

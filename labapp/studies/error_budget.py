@@ -1,4 +1,4 @@
-"""How far a pool's size is off by what its set-up is not exactly known to be, for any scheme."""
+"""Uncertainty of a pool's sizes by the uncertainty of its set-up, for any scheme."""
 
 from __future__ import annotations
 

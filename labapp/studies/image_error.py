@@ -44,7 +44,7 @@ TACK_RIG = Rig(
     Electrode(5.0),
     ImagingPlane.vertical(40.69, 50.8, 0.0),
 )
-"""Its set-up. The text does not tell the electrode's height nor O′: here it is that of Table 4-1,
+"""Its set-up. The text gives neither the electrode's height nor O′: here it is that of Table 4-1,
 and the 4″ plane stands on the paper, its middle opposite the torch."""
 
 BENCH = Rig(

@@ -46,7 +46,7 @@ BESIDE_PX, ASIDE_PX = 110, 62
 """What the scale takes of a picture's width, and how far that moves the pool's middle."""
 
 USUAL_DPI = 72
-"""At it VTK draws texts as large as they are told to be."""
+"""At this resolution VTK draws texts at their nominal size."""
 
 FLAT = 1 / 8
 """Axes less high than this part of their width have one number upwards: more would overlap."""
@@ -75,7 +75,7 @@ class Drawing:
         A `pyvista.Plotter`; nothing but scenes is drawn in it.
     steady
         Whether axes stay while the next scene fills them well: they do not jump from frame to
-        frame, and new ones take long to draw. Else a picture does not tell what was there before.
+        frame, and new ones take long to draw. Else a picture does not depend on the scene before.
     """
 
     def __init__(self, plotter: Any, steady: bool = False) -> None:
@@ -290,7 +290,7 @@ def _holds(box: FloatArray, other: FloatArray) -> bool:
 
 
 def _polydata(points: FloatArray, kind: str, length: int) -> Any:
-    """Points, or lines of so many points each, for VTK; None without points."""
+    """Points, or lines of a number of points each, for VTK; None without points."""
     import pyvista
 
     if not len(points):

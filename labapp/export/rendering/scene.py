@@ -27,7 +27,7 @@ SPACING_MM = 0.15
 HEIGHT = "height (mm)"
 
 SPOKES = 120
-"""About so many vertices a ring: its sides are within a thousandth of a pool's radius."""
+"""Approximate number of vertices a ring: its sides are within a thousandth of a pool's radius."""
 
 EMPTY = np.empty((0, 3))
 
@@ -57,7 +57,7 @@ class Scene(ReadOnlyArrays):
     electrode
         Whether to mark the electrode's axis, X = Y = 0.
     exaggeration
-        Heights are drawn so many times as high; the axes tell true ones.
+        Factor by which heights are drawn larger; the axes show true heights.
     within_mm
         Places that the axes hold in any case, shape (k, 3): pictures of a film share them.
     stamp

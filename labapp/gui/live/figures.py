@@ -29,7 +29,7 @@ OLD_S = 2.0
 """A figure that is older is not of the pool that is seen: it is not in order, whatever it is."""
 
 LARGE = 1.9
-"""A figure that is read from afar is so many times as large as others."""
+"""How much larger a figure is that is read from a distance."""
 
 ACKNOWLEDGE_PX = 40
 """Least height of a button that is pressed in gloves."""
@@ -59,7 +59,7 @@ def figures(
 ) -> tuple[Figure, ...]:
     """Width, length and height, of a hollow pool the depth.
 
-    All with as many decimals, whatever the ±: nothing jumps as they change.
+    All with the same number of decimals, whatever the ±: nothing jumps as they change.
 
     Parameters
     ----------

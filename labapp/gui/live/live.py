@@ -320,7 +320,7 @@ class Live:
         return self._judged.popleft() if self._judged else None
 
     def events(self) -> list[Event]:
-        """What has happened since it was asked last."""
+        """Events since the last call."""
         return [self._events.get() for _ in range(self._events.qsize())]
 
     def ended_takes(self) -> list[Take]:
@@ -335,7 +335,7 @@ class Live:
         return self._recorders[-1].running if self._recorders else None
 
     def rate_hz(self) -> float | None:
-        """Frames a second that came of late; None while that is not known."""
+        """Present rate of frames, 1/s; None while it is unknown."""
         now_s, counted = time.monotonic(), self._counted
         counted.append((now_s, 0 if self.feed is None else self.feed.counts.frames))
         while len(counted) > 2 and counted[1][0] < now_s - RATE_S:

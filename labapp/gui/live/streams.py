@@ -89,7 +89,7 @@ class LiveStreams(QWidget):
                 self._bring_about(kind)
 
     def _wanted(self, kind: str) -> tuple[LiveWatch | None, str, bool]:
-        """What is to be: who tells, where (empty: nowhere), and whether others may listen."""
+        """What sends, its address (empty: none), and whether other machines may connect."""
         anywhere, port = self.anywhere.isChecked(), int(self.ports[kind].value() or 0)
         place = f"{ANY if anywhere else OWN}:{port}"
         return self._watch(), place if self.boxes[kind].isChecked() else "", anywhere

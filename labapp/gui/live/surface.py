@@ -82,7 +82,7 @@ class LiveSurface(QWidget):
 
     def _show(self, scene: Scene | None) -> None:
         self.view.show_scene(scene)
-        self.view.repaint()  # at once: how long it takes tells how soon the next may come
+        self.view.repaint()  # at once: its duration determines when the next may come
 
 
 def steady_limits(

@@ -320,14 +320,14 @@ class LiveView(QObject):
             self._timer.setInterval(wanted)
 
     def _follow(self, watch: LiveWatch) -> None:
-        """Show what was measured since it was asked last."""
+        """Show what was measured since the last call."""
         result = watch.newest()
         if result is not None:
             former, was_old = self._result, self._age_s > OLD_S
             self._result, self.measured_s = result, time.monotonic()
             self._show_figures(watch)
             if was_old or former is None or former.measurement.status != result.measurement.status:
-                self._status_s = 0.0  # what is said of the figures goes with them
+                self._status_s = 0.0  # the text about the figures is cleared with them
             if self._age_s <= OLD_S:  # else it is not of what is in view
                 self._show_quality(result.quality)
         self.updates += self.canvas.follow(result, watch)

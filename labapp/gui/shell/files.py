@@ -138,7 +138,7 @@ class Files(QObject):
             self.workspace.show(None)
 
     def may_close(self) -> bool:
-        """Ask what becomes of a recording that runs; False if it is to go on, nothing closed."""
+        """Ask what to do with a running recording; False if it continues and nothing is closed."""
         camera = self._camera()
         take = None if camera is None else camera.recording
         if camera is None or take is None:

@@ -27,11 +27,11 @@ PROBLEM = "▲"
 """Before a problem, which is shown by shape as well as by colour."""
 
 TOLD = Qt.ItemDataRole.UserRole
-"""Of a line of the log: what it tells, since when, and how often it was said."""
+"""Of a line of the log: its text, since when, and how many times."""
 
 
 class LogPanel(QListWidget):
-    """Everything that was said, the last at the end."""
+    """All messages, the last at the end."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class LogPanel(QListWidget):
         return QSize(400, self.fontMetrics().height() * 6)
 
     def add(self, text: str, problem: bool) -> None:
-        """Add what was said; the same again in the same line, with how often."""
+        """Add a message; a repeated one is counted in the same line."""
         now = datetime.datetime.now().strftime("%H:%M:%S")
         message = f"{PROBLEM + ' ' if problem else ''}{text}"
         last = self.item(self.count() - 1) if self.count() else None
@@ -83,7 +83,7 @@ class LogPanel(QListWidget):
 class StatusLine(QWidget):
     """The last message, and how far the work under way is.
 
-    A problem stays until it was read, or is over, whatever is said after it.
+    A problem stays until it was read or is solved, whatever message follows.
     """
 
     read = Signal()

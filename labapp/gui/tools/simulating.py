@@ -49,7 +49,7 @@ def choices(own: Path | None) -> list[tuple[str, str]]:
 
 
 def rows(shown: ScenarioPreview, frames: int) -> tuple[ResultRow, ...]:
-    """What is known of a scenario's first frame, and of a recording of so many."""
+    """What is known of a scenario's first frame, and of a recording of that many frames."""
     recording, frame = shown.scenario.recording, shown.frame
     size, seen = frame.pool.size, frame.reflections
     free = seen.lit & ~seen.blocked

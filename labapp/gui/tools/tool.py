@@ -118,7 +118,7 @@ class ToolWindow(QDialog):
     # --- what tools say for themselves ---------------------------------------------------------
 
     def prefill(self) -> None:
-        """Put what the session holds into the form, where that is another than last time."""
+        """Put what the session holds into the form, where it changed since last time."""
 
     def show_state(self) -> None:
         """Enable what is of use now."""
@@ -203,7 +203,7 @@ class ToolWindow(QDialog):
             self.save(folder)
 
     def save(self, folder: Path) -> None:
-        """Write what was found, as the command does; each file is whole."""
+        """Write the results, as the command does; each file atomically."""
 
         def write() -> Path:
             with os_errors_as_input(folder, "folder", "one that can be written"):
@@ -220,7 +220,7 @@ class ToolWindow(QDialog):
         self.message.setText(f"{PROBLEM} {text}" if problem else text)
 
     def _repeat_message(self, text: str, problem: bool) -> None:
-        """What is said behind this window is said here too."""
+        """Show messages of the main window here, too."""
         if self.isVisible():
             self.say(text, problem)
 

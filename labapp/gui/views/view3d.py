@@ -1,7 +1,7 @@
 """The 3-D view: a scene that can be turned, in the window's own OpenGL or drawn off-screen.
 
 Where Qt has no OpenGL for VTK (no display, or Wayland) the scene is drawn off-screen and shown as
-a picture. So it is where the processor draws: a window with OpenGL in it is put together whole for
+a picture. So it is where the processor draws: a window with OpenGL in it is composed as a whole for
 every picture, which costs more than the scene does. Where nothing can be drawn, words say so.
 """
 

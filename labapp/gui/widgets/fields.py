@@ -1,6 +1,6 @@
 """Fields for numbers, words and choices, and the form that lays them out.
 
-A field tells of an edit only when it is finished: Enter, leaving the field, or a pause after steps.
+A field reports an edit only when it is finished: Enter, leaving the field, or a pause after steps.
 What is wrong stands in words below it: why the last entry was refused, until another one is taken;
 else what is wrong with the value that it holds.
 """
@@ -111,7 +111,7 @@ class Field(QWidget):
 class NumberField(Field):
     """A number with its unit, right-aligned; steps by arrow keys, buttons and wheel.
 
-    What is no number, or out of range, is said below the field, and the former value stays. While
+    What is no number, or out of range, is shown below the field, and the former value stays. While
     the operator types, `set_value` does not take the text from under the hand.
 
     Parameters

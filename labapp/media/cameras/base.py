@@ -14,7 +14,7 @@ from labapp.errors import InputError
 from labapp.media.base import GreyImage
 
 Trigger = Literal["free", "software", "line"]
-"""When a frame is taken: at the camera's own rate, when told to, at a signal on its input."""
+"""When a frame is taken: at the camera's own rate, by software, at a signal on its input."""
 
 Region = tuple[int, int, int, int]
 """(u, v, width, height) of the part of the sensor that is read out, px."""
@@ -23,11 +23,11 @@ NUMBERS = {"exposure_us": "µs", "gain_db": "dB", "rate_hz": "frames/s"}
 """What is set by a number, and its unit."""
 
 BUFFERED_S, BUFFERED_BYTE, LEAST_BUFFERED = 2.0, 128_000_000, 32
-"""Frames that wait for their reader: those of so long, as far as so much memory holds them."""
+"""Frames that wait for their reader: a duration, s, limited by an amount of memory, bytes."""
 
 
 class CameraError(Exception):
-    """A camera does not do what was asked; the message says what, and what to do about it."""
+    """A camera did not do what was requested; the message says what, and what to do about it."""
 
 
 class CameraLost(CameraError):
@@ -35,7 +35,7 @@ class CameraLost(CameraError):
 
 
 class BrokenFrame(CameraError):
-    """A frame arrived that is not whole; the next may be."""
+    """A frame arrived incomplete; the next may be complete."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class CameraFrame(ReadOnlyArrays):
     """A frame as a camera gave it."""
 
     number: int
-    """The camera's own count; a gap tells of frames that were lost on the way."""
+    """The camera's own count; a gap means frames that were lost in transfer."""
     time_s: float
     """The camera's clock, s; by the computer's where the camera has none."""
     arrived_s: float
@@ -166,7 +166,7 @@ class Camera(Protocol):
         Raises
         ------
         BrokenFrame
-            If one came that is not whole.
+            If an incomplete one arrived.
         CameraLost
             If none will come any more.
         """
@@ -186,7 +186,7 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the camera. Closing twice does no harm."""
+        """Release the camera. Closing twice does no harm."""
         ...
 
     def __enter__(self) -> Self:

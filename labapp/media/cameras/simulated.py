@@ -1,6 +1,6 @@
 """A camera that is simulated: any pictures at any rate, and every fault that a real one has.
 
-What it is plugged into is a `SimulatedDevice`, which goes on while cameras are opened and closed.
+What it is plugged into is a `SimulatedDevice`, which runs while cameras are opened and closed.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class Faults:
     """Part of the frames that never arrive, 0 … 1."""
     unplug_every: int = 0
     unplugged_s: float = 0.2
-    """After so many frames the cable is out for so long, s; 0: never."""
+    """Number of frames after which the cable is out, and for how long, s; 0: never."""
     stall_every: int = 0
     stalled_s: float = 0.5
-    """After so many frames none come for so long, s; 0: never."""
+    """Number of frames after which none come, and for how long, s; 0: never."""
     seed: int = 0
 
 
@@ -93,7 +93,7 @@ class SimulatedDevice:
         self.sensor = (columns, rows)
         self.settings = CameraSettings(rate_hz=rate_hz, region=(0, 0, columns, rows))
         self.taken = 0
-        """Frames exposed since it was made; what is drawn from the seed is told by this number."""
+        """Frames exposed since it was made; random numbers follow from the seed and this number."""
         self.disconnects = 0
         self._unplugged_until_s = 0.0
         self._stalled_until_s = 0.0
@@ -121,7 +121,7 @@ class SimulatedDevice:
         return max(0.0, self._stalled_until_s - time.monotonic())
 
     def unplug(self, seconds: float = float("inf")) -> None:
-        """Pull its cable, for so long."""
+        """Pull its cable for a time."""
         self.disconnects += 1
         self._unplugged_until_s = time.monotonic() + seconds
 
@@ -130,7 +130,7 @@ class SimulatedDevice:
         self._unplugged_until_s = 0.0
 
     def stall(self, seconds: float) -> None:
-        """Let no frame come for so long."""
+        """Let no frame come for a time."""
         self._stalled_until_s = time.monotonic() + seconds
 
     def expose(self) -> tuple[GreyImage, Literal["", "lost", "cut off"]]:
@@ -231,7 +231,7 @@ class SimulatedCamera(Camera):
         self._begun_s = None
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
         self.stop()
 
     def _await(self, until_s: float) -> int | None:

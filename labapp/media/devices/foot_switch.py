@@ -34,10 +34,10 @@ BOUNCE_S = 0.05
 """A pedal that is down again within this time of having been down was pressed once."""
 
 GLANCE_MS = 10
-"""So long each device is listened to in turn while one is learned."""
+"""Time, ms, that each device is read in turn while one is learned."""
 
 MODIFIERS = 0xE0
-"""The first of the keys that a keyboard tells by bits (Ctrl, Shift …)."""
+"""The first of the keys that a keyboard sends as bits (Ctrl, Shift …)."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Pedals:
 def _keys(report: bytes) -> frozenset[int]:
     """Keys that are down: a byte of modifiers, one that is unused, then keys by their numbers."""
     modifiers = {MODIFIERS + bit for bit in range(8) if report[:1] and report[0] >> bit & 1}
-    # 1 to 3 tell of errors, such as too many keys.
+    # 1 to 3 mean errors, such as too many keys.
     return frozenset(modifiers | {key for key in report[2:] if key > 3})
 
 
@@ -184,7 +184,7 @@ class FootSwitch(HidReader):
         now_s, before = time.monotonic(), self._known.down
         new = self._known.pressed(number, report)
         first = [p for p in sorted(new) if now_s - self._down_s.get(p, -math.inf) >= BOUNCE_S]
-        # One that is let go now was down until now: contacts bounce then, too.
+        # One that is released now was down until now: contacts bounce then, too.
         self._down_s |= dict.fromkeys(before | new, now_s)
         if number < 0:
             self._down_s.clear()

@@ -44,9 +44,9 @@ class SixAxes:
     """Those that are down, by number from 0."""
 
     def after(self, number: int, report: bytes) -> SixAxes:
-        """How it is held after a report of this number; as before where it tells nothing.
+        """How it is held after a report of this number; unchanged by other reports.
 
-        Number −1, the device is gone: let go of.
+        Number −1, the device is gone: released.
         """
         if number < 0:
             return SixAxes()
@@ -93,7 +93,7 @@ class SpaceMouse(HidReader):
         return info.is_3d
 
     def on_report(self, number: int, report: bytes) -> None:
-        """Tell of a change."""
+        """Report a change."""
         held = self._held.after(number, report)
         if held != self._held:
             self._held = held

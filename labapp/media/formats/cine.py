@@ -91,7 +91,7 @@ class CineSource(StoredFrames):
     Raises
     ------
     InputError
-        If it is no such recording or there is not one whole frame in it.
+        If it is no such recording or there is no complete frame in it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -237,7 +237,7 @@ def _read_setup(path: Path, at: int, size: int) -> _Setup:
         length=length,
         frame_rate_hz=plausible_rate(rate & 0xFFFFFFFF),
         real_bits=field(REAL_BPP),
-        # The high byte tells grey heads of cameras with several.
+        # The high byte distinguishes the heads of cameras with several.
         filtered=bool((field(CFA) or 0) & 0xFFFFFF),
         shown_turned=any(field(offset) for offset in (FLIP_H, FLIP_V, ROTATE)),
     )
@@ -246,7 +246,7 @@ def _read_setup(path: Path, at: int, size: int) -> _Setup:
 def _read_places(
     path: Path, at: int, claimed: int, size: int, form: _Format
 ) -> tuple[npt.NDArray[np.uint64], int]:
-    """Offset of every whole image, shape (n,), and the number of images there should be."""
+    """Offset of every complete image, shape (n,), and the number of images there should be."""
     if claimed == 0:
         raise InputError(path, "ImageCount", 0, "1 frame or more")
     possible = min(claimed, max(size - at, 0) // 8, size // (8 + form.image_bytes))

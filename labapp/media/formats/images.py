@@ -87,7 +87,7 @@ def read_image(path: Path) -> GreyImage:
     Raises
     ------
     InputError
-        If it cannot be opened, is not a whole image, holds several, or NaN or infinity.
+        If it cannot be opened, is no complete image, holds several, or NaN or infinity.
     """
     # Read here rather than by OpenCV: it says why a file cannot be opened.
     with os_errors_as_input(path, "file", "a file that may be read"):

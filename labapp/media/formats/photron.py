@@ -88,7 +88,7 @@ class PhotronSource(StoredFrames):
     ------
     InputError
         If the other file is missing or one of two, the header does not say what is needed, or
-        there is not one whole frame.
+        there is no complete frame.
     """
 
     def __init__(self, path: Path) -> None:

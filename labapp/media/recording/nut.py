@@ -134,7 +134,7 @@ class NutWriter:
         Raises
         ------
         OSError
-            If it cannot be written: frames before it are whole.
+            If it cannot be written: frames before it are intact.
         WrongFrame
             If it is of another shape or has levels of more bits.
         """
@@ -154,7 +154,7 @@ class NutWriter:
         Raises
         ------
         OSError
-            If what is left of it cannot be written: it is whole without.
+            If what is left of it cannot be written: the file is complete without it.
         """
         try:
             self._container.close()

@@ -32,7 +32,7 @@ SWITCH_S = 5e-4
 slower than 200 of them come a second, while a window draws."""
 
 STALL_S = 1.0
-"""A disk that takes longer for a frame is said to stall."""
+"""A disk that takes longer for a frame is reported as stalled."""
 
 RATE_HZ = 25.0
 """Frame rate in the video's header where the camera's is unknown."""
@@ -51,7 +51,7 @@ class Plan:
     before_s: float = 0.0
     """Time recorded from before the trigger, s."""
     after_s: float | None = None
-    """So long from the first frame after it on, s; None: until it is stopped."""
+    """Duration from the first frame after it, s; None: until it is stopped."""
     every: int = 1
     """Every n-th frame."""
     codec: Codec = "raw"

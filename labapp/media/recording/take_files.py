@@ -20,7 +20,7 @@ NOTES = ("time_s", "frame", "source", "kind", "what")
 """Columns of the notes beside a recording; the frame is the one that was next at that time."""
 
 NOTED_LATE = 10_000
-"""A note may refer to a time so many frames ago: measuring a frame can take seconds."""
+"""Number of frames that a note may be late: measuring a frame can take seconds."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class TakeFiles:
             self._note(note)
 
     def _note(self, note: Note) -> None:
-        """Append a note; if that fails the video goes on, with one event."""
+        """Append a note; if that fails the video continues, with one event."""
         time_s = note.time_s - self._first_s
         event = note.event
         later = len(self._times_s) - bisect_right(self._times_s, note.time_s)

@@ -72,7 +72,7 @@ class BenchLimits:
     px_per_mm: float = 4.7
     """Of the camera, on the imaging plane."""
     spacing_px: float = 6.0
-    """Neighbouring dots that lie closer cannot be told apart."""
+    """Neighbouring dots that lie closer cannot be resolved."""
     dot_sigma_px: float = 0.3
     """Standard uncertainty of a dot's place."""
     sigma: Mapping[str, float] = field(default_factory=lambda: dict(NOMINAL))

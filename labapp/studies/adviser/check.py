@@ -69,7 +69,7 @@ class Check(ReadOnlyArrays):
 
     @property
     def off_prediction(self) -> float:
-        """How far the error is off the predicted one, as a share of that."""
+        """Deviation of the error from the predicted one, as a share of that."""
         return self.error_mm / self.advice.error_mm - 1
 
 

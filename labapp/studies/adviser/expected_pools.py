@@ -79,7 +79,7 @@ class ExpectedPools:
         return tuple(dict.fromkeys(self.at(np.array(share)) for share in shares))
 
     def sample(self, count: int, seed: int, even: bool = True, places: int = 1) -> Sample:
-        """Draw pools, each at so many places, and errors of the calibration with each of these.
+        """Draw pools, each at a number of places, and errors of the calibration with each of these.
 
         Evenly, by a scrambled Sobol row, or each independently of the others. The places of a
         pool follow each other.

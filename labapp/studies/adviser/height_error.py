@@ -32,7 +32,7 @@ class Trial:
     last: int
     """Pools ``first`` to before ``last`` of a sample."""
     calibrated: bool = True
-    """Whether the calibration is off, by the sample's errors."""
+    """Whether the calibration has the sample's errors."""
 
 
 def simulated_errors(trial: Trial) -> FloatArray:

@@ -36,7 +36,7 @@ LEAST_DOTS = 9
 RIM_POINTS = 72
 
 DECIDING = 4
-"""So many lit and dark rays nearest the boundary place the level."""
+"""Number of lit and dark rays nearest the boundary that determine the level."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class PredictedError(ReadOnlyArrays):
     """The dots' uncertainty on the plane."""
     parameters_mm: FloatArray
     """What each of the bench's `QUANTITIES` changes by its standard uncertainty, shape (q,); zero
-    where not asked for.
+    where not requested.
     """
     setup_mm: float
     """These together, with their correlations."""

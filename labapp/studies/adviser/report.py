@@ -27,7 +27,7 @@ KEPT, BROKEN = "#1b7a3d", "#b01030"
 
 
 def advice_text(advice: Advice) -> str:
-    """Tell the recommended set-up, what to expect of it and what it keeps; Markdown."""
+    """The recommended set-up, its expected error and its margins, as Markdown."""
     best = advice.best
     if advice.possible:
         height = advice.expected.mean_height_mm

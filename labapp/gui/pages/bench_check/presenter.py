@@ -1,4 +1,4 @@
-"""What the bench-check page shows: mirrors and their pictures, and what they tell of the bench."""
+"""What the bench-check page shows: mirrors and their pictures, and what follows for the bench."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def _sentence(words: str, end: str = ".") -> str:
 
 
 def kept_words(session: Session) -> str:
-    """What is said of the check that the session keeps; empty without one."""
+    """The stored check in words; empty without one."""
     found = session.bench_check
     if found is None:
         return ""

@@ -399,7 +399,7 @@ class _QuantityTable(ReadTable):
         name = "Quantities of the set-up, before and after the check"
         super().__init__(name, f"{name}: Ctrl+C copies it", COLUMNS)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        # Long names take more lines; the header tells of a width before the cells have it.
+        # Long names take more lines; the header reports a width before the cells have it.
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self.resizeRowsToContents)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())

@@ -37,7 +37,7 @@ from labapp.session.session import Session
 from labapp.text import pluralize
 
 REST_MS = 120
-"""Exposure is judged where a frame stays in view so long: not while frames rush by."""
+"""Time, ms, that a frame stays in view before its exposure is judged."""
 
 NONE_YET = (
     "Choose a video, an image, a folder of images or a stack, or drop it on the window; or start a "
@@ -112,7 +112,7 @@ class CapturePage(Page):
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
 
     def leave(self) -> None:
-        """Judge no frame that nobody sees; a camera goes on, and so does its recording."""
+        """Judge no frame that is not in view; a camera and its recording continue."""
         if self._rest.isActive():
             self._rest.stop()
             self._seen = None
@@ -212,7 +212,7 @@ class CapturePage(Page):
     # --- frames to look at --------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Read the frame to be seen in the background; of several asked for, the last."""
+        """Read the frame in view in the background; of several requests, the last."""
         if self.live_view.live is not None:
             return
         session, preview = self.workspace.session, self.preview

@@ -13,7 +13,7 @@ from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 
 REST_MS = 120
-"""Dots are looked for where the frame stays in view so long: not while frames rush by."""
+"""Time, ms, that a frame stays in view before its dots are searched."""
 
 
 class Looking(QObject):

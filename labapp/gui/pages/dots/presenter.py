@@ -284,7 +284,7 @@ def figures(result: Result | None) -> Figures | None:
 
 
 def compared(before: Figures | None, after: Figures | None, pending: str = "") -> list[ResultRow]:
-    """The fit before the last edit and after it; ``pending`` stands for what is not known yet."""
+    """The fit before the last edit and after it; ``pending`` is shown for what is not known yet."""
 
     def pair(texts: Sequence[str]) -> str:
         first, last = texts

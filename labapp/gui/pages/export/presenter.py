@@ -315,7 +315,7 @@ def folder_within(folder: Path, session: Session) -> Path:
     try:
         own = not any(folder.iterdir()) or (folder / MANIFEST).is_file()
     except OSError:
-        own = True  # the export tells what is wrong with it
+        own = True  # the export reports what is wrong with it
     return folder if own else folder / proposed_folder(session).name
 
 

@@ -81,7 +81,7 @@ class Options:
     same_colours: bool = False
     """Whether all frames share one scale of colours."""
     exaggeration: float = 3.0
-    """Heights are drawn so many times as high."""
+    """Factor by which heights are drawn larger."""
     section: tuple[float, float] | None = (90.0, 0.0)
     """Angle, degrees, and offset, mm, of the section line; None without one."""
 

@@ -60,7 +60,7 @@ class TrendsState:
     """How far the set-up can be relied on; empty where it is not complete."""
     spectrum: tuple[Curve, ...]
     spectrum_axis: Axis
-    """Of the measure asked for; no curve where there is none."""
+    """Spectrum of the chosen measure; no curve where there is none."""
     spectrum_words: str
     """The strongest oscillation, or why there is no spectrum."""
     signals_words: str
