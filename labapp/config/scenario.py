@@ -41,21 +41,14 @@ SWINGS = 6
 
 @dataclass(frozen=True)
 class Scenario:
-    """A valid scenario.
-
-    Parameters
-    ----------
-    recording
-        What it describes, to be rendered.
-    setup
-        The setup file of its bench, as text.
-    text
-        The scenario as it was read.
-    """
+    """A valid scenario."""
 
     recording: Recording
+    """What it describes, to be rendered."""
     setup: str
+    """The setup file of its bench, as text."""
     text: str
+    """The scenario as it was read."""
 
     @property
     def title(self) -> str:

@@ -41,25 +41,18 @@ LEAST_ANGLE_DEG = 10.0
 
 @dataclass(frozen=True)
 class Setup:
-    """A valid setup.
-
-    Parameters
-    ----------
-    rig
-        Laser, dot pattern, electrode, imaging plane.
-    calibration
-        Pixel ↔ imaging plane.
-    text
-        The file as it was read, for the record.
-    checked
-        When the bench was checked against a known mirror, ISO 8601; empty where it was not, or was
-        changed since.
-    """
+    """A valid setup."""
 
     rig: Rig
+    """Laser, dot pattern, electrode, imaging plane."""
     calibration: ImageCalibration
+    """Pixel ↔ imaging plane."""
     text: str
+    """The file as it was read, for the record."""
     checked: str = ""
+    """When the bench was checked against a known mirror, ISO 8601; empty where it was not, or was
+    changed since.
+    """
 
     @functools.cached_property
     def bench(self) -> Bench:

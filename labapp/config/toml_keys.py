@@ -51,21 +51,14 @@ def parse_toml(text: str, path: Path, wanted: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule for the value of a key.
-
-    Parameters
-    ----------
-    expected
-        That in words, completing "expected …".
-    accepts
-        Whether a value as TOML gives it is right.
-    required
-        Whether the key must be there.
-    """
+    """Rule for the value of a key."""
 
     expected: str
+    """What is right, in words, completing "expected …"."""
     accepts: Callable[[object], bool]
+    """Whether a value as TOML gives it is right."""
     required: bool = True
+    """Whether the key must be there."""
 
 
 def is_number(value: object) -> TypeGuard[float]:

@@ -67,33 +67,6 @@ OWN_FOLDER = "a new or empty folder, or an earlier export that was not changed (
 class ExportChoice:
     """Choice of what an export contains.
 
-    Parameters
-    ----------
-    tables
-        Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``.
-    surfaces
-        How to write each surface: some of `SURFACE_FORMATS`.
-    solid
-        Whether to add each surface as a watertight body, in the mesh formats of `surfaces`.
-    hdf5
-        Short for ``hdf5`` in `together`.
-    pictures
-        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
-        ``film`` (the surfaces, one after the other in one view and on one colour scale).
-    spacing_mm
-        Distance of the surfaces' nodes, mm.
-    view
-        Where surfaces are looked at from, in pictures and the film: ``free`` (obliquely), ``top``,
-        ``side`` or ``front``.
-    size_px
-        Width and height of these, even, px.
-    film_rate_hz
-        Frames of the film a second; None: as fast as they were recorded (`film.film_times`).
-    together
-        How to write everything into one file: some of `RUN_FORMATS`.
-    sigma_parts
-        Whether `measures.csv` has the parts of standard uncertainties, too.
-
     Raises
     ------
     InputError
@@ -101,16 +74,31 @@ class ExportChoice:
     """
 
     tables: frozenset[str] = frozenset(TABLES)
+    """Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``."""
     surfaces: frozenset[str] = frozenset(SURFACES)
+    """How to write each surface: some of `SURFACE_FORMATS`."""
     solid: bool = False
+    """Whether to add each surface as a watertight body, in the mesh formats of `surfaces`."""
     hdf5: bool = False
+    """Short for ``hdf5`` in `together`."""
     pictures: frozenset[str] = frozenset()
+    """Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
+    ``film`` (the surfaces, one after the other in one view and on one colour scale).
+    """
     spacing_mm: float = SPACING_MM
+    """Distance of the surfaces' nodes, mm."""
     view: Direction = "free"
+    """Where surfaces are looked at from, in pictures and the film: ``free`` (obliquely), ``top``,
+    ``side`` or ``front``.
+    """
     size_px: tuple[int, int] = PICTURE_PX
+    """Width and height of these, even, px."""
     film_rate_hz: float | None = None
+    """Frames of the film a second; None: as fast as they were recorded (`film.film_times`)."""
     together: frozenset[str] = frozenset()
+    """How to write everything into one file: some of `RUN_FORMATS`."""
     sigma_parts: bool = False
+    """Whether `measures.csv` has the parts of standard uncertainties, too."""
 
     def __post_init__(self) -> None:
         allowed: dict[str, Collection[str]] = {

@@ -40,18 +40,12 @@ PLY_FACE = np.dtype([("count", "u1"), ("corner", "<i4", 3)])
 
 @dataclass(frozen=True)
 class Mesh(ReadOnlyArrays):
-    """Triangles; n vertices, k triangles.
-
-    Parameters
-    ----------
-    vertices_mm
-        UCS, shape (n, 3), mm.
-    triangles
-        Indices of their corners, shape (k, 3).
-    """
+    """Triangles; n vertices, k triangles."""
 
     vertices_mm: FloatArray
+    """UCS, shape (n, 3), mm."""
     triangles: IntArray
+    """Indices of their corners, shape (k, 3)."""
 
 
 def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:

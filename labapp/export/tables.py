@@ -35,24 +35,16 @@ Table = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
-
-    Parameters
-    ----------
-    name
-        Its name, which ends in the unit.
-    description
-        What it holds, in a few words.
-    digits
-        Decimals in CSV; 0 for whole numbers, None for text.
-    is_part
-        Whether it is a part of a standard uncertainty: in CSV files where these are requested.
-    """
+    """A column of a table."""
 
     name: str
+    """Its name, which ends in the unit."""
     description: str
+    """What it holds, in a few words."""
     digits: int | None = MM_DIGITS
+    """Decimals in CSV; 0 for whole numbers, None for text."""
     is_part: bool = False
+    """Whether it is a part of a standard uncertainty: in CSV files where these are requested."""
 
     @property
     def unit(self) -> str:
