@@ -31,6 +31,7 @@ from labapp.simulated.simulated_pool import BENCH
 from labapp.simulation.parallel import Progress
 
 RATE_HZ, WAVE_HZ = 200.0, 37.3
+COLD = 3  # frames measured without a prior
 
 SCENARIO = f"""# A pool that swings, before a fast camera.
 
@@ -164,8 +165,8 @@ class Latency:
     """Processor time of a frame measured without a prior, s."""
 
 
-def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
-    """Time the first ``frames`` frames, each followed from the one before, and ``cold`` without."""
+def time_frames(video: Video, frames: int) -> Latency:
+    """Time the first ``frames`` frames, each followed from the one before, and `COLD` without."""
     cv2.setNumThreads(1)
     steps: dict[str, list[float]] = {name: [] for name in STEPS}
     last = [0.0]
@@ -191,10 +192,10 @@ def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
                 wall.append(time.perf_counter() - begun)
                 used.append(time.process_time() - start)
         begun = time.process_time()
-        for number in range(cold):
-            image = source.frame((number + 1) * frames // (cold + 1)).image
+        for number in range(COLD):
+            image = source.frame((number + 1) * frames // (COLD + 1)).image
             measure(image, bench, settings)
-        cold_s = (time.process_time() - begun) / cold
+        cold_s = (time.process_time() - begun) / COLD
     by_step = {name: Spread.of(times) for name, times in steps.items()}
     return Latency(Spread.of(wall), by_step, Spread.of(used), cold_s)
 

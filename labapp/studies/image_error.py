@@ -98,9 +98,9 @@ def axes_of(view: CameraView) -> AxisPoints:
     return AxisPoints(calibration, view.x_axis_mm, view.z_axis_mm)
 
 
-def exactly_seen(cap: Pool, rig: Rig, view: CameraView = VIEW) -> KnownPool:
+def exactly_seen(cap: Pool, rig: Rig) -> KnownPool:
     """A known pool with its dots where they truly are; those that miss the plane are lost."""
-    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, nominal(axes_of(view)))
+    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, nominal(axes_of(VIEW)))
 
 
 def frame_errors(

@@ -38,6 +38,9 @@ USUAL: Mapping[str, tuple[float, float | None]] = {
 }
 """Height and diameter that a mirror of a kind has at first, mm."""
 
+REACH_PX = 8.0
+"""How near to a dot the pointer must be."""
+
 Progress = Callable[[int, int, str], None]
 
 
@@ -311,10 +314,10 @@ def _numbers(picture: MirrorPicture) -> tuple[tuple[str, float, float, bool], ..
     return tuple(made)
 
 
-def ray_words(picture: MirrorPicture, u: float, v: float, reach_px: float = 8.0) -> str:
+def ray_words(picture: MirrorPicture, u: float, v: float) -> str:
     """The ray of the dot at a place, and its residual; empty where there is none."""
     off = np.hypot(*(picture.dot_px - [u, v]).T)
-    if not len(off) or off.min() > reach_px:
+    if not len(off) or off.min() > REACH_PX:
         return ""
     k = int(np.argmin(off))
     (i, j), um = picture.ray[k].tolist(), 1000 * np.hypot(*picture.residual_mm[k])
