@@ -55,7 +55,6 @@ class RunFormat:
     """A format with one file for all frames."""
 
     file: str
-    """Its name."""
     title: str
     tip: str
     """What the Export page calls it, and what it is."""

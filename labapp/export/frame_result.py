@@ -16,7 +16,6 @@ class FrameResult:
     time_s: float | None
     """Its number, and its time where it has one, s."""
     measurement: Measurement
-    """What was measured."""
     track_lost: str | None = None
     """Why it was not measured from the frame before; None if it was, or was not to be."""
     rows: Mapping[str, str] | None = None

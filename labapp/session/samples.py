@@ -17,17 +17,10 @@ UNIT_MM = 6.35
 
 @dataclass(frozen=True)
 class SampleSession:
-    """What is known of a sample besides its folder.
-
-    Parameters
-    ----------
-    recording
-        The recording's name in the folder.
-    record
-        The experiment record.
-    """
+    """What is known of a sample besides its folder."""
 
     recording: str
+    """The recording's name in the folder."""
     record: Record
 
 

@@ -82,17 +82,6 @@ class CameraView:
     from here. The camera stands far off and square to the plane: the map is affine, but for what
     its lens does.
 
-    Parameters
-    ----------
-    origin_px, x_axis_px, z_axis_px
-        (u, v) of O′, of a point on O′X′ and of a point on O′Z′, px.
-    x_axis_mm, z_axis_mm
-        X′ of the former, Z′ of the latter, mm.
-    width_px, height_px
-        Size of the picture.
-    lens
-        What bends the picture; the three points are those of the picture without it. None: nothing.
-
     Raises
     ------
     ValueError
@@ -104,9 +93,11 @@ class CameraView:
     x_axis_mm: float
     z_axis_px: tuple[float, float]
     z_axis_mm: float
+    """(u, v) of O′; (u, v), px, and X′ or Z′, mm, of a point on O′X′ and of one on O′Z′."""
     width_px: int = 480
     height_px: int = 640
     lens: Lens | None = None
+    """What bends the picture; the three points are those without it. None: nothing."""
 
     def __post_init__(self) -> None:
         if self.lens is None:

@@ -36,19 +36,12 @@ STATES = {
 
 @dataclass(frozen=True)
 class Series:
-    """A size over the frames; n of them.
-
-    Parameters
-    ----------
-    label
-        Its name and unit.
-    values, sigma
-        Shape (n,); NaN where there is none.
-    """
+    """A size over the frames; n of them."""
 
     label: str
     values: FloatArray
     sigma: FloatArray
+    """Shape (n,); NaN where there is none."""
 
 
 def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
